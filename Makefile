@@ -1,0 +1,41 @@
+# Two commands do their own set-up: `make demo` and `make test`. PYTHON chooses the interpreter.
+PYTHON ?= python3
+VENV   ?= .venv
+BIN    := $(VENV)/bin
+STAMP  := $(VENV)/.installed
+
+.PHONY: demo test check check-static bench clean help
+
+help:
+	@echo "make demo    bring up a small robot from its manifest, verified, then shut it down"
+	@echo "make test    set up and run the tests that need no privilege"
+	@echo "make check   everything CI runs: lint, types, import contracts, all tests"
+	@echo "make bench   run the benchmarks and print their ratios"
+
+$(STAMP): pyproject.toml
+	$(PYTHON) -c 'import sys; sys.exit("lifecycle needs CPython 3.10 to 3.13, this is " + sys.version.split()[0]) if not (3, 10) <= sys.version_info[:2] <= (3, 13) else None'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	touch $(STAMP)
+
+demo: $(STAMP)
+	$(BIN)/lifecycle up manifests/teleop.lifecycle.yaml --stop-after 5
+
+# Side by side what minds no company; one after the other what is about time and silence.
+test: $(STAMP)
+	$(BIN)/python -m pytest -n 2 tests/unit tests/ros/faults
+	$(BIN)/python -m pytest tests/ros tests/net --ignore=tests/ros/faults
+
+check-static: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+check: check-static test
+
+bench: $(STAMP)
+	@for each in benchmarks/*.py; do echo "== $$each"; $(BIN)/python $$each || exit 1; done
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
