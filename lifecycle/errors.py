@@ -1,0 +1,61 @@
+"""The root exception, its kinds, and the process exit codes each one maps to.
+
+Owns: every exit code of the command line and the exceptions that cross room borders. One
+boundary (`lifecycle.cli.main`) turns exceptions into exit codes. Imports nothing of the package.
+"""
+
+from __future__ import annotations
+
+import enum
+
+
+class ExitCode(enum.IntEnum):
+    """Exit codes of every `lifecycle` verb."""
+
+    OK = 0
+    USAGE = 2
+    MANIFEST_INVALID = 3
+    VIOLATED = 4
+    UNVERIFIABLE = 5
+    BRING_UP_FAILED = 6
+    SUPERVISION_GAVE_UP = 7
+    INTERNAL = 70
+    INTERRUPTED = 130
+
+
+class LifecycleError(Exception):
+    """Root of every exception that this package raises on purpose.
+
+    Attributes:
+        message: one sentence that starts with "cannot", quotes the value, says what is allowed.
+        hint: the next thing to do, often a command; empty where there is none.
+        exit_code: what the command line exits with when nothing handled it.
+    """
+
+    exit_code: ExitCode = ExitCode.INTERNAL
+
+    def __init__(self, message: str, *, hint: str = "") -> None:
+        super().__init__(message)
+        self.message = message
+        self.hint = hint
+
+    def __str__(self) -> str:
+        return f"{self.message}; {self.hint}" if self.hint else self.message
+
+
+class UsageError(LifecycleError):
+    """The command line was used wrongly: unknown node name, bad `name:=value`, missing file."""
+
+    exit_code = ExitCode.USAGE
+
+
+class MiddlewareError(LifecycleError):
+    """The middleware refused or failed; carries the RMW's own reason."""
+
+    exit_code = ExitCode.BRING_UP_FAILED
+
+
+class BringUpError(LifecycleError):
+    """A process died, a transition failed or a deadline passed while bringing a system up."""
+
+    exit_code = ExitCode.BRING_UP_FAILED

@@ -1,0 +1,70 @@
+"""Positions in a document and the diagnostics that point at them.
+
+Owns: `Position`, `Diagnostic`, `ManifestError`. Every check appends diagnostics and goes on, so
+that a user sees all findings at once. Pure.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+from collections.abc import Iterable
+
+from lifecycle.errors import ExitCode, LifecycleError
+
+
+class Severity(enum.Enum):
+    """How bad a diagnostic is; only ERROR stops a manifest from loading."""
+
+    ERROR = "error"
+    WARNING = "warning"
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Position:
+    """Where something stands in a document.
+
+    Attributes:
+        file: path as the user wrote it.
+        line: from 1.
+        column: from 1.
+        path: place in the document, `nodes.camera.interface.publishers[0].qos.depth`.
+    """
+
+    file: str
+    line: int
+    column: int
+    path: str = ""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Diagnostic:
+    """One finding of a static check.
+
+    Attributes:
+        rule: stable id, `manifest.unknown-key`, `check.qos-incompatible`.
+        message: starts with "cannot", quotes the value, says what is allowed.
+        hint: the fix or the command that fixes it; may be empty.
+    """
+
+    rule: str
+    severity: Severity
+    at: Position
+    message: str
+    hint: str = ""
+
+    def __str__(self) -> str:
+        place = f"{self.at.file}:{self.at.line}:{self.at.column}: "
+        path = f"{self.at.path}: " if self.at.path else ""
+        word = "warning: " if self.severity is Severity.WARNING else ""
+        return f"{place}{word}{path}{self.message}" + (f"; {self.hint}" if self.hint else "")
+
+
+class ManifestError(LifecycleError):
+    """A manifest that cannot be used; carries every diagnostic, errors and warnings."""
+
+    exit_code = ExitCode.MANIFEST_INVALID
+
+    def __init__(self, diagnostics: Iterable[Diagnostic]) -> None:
+        self.diagnostics = tuple(diagnostics)
+        super().__init__("\n".join(str(each) for each in self.diagnostics))

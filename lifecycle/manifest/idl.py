@@ -1,0 +1,171 @@
+"""The part of OMG IDL that ROS interfaces are installed in: one structure, its fields and typedefs.
+
+Owns: reading `struct Name { … }` out of an `.idl` file as rosidl writes or accepts it
+(https://design.ros2.org/articles/idl_interface_definition.html). Everything else is skipped. Pure.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Iterator
+
+_WORD = re.compile(
+    r"""//[^\n]*|/\*.*?\*/|\#[^\n]*      # comments and includes
+    |"(?:\\.|[^"\\])*"|'(?:\\.|[^'\\])'  # text of annotations and defaults
+    |[A-Za-z_][\w]*(?:::[A-Za-z_]\w*)*   # names, scoped ones whole
+    |[\d.][\w.+-]*|\S""",
+    re.VERBOSE | re.DOTALL,
+)
+_SKIPPED = ("//", "/*", "#")
+_UNSIGNED = {"short": "uint16", "long": "uint32"}
+
+
+class IdlError(Exception):
+    """The text is not IDL of the kind that is read here."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Field:
+    """One field of a structure, typedefs followed.
+
+    Attributes:
+        type: a primitive's IDL name, `string`, `wstring`, or a scoped name `a::msg::B`.
+        length: number of items of a fixed array, 1 for a single value.
+        is_sequence: of variable length.
+        bound: most items of a sequence; None if it has no bound.
+        string_bound: most characters of a string; None if it has no bound.
+    """
+
+    type: str
+    length: int = 1
+    is_sequence: bool = False
+    bound: int | None = None
+    string_bound: int | None = None
+
+
+def parse_struct(text: str, name: str) -> tuple[Field, ...]:
+    """Return the fields of the structure `name`.
+
+    Raises:
+        IdlError: there is no such structure, or it holds something that is not understood.
+    """
+    return _Parser(text).struct(name)
+
+
+class _Parser:
+    def __init__(self, text: str) -> None:
+        found: list[str] = _WORD.findall(text)
+        self._words: list[str] = [each for each in found if not each.startswith(_SKIPPED)]
+        self._at = 0
+        self._typedefs: dict[str, Field] = {}
+
+    def struct(self, name: str) -> tuple[Field, ...]:
+        while self._at < len(self._words):
+            word = self._next()
+            if word == "@":
+                self._annotation()
+            elif word == "typedef":
+                type_ = self._type()
+                self._typedefs.update(self._declarators(type_))
+            elif word == "struct" and self._peek() == name:
+                self._next()
+                return tuple(self._members())
+        raise IdlError(f"cannot find struct {name!r}")
+
+    def _members(self) -> Iterator[Field]:
+        self._expect("{")
+        while self._peek() != "}":
+            while self._peek() == "@":
+                self._next()
+                self._annotation()
+            yield from self._declarators(self._type()).values()
+
+    def _type(self) -> Field:
+        word = self._next()
+        if word == "sequence":
+            return self._sequence()
+        if word in ("string", "wstring"):
+            bound = None
+            if self._peek() == "<":
+                self._next()
+                bound = self._number()
+                self._expect(">")
+            return Field(type=word, string_bound=bound)
+        if word == "unsigned":
+            word = _UNSIGNED.get(self._next(), "")
+            if word == "uint32" and self._peek() == "long":
+                self._next()
+                word = "uint64"
+        elif word == "long" and self._peek() in ("long", "double"):
+            word = {"long": "int64", "double": "long double"}[self._next()]
+        if word in self._typedefs:
+            return self._typedefs[word]
+        if not word or not (word[0].isalpha() or word[0] == "_"):
+            raise IdlError(f"cannot read a type at {word!r}")
+        return Field(type=word)
+
+    def _sequence(self) -> Field:
+        self._expect("<")
+        item = self._type()
+        bound = None
+        if self._peek() == ",":
+            self._next()
+            bound = self._number()
+        self._expect(">")
+        if item.is_sequence or item.length != 1:
+            raise IdlError("cannot read a sequence of sequences or arrays")
+        return dataclasses.replace(item, is_sequence=True, bound=bound)
+
+    def _declarators(self, type_: Field) -> dict[str, Field]:
+        """Read `name[3][4], other;` after a type."""
+        found: dict[str, Field] = {}
+        while True:
+            name, length = self._next(), 1
+            if not name.isidentifier():
+                raise IdlError(f"cannot read {name!r} as the name of a field")
+            while self._peek() == "[":
+                self._next()
+                length *= self._number()
+                self._expect("]")
+            if length != 1 and type_.is_sequence:
+                raise IdlError("cannot read an array of sequences")
+            found[name] = dataclasses.replace(type_, length=type_.length * length)
+            word = self._next()
+            if word == ";":
+                return found
+            if word != ",":
+                raise IdlError(f"cannot read {word!r} after a name")
+
+    def _annotation(self) -> None:
+        """Skip `@name` or `@name(…)`; the @ is read."""
+        self._next()
+        if self._peek() != "(":
+            return
+        depth = 0
+        while True:
+            word = self._next()
+            depth += {"(": 1, ")": -1}.get(word, 0)
+            if depth == 0:
+                return
+
+    def _number(self) -> int:
+        word = self._next()
+        try:
+            return int(word, 0)
+        except ValueError:
+            raise IdlError(f"cannot use {word!r} as a bound") from None
+
+    def _expect(self, word: str) -> None:
+        if (found := self._next()) != word:
+            raise IdlError(f"cannot read {found!r} where {word!r} must be")
+
+    def _peek(self) -> str:
+        if self._at >= len(self._words):
+            raise IdlError("cannot read on: the text ends")
+        return self._words[self._at]
+
+    def _next(self) -> str:
+        word = self._peek()
+        self._at += 1
+        return word

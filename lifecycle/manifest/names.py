@@ -1,0 +1,276 @@
+"""ROS names: which are legal, what a declared name becomes, and which rules remap it.
+
+Owns: the rules of rmw_validate_node_name, rmw_validate_namespace, rmw_validate_full_topic_name,
+rcl_validate_topic_name, rcl_expand_topic_name and the order in which rcl applies them. How a remap
+rule is written is `remapping`'s. plan/ resolves every endpoint through `resolve`. Pure.
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+from collections.abc import Iterable, Mapping, Sequence
+
+from lifecycle.errors import ExitCode, LifecycleError
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.manifest.remapping import RemapKind, RemapRule, parse_rule
+from lifecycle.manifest.scalars import quote
+
+MAX_TOPIC_LENGTH = 247
+"""RMW_TOPIC_MAX_NAME_LENGTH: 255 less 8 that are reserved for prefixes."""
+
+MAX_NAMESPACE_LENGTH = MAX_TOPIC_LENGTH - 2
+"""RMW_NAMESPACE_MAX_LENGTH: room for `/` and a name of one character."""
+
+MAX_NODE_NAME_LENGTH = 255
+"""RMW_NODE_NAME_MAX_NAME_LENGTH."""
+
+ACTION_SERVICES = ("send_goal", "cancel_goal", "get_result")
+"""Services under `<action>/_action/` (rcl_action/names.h)."""
+
+ACTION_TOPICS = ("feedback", "status")
+"""Topics under `<action>/_action/` (rcl_action/names.h)."""
+
+_NOT_IN = {"": re.compile(r"[^A-Za-z0-9_]"), "/": re.compile(r"[^A-Za-z0-9_/]")}
+_SUBSTITUTION = re.compile(r"\{([^{}]*)\}")
+_KNOWN_SUBSTITUTIONS = ("node", "ns", "namespace")
+
+_ACTIONS = (EndpointKind.ACTION_SERVER, EndpointKind.ACTION_CLIENT)
+
+
+class NameNotLegalError(LifecycleError):
+    """A name that no ROS node can use."""
+
+    exit_code = ExitCode.MANIFEST_INVALID
+
+
+def node_name_problem(name: str) -> str:
+    """Return why `name` is no node name, as a sentence without full stop; empty if it is legal."""
+    length = len(name)
+    return _first(
+        (not name, "a node name must not be empty"),
+        (_odd(name, ""), f"a node name holds letters, digits and '_' only{_odd(name, '')}"),
+        (name[:1].isdigit(), "a node name must not start with a digit"),
+        (
+            length > MAX_NODE_NAME_LENGTH,
+            f"a node name has at most {MAX_NODE_NAME_LENGTH} characters, this one {length}",
+        ),
+    )
+
+
+def namespace_problem(namespace: str) -> str:
+    """Return why `namespace` is no namespace of a node; empty if it is legal."""
+    if namespace == "/":
+        return ""
+    return _absolute_problem(namespace, "a namespace", MAX_NAMESPACE_LENGTH)
+
+
+def full_name_problem(name: str) -> str:
+    """Return why `name` is no fully qualified topic or service name; empty if it is legal."""
+    return _absolute_problem(name, "a fully qualified name", MAX_TOPIC_LENGTH)
+
+
+def name_problem(name: str) -> str:
+    """Return why `name` cannot name a topic, service or action in a node's code; empty if legal.
+
+    Relative, absolute and `~/private` names and the substitutions `{node}`, `{ns}` and
+    `{namespace}` are legal here.
+    """
+    plain = _SUBSTITUTION.sub("", name)
+    unknown = [each for each in _SUBSTITUTION.findall(name) if each not in _KNOWN_SUBSTITUTIONS]
+    known = ", ".join(f"'{{{each}}}'" for each in _KNOWN_SUBSTITUTIONS)
+    odd = _odd(plain[1:] if plain[:1] == "~" else plain, "/")
+    return _first(
+        (not name, "a name must not be empty"),
+        (name.endswith("/"), "a name must not end with '/'"),
+        ("~" in name[1:], "'~' may only be the first character of a name"),
+        (
+            name[:1] == "~" and name[1:2] not in ("", "/"),
+            f"'~' must be followed by '/', as in '~/{name[1:]}'",
+        ),
+        (
+            "{" in plain or "}" in plain,
+            "braces must be paired and not nested, as in '{node}/status'",
+        ),
+        (unknown, f"there is no substitution '{{{''.join(unknown[:1])}}}'; rcl knows {known}"),
+        (odd, f"a name holds letters, digits, '_' and '/' only{odd}"),
+        (_digit_first(name), "no part of a name may start with a digit"),
+    )
+
+
+@functools.lru_cache(maxsize=1 << 16)  # every check of a large system asks again
+def expand(name: str, node_name: str, namespace: str) -> str:
+    """Return the fully qualified form of `name`, before remapping, as rcl_expand_topic_name.
+
+    Args:
+        name: relative, absolute, `~`, `~/private`, with or without substitutions.
+        node_name: base name of the node.
+        namespace: absolute, `/` for the root.
+
+    Raises:
+        NameNotLegalError: the name, the node's name or its namespace is not legal, or the result
+            is not (two slashes in a row, too long).
+    """
+    checks = (
+        (name, name_problem(name)),
+        (node_name, node_name_problem(node_name)),
+        (namespace, namespace_problem(namespace)),
+    )
+    for value, problem in checks:
+        if problem:
+            raise NameNotLegalError(f"cannot use {quote(value)} as a name: {problem}")
+    prefix = namespace.rstrip("/")
+    expanded = f"{prefix}/{node_name}{name[1:]}" if name[0] == "~" else name
+    values = {"node": node_name, "ns": namespace, "namespace": namespace}
+    expanded = _SUBSTITUTION.sub(lambda match: values[match[1]], expanded)
+    if not expanded.startswith("/"):
+        expanded = f"{prefix}/{expanded}"
+    if problem := full_name_problem(expanded):
+        raise NameNotLegalError(
+            f"cannot use {quote(name)}, which expands to {quote(expanded)}: {problem}"
+        )
+    return expanded
+
+
+def resolve(
+    name: str,
+    *,
+    node_name: str,
+    namespace: str,
+    remap: Iterable[tuple[str, str]] = (),
+    kind: EndpointKind = EndpointKind.PUBLISHER,
+) -> str:
+    """Return the fully qualified name that an endpoint has in the graph.
+
+    The name is expanded, then the first rule whose expanded `from` equals it replaces it
+    (rcl_remap_name); a replacement is not remapped again. Actions are expanded only: rcl of ROS 2
+    Jazzy remaps an action's hidden topics and services one by one, never the action, so an action
+    is renamed exactly when rules give all its hidden names one new action name.
+
+    Args:
+        name: as declared.
+        node_name: base name of the node.
+        namespace: absolute.
+        remap: (from, to) as written, in order.
+        kind: decides whether `rostopic://` or `rosservice://` rules apply.
+
+    Raises:
+        NameNotLegalError: a name or a rule is not legal, or the rules tear an action apart.
+    """
+    rules = [parse_rule(match, replacement) for match, replacement in remap]
+    expanded = expand(name, node_name, namespace)
+    if kind in _ACTIONS:
+        return _resolve_action(name, expanded, rules, node_name, namespace)
+    names = RemapKind.TOPIC if kind.is_topic else RemapKind.SERVICE
+    return _remap(expanded, rules, names, node_name, namespace)
+
+
+def matching_rule(
+    expanded: str,
+    rules: Sequence[RemapRule],
+    kind: RemapKind,
+    *,
+    node_name: str,
+    namespace: str,
+) -> RemapRule | None:
+    """Return the rule that rcl applies to the fully qualified name `expanded`; None if none does.
+
+    Raises:
+        NameNotLegalError: a rule's `from` is not a legal name.
+    """
+    for rule in rules:
+        if (
+            rule.applies_to(kind, node_name)
+            and expand(rule.match, node_name, namespace) == expanded
+        ):
+            return rule
+    return None
+
+
+def full_node_name(node_name: str, namespace: str) -> str:
+    """Return the fully qualified node name, `/robot/camera`."""
+    return f"{namespace.rstrip('/')}/{node_name}"
+
+
+def hidden_names(action: str) -> tuple[tuple[str, EndpointKind], ...]:
+    """Return what an action server really offers: its hidden services, then its hidden topics.
+
+    Args:
+        action: name of the action, in any form.
+
+    Returns:
+        (name, kind) with SERVICE_SERVER or PUBLISHER, as the server's side has them.
+    """
+    services = (
+        (f"{action}/_action/{each}", EndpointKind.SERVICE_SERVER) for each in ACTION_SERVICES
+    )
+    topics = ((f"{action}/_action/{each}", EndpointKind.PUBLISHER) for each in ACTION_TOPICS)
+    return (*services, *topics)
+
+
+def action_of(name: str, resolved: Mapping[str, str]) -> str:
+    """Return what an action is called whose hidden names were resolved one by one.
+
+    Args:
+        name: of the action, for messages.
+        resolved: hidden name → fully qualified name after remapping, of all five.
+
+    Raises:
+        NameNotLegalError: they belong to different actions.
+    """
+    actions = {}
+    for hidden, full_name in resolved.items():
+        action, _, last = full_name.rpartition("/_action/")
+        actions[hidden] = action if last == hidden.rpartition("/")[2] else full_name
+    if len(set(actions.values())) > 1:
+        torn = ", ".join(f"{hidden} → {action}" for hidden, action in actions.items())
+        raise NameNotLegalError(
+            f"cannot remap only some of action {name!r}'s hidden names: {torn}",
+            hint="remap all five to one action name, or none",
+        )
+    return next(iter(actions.values()))
+
+
+def _remap(
+    expanded: str, rules: Sequence[RemapRule], kind: RemapKind, node_name: str, namespace: str
+) -> str:
+    rule = matching_rule(expanded, rules, kind, node_name=node_name, namespace=namespace)
+    return expanded if rule is None else expand(rule.replacement, node_name, namespace)
+
+
+def _resolve_action(
+    name: str, expanded: str, rules: Sequence[RemapRule], node_name: str, namespace: str
+) -> str:
+    resolved = {}
+    for hidden, kind in hidden_names(expanded):
+        names = RemapKind.TOPIC if kind.is_topic else RemapKind.SERVICE
+        resolved[hidden] = _remap(hidden, rules, names, node_name, namespace)
+    return action_of(name, resolved)
+
+
+def _absolute_problem(name: str, what: str, longest: int) -> str:
+    odd = _odd(name, "/")
+    return _first(
+        (not name, f"{what} must not be empty"),
+        (not name.startswith("/"), f"{what} must start with '/'"),
+        (name.endswith("/"), f"{what} must not end with '/'"),
+        (odd, f"{what} holds letters, digits, '_' and '/' only{odd}"),
+        ("//" in name, f"{what} must not hold two '/' in a row"),
+        (_digit_first(name), f"no part of {what} may start with a digit"),
+        (len(name) > longest, f"{what} has at most {longest} characters, this one {len(name)}"),
+    )
+
+
+def _first(*checks: tuple[object, str]) -> str:
+    """Return the sentence of the first check that fired; empty if none did."""
+    return next((sentence for fired, sentence in checks if fired), "")
+
+
+def _digit_first(name: str) -> bool:
+    return any(part[:1].isdigit() for part in name.split("/"))
+
+
+def _odd(text: str, allowed: str) -> str:
+    """Name the first character that is neither a word's nor in `allowed`; empty if none is."""
+    found = _NOT_IN[allowed].search(text)
+    return f", not {found[0]!r}" if found else ""

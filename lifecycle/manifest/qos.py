@@ -1,0 +1,269 @@
+"""QoS profiles in rmw's words, the presets ROS names, and offered/requested compatibility.
+
+Owns: the one rule of QoS compatibility that static checks and live verification share. Pure.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import types
+from collections.abc import Mapping
+from typing import TypeVar
+
+
+class History(enum.Enum):
+    """rmw_qos_history_policy_t."""
+
+    SYSTEM_DEFAULT = "SYSTEM_DEFAULT"
+    KEEP_LAST = "KEEP_LAST"
+    KEEP_ALL = "KEEP_ALL"
+    UNKNOWN = "UNKNOWN"
+
+
+class Reliability(enum.Enum):
+    """rmw_qos_reliability_policy_t."""
+
+    SYSTEM_DEFAULT = "SYSTEM_DEFAULT"
+    RELIABLE = "RELIABLE"
+    BEST_EFFORT = "BEST_EFFORT"
+    BEST_AVAILABLE = "BEST_AVAILABLE"
+    UNKNOWN = "UNKNOWN"
+
+
+class Durability(enum.Enum):
+    """rmw_qos_durability_policy_t."""
+
+    SYSTEM_DEFAULT = "SYSTEM_DEFAULT"
+    TRANSIENT_LOCAL = "TRANSIENT_LOCAL"
+    VOLATILE = "VOLATILE"
+    BEST_AVAILABLE = "BEST_AVAILABLE"
+    UNKNOWN = "UNKNOWN"
+
+
+class Liveliness(enum.Enum):
+    """rmw_qos_liveliness_policy_t."""
+
+    SYSTEM_DEFAULT = "SYSTEM_DEFAULT"
+    AUTOMATIC = "AUTOMATIC"
+    MANUAL_BY_TOPIC = "MANUAL_BY_TOPIC"
+    BEST_AVAILABLE = "BEST_AVAILABLE"
+    UNKNOWN = "UNKNOWN"
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class QosProfile:
+    """One rmw QoS profile; field names are NoDL v2's.
+
+    Durations are nanoseconds, 0 to 2**63-1; None is rmw's default, which means infinite. `depth`
+    counts messages, >= 1 under KEEP_LAST; 0 where not observable or KEEP_ALL.
+    """
+
+    history: History = History.KEEP_LAST
+    depth: int = 10
+    reliability: Reliability = Reliability.RELIABLE
+    durability: Durability = Durability.VOLATILE
+    deadline_ns: int | None = None
+    lifespan_ns: int | None = None
+    liveliness: Liveliness = Liveliness.AUTOMATIC
+    liveliness_lease_duration_ns: int | None = None
+
+
+_Policy = TypeVar("_Policy", Reliability, Durability, Liveliness)
+
+INFINITE_NS = 2**63 - 1
+"""RMW_DURATION_INFINITE in nanoseconds; also the largest duration rmw can hold."""
+
+BEST_AVAILABLE_NS = INFINITE_NS - 1
+"""RMW_QOS_DEADLINE_BEST_AVAILABLE and RMW_QOS_LIVELINESS_LEASE_DURATION_BEST_AVAILABLE."""
+
+_SYSTEM_LIVELINESS = QosProfile(liveliness=Liveliness.SYSTEM_DEFAULT)
+
+PRESETS: Mapping[str, QosProfile] = types.MappingProxyType(
+    {
+        "default": _SYSTEM_LIVELINESS,
+        "sensor_data": dataclasses.replace(
+            _SYSTEM_LIVELINESS, depth=5, reliability=Reliability.BEST_EFFORT
+        ),
+        "parameters": dataclasses.replace(_SYSTEM_LIVELINESS, depth=1000),
+        "parameter_events": dataclasses.replace(_SYSTEM_LIVELINESS, depth=1000),
+        "services_default": _SYSTEM_LIVELINESS,
+        "system_default": QosProfile(
+            history=History.SYSTEM_DEFAULT,
+            depth=0,
+            reliability=Reliability.SYSTEM_DEFAULT,
+            durability=Durability.SYSTEM_DEFAULT,
+            liveliness=Liveliness.SYSTEM_DEFAULT,
+        ),
+        "best_available": QosProfile(
+            reliability=Reliability.BEST_AVAILABLE,
+            durability=Durability.BEST_AVAILABLE,
+            deadline_ns=BEST_AVAILABLE_NS,
+            liveliness=Liveliness.BEST_AVAILABLE,
+            liveliness_lease_duration_ns=BEST_AVAILABLE_NS,
+        ),
+        "rosout_default": dataclasses.replace(
+            _SYSTEM_LIVELINESS,
+            depth=1000,
+            durability=Durability.TRANSIENT_LOCAL,
+            lifespan_ns=10 * 10**9,
+        ),
+        "clock": dataclasses.replace(
+            _SYSTEM_LIVELINESS, depth=1, reliability=Reliability.BEST_EFFORT
+        ),
+        "action_status_default": dataclasses.replace(
+            _SYSTEM_LIVELINESS, depth=1, durability=Durability.TRANSIENT_LOCAL
+        ),
+    }
+)
+"""Profiles by the names ROS gives them.
+
+Values are those of rmw/qos_profiles.h, except `rosout_default` (rcl/logging_rosout.h), `clock`
+(rclcpp::ClockQoS) and `action_status_default` (rcl_action/default_qos.h).
+"""
+
+
+class Certainty(enum.Enum):
+    """Whether an incompatibility is a fact or only cannot be ruled out."""
+
+    CERTAIN = "certain"
+    POSSIBLE = "possible"
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Incompatibility:
+    """One policy by which a publisher and a subscription do not, or may not, match.
+
+    Attributes:
+        policy: the profile's field, `reliability`, `liveliness_lease_duration`.
+        offered: the publisher's value as rmw spells it, `BEST_EFFORT`; durations as `500000000 ns`.
+        requested: the subscription's value, likewise.
+        severity: CERTAIN where rmw reports an error, POSSIBLE where the values do not tell.
+    """
+
+    policy: str
+    offered: str
+    requested: str
+    severity: Certainty
+
+
+def incompatibilities(offered: QosProfile, requested: QosProfile) -> tuple[Incompatibility, ...]:
+    """Compare what a publisher offers with what a subscription requests, policy by policy.
+
+    A policy whose value is SYSTEM_DEFAULT, UNKNOWN or BEST_AVAILABLE stands for every value it
+    may turn out to be: if some of them do not match, the result is POSSIBLE, if all, CERTAIN. That
+    yields rmw_dds_common's `qos_profile_check_compatible` (its errors are CERTAIN, its warnings
+    POSSIBLE), with two differences on purpose: BEST_AVAILABLE, which rmw passes over, is resolved
+    when the endpoint is made and depends on what discovery has shown by then, so a subscription
+    with it may still fail to match; and an infinite duration equals an unset one.
+
+    Returns:
+        Findings in the order reliability, durability, deadline, liveliness, lease; empty if the two
+        match for certain. History, depth and lifespan never stop a match (DDS 1.4 §2.2.3).
+    """
+    found = (
+        _ordered(
+            "reliability",
+            offered.reliability,
+            requested.reliability,
+            offers=_RELIABILITY_OFFERS,
+            strong=Reliability.RELIABLE,
+            weak=Reliability.BEST_EFFORT,
+        ),
+        _ordered(
+            "durability",
+            offered.durability,
+            requested.durability,
+            offers=_DURABILITY_OFFERS,
+            strong=Durability.TRANSIENT_LOCAL,
+            weak=Durability.VOLATILE,
+        ),
+        _duration("deadline", offered.deadline_ns, requested.deadline_ns),
+        _ordered(
+            "liveliness",
+            offered.liveliness,
+            requested.liveliness,
+            offers={},
+            strong=Liveliness.MANUAL_BY_TOPIC,
+            weak=Liveliness.AUTOMATIC,
+        ),
+        _duration(
+            "liveliness_lease_duration",
+            offered.liveliness_lease_duration_ns,
+            requested.liveliness_lease_duration_ns,
+        ),
+    )
+    return tuple(each for each in found if each is not None)
+
+
+def problems(profile: QosProfile) -> tuple[str, ...]:
+    """Return what no rmw can do with `profile`; each a phrase to put after "cannot ".
+
+    Rules of rmw/types.h: a duration is 0 to 2**63-1 ns, KEEP_LAST keeps at least one message.
+    """
+    found = []
+    if profile.depth < 0:
+        found.append(f"use depth {profile.depth}: depth counts messages, 0 or more")
+    elif profile.history is History.KEEP_LAST and profile.depth == 0:
+        found.append("use depth 0 with KEEP_LAST: it would keep nothing; set depth >= 1")
+    for name in ("deadline_ns", "lifespan_ns", "liveliness_lease_duration_ns"):
+        value = getattr(profile, name)
+        if value is not None and not 0 <= value <= INFINITE_NS:
+            found.append(f"use {name} {value}: a duration is 0 to 2**63-1 nanoseconds")
+    return tuple(found)
+
+
+_RELIABILITY_OFFERS = {Reliability.BEST_AVAILABLE: Reliability.RELIABLE}
+_DURABILITY_OFFERS = {Durability.BEST_AVAILABLE: Durability.TRANSIENT_LOCAL}
+# rmw_dds_common gives a BEST_AVAILABLE publisher the stronger value whatever it has discovered;
+# only its liveliness and durations depend on the subscriptions seen when it is made.
+
+
+def _ordered(
+    policy: str,
+    offered: _Policy,
+    requested: _Policy,
+    *,
+    offers: Mapping[_Policy, _Policy],
+    strong: _Policy,
+    weak: _Policy,
+) -> Incompatibility | None:
+    """Judge a two-valued policy: only a weak offer to a strong request fails."""
+    effective = offers.get(offered, offered)
+    if effective is strong or requested is weak:
+        return None
+    certain = effective is weak and requested is strong
+    return Incompatibility(
+        policy=policy,
+        offered=offered.value,
+        requested=requested.value,
+        severity=Certainty.CERTAIN if certain else Certainty.POSSIBLE,
+    )
+
+
+def _duration(policy: str, offered: int | None, requested: int | None) -> Incompatibility | None:
+    """Judge a duration: the offered one may not be longer than the requested one."""
+    offer, request = _finite(offered), _finite(requested)
+    if request is None:
+        return None
+    if BEST_AVAILABLE_NS in (offer, request):
+        severity = Certainty.POSSIBLE
+    elif offer is not None and offer <= request:
+        return None
+    else:
+        severity = Certainty.CERTAIN
+    return Incompatibility(
+        policy=policy, offered=_spell(offer), requested=_spell(request), severity=severity
+    )
+
+
+def _finite(duration_ns: int | None) -> int | None:
+    """Return None for every spelling of infinite: unset, RMW_DURATION_UNSPECIFIED, INFINITE."""
+    return None if duration_ns in (None, 0, INFINITE_NS) else duration_ns
+
+
+def _spell(duration_ns: int | None) -> str:
+    """Spell a duration as messages show it."""
+    if duration_ns is None:
+        return "infinite"
+    return "BEST_AVAILABLE" if duration_ns == BEST_AVAILABLE_NS else f"{duration_ns} ns"

@@ -1,0 +1,103 @@
+"""Everything a manifest's parts say about each other: the checks that need the whole system.
+
+Owns: `check`, which runs every topic's checks and collects what they find, and `check_sound`, which
+runs those that hold of a part; one file per topic, each a generator of diagnostics with rule ids
+`check.*`. Needs no ROS: types come from the ament index.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+
+from lifecycle.manifest.ament_index import search_prefixes
+from lifecycle.manifest.diagnostics import Diagnostic
+from lifecycle.manifest.flow_needs import FlowNeeds
+from lifecycle.manifest.model import Manifest
+from lifecycle.manifest.semantics import (
+    connection_urls,
+    connections,
+    declared_connections,
+    discovery,
+    flow_transport,
+    flows,
+    identifiers,
+    links,
+    matching,
+    middleware,
+    names,
+    order,
+    parameter_files,
+    parameters,
+    placement,
+    remaps,
+    types,
+)
+from lifecycle.manifest.semantics.system import System
+
+__all__ = ["check", "check_sound"]
+
+
+def check(
+    manifest: Manifest, *, environment: Mapping[str, str] | None = None
+) -> tuple[Diagnostic, ...]:
+    """Check a manifest that has been built; nothing stops at the first finding.
+
+    Args:
+        manifest: what `load` or a test has built.
+        environment: for AMENT_PREFIX_PATH, ROS_DOMAIN_ID, RMW_IMPLEMENTATION and
+            FASTDDS_BUILTIN_TRANSPORTS; this process's if None.
+
+    Returns:
+        Every error and warning, in the order of their places in each document.
+    """
+    variables = os.environ if environment is None else environment
+    system = System.of(manifest)
+    prefixes = search_prefixes(variables)
+    needs = FlowNeeds(manifest, prefixes)
+    found = [
+        *names.check(system),
+        *remaps.check(system),
+        *types.check(system, prefixes),
+        *matching.check(system),
+        *connections.check(system),
+        *order.check(system),
+        *parameters.check(system),
+        *parameter_files.check(system),
+        *placement.check(system, needs, variables),
+        *discovery.check(system, variables),
+        *declared_connections.check(system, needs),
+        *connection_urls.check(system),
+        *flows.check(system, needs),
+        *flow_transport.check(system, needs, variables),
+        *identifiers.check(system, needs),
+        *middleware.check(system, needs, variables),
+        *links.check(system, needs),
+    ]
+    files = {each.at.file: None for each in found}
+    rank = {file: index for index, file in enumerate((manifest.path, *files))}
+    found.sort(key=lambda each: (rank[each.at.file], each.at.line, each.at.column))
+    return tuple(dict.fromkeys(found))
+
+
+def check_sound(
+    manifest: Manifest, *, environment: Mapping[str, str] | None = None
+) -> tuple[Diagnostic, ...]:
+    """Check what is left of a manifest without the nodes in which something is wrong already.
+
+    So that one run tells as much as it can. Only what whatever is missing could not put right: two
+    names that are one, two ends that do not fit, nodes that wait for each other.
+
+    Args:
+        manifest: sound nodes, as `load` has built them.
+        environment: as for `check`.
+    """
+    variables = os.environ if environment is None else environment
+    system = System.of(manifest)
+    return (
+        *names.check(system),
+        *types.check(system, search_prefixes(variables)),
+        *matching.check(system),
+        *order.cycles(system),
+        *parameters.check(system),
+    )
