@@ -1,0 +1,169 @@
+"""Differentiated services code points: names, numbers and the TOS byte they travel in.
+
+Owns: every spelling of a DSCP that a user may write or read. Pure.
+
+A DSCP is the upper six bits of the byte that IPv4 calls TOS and IPv6 calls traffic class; the lower
+two are ECN (RFC 2474, RFC 3168). Products differ in which of the two numbers they ask for, so both
+are always shown side by side.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import functools
+import re
+
+from lifecycle.network.tables import read_table
+
+MAX_DSCP = 63
+"""Six bits."""
+
+ECN_MASK = 0b11
+"""The two lower bits of the TOS byte; Linux sends them as given to IP_TOS."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class CodePoint:
+    """One named code point.
+
+    Attributes:
+        dscp: 0–63.
+        rfc: the document that assigns it.
+        phb: per-hop behaviour.
+        service_class: RFC 4594's service class; empty where it names none.
+        nft: how nftables spells it.
+    """
+
+    name: str
+    dscp: int
+    aliases: tuple[str, ...]
+    rfc: str
+    phb: str
+    service_class: str
+    nft: str
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class _Table:
+    code_points: tuple[CodePoint, ...]
+
+
+@functools.cache
+def code_points() -> tuple[CodePoint, ...]:
+    """Every named code point, by rising number."""
+    return read_table("dscp", _Table).code_points
+
+
+@functools.cache
+def _by_name() -> dict[str, CodePoint]:
+    return {name: each for each in code_points() for name in (each.name, *each.aliases)}
+
+
+@functools.cache
+def _by_number() -> dict[int, CodePoint]:
+    return {each.dscp: each for each in code_points()}
+
+
+def parse_dscp(value: str | int) -> int:
+    """Return the DSCP, 0–63, that a user wrote as a name (any case) or as a number.
+
+    Numbers may be decimal or hexadecimal (`0x2e`) text.
+
+    Raises:
+        ValueError: neither a name nor a number in range; says the nearest name, or which DSCP was
+            meant when the number is a TOS byte.
+    """
+    # YAML reads `yes` and `on` as booleans, and bool is an int: True is not DSCP 1.
+    if isinstance(value, bool):
+        raise ValueError(  # noqa: TRY004 - callers report every refusal alike
+            f"cannot use {value!r} as DSCP; use 0 to {MAX_DSCP} or a name such as EF"
+        )
+    number = value if isinstance(value, int) else _number(value.strip())
+    if number is None:
+        return _named(str(value))
+    if not 0 <= number <= MAX_DSCP:
+        raise ValueError(
+            f"cannot use DSCP {value}; use 0 to {MAX_DSCP} or a name such as EF{_tos_hint(number)}"
+        )
+    return number
+
+
+def _number(text: str) -> int | None:
+    """The decimal or hexadecimal number that `text` spells, else None."""
+    # int() reads more than we document ("1_0", other scripts' digits) and refuses 4301 digits.
+    if not re.fullmatch(r"-?(0[xX][0-9a-fA-F]{1,8}|[0-9]{1,9})", text):
+        return None
+    return int(text, 16 if "x" in text.lower() else 10)
+
+
+def _named(text: str) -> int:
+    """The DSCP with this name."""
+    name = text.strip().upper().replace("_", "-")
+    if (found := _by_name().get(name)) is not None:
+        return found.dscp
+    close = difflib.get_close_matches(name, _by_name(), n=len(_by_name()))
+    # Many names are equally near (AF14: AF13, AF41); people mistype the last digit, not the first.
+    nearest = max(close, key=lambda each: each[:-1] == name[:-1], default="")
+    hint = f"; did you mean {nearest}?" if nearest else ""
+    names = ", ".join(each.name for each in code_points())
+    raise ValueError(f"cannot use {text!r} as DSCP; use 0 to {MAX_DSCP} or one of {names}{hint}")
+
+
+def _tos_hint(number: int) -> str:
+    """What a number beyond 63 probably meant."""
+    if not 0 <= number <= 0xFF:
+        return ""
+    dscp = number >> 2
+    name = f" ({_by_number()[dscp].name})" if dscp in _by_number() else ""
+    ecn = " and sets ECN bits" if number & ECN_MASK else ""
+    return f"; {number} is a TOS byte{ecn}: DSCP {dscp}{name}"
+
+
+def dscp_name(dscp: int) -> str:
+    """Return the code point's name, or the number in decimal where it has none.
+
+    `parse_dscp` reads either back.
+
+    Raises:
+        ValueError: not 0–63.
+    """
+    number = parse_dscp(dscp)
+    return _by_number()[number].name if number in _by_number() else str(number)
+
+
+def tos(dscp: int) -> int:
+    """Return the TOS byte (IPv4) or traffic class (IPv6), 0–252, that carries this DSCP, ECN clear.
+
+    Raises:
+        ValueError: not 0–63.
+    """
+    return parse_dscp(dscp) << 2
+
+
+def dscp_of_tos(tos_byte: int) -> int:
+    """Return the DSCP, 0–63, in a TOS byte.
+
+    Raises:
+        ValueError: not 0–255, or the ECN bits are set: they belong to the transport (RFC 3168).
+    """
+    if not 0 <= tos_byte <= 0xFF:
+        raise ValueError(f"cannot use TOS {tos_byte}; use 0 to 255")
+    if tos_byte & ECN_MASK:
+        clear = tos_byte & ~ECN_MASK
+        raise ValueError(
+            f"cannot use TOS {tos_byte} (0x{tos_byte:02x}): its two lowest bits are ECN and "
+            f"belong to the transport; use {clear} (0x{clear:02x}), {describe(clear >> 2)}"
+        )
+    return tos_byte >> 2
+
+
+def describe(dscp: int) -> str:
+    """Return DSCP and TOS side by side: `EF = DSCP 46 = TOS 184 (0xb8)`.
+
+    Raises:
+        ValueError: not 0–63.
+    """
+    name = dscp_name(dscp)
+    prefix = "" if name.isdecimal() else f"{name} = "
+    return f"{prefix}DSCP {dscp} = TOS {tos(dscp)} (0x{tos(dscp):02x})"

@@ -1,0 +1,295 @@
+"""5G QoS identifiers (5QIs): the standardized classes, checks against them, and proposals.
+
+Owns: 3GPP TS 23.501 Table 5.7.4-1 as data with its sources, and the judgement whether a class can
+keep what a flow declares. Pure.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import functools
+
+from lifecycle.network.tables import read_table
+
+
+class ResourceType(enum.Enum):
+    """What a class guarantees; the table's second column."""
+
+    GBR = "GBR"
+    NON_GBR = "Non-GBR"
+    DELAY_CRITICAL_GBR = "Delay-critical GBR"
+
+    @property
+    def guarantees_rate(self) -> bool:
+        """Whether a flow of this type has a guaranteed bit rate."""
+        return self is not ResourceType.NON_GBR
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class FiveQi:
+    """One standardized 5QI and its characteristics.
+
+    Attributes:
+        priority_level: 1–127, lower is more important.
+        packet_delay_budget_ms: upper bound between device and N6.
+        packet_error_rate: upper bound of the share of packets lost or late, 0–1.
+        max_data_burst_bytes: default volume served within the delay budget; None if not applicable.
+        averaging_window_ms: default window of the guaranteed rate; None if not applicable.
+        first_release: 3GPP release.
+        in_release_16: one of the 26 values that *Unique Network Flows* speaks of.
+        flagged: fields on which the sources disagree or that only a weak one supports.
+        sources: names in the table's own list of those that agree.
+        note: what is doubtful about the row; often empty.
+    """
+
+    value: int
+    resource_type: ResourceType
+    priority_level: int
+    packet_delay_budget_ms: int
+    packet_error_rate: float
+    max_data_burst_bytes: int | None
+    averaging_window_ms: int | None
+    example_services: str
+    first_release: int
+    in_release_16: bool
+    flagged: tuple[str, ...]
+    sources: tuple[str, ...]
+    note: str
+
+    def __str__(self) -> str:
+        return f"5QI {self.value} ({self.resource_type.value})"
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class ClassIssue:
+    """A declared need that a class does not keep.
+
+    Attributes:
+        field: the parameter of `check_class` that it is about.
+        message: starts with "cannot".
+    """
+
+    field: str
+    message: str
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Proposal:
+    """The answer to `five_qi: auto`.
+
+    Attributes:
+        five_qi: None if no class fits.
+        why: a sentence for people either way.
+    """
+
+    five_qi: FiveQi | None
+    why: str
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class _Table:
+    sources: dict[str, str]
+    values: tuple[FiveQi, ...]
+
+
+@functools.cache
+def _table() -> _Table:
+    return read_table("five_qi", _Table)
+
+
+def five_qis(*, include_flagged: bool = False) -> tuple[FiveQi, ...]:
+    """Return the standardized 5QIs by rising value.
+
+    Args:
+        include_flagged: also those with a doubtful cell, which are not offered by default.
+    """
+    return tuple(each for each in _table().values if include_flagged or not each.flagged)
+
+
+def five_qi_of(value: int) -> FiveQi:
+    """Return one standardized 5QI, flagged or not.
+
+    Raises:
+        ValueError: not a standardized value.
+    """
+    for each in _table().values:
+        if each.value == value:
+            return each
+    known = ", ".join(str(each.value) for each in _table().values)
+    raise ValueError(f"cannot use 5QI {value}; standardized are {known}")
+
+
+def check_class(
+    class_: FiveQi,
+    *,
+    max_delay_ms: float | None = None,
+    loss: float | None = None,
+    rate_bps: float | None = None,
+    message_bytes: int | None = None,
+) -> tuple[ClassIssue, ...]:
+    """Return what a flow declares and the class does not keep; empty if it keeps all.
+
+    Args:
+        class_: the 5QI that the flow asks for.
+        max_delay_ms: declared bound of the delay, > 0, against the packet delay budget.
+        loss: declared bound of the loss, 0–1, against the packet error rate.
+        rate_bps: bits per second, > 0, against the type and the data burst volume.
+        message_bytes: largest message, > 0, against the data burst volume.
+    """
+    found: list[ClassIssue] = []
+    budget_ms, burst = class_.packet_delay_budget_ms, class_.max_data_burst_bytes
+    if max_delay_ms is not None and max_delay_ms < budget_ms:
+        found.append(
+            ClassIssue(
+                field="max_delay_ms",
+                message=f"cannot keep a delay of {max_delay_ms:g} ms with {class_}: "
+                f"its packet delay budget is {budget_ms} ms",
+            )
+        )
+    if loss is not None and loss < class_.packet_error_rate:
+        found.append(
+            ClassIssue(
+                field="loss",
+                message=f"cannot keep a loss of {loss:g} with {class_}: "
+                f"its packet error rate is {class_.packet_error_rate:g}",
+            )
+        )
+    if rate_bps is not None and not class_.resource_type.guarantees_rate:
+        found.append(
+            ClassIssue(
+                field="rate_bps",
+                message=f"cannot guarantee {rate_bps:g} bit/s with {class_}: "
+                f"only GBR classes guarantee a rate",
+            )
+        )
+    if burst is None:
+        return tuple(found)
+    served_bps = _served_bps(class_)
+    if rate_bps is not None and rate_bps > served_bps:
+        found.append(
+            ClassIssue(
+                field="rate_bps",
+                message=f"cannot keep the delay of {rate_bps:g} bit/s with {class_}: by default "
+                f"it serves {burst} bytes in {budget_ms} ms, {served_bps:g} bit/s",
+            )
+        )
+    if message_bytes is not None and message_bytes > burst:
+        found.append(
+            ClassIssue(
+                field="message_bytes",
+                message=f"cannot keep the delay of a message of {message_bytes} bytes with "
+                f"{class_}: by default it serves {burst} bytes in {budget_ms} ms",
+            )
+        )
+    return tuple(found)
+
+
+def propose(
+    max_delay_ms: float,
+    loss: float,
+    gbr: bool | None,
+    *,
+    message_bytes: int | None = None,
+    rate_bps: float | None = None,
+    include_flagged: bool = False,
+) -> Proposal:
+    """Propose the least demanding class that keeps a delay and a loss, and say why.
+
+    Least demanding, because a better class than needed wastes what the network has. Classes of
+    Release 16 come first, as every network knows them; then the longest delay budget, the highest
+    error rate, the least important priority.
+
+    Args:
+        max_delay_ms: bound of the delay, > 0.
+        loss: bound of the loss, > 0 and <= 1.
+        gbr: True asks for a guaranteed bit rate, False for none, None for either.
+        message_bytes: largest message that must arrive within the delay, > 0.
+        rate_bps: bits per second that must be guaranteed, > 0; then only GBR classes fit.
+        include_flagged: offer classes with a doubtful cell too.
+
+    Raises:
+        ValueError: a bound is out of range.
+    """
+    if not max_delay_ms > 0:
+        raise ValueError(f"cannot use max_delay_ms {max_delay_ms:g}; use more than 0")
+    if not 0 < loss <= 1:
+        raise ValueError(f"cannot use loss {loss:g}; use more than 0, at most 1")
+    offered = [
+        each
+        for each in five_qis(include_flagged=include_flagged)
+        if gbr in (None, each.resource_type.guarantees_rate)
+    ]
+    fitting = [
+        each
+        for each in offered
+        if not check_class(
+            each,
+            max_delay_ms=max_delay_ms,
+            loss=loss,
+            message_bytes=message_bytes,
+            rate_bps=rate_bps,
+        )
+    ]
+    if not fitting:
+        why = _why_none(offered, max_delay_ms, loss, message_bytes, rate_bps)
+        return Proposal(five_qi=None, why=why)
+    best = max(
+        fitting,
+        key=lambda each: (
+            each.in_release_16,
+            each.packet_delay_budget_ms,
+            each.packet_error_rate,
+            each.priority_level,
+            -each.value,
+        ),
+    )
+    release = "Release 16" if best.in_release_16 else f"Release {best.first_release}"
+    return Proposal(
+        five_qi=best,
+        why=f"{best}: delay budget {best.packet_delay_budget_ms} ms <= {max_delay_ms:g} ms, error "
+        f"rate {best.packet_error_rate:g} <= {loss:g}; the least demanding class of {release} "
+        f"that fits",
+    )
+
+
+def _why_none(
+    offered: list[FiveQi],
+    max_delay_ms: float,
+    loss: float,
+    message_bytes: int | None,
+    rate_bps: float | None,
+) -> str:
+    """Name the first bound that rules out what was left of the classes."""
+    left = [each for each in offered if not check_class(each, loss=loss)]
+    if not left:
+        lowest = min(offered, key=lambda each: each.packet_error_rate)
+        return (
+            f"cannot propose a 5QI for a loss of {loss:g}: "
+            f"the lowest error rate is {lowest.packet_error_rate:g}, of {lowest}"
+        )
+    fast = [each for each in left if not check_class(each, max_delay_ms=max_delay_ms)]
+    if not fast:
+        fastest = min(left, key=lambda each: each.packet_delay_budget_ms)
+        return (
+            f"cannot propose a 5QI for a delay of {max_delay_ms:g} ms with a loss of {loss:g}: the "
+            f"shortest delay budget is {fastest.packet_delay_budget_ms} ms, of {fastest}"
+        )
+    roomy = [each for each in fast if not check_class(each, message_bytes=message_bytes)]
+    if roomy:
+        # A class that states no burst serves any rate, so one that states it is what is left.
+        fastest = max(roomy, key=_served_bps)
+        return (
+            f"cannot propose a 5QI for {rate_bps:g} bit/s in {max_delay_ms:g} ms with a loss of "
+            f"{loss:g}: the highest rate is {_served_bps(fastest):g} bit/s, of {fastest}"
+        )
+    largest = max(fast, key=lambda each: each.max_data_burst_bytes or 0)
+    return (
+        f"cannot propose a 5QI for messages of {message_bytes} bytes in {max_delay_ms:g} ms with a "
+        f"loss of {loss:g}: the largest burst is {largest.max_data_burst_bytes} bytes, of {largest}"
+    )
+
+
+def _served_bps(each: FiveQi) -> float:
+    """Bits per second that a class serves within its delay budget by default; 0 if not stated."""
+    return (each.max_data_burst_bytes or 0) * 8000 / each.packet_delay_budget_ms

@@ -1,0 +1,281 @@
+"""Network flow endpoints (NFEs) and what "unique" means, as *Unique Network Flows* defines it.
+
+Owns: the NFE tuple, the requirement enum and the predicates dissimilar, unique, weakly and
+strongly unique. Pure.
+
+The article defines uniqueness for one NFE. An endpoint usually has several: one per interface, one
+per transport, multicast beside unicast, and the middleware chooses per packet. Here an endpoint
+is unique when *every* IP NFE of it is dissimilar to every NFE of every other endpoint: the
+article's own getter example compares all pairs so, and one shared NFE (a multicast group, say) is a
+path on which the network cannot tell the endpoints apart.
+
+A publisher's NFE is the source of a flow and a subscription's the destination, two different places
+of the tuple; so publishers are compared with publishers and subscriptions with subscriptions.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+from collections.abc import Iterable, Sequence
+
+from lifecycle.network.address import may_be_same
+
+
+class TransportProtocol(enum.Enum):
+    """Transport protocol of an NFE (rmw_transport_protocol_t); UNKNOWN covers shared memory."""
+
+    UNKNOWN = "unknown"
+    UDP = "udp"
+    TCP = "tcp"
+
+
+class InternetProtocol(enum.Enum):
+    """Internet protocol of an NFE (rmw_internet_protocol_t); UNKNOWN covers shared memory."""
+
+    UNKNOWN = "unknown"
+    IPV4 = "ipv4"
+    IPV6 = "ipv6"
+
+
+class UniqueRequirement(enum.Enum):
+    """`require_unique_network_flow_endpoints`: a creation-time option of every endpoint.
+
+    Values are the words of the manifest; `rmw_value` is the number in
+    rmw_unique_network_flow_endpoints_requirement_t.
+    """
+
+    NOT_REQUIRED = "not_required"
+    STRICTLY_REQUIRED = "strictly_required"
+    OPTIONALLY_REQUIRED = "optionally_required"
+    SYSTEM_DEFAULT = "system_default"
+
+    @property
+    def rmw_value(self) -> int:
+        """The number in rmw_unique_network_flow_endpoints_requirement_t."""
+        return list(UniqueRequirement).index(self)
+
+
+class FlowIdentifier(enum.Enum):
+    """Which resources tell flows apart; the article's background section names the first three.
+
+    ANY is its definition of dissimilar: a difference in one or more resources. The others say what
+    a given network looks at: a rule on ports does not see the DSCP.
+    """
+
+    FIVE_TUPLE = "5-tuple"  # protocols, addresses, ports
+    THREE_TUPLE = "3-tuple"  # IPv6 addresses and flow label (RFC 6437)
+    SIX_TUPLE = "6-tuple"  # the 5-tuple and the DSCP: a last resort, at most 64 values
+    ANY = "any"
+
+
+class FlowUniqueness(enum.Enum):
+    """How unique a network flow is: by neither, one or both of its NFEs."""
+
+    NOT = "not"
+    WEAKLY = "weakly"
+    STRONGLY = "strongly"
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class NetworkFlowEndpoint:
+    """The part of a network flow that belongs to one publisher or subscription.
+
+    Field names are those of rmw_network_flow_endpoint_t. Equality is the article's "not
+    dissimilar": two NFEs are dissimilar if one or more of their networking resources differ.
+    `dissimilar` adds what textual equality cannot know: wildcards and other spellings.
+
+    Attributes:
+        transport_port: 0–65535; 0 where the transport has none.
+        flow_label: IPv6 flow label, 0–0xFFFFF, publishers only.
+        dscp: 0–63, publishers only.
+        internet_address: textual address, empty for shared memory.
+    """
+
+    transport_protocol: TransportProtocol
+    internet_protocol: InternetProtocol
+    transport_port: int
+    flow_label: int = 0
+    dscp: int = 0
+    internet_address: str = ""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class LocatedNfe:
+    """An NFE and the machine it is on, which says what `0.0.0.0` and `127.0.0.1` stand for.
+
+    Attributes:
+        machine_id: any text that is equal on one machine only; empty when not known.
+    """
+
+    machine_id: str
+    nfe: NetworkFlowEndpoint
+
+
+Nfe = NetworkFlowEndpoint | LocatedNfe
+"""An NFE without a machine may be on any: comparisons then lean to "not dissimilar"."""
+
+
+def located(
+    nfes: Iterable[NetworkFlowEndpoint] | None, machine_id: str, *, dscp: int | None = None
+) -> tuple[LocatedNfe, ...] | None:
+    """Return an endpoint's NFEs with their machine; None (not known) stays None.
+
+    Args:
+        nfes: as the RMW reports them.
+        machine_id: of the process that reports them.
+        dscp: 0–63, as read back from the sender sockets. Fast DDS always reports 0, whatever is
+            marked, so what was read back replaces it.
+    """
+    if nfes is None:
+        return None
+    return tuple(
+        LocatedNfe(
+            machine_id=machine_id,
+            nfe=each if dscp is None else dataclasses.replace(each, dscp=dscp),
+        )
+        for each in nfes
+    )
+
+
+def is_ip(nfe: Nfe) -> bool:
+    """Whether this is an end of an IP flow; shared memory has neither protocol nor address."""
+    plain = _plain(nfe)
+    return (
+        plain.transport_protocol is not TransportProtocol.UNKNOWN
+        and plain.internet_protocol is not InternetProtocol.UNKNOWN
+        and bool(plain.internet_address)
+    )
+
+
+def dissimilar(a: Nfe, b: Nfe, *, by: FlowIdentifier = FlowIdentifier.ANY) -> bool:
+    """Return whether one or more networking resources of two NFEs differ.
+
+    Addresses differ unless packets of both can carry the same one: a publisher that sends from
+    `0.0.0.0:p` sends from every address of its machine, and two machines' `0.0.0.0` differ.
+
+    Args:
+        a: one NFE.
+        b: the other; both of publishers or both of subscriptions.
+        by: the resources that count.
+    """
+    one, other = _plain(a), _plain(b)
+    if _exact_resources(one, by) != _exact_resources(other, by):
+        return True
+    machines = _machine(a), _machine(b)
+    return not may_be_same(
+        one.internet_address,
+        other.internet_address,
+        same_machine=machines[0] == machines[1] if all(machines) else None,
+    )
+
+
+def is_unique(nfe: Nfe, others: Iterable[Nfe], *, by: FlowIdentifier = FlowIdentifier.ANY) -> bool:
+    """Return whether an NFE is dissimilar to all other NFEs."""
+    return all(dissimilar(nfe, other, by=by) for other in others)
+
+
+def is_unique_endpoint(
+    nfes: Sequence[Nfe] | None,
+    others: Iterable[Sequence[Nfe] | None],
+    *,
+    by: FlowIdentifier = FlowIdentifier.ANY,
+) -> bool | None:
+    """Return whether every IP NFE of an endpoint is unique; None when that cannot be told.
+
+    An endpoint without an IP NFE is not unique: the network sees nothing of it that it could tell
+    from anything else.
+
+    Args:
+        nfes: of this endpoint; None when not known.
+        others: those of each other endpoint on the same side (publishers or subscriptions) in the
+            whole system; None for one whose NFEs are not known, which may hide an equal one.
+        by: the resources that count.
+    """
+    if nfes is None:
+        return None
+    own = [each for each in nfes if is_ip(each)]
+    if not own:
+        return False
+    every = list(others)
+    known = [each for other in every if other is not None for each in other if is_ip(each)]
+    if not all(is_unique(each, known, by=by) for each in own):
+        return False
+    return None if None in every else True
+
+
+def meets(
+    demanded: FlowUniqueness, *, publisher: bool | None, subscription: bool | None
+) -> bool | None:
+    """Return whether a flow is at least as unique as demanded; None when that cannot be told.
+
+    One end that is unique is enough for WEAKLY, whatever is not known of the other; one that is
+    not is enough to fail STRONGLY.
+
+    Args:
+        demanded: what is asked; NOT is always met.
+        publisher: whether the publisher's NFEs are unique, as `is_unique_endpoint` says.
+        subscription: the same of the subscription.
+    """
+    ends = (publisher, subscription)
+    if demanded is FlowUniqueness.NOT:
+        return True
+    decisive = demanded is FlowUniqueness.WEAKLY
+    if decisive in ends:
+        return decisive
+    return None if None in ends else not decisive
+
+
+def uniqueness(
+    publisher: Sequence[Nfe] | None,
+    subscription: Sequence[Nfe] | None,
+    other_publishers: Iterable[Sequence[Nfe] | None],
+    other_subscriptions: Iterable[Sequence[Nfe] | None],
+    *,
+    by: FlowIdentifier = FlowIdentifier.ANY,
+) -> FlowUniqueness | None:
+    """Return how unique the flow from a publisher to a subscription is; None if it cannot be told.
+
+    Strongly if both its NFEs are unique, weakly if one of them is. `meets` answers more where
+    only one end is known.
+
+    Args:
+        publisher: NFEs of the publisher.
+        subscription: NFEs of the subscription.
+        other_publishers: NFEs of each other publisher in the whole system, not of this process.
+        other_subscriptions: NFEs of each other subscription in the whole system.
+        by: the resources that count.
+    """
+    ends = (
+        is_unique_endpoint(publisher, other_publishers, by=by),
+        is_unique_endpoint(subscription, other_subscriptions, by=by),
+    )
+    if None in ends:
+        return None
+    return (FlowUniqueness.NOT, FlowUniqueness.WEAKLY, FlowUniqueness.STRONGLY)[ends.count(True)]
+
+
+def _plain(nfe: Nfe) -> NetworkFlowEndpoint:
+    return nfe.nfe if isinstance(nfe, LocatedNfe) else nfe
+
+
+def _machine(nfe: Nfe) -> str:
+    return nfe.machine_id if isinstance(nfe, LocatedNfe) else ""
+
+
+def _exact_resources(nfe: NetworkFlowEndpoint, by: FlowIdentifier) -> tuple[object, ...]:
+    """The resources that count, but the address, which is compared by meaning."""
+    label: tuple[object, ...] = (nfe.internet_protocol, nfe.flow_label)
+    ports: tuple[object, ...] = (
+        nfe.internet_protocol,
+        nfe.transport_protocol,
+        nfe.transport_port,
+    )
+    if by is FlowIdentifier.THREE_TUPLE:
+        # RFC 6437 knows no label in IPv4: there, only the addresses are left.
+        return label if nfe.internet_protocol is InternetProtocol.IPV6 else label[:1]
+    if by is FlowIdentifier.FIVE_TUPLE:
+        return ports
+    if by is FlowIdentifier.SIX_TUPLE:
+        return (*ports, nfe.dscp)
+    return (*ports, nfe.dscp, nfe.flow_label)

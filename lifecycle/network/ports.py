@@ -1,0 +1,288 @@
+"""DDS port arithmetic: which UDP ports a participant uses and how many participants fit.
+
+Owns: the formula of DDSI-RTPS §9.6.2.3 with its default constants, the platforms' ephemeral port
+ranges, and the limits that follow (the article *The ROS_DOMAIN_ID*). Pure.
+
+These are the ports a participant asks for. A busy one is replaced by the implementation, so the
+ports of a running system are read from it, never inferred from here.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+from collections.abc import Callable
+
+PB = 7400
+"""Port base."""
+DG = 250
+"""Domain gain: the ports that one domain owns."""
+PG = 2
+"""Participant gain: the unicast ports that one participant owns."""
+D0 = 0
+"""Offset of discovery (metatraffic) multicast."""
+D1 = 10
+"""Offset of discovery (metatraffic) unicast."""
+D2 = 1
+"""Offset of user multicast."""
+D3 = 11
+"""Offset of user unicast."""
+
+MAX_PORT = 65535
+MAX_DOMAIN_ID = 232
+"""The highest domain whose multicast ports exist; Fast DDS ends the process beyond it."""
+PARTICIPANTS_PER_DOMAIN = (DG - D1) // PG
+"""Participants until the unicast ports reach the next domain's multicast ports: 120."""
+
+EPHEMERAL_RANGE_FILE = "/proc/sys/net/ipv4/ip_local_port_range"
+
+
+def domain_of(text: str) -> int | None:
+    """Return the domain id that ROS_DOMAIN_ID says, 0–232; None for what is none."""
+    if not (text.isascii() and text.isdecimal() and len(text) < 10):
+        return None
+    return domain if (domain := int(text)) <= MAX_DOMAIN_ID else None
+
+
+class Platform(enum.Enum):
+    """Operating systems that the article gives numbers for."""
+
+    LINUX = "linux"
+    MACOS = "macos"
+    WINDOWS = "windows"
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class EphemeralRange:
+    """Ports that an operating system hands to whoever asks for any port; both ends belong to it."""
+
+    first: int
+    last: int
+
+    def __post_init__(self) -> None:
+        if not 0 < self.first <= self.last <= MAX_PORT:
+            raise ValueError(
+                f"cannot use ephemeral port range {self}; use 1 to {MAX_PORT}, lower end first"
+            )
+
+    def __contains__(self, port: int) -> bool:
+        return self.first <= port <= self.last
+
+    def __str__(self) -> str:
+        return f"{self.first}–{self.last}"
+
+
+DEFAULT_EPHEMERAL_RANGE: dict[Platform, EphemeralRange] = {
+    Platform.LINUX: EphemeralRange(first=32768, last=60999),
+    Platform.MACOS: EphemeralRange(first=49152, last=65535),
+    Platform.WINDOWS: EphemeralRange(first=49152, last=65535),
+}
+"""Each platform's default, as the article gives it; all three can be configured."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class ParticipantPorts:
+    """The four UDP ports of one participant; the multicast ones are shared by the whole domain."""
+
+    discovery_multicast: int
+    user_multicast: int
+    discovery_unicast: int
+    user_unicast: int
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Capacity:
+    """How many participants of one domain fit on one host.
+
+    Attributes:
+        participants: participants 0 to `participants - 1` are free of conflict.
+        limit: what the next one would run into, a phrase for people.
+    """
+
+    participants: int
+    limit: str
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class PortUse:
+    """What the formula assigns a port to.
+
+    Attributes:
+        role: the field name in ParticipantPorts.
+        participant_id: 0–119; None for the multicast ports.
+    """
+
+    domain_id: int
+    role: str
+    participant_id: int | None
+
+
+def domain_base(domain_id: int) -> int:
+    """Return the first port of a domain, which is its discovery multicast port.
+
+    Raises:
+        ValueError: not 0–232.
+    """
+    if not 0 <= domain_id <= MAX_DOMAIN_ID:
+        raise ValueError(
+            f"cannot use domain id {domain_id}: its ports would lie outside 1 to {MAX_PORT}; "
+            f"use 0 to {MAX_DOMAIN_ID}"
+        )
+    return PB + DG * domain_id
+
+
+def participant_ports(domain_id: int, participant_id: int) -> ParticipantPorts:
+    """Return the ports of a participant, DDSI-RTPS §9.6.2.3.
+
+    Args:
+        domain_id: 0–232.
+        participant_id: counts the participants of the domain on one host from 0.
+
+    Raises:
+        ValueError: a number is out of range, or a port would pass 65535. Participant 63 of domain
+            232 does: Fast DDS wraps it silently to port 1.
+    """
+    base = domain_base(domain_id)
+    if participant_id < 0:
+        raise ValueError(f"cannot use participant id {participant_id}; use 0 or more")
+    ports = ParticipantPorts(
+        discovery_multicast=base + D0,
+        user_multicast=base + D2,
+        discovery_unicast=base + D1 + PG * participant_id,
+        user_unicast=base + D3 + PG * participant_id,
+    )
+    if ports.user_unicast > MAX_PORT:
+        raise ValueError(
+            f"cannot use participant id {participant_id} in domain {domain_id}: its unicast ports "
+            f"would be {ports.discovery_unicast} and {ports.user_unicast}, beyond {MAX_PORT}; "
+            f"use 0 to {(MAX_PORT - base - D3) // PG}"
+        )
+    return ports
+
+
+def owner_of(port: int) -> PortUse | None:
+    """Return the domain and role that the formula gives a port; None where it gives none."""
+    domain_id, offset = divmod(port - PB, DG)
+    if not 0 <= domain_id <= MAX_DOMAIN_ID or port > MAX_PORT:
+        return None
+    if offset in (D0, D2):
+        role = "discovery_multicast" if offset == D0 else "user_multicast"
+        return PortUse(domain_id=domain_id, role=role, participant_id=None)
+    if offset < D1:
+        return None
+    participant_id, unicast = divmod(offset - D1, PG)
+    role = "user_unicast" if unicast else "discovery_unicast"
+    return PortUse(domain_id=domain_id, role=role, participant_id=participant_id)
+
+
+def overlaps(domain_id: int, participant_id: int) -> tuple[PortUse, ...]:
+    """Return what else the unicast ports of this participant belong to, in the domains above.
+
+    Empty up to participant 119. Participant 120 of domain d overlaps with the multicast ports of
+    domain d + 1.
+
+    Raises:
+        ValueError: as `participant_ports`.
+    """
+    ports = participant_ports(domain_id, participant_id)
+    uses = (owner_of(ports.discovery_unicast), owner_of(ports.user_unicast))
+    return tuple(each for each in uses if each is not None and each.domain_id != domain_id)
+
+
+def ephemeral_range(platform: Platform | EphemeralRange) -> EphemeralRange:
+    """Return a platform's default range; a range is returned as it is."""
+    return DEFAULT_EPHEMERAL_RANGE[platform] if isinstance(platform, Platform) else platform
+
+
+def max_participants(
+    domain_id: int, ephemeral: Platform | EphemeralRange, *, only_domain: bool = False
+) -> Capacity:
+    """Return how many participants of a domain fit on one host, each process being at least one.
+
+    Args:
+        domain_id: 0–232.
+        ephemeral: the host's ephemeral range, or a platform for its default.
+        only_domain: the host takes part in this domain alone, so that running into the ports of
+            the next one does no harm.
+
+    Raises:
+        ValueError: the domain is not 0–232.
+    """
+    base = domain_base(domain_id)
+    taken = ephemeral_range(ephemeral)
+    found = [
+        Capacity(
+            participants=(MAX_PORT - base - D3) // PG + 1,
+            limit=f"the highest port, {MAX_PORT}",
+        )
+    ]
+    if domain_id < MAX_DOMAIN_ID and not only_domain:
+        found.append(
+            Capacity(
+                participants=PARTICIPANTS_PER_DOMAIN,
+                limit=f"the ports of domain {domain_id + 1}, from {base + DG}",
+            )
+        )
+    inside = f"the ephemeral ports {taken}"
+    if base + D0 in taken or base + D2 in taken:
+        found.append(Capacity(participants=0, limit=f"{inside}: they hold its multicast ports"))
+    elif taken.last >= base + D1:
+        # The first participant whose upper port is not below the range is the first inside it.
+        free = max(0, -(-(taken.first - base - D3) // PG))
+        found.append(Capacity(participants=free, limit=inside))
+    return min(found, key=lambda each: each.participants)
+
+
+def safe_domains(ephemeral: Platform | EphemeralRange) -> tuple[range, ...]:
+    """Return the domain ids whose first participant is clear of the ephemeral ports, as runs.
+
+    0–101 and 215–232 on Linux, 0–166 on macOS and Windows, by their defaults.
+    """
+    runs: list[range] = []
+    for domain_id in range(MAX_DOMAIN_ID + 1):
+        if max_participants(domain_id, ephemeral).participants == 0:
+            continue
+        if runs and runs[-1].stop == domain_id:
+            runs[-1] = range(runs[-1].start, domain_id + 1)
+        else:
+            runs.append(range(domain_id, domain_id + 1))
+    return tuple(runs)
+
+
+def read_ephemeral_range(read: Callable[[str], str]) -> EphemeralRange:
+    """Return this machine's real ephemeral range (ip(7), ip_local_port_range).
+
+    Args:
+        read: returns the text of a file by its path; injected, so that this room opens nothing.
+
+    Raises:
+        OSError: `read` could not; not Linux, or no /proc.
+        ValueError: the file does not hold two ports.
+    """
+    text = read(EPHEMERAL_RANGE_FILE)
+    numbers = text.split()
+    if len(numbers) != 2 or not all(each.isdecimal() for each in numbers):
+        raise ValueError(f"cannot read {EPHEMERAL_RANGE_FILE}: {text!r} is not two ports")
+    return EphemeralRange(first=int(numbers[0]), last=int(numbers[1]))
+
+
+def unique_flow_ports() -> range:
+    """Return the ports that Fast DDS gives to unique subscriptions: 7000–7399.
+
+    It takes the first free one of [PB − 400, PB), the same in every domain, so all processes of a
+    host share these 400. Each participant takes one for `ros_discovery_info`.
+    """
+    return range(PB - 400, PB)
+
+
+def max_unique_subscriptions(participants: int) -> int:
+    """Return how many unique subscriptions fit on one host beside so many participants of its own.
+
+    Counts all domains of the host together, see `unique_flow_ports`. Never negative.
+
+    Raises:
+        ValueError: negative number of participants.
+    """
+    if participants < 0:
+        raise ValueError(f"cannot use {participants} participants; use 0 or more")
+    return max(0, len(unique_flow_ports()) - participants)
