@@ -1,0 +1,315 @@
+"""The plan: the computational graph and the data layer graph of one system, ready to run.
+
+Owns: the types that cross from this room into verify/, middleware/, node/ and supervisor/.
+Every name in it is fully qualified. JSON-able through `lifecycle.codec`. Pure.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+from lifecycle.manifest.diagnostics import Position
+from lifecycle.manifest.model import (
+    After,
+    Authority,
+    DataLayer,
+    Discovery,
+    DiscoveryMode,
+    DiscoveryRange,
+    EndpointKind,
+    EndpointPolicy,
+    FlowIdentification,
+    FlowTransport,
+    Machine,
+    ParameterDeclaration,
+    ParameterValue,
+    Policy,
+    Run,
+    Timeouts,
+    UniqueHow,
+)
+from lifecycle.manifest.qos import QosProfile
+from lifecycle.network.nfe import UniqueRequirement
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class StaticEndpoint:
+    """One line of the table of static endpoint discovery (Fast DDS, STATIC EDP).
+
+    Attributes:
+        writer: a DataWriter; else a DataReader.
+        topic: DDS name, `rt/chatter`, `ros_discovery_info`.
+        type: DDS name, `std_msgs::msg::dds_::String_`.
+        profile: the name by which rmw looks for the endpoint's profile, `/chatter`.
+        user_id: 1–65535, unique in the system.
+    """
+
+    writer: bool
+    topic: str
+    type: str
+    profile: str
+    user_id: int
+    reliable: bool = True
+    transient_local: bool = False
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class StaticParticipant:
+    """A participant that others know without being told. `name` is its enclave, `/camera_net`."""
+
+    name: str
+    endpoints: tuple[StaticEndpoint, ...]
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class ParticipantConnections:
+    """How one participant is connected: what `connect_to` is told.
+
+    Attributes:
+        urls: its transports, as connection URLs in text; empty leaves everything to the RMW.
+        static_name: its own name in `static_participants`.
+        static_participants: everybody, itself included, where endpoints are not announced.
+        super_client: it learns of everything that the discovery servers of its URLs know, as an
+            observer must; else only of what matches its own endpoints.
+    """
+
+    urls: tuple[str, ...] = ()
+    static_name: str = ""
+    static_participants: tuple[StaticParticipant, ...] = ()
+    super_client: bool = False
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class PlannedParticipant:
+    """An extra DDS participant that carries publishers which need their own flow.
+
+    A publisher becomes unique only in its own participant, so the planner groups publishers of one
+    class (same DSCP, same need) and gives each strictly or optionally unique one its own.
+
+    Attributes:
+        name: base name of the hidden node that owns it, `_camera_flow_0`; its namespace is the
+            node's.
+        dscp: 0–63 set on its sender sockets; None leaves them alone.
+        reason: one phrase for people, "unique publisher video".
+        transports: all that it may use, "udpv4", "udpv6"; empty leaves it to the RMW.
+        max_datagram_bytes: UDP payload above which RTPS splits messages itself, so that IP does
+            not; None leaves it to the RMW.
+        non_blocking_send: its sockets never wait; what finds a full buffer is lost.
+        connection: name of the connection it stands for, unique in the node, `net`; empty for one
+            that only tells a publisher's flow apart.
+        connections: what `connect_to` is told.
+    """
+
+    name: str
+    dscp: int | None
+    reason: str
+    transports: tuple[str, ...] = ()
+    max_datagram_bytes: int | None = None
+    non_blocking_send: bool = False
+    connection: str = ""
+    connections: ParticipantConnections = ParticipantConnections()
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class PlannedEndpoint:
+    """One endpoint as it must exist at run time.
+
+    Attributes:
+        name: as declared in the interface; the handle that code uses.
+        resolved: fully qualified topic, service or action name after namespace and remap.
+        dscp_reason: where a DSCP comes from that is not written as such; empty if it is.
+        five_qi_reason: why it is this 5QI, or none, where the manifest says `auto`; else empty.
+        participant: base name of the PlannedParticipant that carries it; empty for the node's own.
+        transport: NETWORK must not go by shared memory.
+        max_delay_ms: declared bound, or the shortest of the links on its topic; None without.
+        loss: declared bound of the share lost or late, > 0 and <= 1.
+        rate_hz: declared messages per second.
+        max_message_size: largest serialized message, bytes: as declared, else the type's bound;
+            None if the type has none or is not installed here.
+        lossy: the data bear an unreliable transport; None if nobody said.
+    """
+
+    kind: EndpointKind
+    name: str
+    resolved: str
+    type: str
+    qos: QosProfile | None
+    unique: UniqueRequirement = UniqueRequirement.NOT_REQUIRED
+    dscp: int | None = None
+    enforce_dscp: bool = True
+    dscp_reason: str = ""
+    five_qi: int | None = None
+    five_qi_reason: str = ""
+    participant: str = ""
+    transport: FlowTransport = FlowTransport.ANY
+    max_delay_ms: float | None = None
+    loss: float | None = None
+    rate_hz: float | None = None
+    max_message_size: int | None = None
+    lossy: bool | None = None
+    at: Position
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class PlannedNode:
+    """One node as it must exist at run time.
+
+    Attributes:
+        key: the manifest key.
+        name: base name.
+        namespace: absolute.
+        process: name of its PlannedProcess.
+        parameters: (name, value) given on top of parameter files.
+        transports: all that the node's own participant may use, "udpv4", "udpv6"; empty leaves it
+            to the RMW. Nodes of one process share a participant if these and `max_datagram_bytes`
+            are equal.
+        max_datagram_bytes: as in PlannedParticipant, for the node's own participant.
+        connections: how its own participant is connected; likewise shared by equals.
+        authority: SUPERVISOR: `connect` maps nothing by itself; every endpoint must have been
+            mapped by `map_to`, or the transition fails and names the missing ones.
+        events: it tells the graph what becomes of its connections and mappings.
+        membership: it tells the graph that it joins and leaves, its state and its checksum; so does
+            whoever tells events.
+    """
+
+    key: str
+    name: str
+    namespace: str
+    machine: str
+    process: str
+    managed: bool
+    run: Run
+    endpoints: tuple[PlannedEndpoint, ...]
+    declared_parameters: tuple[ParameterDeclaration, ...]
+    parameters: tuple[tuple[str, ParameterValue], ...]
+    parameter_files: tuple[str, ...]
+    remap: tuple[tuple[str, str], ...]
+    participants: tuple[PlannedParticipant, ...]
+    after: tuple[After, ...]
+    timeouts: Timeouts
+    endpoint_policy: EndpointPolicy
+    log_level: str
+    transports: tuple[str, ...] = ()
+    max_datagram_bytes: int | None = None
+    connections: ParticipantConnections = ParticipantConnections()
+    authority: Authority = Authority.NODES
+    events: bool = False
+    membership: bool = False
+    at: Position
+
+    @property
+    def full_name(self) -> str:
+        """Fully qualified node name, `/robot/camera`."""
+        return f"{self.namespace.rstrip('/')}/{self.name}"
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class PlannedProcess:
+    """One operating system process.
+
+    Attributes:
+        name: unique in the plan; the node's key when the process holds one node.
+        nodes: keys of its nodes, in manifest order.
+        argv: full command line for a COMMAND process; empty for PYTHON and ATTACH.
+        environment: (name, value) on top of the supervisor's.
+    """
+
+    name: str
+    machine: str
+    run: Run
+    nodes: tuple[str, ...]
+    argv: tuple[str, ...] = ()
+    environment: tuple[tuple[str, str], ...] = ()
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class PlannedFlow:
+    """One publisher → subscription pair that must match and what its flow must be.
+
+    Attributes:
+        publisher: key of the publishing node.
+        subscription: key of the subscribing node.
+        unique: the strongest demand of a link on this pair.
+        linked: a `links:` entry names this pair.
+        transport: what a link says must carry it; ANY where none does.
+        medium: what will carry it, "intraprocess", "shm", "udpm", "udpv4", "udpv6" or "tcpv4";
+            empty if that is not known before the nodes' configurations are.
+        medium_reason: one phrase for people, "same host", "links say so".
+    """
+
+    topic: str
+    publisher: str
+    subscription: str
+    unique: UniqueHow = UniqueHow.NOT
+    max_delay_ms: float | None = None
+    linked: bool = False
+    transport: FlowTransport = FlowTransport.ANY
+    medium: str = ""
+    medium_reason: str = ""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class PlannedServer:
+    """The discovery server that a supervisor starts, watches and ends.
+
+    Attributes:
+        machine: where it runs; empty for this host.
+        address: what clients are told, and it listens on.
+        port: 1–65535.
+        tcp: over TCP; else UDP.
+        prefix: its GUID prefix, as in connection URLs.
+    """
+
+    machine: str
+    address: str
+    port: int
+    tcp: bool = True
+    prefix: str
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """A system, planned.
+
+    Attributes:
+        levels: node keys by dependency level; a level's nodes have no order among themselves.
+        rmw: RMW identifier of processes that set none of their own, `rmw_fastrtps_cpp`.
+        flow_identification: how publishers that need a unique flow get one.
+        data_layer: who wires it, from what, and whether events are followed.
+        discovery_mode: how participants find each other.
+        discovery: as declared; what `discovery_mode` and `domain_id` do not say of it.
+        max_datagram_bytes: UDP payload that the path carries unfragmented; None assumes Ethernet.
+        server: the discovery server; None without.
+        observers: (machine, how its supervisor's own participant is connected); machine is empty
+            for this host. Machines without an entry leave it to the RMW.
+    """
+
+    system: str
+    manifest_path: str
+    domain_id: int
+    discovery_range: DiscoveryRange
+    policy: Policy
+    machines: tuple[Machine, ...]
+    processes: tuple[PlannedProcess, ...]
+    nodes: tuple[PlannedNode, ...]
+    flows: tuple[PlannedFlow, ...]
+    levels: tuple[tuple[str, ...], ...]
+    rmw: str = ""
+    flow_identification: FlowIdentification = FlowIdentification.PARTICIPANT
+    data_layer: DataLayer = DataLayer()
+    discovery_mode: DiscoveryMode = DiscoveryMode.DYNAMIC
+    discovery: Discovery = Discovery()  # noqa: RUF009 - frozen
+    max_datagram_bytes: int | None = None
+    server: PlannedServer | None = None
+    observers: tuple[tuple[str, ParticipantConnections], ...] = ()
+
+    def node(self, key: str) -> PlannedNode:
+        """Return the node with this manifest key.
+
+        Raises:
+            KeyError: no such key.
+        """
+        for node in self.nodes:
+            if node.key == key:
+                return node
+        raise KeyError(key)

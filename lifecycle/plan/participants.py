@@ -1,0 +1,127 @@
+"""Extra participants for publishers that need a network flow of their own.
+
+Owns: naming and describing the participants that `lifecycle.manifest.flow_needs` groups publishers
+into, and what one costs. On Fast DDS a publisher's
+network flow endpoints are its participant's sender sockets, so only a participant of its own makes
+it unique, and only all publishers of one participant together can carry a DSCP. Pure.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+from lifecycle.manifest.flow_needs import ParticipantGroup
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.network.dscp import describe
+from lifecycle.plan.model import PlannedEndpoint, PlannedParticipant
+
+
+def place_publishers(
+    node_name: str, endpoints: Sequence[PlannedEndpoint], groups: Sequence[ParticipantGroup]
+) -> tuple[tuple[PlannedEndpoint, ...], tuple[PlannedParticipant, ...]]:
+    """Make a participant of each group; leave all endpoints that are in none alone.
+
+    Names count from 0 in the order in which the interface first needs them, so they are the same in
+    every run.
+
+    Args:
+        node_name: the node's base name.
+        endpoints: all of the node's endpoints, in the interface's order.
+        groups: publishers that share, as `FlowNeeds.groups` makes them.
+
+    Returns:
+        The endpoints with `participant` filled in, and the participants by index.
+    """
+    names = {
+        publisher: f"_{node_name}_flow_{index}"
+        for index, group in enumerate(groups)
+        for publisher in group.publishers
+    }
+    placed = tuple(
+        dataclasses.replace(each, participant=names[each.name])
+        if each.kind is EndpointKind.PUBLISHER and each.name in names
+        else each
+        for each in endpoints
+    )
+    participants = tuple(
+        PlannedParticipant(
+            name=names[group.publishers[0]],
+            dscp=group.dscp,
+            reason=_reason(group),
+            transports=group.transports,
+            max_datagram_bytes=group.max_datagram_bytes,
+            non_blocking_send=group.non_blocking_send,
+        )
+        for group in groups
+    )
+    return placed, participants
+
+
+def _reason(group: ParticipantGroup) -> str:
+    plural = "s" if len(group.publishers) > 1 else ""
+    facts = [f"{'unique ' if group.unique else ''}publisher{plural} {', '.join(group.publishers)}"]
+    if group.dscp is not None:
+        facts.append(f"marked {describe(group.dscp)}")
+    if group.five_qi is not None:
+        facts.append(f"for 5QI {group.five_qi}")
+    if group.transports:
+        facts.append(f"by {' and '.join(group.transports)} only")
+    if group.max_datagram_bytes is not None:
+        facts.append(f"in datagrams of at most {group.max_datagram_bytes} bytes")
+    if group.non_blocking_send:
+        facts.append("sent without waiting")
+    return " ".join(facts)
+
+
+def owner_of(participant: str) -> str:
+    """Return the full name of the node that a hidden participant node belongs to.
+
+    Args:
+        participant: a fully qualified node name, `/robot/_camera_flow_0`.
+
+    Returns:
+        `/robot/camera`; empty when the name is not a hidden participant's.
+    """
+    namespace, _, base = participant.rpartition("/")
+    stem, separator, index = base.rpartition("_flow_")
+    if not separator or not stem.startswith("_") or len(stem) == 1 or not index.isdecimal():
+        return ""
+    return f"{namespace}/{stem[1:]}"
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class ParticipantCost:
+    """What DDS participants cost, as measured with Fast DDS 2.14 on 2 cores.
+
+    Attributes:
+        rss_mb: resident memory, megabytes.
+        threads: threads.
+        sockets: sockets.
+        start_ms: time to make them, milliseconds, from best to worst.
+        discovery_pairs: pairs of a participant and a peer that discovery keeps up because of them.
+    """
+
+    rss_mb: float
+    threads: int
+    sockets: int
+    start_ms: tuple[int, int]
+    discovery_pairs: int = 0
+
+
+def participants_cost(count: int, *, others: int = 0) -> ParticipantCost:
+    """Estimate what extra participants cost.
+
+    Args:
+        count: of the extra ones, >= 0.
+        others: participants of the domain besides them, >= 0. Each participant announces itself to
+            each other one, so discovery grows with participants x peers.
+    """
+    together = count + others
+    return ParticipantCost(
+        rss_mb=2.5 * count,
+        threads=7 * count,
+        sockets=6 * count,
+        start_ms=(6 * count, 10 * count),
+        discovery_pairs=together * (together - 1) - others * (others - 1),
+    )
