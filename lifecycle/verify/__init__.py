@@ -1,0 +1,52 @@
+"""Plan × Observation → Verdict, and the verdict's reports. Pure: no ROS, no files, no clock."""
+
+from lifecycle.verify.judge import verify
+from lifecycle.verify.missing import missing, not_ok
+from lifecycle.verify.noise import (
+    action_part,
+    fold_actions,
+    is_noise_endpoint,
+    is_noise_node,
+    our_nodes,
+    without_noise,
+)
+from lifecycle.verify.observation import (
+    EndpointReport,
+    Identity,
+    NodeConfiguration,
+    Observation,
+    ObservedEndpoint,
+    ObservedNode,
+)
+from lifecycle.verify.report import render_text, to_json, to_junit, to_sarif
+from lifecycle.verify.rules import RULES, Rule
+from lifecycle.verify.verdict import Finding, FlowReport, Outcome, Stage, Verdict
+
+__all__ = [
+    "RULES",
+    "EndpointReport",
+    "Finding",
+    "FlowReport",
+    "Identity",
+    "NodeConfiguration",
+    "Observation",
+    "ObservedEndpoint",
+    "ObservedNode",
+    "Outcome",
+    "Rule",
+    "Stage",
+    "Verdict",
+    "action_part",
+    "fold_actions",
+    "is_noise_endpoint",
+    "is_noise_node",
+    "missing",
+    "not_ok",
+    "our_nodes",
+    "render_text",
+    "to_json",
+    "to_junit",
+    "to_sarif",
+    "verify",
+    "without_noise",
+]

@@ -1,0 +1,366 @@
+"""Laying the plan and the observation side by side.
+
+Owns: which observed endpoint and which report belong to which declared endpoint, and what is left
+over. All rules read the result, so that they agree on what is the same thing. Pure.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedFlow, PlannedNode
+from lifecycle.verify.hidden import Owners
+from lifecycle.verify.noise import (
+    action_part,
+    fold_actions,
+    is_noise_endpoint,
+    is_noise_node,
+    known_node,
+)
+from lifecycle.verify.observation import (
+    EndpointReport,
+    NodeConfiguration,
+    Observation,
+    ObservedEndpoint,
+    ObservedNode,
+)
+from lifecycle.verify.verdict import Stage
+from lifecycle.verify.view import (
+    Actual,
+    FlowView,
+    Seen,
+    View,
+    actual_qos,
+    may_hide,
+    only_shared_memory,
+)
+
+_Pools = dict[tuple[EndpointKind, str], list[ObservedEndpoint]]
+"""One node's endpoints by kind and name."""
+
+
+def lay_out(
+    plan: Plan,
+    observation: Observation,
+    stage: Stage,
+    *,
+    machines: frozenset[str] | None = None,
+    ahead: frozenset[str] = frozenset(),
+) -> View:
+    """Match everything observed to everything planned; deterministic for any input order."""
+    planned = {node.full_name: node for node in plan.nodes}
+    reported = _by_identity(observation)
+    configurations = {each.name: each for each in reversed(reported)}
+    duplicated = {each.full_name for each in observation.nodes if each.count > 1}
+    owners = Owners(planned.values(), reported)
+    endpoints = _attributed(observation, planned, configurations, owners)
+    places: dict[str, _Pools] = {}
+    for endpoint in endpoints:
+        pools = places.setdefault(endpoint.node, {})
+        pools.setdefault((endpoint.kind, endpoint.name), []).append(endpoint)
+    by_node: dict[str, tuple[Actual, ...]] = {}
+    left_over: list[ObservedEndpoint] = []
+    for node in plan.nodes:
+        configuration = configurations.get(node.full_name)
+        elsewhere = machines is not None and node.machine not in machines
+        matched, rest = _match_node(
+            node,
+            configuration,
+            places.get(node.full_name, {}),
+            beyond=elsewhere and only_shared_memory(node.connections),
+        )
+        by_node[node.full_name] = tuple(matched)
+        # A second node of the same name has the same endpoints again; that is one finding.
+        left_over += [] if node.full_name in duplicated else rest
+    actual = tuple(each for matched in by_node.values() for each in matched)
+    known_actions = {(each.node, each.kind, each.name) for each in endpoints} | {
+        (each.node.full_name, each.planned.kind, each.planned.resolved) for each in actual
+    }
+    undeclared = [each for each in left_over if not _is_part_of(each, known_actions)]
+    return View(
+        plan=plan,
+        stage=stage,
+        machines=machines,
+        ahead=ahead,
+        planned=planned,
+        observed=_graph_nodes(observation.nodes, planned, owners),
+        reported=reported,
+        configurations=configurations,
+        actual=actual,
+        actual_by_node=by_node,
+        undeclared=_sorted(undeclared),
+        unattributed=tuple(each for each in endpoints if not each.node),
+        foreign=tuple(
+            each
+            for each in endpoints
+            if each.node and each.node not in planned and not is_noise_node(each.node)
+        ),
+        seen=_seen(
+            (*endpoints, *(each.observed for each in actual if each.unseen and each.observed)),
+            actual,
+            planned,
+        ),
+        flows=tuple(_flow(each, plan, by_node) for each in plan.flows),
+    )
+
+
+def _by_identity(observation: Observation) -> tuple[NodeConfiguration, ...]:
+    return tuple(
+        sorted(observation.configurations, key=lambda each: (each.name, repr(each.identity)))
+    )
+
+
+def _attributed(
+    observation: Observation,
+    planned: dict[str, PlannedNode],
+    configurations: dict[str, NodeConfiguration],
+    owners: Owners,
+) -> tuple[ObservedEndpoint, ...]:
+    """Give each endpoint to its node: by hidden participant, or by the GID that a node reported.
+
+    What client libraries bring along is left out here, unless it is declared.
+    """
+    declared = {
+        (name, each.kind, each.resolved)
+        for name, node in planned.items()
+        for each in node.endpoints
+    }
+    by_gid = {
+        report.gid: name
+        for name, configuration in configurations.items()
+        for report in configuration.endpoints
+        if report.gid
+    }
+    found: list[ObservedEndpoint] = []
+    for endpoint in observation.endpoints:
+        node = known_node(endpoint.node)
+        if node not in planned:
+            node = owners.of(node) or node
+        if not node:
+            node = by_gid.get(endpoint.gid, "")
+        if (node, endpoint.kind, endpoint.name) not in declared and is_noise_endpoint(
+            endpoint.kind,
+            known_node(endpoint.node),
+            endpoint.name,
+            endpoint.type,
+            ours=node in configurations,
+        ):
+            continue
+        found.append(
+            endpoint if node == endpoint.node else dataclasses.replace(endpoint, node=node)
+        )
+    return _sorted(fold_actions(_sorted(found)))
+
+
+def _match_node(
+    node: PlannedNode,
+    configuration: NodeConfiguration | None,
+    places: _Pools,
+    *,
+    beyond: bool,
+) -> tuple[list[Actual], list[ObservedEndpoint]]:
+    """Match one node's declarations to what is seen of it; return them and what is left over."""
+    reports = list(configuration.endpoints) if configuration else []
+    pools = {place: list(endpoints) for place, endpoints in places.items()}
+    matched: dict[int, Actual] = {}
+    used: set[tuple[EndpointKind, str]] = set()
+    # Exact types choose first, so that one wrong type does not take another one's place.
+    for exact in (True, False):
+        for index, planned in enumerate(node.endpoints):
+            if index in matched:
+                continue
+            place = (planned.kind, planned.resolved)
+            report = _pick_report(planned, reports, exact=exact)
+            observed = _pick_observed(planned, report, pools.get(place, []), exact=exact)
+            if exact and observed is None:
+                continue
+            unseen = observed is None and may_hide(node, planned)
+            if observed is not None and observed.gid:
+                pools[place].remove(observed)
+            elif observed is not None:
+                used.add(place)  # found by name only: it stands for any number of them
+            elif unseen and report is not None and _is_there(report, planned.resolved):
+                observed = _as_observed(node, report, report.resolved)
+            if report is not None:
+                reports.remove(report)
+            matched[index] = Actual(
+                node=node,
+                planned=planned,
+                observed=observed,
+                report=report,
+                unseen=unseen,
+                beyond=beyond,
+            )
+    rest = [endpoint for place, pool in pools.items() if place not in used for endpoint in pool]
+    rest += [
+        _as_observed(node, actual.report, name)
+        for actual in matched.values()
+        if actual.report is not None
+        for name in (actual.report.resolved, *actual.report.aliases)
+        if name != actual.planned.resolved
+        and _is_there(actual.report, name)
+        and (actual.report.kind, name) not in places
+    ]
+    rest += [
+        _as_observed(node, report, report.resolved)
+        for report in reports
+        if (report.kind, report.resolved) not in places
+        and not is_noise_endpoint(
+            report.kind, node.full_name, report.resolved, report.type, ours=True
+        )
+    ]
+    return [matched[index] for index in range(len(node.endpoints))], rest
+
+
+def _pick_report(
+    planned: PlannedEndpoint, reports: Sequence[EndpointReport], *, exact: bool
+) -> EndpointReport | None:
+    """Choose the report on a declared endpoint: by its declared name, else by its resolved one."""
+    for report in reports:
+        if report.kind is planned.kind and report.name == planned.name:
+            return report
+    for report in reports:
+        if (
+            report.kind is planned.kind
+            and report.resolved == planned.resolved
+            and (not exact or report.type == planned.type)
+            and not report.name
+        ):
+            return report
+    return None
+
+
+def _pick_observed(
+    planned: PlannedEndpoint,
+    report: EndpointReport | None,
+    pool: Sequence[ObservedEndpoint],
+    *,
+    exact: bool,
+) -> ObservedEndpoint | None:
+    """Choose what discovery shows of a declared endpoint: by GID, else by type, else any."""
+    if report is not None and report.gid:
+        for endpoint in pool:
+            if endpoint.gid == report.gid:
+                return endpoint
+    for endpoint in pool:
+        if endpoint.type == planned.type or not exact:
+            return endpoint
+    return None
+
+
+def _is_there(report: EndpointReport, name: str) -> bool:
+    """Tell whether a node says that an endpoint exists under a name; it may have been remapped."""
+    return report.mapped and not report.error and name in (report.resolved, *report.aliases)
+
+
+def _as_observed(node: PlannedNode, report: EndpointReport, name: str) -> ObservedEndpoint:
+    """An endpoint that only its node told of, discovery not showing it, or not yet."""
+    return ObservedEndpoint(
+        kind=report.kind,
+        node=node.full_name,
+        name=name,
+        type=report.type,
+        qos=report.qos,
+        gid=report.gid,
+    )
+
+
+def _is_part_of(endpoint: ObservedEndpoint, actions: set[tuple[str, EndpointKind, str]]) -> bool:
+    """Tell whether an endpoint is a hidden part of an action that is declared or seen."""
+    action = action_part(endpoint.kind, endpoint.name)
+    return action is not None and (endpoint.node, *action) in actions
+
+
+def _graph_nodes(
+    nodes: Iterable[ObservedNode], planned: dict[str, PlannedNode], owners: Owners
+) -> dict[str, ObservedNode]:
+    """Nodes that count: tools and hidden participants of declared nodes left out."""
+    merged: dict[str, ObservedNode] = {}
+    for node in sorted(nodes, key=lambda each: each.full_name):
+        name = node.full_name
+        if not known_node(name):
+            continue  # its endpoints are judged; it is no name that could be declared or not
+        if name not in planned and (is_noise_node(name) or owners.of(name)):
+            continue
+        known = merged.get(name)
+        merged[name] = (
+            node if known is None else dataclasses.replace(known, count=known.count + node.count)
+        )
+    return merged
+
+
+def _seen(
+    endpoints: Iterable[ObservedEndpoint],
+    actual: Sequence[Actual],
+    planned: dict[str, PlannedNode],
+) -> tuple[Seen, ...]:
+    """Collect publishers and subscriptions with all that is known of them, tools left out."""
+    known = {id(each.observed): each for each in actual if each.observed is not None}
+    # Nobody here can see those, but who hears them counts them.
+    found = [
+        Seen(
+            kind=each.planned.kind,
+            node=each.node.full_name,
+            name=each.planned.resolved,
+            type=each.planned.type,
+            qos=each.planned.qos,
+            report=None,
+            planned=each.planned,
+        )
+        for each in actual
+        if each.beyond and each.planned.kind.is_topic
+    ]
+    for endpoint in endpoints:
+        if not endpoint.kind.is_topic:
+            continue
+        if endpoint.node not in planned and is_noise_node(endpoint.node):
+            continue
+        match = known.get(id(endpoint))
+        report = match.report if match else None
+        found.append(
+            Seen(
+                kind=endpoint.kind,
+                node=endpoint.node,
+                name=endpoint.name,
+                type=endpoint.type,
+                qos=actual_qos(endpoint.qos, report.qos if report else None),
+                report=report,
+                planned=match.planned if match else None,
+            )
+        )
+    return tuple(found)
+
+
+def _flow(planned: PlannedFlow, plan: Plan, by_node: dict[str, tuple[Actual, ...]]) -> FlowView:
+    publisher = plan.node(planned.publisher).full_name
+    subscription = plan.node(planned.subscription).full_name
+    publishers, subscriptions = (
+        tuple(
+            each
+            for each in by_node[name]
+            if each.planned.kind is kind and each.planned.resolved == planned.topic
+        )
+        for name, kind in (
+            (publisher, EndpointKind.PUBLISHER),
+            (subscription, EndpointKind.SUBSCRIPTION),
+        )
+    )
+    return FlowView(
+        planned=planned,
+        publisher=publisher,
+        subscription=subscription,
+        publishers=publishers,
+        subscriptions=subscriptions,
+        at=next((each.planned.at for each in (*subscriptions, *publishers)), None),
+    )
+
+
+def _sorted(endpoints: Iterable[ObservedEndpoint]) -> tuple[ObservedEndpoint, ...]:
+    return tuple(
+        sorted(
+            endpoints,
+            key=lambda each: (each.node, each.name, each.kind.value, each.type, each.gid),
+        )
+    )

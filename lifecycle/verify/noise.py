@@ -1,0 +1,236 @@
+"""What every ROS 2 graph holds that no manifest declares.
+
+Owns: the list of nodes and endpoints that tools and client libraries bring along, and the folding
+of an action's hidden topics and services into action endpoints. Data and predicates only: who
+observes a graph may use them, `verify` always does. Pure.
+
+Sources: rcl (parameter, type description and logger services, rosout), rcl_lifecycle, the actions
+article (https://design.ros2.org/articles/actions.html), names of nodes as the tools choose them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.verify.observation import ObservedEndpoint
+
+NOISE_NODE_PREFIXES = (
+    "_ros2cli_",
+    "_lifecycle_",
+    "launch_ros_",
+    "rqt_",
+    "rviz_",
+    "transform_listener_impl_",
+)
+"""Base names of nodes that tools make start so; in whichever namespace. `_lifecycle_` is ours."""
+
+NOISE_NODE_NAMES = frozenset({"rviz", "rviz2", "rosbag2_recorder", "rosbag2_player"})
+"""Base names of tools that always use the same one."""
+
+PLACEHOLDER_NAMES = frozenset({"_NODE_NAME_UNKNOWN_", "_CREATED_BY_BARE_DDS_APP_"})
+"""What rmw_dds_common calls the node of an endpoint whose node it does not know (yet)."""
+
+GRAPH_TOPIC = "/lifecycle/graph"
+"""Where nodes tell the graph what becomes of them, and hear of others (lifecycle.graph)."""
+
+NOISE_TOPICS = frozenset(
+    {
+        (EndpointKind.PUBLISHER, "/rosout"),
+        (EndpointKind.PUBLISHER, "/parameter_events"),
+        (EndpointKind.SUBSCRIPTION, "/parameter_events"),
+        # every client library subscribes to it when use_sim_time is set
+        (EndpointKind.SUBSCRIPTION, "/clock"),
+        (EndpointKind.PUBLISHER, GRAPH_TOPIC),
+        (EndpointKind.SUBSCRIPTION, GRAPH_TOPIC),
+    }
+)
+"""Topics of the client libraries themselves, and ours."""
+
+NODE_SERVICES: Mapping[str, str] = {
+    "describe_parameters": "rcl_interfaces/srv/DescribeParameters",
+    "get_parameter_types": "rcl_interfaces/srv/GetParameterTypes",
+    "get_parameters": "rcl_interfaces/srv/GetParameters",
+    "list_parameters": "rcl_interfaces/srv/ListParameters",
+    "set_parameters": "rcl_interfaces/srv/SetParameters",
+    "set_parameters_atomically": "rcl_interfaces/srv/SetParametersAtomically",
+    "get_type_description": "type_description_interfaces/srv/GetTypeDescription",
+    "get_logger_levels": "rcl_interfaces/srv/GetLoggerLevels",
+    "set_logger_levels": "rcl_interfaces/srv/SetLoggerLevels",
+    "change_state": "lifecycle_msgs/srv/ChangeState",
+    "get_state": "lifecycle_msgs/srv/GetState",
+    "get_available_states": "lifecycle_msgs/srv/GetAvailableStates",
+    "get_available_transitions": "lifecycle_msgs/srv/GetAvailableTransitions",
+    "get_transition_graph": "lifecycle_msgs/srv/GetAvailableTransitions",
+}
+"""Services that client libraries offer under a node's own name, `~/get_state`, and their types."""
+
+OUR_SERVICES: Mapping[str, str] = {
+    "get_configuration": "std_srvs/srv/Trigger",
+    "connect_to": "rcl_interfaces/srv/SetParameters",
+    "map_to": "rcl_interfaces/srv/SetParameters",
+    "disconnect": "rcl_interfaces/srv/SetParameters",
+    "remap": "rcl_interfaces/srv/SetParameters",
+    "alias": "rcl_interfaces/srv/SetParameters",
+}
+"""Services that nodes of ours offer besides. The names are common words and the types standard, so
+that a node counts as ours only with the two that no other node has together, `OURS_BY`."""
+
+OURS_BY = frozenset({"get_configuration", "map_to"})
+"""Who offers both under its own name is a node of ours."""
+
+NODE_TOPICS = frozenset({"_alive", "_alive_pulse", "transition_event"})
+"""Topics that a node publishes under its own name."""
+
+_ACTION_PART = "/_action/"
+_ACTION_SERVER_PARTS = frozenset(
+    {
+        (EndpointKind.SERVICE_SERVER, "send_goal"),
+        (EndpointKind.SERVICE_SERVER, "cancel_goal"),
+        (EndpointKind.SERVICE_SERVER, "get_result"),
+        (EndpointKind.PUBLISHER, "feedback"),
+        (EndpointKind.PUBLISHER, "status"),
+    }
+)
+_ACTION_CLIENT_PARTS = frozenset(
+    {
+        (EndpointKind.SERVICE_CLIENT, "send_goal"),
+        (EndpointKind.SERVICE_CLIENT, "cancel_goal"),
+        (EndpointKind.SERVICE_CLIENT, "get_result"),
+        (EndpointKind.SUBSCRIPTION, "feedback"),
+        (EndpointKind.SUBSCRIPTION, "status"),
+    }
+)
+_ACTION_SIDES = (
+    (EndpointKind.ACTION_SERVER, _ACTION_SERVER_PARTS),
+    (EndpointKind.ACTION_CLIENT, _ACTION_CLIENT_PARTS),
+)
+_SEND_GOAL_TYPE_SUFFIX = "_SendGoal"
+
+
+def is_noise_node(full_name: str) -> bool:
+    """Tell whether a node belongs to a tool and not to a system.
+
+    Args:
+        full_name: fully qualified, `/launch_ros_4711`. A manifest may declare a node of such a
+            name; whoever filters must keep declared names.
+    """
+    base = full_name.rpartition("/")[2]
+    return base in NOISE_NODE_NAMES or base.startswith(NOISE_NODE_PREFIXES)
+
+
+def known_node(full_name: str) -> str:
+    """Return a node's name, or an empty one where it only stands for "not known"."""
+    return "" if full_name.rpartition("/")[2] in PLACEHOLDER_NAMES else full_name
+
+
+def is_noise_endpoint(kind: EndpointKind, node: str, name: str, type_: str, *, ours: bool) -> bool:
+    """Tell whether an endpoint is one that client libraries make without being asked.
+
+    Offering such a service counts as noise only under the node's own name; using it, under any:
+    who drives another node's lifecycle or parameters declares nothing. A service of another type
+    only has the name, and is somebody's. An endpoint whose node is not known is never noise: it
+    may be the first sign of a node that must not be there.
+
+    Args:
+        kind: kind of the endpoint.
+        node: fully qualified name of the endpoint's node; empty while unknown.
+        name: fully qualified name of the topic, service or action.
+        type_: of the endpoint, `rcl_interfaces/srv/GetParameters`.
+        ours: the node is one of ours (`our_nodes`), so that the services of the node interface
+            are its own. Using those of others is noise from anywhere.
+    """
+    if not node:
+        return False
+    if (kind, name) in NOISE_TOPICS:
+        return True
+    owner, _, base = name.rpartition("/")
+    offers = kind in (EndpointKind.SERVICE_SERVER, EndpointKind.PUBLISHER)
+    if offers and owner != node:
+        return False
+    if kind in (EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT):
+        if NODE_SERVICES.get(base) == type_:
+            return True
+        return OUR_SERVICES.get(base) == type_ and (ours or not offers)
+    return base in NODE_TOPICS
+
+
+def our_nodes(endpoints: Iterable[ObservedEndpoint]) -> frozenset[str]:
+    """Return the nodes that offer the node interface and the node configuration interface.
+
+    Args:
+        endpoints: all of whoever is asked about; nothing left out as noise before.
+    """
+    offered: dict[str, set[str]] = {}
+    for each in endpoints:
+        owner, _, base = each.name.rpartition("/")
+        if (
+            each.kind is EndpointKind.SERVICE_SERVER
+            and each.node
+            and owner == each.node
+            and OUR_SERVICES.get(base) == each.type
+        ):
+            offered.setdefault(each.node, set()).add(base)
+    return frozenset(node for node, bases in offered.items() if bases >= OURS_BY)
+
+
+def without_noise(endpoints: Iterable[ObservedEndpoint]) -> tuple[ObservedEndpoint, ...]:
+    """Return what somebody wrote on purpose, in order; the input must be complete per node."""
+    found = tuple(endpoints)
+    ours = our_nodes(found)
+    return tuple(
+        each
+        for each in found
+        if not is_noise_endpoint(each.kind, each.node, each.name, each.type, ours=each.node in ours)
+    )
+
+
+def action_part(kind: EndpointKind, name: str) -> tuple[EndpointKind, str] | None:
+    """Return the action endpoint that a hidden topic or service is a part of.
+
+    Args:
+        kind: kind of the hidden endpoint.
+        name: its fully qualified name, `/dock/_action/send_goal`.
+
+    Returns:
+        ACTION_SERVER or ACTION_CLIENT and the action's name; None if it is no part of an action.
+    """
+    action, separator, part = name.rpartition(_ACTION_PART)
+    if not separator or not action:
+        return None
+    for side, parts in _ACTION_SIDES:
+        if (kind, part) in parts:
+            return side, action
+    return None
+
+
+def fold_actions(endpoints: Iterable[ObservedEndpoint]) -> tuple[ObservedEndpoint, ...]:
+    """Replace complete sets of an action's hidden endpoints by one action endpoint.
+
+    A server is complete with three services and two publishers, a client with three service
+    clients and two subscriptions. Parts of an incomplete action stay as they are: an action that
+    discovery shows only half of is not there yet. Action endpoints already in the input stay.
+    """
+    kept: list[ObservedEndpoint] = []
+    groups: dict[tuple[str, EndpointKind, str], list[ObservedEndpoint]] = {}
+    for endpoint in endpoints:
+        action = action_part(endpoint.kind, endpoint.name)
+        if action is None:
+            kept.append(endpoint)
+        else:
+            groups.setdefault((endpoint.node, *action), []).append(endpoint)
+    known = {(each.node, each.kind, each.name) for each in kept}
+    for (node, side, name), parts in groups.items():
+        needed = dict(_ACTION_SIDES)[side]
+        if (node, side, name) in known:
+            continue
+        if {(part.kind, part.name.rpartition("/")[2]) for part in parts} == needed:
+            type_ = next(
+                part.type.removesuffix(_SEND_GOAL_TYPE_SUFFIX)
+                for part in parts
+                if part.name.endswith("/send_goal")
+            )
+            kept.append(ObservedEndpoint(kind=side, node=node, name=name, type=type_))
+        else:
+            kept.extend(parts)
+    return tuple(kept)

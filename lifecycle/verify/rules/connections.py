@@ -1,0 +1,179 @@
+"""Rules about connections and mappings: missing, failed, otherwise than planned. Pure.
+
+A connection is a participant that only its own node can tell of: discovery shows a hidden node, but
+neither what it was told to connect to nor why it could not. So the nodes' reports are judged.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from lifecycle.network.connection_url import ConnectionUrl, ConnectionUrlError, parse
+from lifecycle.plan.model import ParticipantConnections, PlannedNode
+from lifecycle.plan.restart import is_restarted_url
+from lifecycle.verify.observation import ConnectionReport
+from lifecycle.verify.rules.catalogue import Rule
+from lifecycle.verify.verdict import Finding, Outcome
+from lifecycle.verify.view import Actual, View, connection_of
+
+MISSING = Rule(
+    id="connection.missing",
+    meaning="a planned connection of a node does not exist",
+    outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
+    fix="see who was to make it: the node at connect, or the supervisor by connect_to",
+    concerns_flow=True,
+)
+FAILED = Rule(
+    id="connection.failed",
+    meaning="a node reports that it could not make a connection",
+    outcomes=(Outcome.VIOLATED,),
+    fix="read the reason: addresses and ports of a URL must be free on the node's own machine",
+    concerns_flow=True,
+)
+DIFFERS = Rule(
+    id="connection.differs",
+    meaning="a connection was made to other URLs than planned",
+    outcomes=(Outcome.VIOLATED,),
+    fix="see who called connect_to; disconnect it, and let its authority make it again",
+    concerns_flow=True,
+)
+WRONG_MAPPING = Rule(
+    id="connection.wrong-mapping",
+    meaning="an endpoint is mapped onto another connection than planned",
+    outcomes=(Outcome.VIOLATED,),
+    fix="see who called map_to; map it back, or change the node's `connections`",
+    concerns_flow=True,
+)
+RULES = (MISSING, FAILED, DIFFERS, WRONG_MAPPING)
+
+
+def check(view: View) -> Iterator[Finding]:
+    """Judge every planned connection and mapping."""
+    for name, node in view.planned.items():
+        if view.is_absent(node):
+            continue
+        yield from _own(view, node)
+        for participant in node.participants:
+            if participant.connection:
+                yield from _connection(view, node, participant.connection, participant.connections)
+        for actual in view.actual_by_node[name]:
+            yield from _mapping(actual)
+
+
+def _own(view: View, node: PlannedNode) -> Iterator[Finding]:
+    """The node's own participant: it is always there, but may be connected otherwise."""
+    configuration = view.configurations.get(node.full_name)
+    for report in configuration.connections if configuration else ():
+        if not report.name and report.urls and node.connections.urls:
+            yield from _urls(view, node, report, node.connections)
+
+
+def _connection(
+    view: View, node: PlannedNode, name: str, planned: ParticipantConnections
+) -> Iterator[Finding]:
+    configuration = view.configurations.get(node.full_name)
+    if configuration is None:
+        if view.ours(node):
+            return  # that it does not report is said
+        yield MISSING.on_node(
+            Outcome.UNVERIFIABLE,
+            node,
+            expected=f"connection {name}",
+            observed="unknown",
+            message=f"cannot verify connection {name!r} of {node.full_name}: the node does not"
+            " report its connections",
+        )
+        return
+    report = next((each for each in configuration.connections if each.name == name), None)
+    if report is None:
+        yield MISSING.on_node(
+            Outcome.VIOLATED,
+            node,
+            expected=f"connection {name}",
+            observed=_listed(configuration.connections),
+            message=f"cannot find connection {name!r} of {node.full_name};"
+            f" it has {_listed(configuration.connections)}",
+        )
+    elif report.error:
+        yield FAILED.on_node(
+            Outcome.VIOLATED,
+            node,
+            expected=f"connection {name}",
+            observed=report.error,
+            message=f"cannot connect {node.full_name} to {name!r}"
+            f" ({', '.join(report.urls or planned.urls)}): {report.error}",
+        )
+    else:
+        yield from _urls(view, node, report, planned)
+
+
+def _urls(
+    view: View, node: PlannedNode, report: ConnectionReport, planned: ParticipantConnections
+) -> Iterator[Finding]:
+    if _as_planned(view, report.urls, planned.urls):
+        return
+    what = f"connection {report.name!r}" if report.name else "the own participant"
+    yield DIFFERS.on_node(
+        Outcome.VIOLATED,
+        node,
+        expected=", ".join(planned.urls),
+        observed=", ".join(report.urls) or "no URL",
+        message=f"cannot accept {what} of {node.full_name}: it was connected to"
+        f" {', '.join(report.urls) or 'no URL'} and must be to {', '.join(planned.urls)}",
+    )
+
+
+def _mapping(actual: Actual) -> Iterator[Finding]:
+    report = actual.report
+    if report is None or report.error or not report.mapped:
+        return  # that is judged as an endpoint
+    wanted = connection_of(actual.node, actual.planned)
+    if report.connection == wanted:
+        return
+    node, planned = actual.node, actual.planned
+    yield WRONG_MAPPING.on_endpoint(
+        Outcome.VIOLATED,
+        actual,
+        expected=_spell(wanted),
+        observed=_spell(report.connection),
+        message=f"cannot accept the {planned.kind.noun} of {planned.resolved} in"
+        f" {node.full_name}: it is mapped onto {_spell(report.connection)} and must be onto"
+        f" {_spell(wanted)}",
+    )
+
+
+def _as_planned(view: View, reported: Sequence[str], planned: Sequence[str]) -> bool:
+    """Whether URLs mean the same, or what a node has after a restart."""
+    was, now = _meant(planned), _meant(reported)
+    if len(was) != len(now):
+        return False
+    first_port = view.plan.discovery.first_port
+    return all(
+        old == new
+        or (
+            isinstance(old, ConnectionUrl)
+            and isinstance(new, ConnectionUrl)
+            and is_restarted_url(str(old), str(new), first_port=first_port)
+        )
+        for old, new in zip(was, now, strict=True)
+    )
+
+
+def _meant(urls: Sequence[str]) -> tuple[ConnectionUrl | str, ...]:
+    """Return what URLs mean: one URL may be written in several ways."""
+    return tuple(_read(each) for each in urls)
+
+
+def _read(url: str) -> ConnectionUrl | str:
+    try:
+        return parse(url)
+    except ConnectionUrlError:
+        return url
+
+
+def _spell(connection: str) -> str:
+    return f"connection {connection!r}" if connection else "the node's own participant"
+
+
+def _listed(connections: Sequence[ConnectionReport]) -> str:
+    return ", ".join(repr(each.name) for each in connections if each.name) or "no connection"

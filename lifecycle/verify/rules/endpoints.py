@@ -1,0 +1,269 @@
+"""Rules about endpoints: missing, undeclared, of another type, not made, nobody's. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from lifecycle.manifest.model import EndpointKind, EndpointPolicy
+from lifecycle.verify.observation import ObservedEndpoint
+from lifecycle.verify.rules.catalogue import Rule
+from lifecycle.verify.verdict import Finding, Outcome, Stage
+from lifecycle.verify.view import Actual, Seen, View
+
+MISSING_ENDPOINT = Rule(
+    id="graph.missing-endpoint",
+    meaning="a declared endpoint is not in the graph",
+    outcomes=(Outcome.VIOLATED,),
+    fix="compare the declared name, remaps and namespace with what the node creates",
+    concerns_flow=True,
+)
+TYPE_MISMATCH = Rule(
+    id="graph.type-mismatch",
+    meaning="an endpoint has another type than declared, or than others of its name",
+    outcomes=(Outcome.VIOLATED,),
+    fix="correct the type in the manifest or in the node; DDS never matches two types",
+    concerns_flow=True,
+)
+ENDPOINT_ERROR = Rule(
+    id="endpoint.error",
+    meaning="a node reports that it could not make an endpoint as asked",
+    outcomes=(Outcome.VIOLATED,),
+    fix="read the reason: it is the middleware's own",
+    concerns_flow=True,
+)
+UNSEEN_ENDPOINT = Rule(
+    id="graph.unseen-endpoint",
+    meaning="an endpoint that discovery does not show to this observer is not proven either way",
+    outcomes=(Outcome.UNVERIFIABLE,),
+    fix="verify it where it can be seen: on its own host, or with its connection's peers",
+    concerns_flow=True,
+)
+UNATTRIBUTED_ENDPOINT = Rule(
+    id="graph.unattributed-endpoint",
+    meaning="the graph has an endpoint whose node is not known",
+    outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
+    fix="wait for discovery; a plain DDS program never tells a node name: give it another domain",
+)
+
+_MEETS = {
+    EndpointKind.PUBLISHER: "topic",
+    EndpointKind.SUBSCRIPTION: "topic",
+    EndpointKind.SERVICE_SERVER: "service",
+    EndpointKind.SERVICE_CLIENT: "service",
+    EndpointKind.ACTION_SERVER: "action",
+    EndpointKind.ACTION_CLIENT: "action",
+}
+"""Kinds that meet under one name: topics, services and actions do not see each other."""
+
+
+def _article(word: str) -> str:
+    return "an" if word.startswith("a") else "a"
+
+
+UNDECLARED = {
+    kind: Rule(
+        id=f"graph.undeclared-{kind.noun.replace(' ', '-')}",
+        meaning=f"a declared node has {_article(kind.noun)} {kind.noun} that the manifest does "
+        "not declare",
+        outcomes=(Outcome.VIOLATED,),
+        fix="declare it in the node's interface, remove it, or set `endpoints: open` on the node",
+    )
+    for kind in EndpointKind
+}
+_OTHER = {
+    EndpointKind.PUBLISHER: EndpointKind.SUBSCRIPTION,
+    EndpointKind.SUBSCRIPTION: EndpointKind.PUBLISHER,
+}
+
+RULES = (
+    MISSING_ENDPOINT,
+    UNSEEN_ENDPOINT,
+    *UNDECLARED.values(),
+    TYPE_MISMATCH,
+    ENDPOINT_ERROR,
+    UNATTRIBUTED_ENDPOINT,
+)
+
+
+def check(view: View) -> Iterator[Finding]:
+    """Judge the existence and the type of endpoints."""
+    for name, node in view.planned.items():
+        absent = view.is_absent(node)
+        for actual in view.actual_by_node[name]:
+            yield from _declared(actual, absent=absent)
+            if actual.unseen and not absent:
+                yield from _unseen(view, actual)
+    yield from _undeclared(view)
+    yield from _conflicts(view)
+    if view.plan.policy.undeclared_nodes is EndpointPolicy.DECLARED:
+        yield from _unattributed(view)
+
+
+def _declared(actual: Actual, *, absent: bool) -> Iterator[Finding]:
+    node, planned = actual.node, actual.planned
+    word = planned.kind.noun
+    if actual.report is not None and actual.report.error:
+        yield ENDPOINT_ERROR.on_endpoint(
+            Outcome.VIOLATED,
+            actual,
+            expected=f"{word} of {node.full_name}",
+            observed=actual.report.error,
+            message=f"cannot make the {word} {planned.name!r} of {node.full_name}:"
+            f" {actual.report.error}",
+        )
+    elif actual.observed is None and not absent and not _is_hidden(actual):
+        yield MISSING_ENDPOINT.on_endpoint(
+            Outcome.VIOLATED,
+            actual,
+            expected=f"{word} of {node.full_name}",
+            observed=f"no such {word}",
+            message=f"cannot find the {word} of {planned.resolved} that {node.full_name} declares",
+            hint=_remapped(actual),
+        )
+    seen = actual.observed or actual.report
+    if seen is not None and seen.type != planned.type:
+        yield TYPE_MISMATCH.on_endpoint(
+            Outcome.VIOLATED,
+            actual,
+            expected=planned.type,
+            observed=seen.type or "no type",
+            message=f"cannot accept the {word} of {planned.resolved} in {node.full_name}:"
+            f" it is declared as {planned.type} and is {seen.type or 'of unknown type'}",
+        )
+
+
+def _remapped(actual: Actual) -> str:
+    """Say which other name its node has the endpoint under; empty if it has none."""
+    planned, report = actual.planned, actual.report
+    if report is None or not report.name or report.resolved == planned.resolved:
+        return ""
+    return (
+        f"{report.kind.value}/{report.name} is {report.resolved} now: is a remap wrong, or did "
+        f"somebody call {actual.node.full_name}/remap? the name '' gives back the declared one"
+    )
+
+
+def _is_hidden(actual: Actual) -> bool:
+    """Tell whether neither discovery nor a report could have shown the endpoint."""
+    return actual.unseen and actual.report is None
+
+
+def _unseen(view: View, actual: Actual) -> Iterator[Finding]:
+    """What discovery does not show is proven by its node's report and by matched counts."""
+    node, planned, report = actual.node, actual.planned, actual.report
+    word = planned.kind.noun
+    if report is None:
+        reason = "discovery does not show it here, and its node does not report it"
+    elif actual.observed is None:
+        return  # its node says that it is not there: that is violated, and said
+    elif report.matched is None:
+        reason = "discovery does not show it here, and nobody counts whom it is matched with"
+    else:
+        known = sum(
+            seen.name == planned.resolved and seen.kind is _OTHER[planned.kind]
+            for seen in view.seen
+        )
+        more = report.matched - known
+        if more <= 0 or view.plan.policy.undeclared_nodes is EndpointPolicy.OPEN:
+            return
+        reason = f"it is matched with {report.matched}, of which {known} are known here"
+    yield UNSEEN_ENDPOINT.on_endpoint(
+        Outcome.UNVERIFIABLE,
+        actual,
+        expected=f"{word} of {node.full_name}",
+        observed="not shown by discovery",
+        message=f"cannot verify the {word} of {planned.resolved} in {node.full_name}: {reason}",
+    )
+
+
+def _undeclared(view: View) -> Iterator[Finding]:
+    for endpoint in view.undeclared:
+        node = view.planned[endpoint.node]
+        if node.endpoint_policy is EndpointPolicy.OPEN:
+            continue
+        word = endpoint.kind.noun
+        similar = [
+            each.planned
+            for each in view.actual_by_node[endpoint.node]
+            if each.planned.kind is endpoint.kind
+            and each.planned.type == endpoint.type
+            and each.observed is None
+        ]
+        hint = _given_name(view, endpoint)
+        if not hint and len(similar) == 1:
+            hint = f"{similar[0].resolved} of the same type is missing: is a remap or a name wrong?"
+        yield UNDECLARED[endpoint.kind].finding(
+            Outcome.VIOLATED,
+            subject=endpoint.name,
+            expected=f"no such {word} of {endpoint.node}",
+            observed=f"{word} of type {endpoint.type}" if endpoint.type else word,
+            message=f"cannot allow the {word} of {endpoint.name} in {endpoint.node}:"
+            " the manifest does not declare it",
+            at=node.at,
+            node=endpoint.node,
+            endpoint=endpoint.kind,
+            hint=hint,
+        )
+
+
+def _given_name(view: View, endpoint: ObservedEndpoint) -> str:
+    """Say that a name was given to a declared endpoint while it ran; empty if it was not."""
+    for actual in view.actual_by_node[endpoint.node]:
+        report = actual.report
+        if report is None or report.kind is not endpoint.kind:
+            continue
+        declared = f"{report.kind.value}/{report.name}"
+        if endpoint.name in report.aliases:
+            return f"it is an alias of {declared}: see who called {endpoint.node}/alias"
+        if endpoint.name == report.resolved != actual.planned.resolved:
+            return (
+                f"it is {declared} under another name: is a remap wrong, or did somebody call "
+                f"{endpoint.node}/remap?"
+            )
+    return ""
+
+
+def _conflicts(view: View) -> Iterator[Finding]:
+    """A topic, service or action of ours that somebody undeclared uses with another type."""
+    types: dict[tuple[str, str], dict[str, None]] = {}
+    for actual in view.actual:
+        place = (_MEETS[actual.planned.kind], actual.planned.resolved)
+        types.setdefault(place, {})[actual.planned.type] = None
+    others = (*view.undeclared, *view.foreign, *view.unattributed)
+    undeclared: tuple[Seen | ObservedEndpoint, ...] = (
+        *(each for each in view.seen if each.planned is None),
+        *(each for each in others if not each.kind.is_topic),
+    )
+    for seen in undeclared:
+        what = _MEETS[seen.kind]
+        declared = types.get((what, seen.name))
+        if declared is None or seen.type in declared:
+            continue
+        word = seen.kind.noun
+        who = seen.node or "an unknown node"
+        yield TYPE_MISMATCH.finding(
+            Outcome.VIOLATED,
+            subject=seen.name,
+            expected=" or ".join(declared),
+            observed=seen.type or "no type",
+            message=f"cannot match the {word} of {seen.name} in {who}: it is {seen.type},"
+            f" the manifest declares the {what} as {' or '.join(declared)}",
+            node=seen.node,
+            endpoint=seen.kind,
+        )
+
+
+def _unattributed(view: View) -> Iterator[Finding]:
+    """Closed world: before the gate, every endpoint must be known to be somebody's."""
+    outcome = Outcome.VIOLATED if view.stage is Stage.CONNECTED else Outcome.UNVERIFIABLE
+    for endpoint in view.unattributed:
+        word = endpoint.kind.noun
+        yield UNATTRIBUTED_ENDPOINT.finding(
+            outcome,
+            subject=endpoint.name,
+            expected=f"{word} of a declared node",
+            observed=f"{word} of an unknown node",
+            message=f"cannot tell whose {word} of {endpoint.name} this is"
+            + (f" (GID {endpoint.gid})" if endpoint.gid else ""),
+            endpoint=endpoint.kind,
+        )

@@ -1,0 +1,191 @@
+"""Rules about QoS: declared against actual, and offered against requested. Pure."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Iterator
+
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.manifest.qos import (
+    BEST_AVAILABLE_NS,
+    INFINITE_NS,
+    Certainty,
+    History,
+    Incompatibility,
+    QosProfile,
+    incompatibilities,
+)
+from lifecycle.verify.rules.catalogue import Rule
+from lifecycle.verify.verdict import Finding, Outcome
+from lifecycle.verify.view import UNKNOWN_QOS, Actual, Seen, View, actual_qos
+
+QOS_DIFFERS = Rule(
+    id="graph.qos-differs",
+    meaning="an endpoint's QoS is not the declared one",
+    outcomes=(Outcome.VIOLATED,),
+    fix="correct the profile in the manifest or in the node; look for an XML profile or a"
+    " qos_overrides parameter",
+)
+QOS_UNVERIFIABLE = Rule(
+    id="graph.qos-unverifiable",
+    meaning="a declared QoS policy can be read neither from discovery nor from the node",
+    outcomes=(Outcome.UNVERIFIABLE,),
+    fix="Fast DDS does not announce history and depth: only a node that reports its"
+    " configuration can prove them",
+)
+QOS_INCOMPATIBLE = Rule(
+    id="graph.qos-incompatible",
+    meaning="a publisher offers less than a subscription of its topic requests",
+    outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
+    fix="offer more or request less: DDS does not match them, and no data flows",
+    concerns_flow=True,
+)
+RULES = (QOS_DIFFERS, QOS_UNVERIFIABLE, QOS_INCOMPATIBLE)
+
+_FREE = frozenset({"SYSTEM_DEFAULT", "BEST_AVAILABLE", "UNKNOWN"})
+"""Declared values that leave the choice to the middleware, or mark a gap: nothing to compare."""
+
+_COMPARED = (
+    "history",
+    "depth",
+    "reliability",
+    "durability",
+    "deadline_ns",
+    "lifespan_ns",
+    "liveliness",
+    "liveliness_lease_duration_ns",
+)
+
+
+def check(view: View) -> Iterator[Finding]:
+    """Judge the QoS of every declared endpoint, then of every pair."""
+    for actual in view.actual:
+        if actual.observed is not None or actual.report is not None:
+            yield from _against_declaration(actual)
+    yield from _pairs(view)
+
+
+def _against_declaration(actual: Actual) -> Iterator[Finding]:
+    planned, node = actual.planned, actual.node
+    if planned.qos is None or _leaves_all(planned.qos):
+        return
+    known = actual_qos(
+        actual.observed.qos if actual.observed else None,
+        actual.report.qos if actual.report else None,
+    )
+    differing: list[tuple[str, str, str]] = []
+    unknown: list[tuple[str, str]] = []
+    for policy in _comparable(planned.kind, planned.qos):
+        want = spell(planned.qos, policy)
+        have = spell(known or UNKNOWN_QOS, policy)
+        if known is None or have == "UNKNOWN":
+            unknown.append((policy, want))
+        elif have != want:
+            differing.append((policy, want, have))
+    word = planned.kind.noun
+    where = f"the {word} of {planned.resolved} in {node.full_name}"
+    for policy, want, have in differing:
+        yield QOS_DIFFERS.on_endpoint(
+            Outcome.VIOLATED,
+            actual,
+            expected=f"{policy} {want}",
+            observed=f"{policy} {have}",
+            message=f"cannot accept {where}: {policy} is declared {want} and is {have}",
+        )
+    if unknown:
+        names = ", ".join(policy for policy, _ in unknown)
+        yield QOS_UNVERIFIABLE.on_endpoint(
+            Outcome.UNVERIFIABLE,
+            actual,
+            expected=", ".join(f"{policy} {want}" for policy, want in unknown),
+            observed="not announced",
+            message=f"cannot verify {names} of {where}: nothing tells the actual value",
+        )
+
+
+def _leaves_all(declared: QosProfile) -> bool:
+    """Whether a profile is rmw's system default, which leaves everything to the middleware."""
+    policies = (declared.history, declared.reliability, declared.durability, declared.liveliness)
+    durations = (
+        declared.deadline_ns,
+        declared.lifespan_ns,
+        declared.liveliness_lease_duration_ns,
+    )
+    return all(each.value == "SYSTEM_DEFAULT" for each in policies) and not any(durations)
+
+
+def _comparable(kind: EndpointKind, declared: QosProfile) -> Iterator[str]:
+    """Policies of a declared profile that mean something definite on this kind of endpoint."""
+    for policy in _COMPARED:
+        value = getattr(declared, policy)
+        if policy == "depth" and declared.history is not History.KEEP_LAST:
+            continue
+        # A DataReader has no lifespan (DDS 1.4 §2.2.3.16).
+        if policy == "lifespan_ns" and kind is EndpointKind.SUBSCRIPTION:
+            continue
+        if value == BEST_AVAILABLE_NS and policy.endswith("_ns"):
+            continue
+        if isinstance(value, enum.Enum) and value.value in _FREE:
+            continue
+        yield policy
+
+
+def spell(profile: QosProfile, policy: str) -> str:
+    """Spell one policy's value for people; every form of infinite is `infinite`.
+
+    A depth is unknown where the history is: 0 stands for "not observable" then.
+    """
+    if policy == "depth" and profile.history is History.UNKNOWN:
+        return "UNKNOWN"
+    value = getattr(profile, policy)
+    if isinstance(value, enum.Enum):
+        return str(value.value)
+    if not policy.endswith("_ns"):
+        return str(value)
+    return "infinite" if value in (None, 0, INFINITE_NS) else f"{value} ns"
+
+
+def _pairs(view: View) -> Iterator[Finding]:
+    """Every publisher against every subscription of a topic, at least one of them ours."""
+    publishers: dict[str, list[Seen]] = {}
+    subscriptions: dict[str, list[Seen]] = {}
+    for seen in view.seen:
+        side = publishers if seen.kind is EndpointKind.PUBLISHER else subscriptions
+        side.setdefault(seen.name, []).append(seen)
+    done: set[tuple[str, str, str, str, str, str]] = set()
+    for topic in sorted(publishers.keys() & subscriptions.keys()):
+        for publisher in publishers[topic]:
+            for subscription in subscriptions[topic]:
+                if publisher.node not in view.planned and subscription.node not in view.planned:
+                    continue
+                if publisher.type != subscription.type:
+                    continue
+                offered, requested = publisher.qos or UNKNOWN_QOS, subscription.qos or UNKNOWN_QOS
+                for each in incompatibilities(offered, requested):
+                    key = (
+                        topic,
+                        publisher.node,
+                        subscription.node,
+                        each.policy,
+                        each.offered,
+                        each.requested,
+                    )
+                    if key not in done:
+                        done.add(key)
+                        yield _incompatible(publisher, subscription, each)
+
+
+def _incompatible(publisher: Seen, subscription: Seen, found: Incompatibility) -> Finding:
+    certain = found.severity is Certainty.CERTAIN
+    offers, requests = publisher.node or "an unknown node", subscription.node or "an unknown node"
+    declared = publisher.planned or subscription.planned
+    verb = "cannot match" if certain else "cannot verify that these match:"
+    return QOS_INCOMPATIBLE.finding(
+        Outcome.VIOLATED if certain else Outcome.UNVERIFIABLE,
+        subject=f"{publisher.name}: {offers} → {requests}",
+        expected=f"{found.policy} of at least {found.requested} offered",
+        observed=f"{found.policy} {found.offered} offered",
+        message=f"{verb} {offers} → {requests} on {publisher.name}: {offers} offers"
+        f" {found.policy} {found.offered}, {requests} requests {found.policy} {found.requested}",
+        at=declared.at if declared else None,
+    )

@@ -1,0 +1,71 @@
+"""Rules about the run itself: what a supervisor finds while it brings a system up and holds it.
+
+Nothing here can be seen in an observation, so `check` finds nothing: the supervisor makes these
+findings and puts them into the run's last verdict, so that it names what went wrong. Pure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from lifecycle.verify.rules.catalogue import Rule
+from lifecycle.verify.verdict import Finding, Outcome
+from lifecycle.verify.view import View
+
+PROCESS_DIED = Rule(
+    id="run.process-died",
+    meaning="a process of the system ended although nobody asked it to",
+    outcomes=(Outcome.VIOLATED,),
+    fix="look at the last lines of its log",
+)
+START_FAILED = Rule(
+    id="run.start-failed",
+    meaning="a process or node could not be started",
+    outcomes=(Outcome.VIOLATED,),
+    fix="look at its `run` entry and at the last lines of its log",
+)
+TRANSITION_FAILED = Rule(
+    id="run.transition-failed",
+    meaning="a node refused or failed a transition",
+    outcomes=(Outcome.VIOLATED,),
+    fix="look at the reason, and at the traceback in the node's log",
+)
+DEADLINE = Rule(
+    id="run.deadline",
+    meaning="a step, or the whole bring-up, took longer than it may",
+    outcomes=(Outcome.VIOLATED,),
+    fix="see what it waited for; raise the node's `timeouts` or `--timeout` if it needs longer",
+)
+NOT_PROGRAMMED = Rule(
+    id="run.not-programmed",
+    meaning="a network could not be programmed with the verified flows",
+    outcomes=(Outcome.VIOLATED,),
+    fix="see which privilege, program or server is missing; `lifecycle flows diff` tries it alone",
+)
+NOT_WIRED = Rule(
+    id="run.not-wired",
+    meaning="a connection or a mapping could not be made, or made again",
+    outcomes=(Outcome.VIOLATED,),
+    fix="the message names node, connection, endpoint and the node's own reason",
+)
+SILENT_NODE = Rule(
+    id="run.silent-node",
+    meaning="a node was stopped, hangs in a callback, or cannot be reached any more",
+    outcomes=(Outcome.VIOLATED,),
+    fix="the message says which; a callback that may take long needs a larger `timeouts.silent_s`",
+)
+RULES = (
+    PROCESS_DIED,
+    START_FAILED,
+    TRANSITION_FAILED,
+    DEADLINE,
+    NOT_PROGRAMMED,
+    NOT_WIRED,
+    SILENT_NODE,
+)
+
+
+def check(view: View) -> Iterator[Finding]:
+    """Find nothing: see above."""
+    del view
+    yield from ()

@@ -1,0 +1,92 @@
+"""Rules about lifecycle states of managed nodes. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from lifecycle.plan.model import PlannedNode
+from lifecycle.verify.observation import NodeConfiguration
+from lifecycle.verify.rules.catalogue import Rule
+from lifecycle.verify.verdict import Finding, Outcome, Stage
+from lifecycle.verify.view import View
+
+WRONG_STATE = Rule(
+    id="state.wrong-state",
+    meaning="a managed node is not in the state that this stage needs",
+    outcomes=(Outcome.VIOLATED,),
+    fix="look at the node's log for the transition that failed, or at who else drives it",
+)
+STATE_UNVERIFIABLE = Rule(
+    id="state.unverifiable",
+    meaning="a managed node's state could not be learnt",
+    outcomes=(Outcome.UNVERIFIABLE,),
+    fix="see whether its ~/get_state answers; a plain node must be declared `managed: false`",
+)
+RULES = (WRONG_STATE, STATE_UNVERIFIABLE)
+
+_STATES = {Stage.CONNECTED: "inactive", Stage.ACTIVE: "active"}
+
+
+def check(view: View) -> Iterator[Finding]:
+    """Judge the state of every managed node that is there."""
+    for name, node in view.planned.items():
+        if node.managed and not view.is_absent(node):
+            yield from _judge(view, name, node)
+
+
+def _judge(view: View, name: str, node: PlannedNode) -> Iterator[Finding]:
+    wanted = _STATES[view.stage]
+    allowed = {wanted}
+    if view.stage is Stage.CONNECTED and (name in view.ahead or not view.brings_up(node)):
+        # Another supervisor brings it up, and its gate opens on the same proof, maybe before ours;
+        # or an earlier gate let it through, and only others have to pass again.
+        allowed.add("active")
+    observed = view.observed.get(name)
+    report = view.configurations.get(name)
+    # Both sources count: if they disagree one of them is late, and nothing is proven yet.
+    states = dict.fromkeys(
+        state
+        for state in (observed.state if observed else None, report.state if report else None)
+        if state
+    )
+    wrong = [state for state in states if state not in allowed]
+    expected = wanted
+    if view.stage is Stage.CONNECTED and view.ours(node):
+        expected = "inactive, connected"
+        if not wrong and report is not None and not report.connected:
+            wrong = ["inactive, disconnected"]
+    expected = " or ".join([expected, *sorted(allowed - {wanted})])
+    if wrong:
+        yield WRONG_STATE.on_node(
+            Outcome.VIOLATED,
+            node,
+            expected=expected,
+            observed=wrong[0],
+            message=f"cannot accept node {name}: it is {wrong[0]} and must be {expected}",
+        )
+    elif observed is not None and observed.managed is False and not _says_so(view, node, report):
+        yield WRONG_STATE.on_node(
+            Outcome.VIOLATED,
+            node,
+            expected=f"managed node, {expected}",
+            observed="not a managed node",
+            message=f"cannot accept node {name}: it offers no lifecycle services",
+            hint="make it a managed node, or declare it `managed: false`",
+        )
+    elif not states:
+        yield STATE_UNVERIFIABLE.on_node(
+            Outcome.UNVERIFIABLE,
+            node,
+            expected=expected,
+            observed="unknown",
+            message=f"cannot verify the state of node {name}: nobody tells it",
+        )
+
+
+def _says_so(view: View, node: PlannedNode, report: NodeConfiguration | None) -> bool:
+    """Tell whether one of our nodes itself says that it is managed, by telling its state.
+
+    It is driven by its host and not by the services, which discovery may show late: the graph
+    shows a node before all of its endpoints.
+    """
+    return view.ours(node) and report is not None and bool(report.state)

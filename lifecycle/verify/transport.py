@@ -1,0 +1,156 @@
+"""Which transport carries a flow.
+
+Owns: the judgement from process, machine and NFEs. An NFE list says what an endpoint could use, not
+what is used; what Fast DDS does with it is known, and is written down here. Pure.
+
+Fast DDS hands data over inside a process without any transport (measured with 2.14: UDP only, 50 MB
+published, next to nothing on the interface), and between processes of one host it prefers shared
+memory to any IP transport that both ends have. To subscriptions that listen at one multicast group
+it sends one datagram to the group; to one that listens there alone, the same one datagram by
+unicast: both count as multicast.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+from collections.abc import Sequence
+
+from lifecycle.network.connection_url import ConnectionTransport, ConnectionUrlError, parse
+from lifecycle.network.nfe import (
+    InternetProtocol,
+    NetworkFlowEndpoint,
+    TransportProtocol,
+    is_ip,
+)
+from lifecycle.verify.observation import Identity
+from lifecycle.verify.view import Actual, FlowView, View
+
+INTRAPROCESS = "intraprocess"
+SHARED_MEMORY = "shm"
+MULTICAST = "udpm"
+NONE = "none"
+UNKNOWN = "unknown"
+
+NETWORK = frozenset({"udpv4", "udpv6", "tcpv4", "tcpv6", MULTICAST})
+"""Transports whose packets a network sees."""
+
+_FAMILIES = {InternetProtocol.IPV4: "v4", InternetProtocol.IPV6: "v6"}
+
+
+def effective_transport(view: View, flow: FlowView) -> str:
+    """Return what carries a planned flow, as `carrier` says."""
+    return carrier(
+        _ways(view, flow.publisher, flow.publishers),
+        _ways(view, flow.subscription, flow.subscriptions),
+        view.identity(flow.publisher),
+        view.identity(flow.subscription),
+    )
+
+
+def _ways(view: View, node: str, ends: Sequence[Actual]) -> tuple[NetworkFlowEndpoint, ...]:
+    """Return the NFEs of one side, and what it was connected to where they do not tell.
+
+    rmw_fastrtps lists no NFE of a TCP transport at a publisher.
+    """
+    configuration = view.configurations.get(node)
+    connections = (
+        {each.name: each.urls for each in configuration.connections} if configuration else {}
+    )
+    found: list[NetworkFlowEndpoint] = []
+    for end in ends:
+        if end.report is None or end.report.nfes is None:
+            continue
+        found += end.report.nfes
+        listed = {each.transport_protocol for each in end.report.nfes}
+        urls = connections.get(end.report.connection, ()) if end.report.mapped else ()
+        found += [
+            each
+            for each in map(_as_nfe, urls)
+            if each is not None
+            and (not listed or (_is_tcp(each) and TransportProtocol.TCP not in listed))
+        ]
+    return tuple(found)
+
+
+def _is_tcp(nfe: NetworkFlowEndpoint) -> bool:
+    return nfe.transport_protocol is TransportProtocol.TCP
+
+
+def _as_nfe(text: str) -> NetworkFlowEndpoint | None:
+    """Return what a connection URL says of the network; None if it says nothing."""
+    try:
+        url = parse(text)
+    except ConnectionUrlError:
+        return None
+    if url.transport is ConnectionTransport.SHM:
+        return NetworkFlowEndpoint(
+            transport_protocol=TransportProtocol.UNKNOWN,
+            internet_protocol=InternetProtocol.UNKNOWN,
+            transport_port=0,
+        )
+    tcp = url.transport is ConnectionTransport.TCPV4
+    ipv6 = url.transport is ConnectionTransport.UDPV6 or ":" in url.address
+    return NetworkFlowEndpoint(
+        transport_protocol=TransportProtocol.TCP if tcp else TransportProtocol.UDP,
+        internet_protocol=InternetProtocol.IPV6 if ipv6 else InternetProtocol.IPV4,
+        transport_port=url.port or 0,
+        internet_address=url.address or ("::" if ipv6 else "0.0.0.0"),  # noqa: S104 - any address
+    )
+
+
+def carrier(
+    source: Sequence[NetworkFlowEndpoint],
+    destination: Sequence[NetworkFlowEndpoint],
+    publisher: Identity | None,
+    subscription: Identity | None,
+) -> str:
+    """Return what carries the data from a publisher to a subscription.
+
+    Args:
+        source: the publisher's NFEs; empty when not known.
+        destination: the subscription's.
+        publisher: identity of the publishing node; None when not known.
+        subscription: likewise.
+
+    Returns:
+        `intraprocess`, `shm`, `udpm` if the destination listens at a group, or the first IP
+        transport of it that the source has too, `udpv4`, `udpv6`, `tcpv4`, `tcpv6`; `none` if they
+        have nothing in common, `unknown` if one side is not known.
+    """
+    if publisher is None or subscription is None:
+        return UNKNOWN
+    same_host = publisher.machine_id == subscription.machine_id
+    if same_host and publisher.process_id == subscription.process_id:
+        return INTRAPROCESS
+    if not source or not destination:
+        return UNKNOWN
+    if same_host and _has_shared_memory(source) and _has_shared_memory(destination):
+        return SHARED_MEMORY
+    leaving = {spell_transport(each) for each in source if is_ip(each)}
+    groups = [each for each in destination if is_ip(each) and _is_group(each)]
+    # A group has no router between here and another host: it is sent with a TTL of 0.
+    if same_host and any(spell_transport(each) in leaving for each in groups):
+        return MULTICAST
+    arriving = (spell_transport(each) for each in destination if is_ip(each) and each not in groups)
+    return next((each for each in arriving if each in leaving), NONE)
+
+
+def spell_transport(nfe: NetworkFlowEndpoint) -> str:
+    """Return the word for an IP NFE's transport, `udpv4`."""
+    return nfe.transport_protocol.value + _FAMILIES.get(nfe.internet_protocol, "")
+
+
+def _is_group(nfe: NetworkFlowEndpoint) -> bool:
+    if nfe.transport_protocol is not TransportProtocol.UDP:
+        return False
+    try:
+        return ipaddress.ip_address(nfe.internet_address).is_multicast
+    except ValueError:
+        return False  # no address in numbers: it is compared as text elsewhere
+
+
+def _has_shared_memory(nfes: Sequence[NetworkFlowEndpoint]) -> bool:
+    return any(
+        each.transport_protocol is TransportProtocol.UNKNOWN and not each.internet_address
+        for each in nfes
+    )

@@ -1,0 +1,131 @@
+"""The verdict: three outcomes, findings, flows.
+
+Owns: the result types of `verify` (schema: schemas/verdict.v1.schema.json). Pure.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+from collections.abc import Iterable
+
+from lifecycle.manifest.model import EndpointKind, UniqueHow
+from lifecycle.network.nfe import NetworkFlowEndpoint, UniqueRequirement
+
+
+class Outcome(enum.Enum):
+    """The three outcomes; nothing unknown is silently OK."""
+
+    OK = "ok"
+    VIOLATED = "violated"
+    UNVERIFIABLE = "unverifiable"
+
+    @classmethod
+    def worst(cls, found: Iterable[Outcome]) -> Outcome:
+        """Return VIOLATED if any is; else UNVERIFIABLE if any is; else OK."""
+        outcomes = set(found)
+        return next((each for each in (cls.VIOLATED, cls.UNVERIFIABLE) if each in outcomes), cls.OK)
+
+
+class Stage(enum.Enum):
+    """Which moment of the lifecycle an observation is judged against."""
+
+    CONNECTED = "connected"  # before the gate: managed nodes inactive, data layer made
+    ACTIVE = "active"  # after the gate, and for `lifecycle verify`
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Finding:
+    """One rule's result on one subject; only violated and unverifiable ones are kept.
+
+    Attributes:
+        rule: id, `graph.missing-node`; documented in docs/rules.md.
+        subject: what it is about, `/robot/camera`, `/robot/video`, `/robot/camera → /viewer`.
+        message: a whole sentence for people.
+        at: `file:line:column` of the declaration; empty for something undeclared.
+        node: fully qualified name of the node it concerns; empty if none or several.
+        endpoint: kind of the endpoint it concerns; None if it is not about one endpoint.
+        hint: what to do about it.
+    """
+
+    rule: str
+    outcome: Outcome
+    subject: str
+    expected: str
+    observed: str
+    message: str
+    at: str = ""
+    node: str = ""
+    endpoint: EndpointKind | None = None
+    hint: str = ""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class FlowReport:
+    """One publisher → subscription pair as it runs.
+
+    Attributes:
+        publisher: fully qualified node name.
+        subscription: fully qualified node name.
+        source: the publisher's NFEs, with the DSCP read back from its sockets; empty when unknown.
+        destination: the subscription's NFEs; empty when unknown.
+        unique: how unique the flow is; None when it cannot be told.
+        dscp: read back from the sender's UDP sockets; None when not read, or where TCP carries it.
+        requirement: the publisher's and the subscription's requirement.
+        demanded: what a link demands.
+        max_delay_ms: what a link demands, declared and not measured here; None if not asked for.
+        five_qi: what is planned, 3GPP TS 23.501 Table 5.7.4-1; None if not asked for, or if several
+            publishers differ.
+        five_qi_reason: why it is this 5QI, or none, where the manifest says `auto`; else empty.
+        effective_transport: what carries it: "intraprocess", "shm", "udpv4", "udpv6", "tcpv4",
+            "tcpv6"; "unknown" where nobody tells, "none" where the ends have nothing in common.
+        transport: "udp", "tcp", "shm or udp" …; what can carry it, as far as the NFEs tell.
+    """
+
+    topic: str
+    publisher: str
+    subscription: str
+    source: tuple[NetworkFlowEndpoint, ...]
+    destination: tuple[NetworkFlowEndpoint, ...]
+    unique: UniqueHow | None
+    dscp: int | None
+    requirement: tuple[UniqueRequirement, UniqueRequirement]
+    demanded: UniqueHow
+    transport: str
+    outcome: Outcome
+    max_delay_ms: float | None = None
+    five_qi: int | None = None
+    five_qi_reason: str = ""
+    effective_transport: str = "unknown"
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class OpenEndpoint:
+    """An endpoint that no manifest declares, of a node that may have such: `endpoints: open`.
+
+    Attributes:
+        node: fully qualified node name.
+        name: fully qualified.
+    """
+
+    kind: EndpointKind
+    node: str
+    name: str
+    type: str
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Verdict:
+    """The result of `verify`.
+
+    Attributes:
+        verdict: VIOLATED if any finding is; else UNVERIFIABLE if any finding is; else OK.
+        blocking: the gate stays closed: VIOLATED, or UNVERIFIABLE where the policy says so.
+        open_endpoints: what nodes made in code and may make; no finding, but nothing is hidden.
+    """
+
+    verdict: Outcome
+    blocking: bool
+    findings: tuple[Finding, ...]
+    flows: tuple[FlowReport, ...]
+    open_endpoints: tuple[OpenEndpoint, ...] = ()

@@ -1,0 +1,257 @@
+"""What every rule reads: the plan and the observation laid side by side.
+
+Owns: the types of the view and the one way to combine announced and reported QoS. How the view is
+filled is `layout`'s. Pure.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+
+from lifecycle.manifest.diagnostics import Position
+from lifecycle.manifest.model import EndpointKind, RunKind
+from lifecycle.manifest.qos import Durability, History, Liveliness, QosProfile, Reliability
+from lifecycle.network.connection_url import ConnectionTransport
+from lifecycle.network.nfe import UniqueRequirement
+from lifecycle.plan.model import (
+    ParticipantConnections,
+    Plan,
+    PlannedEndpoint,
+    PlannedFlow,
+    PlannedNode,
+)
+from lifecycle.verify.observation import (
+    EndpointReport,
+    Identity,
+    NodeConfiguration,
+    ObservedEndpoint,
+    ObservedNode,
+)
+from lifecycle.verify.verdict import Stage
+
+UNKNOWN_QOS = QosProfile(
+    history=History.UNKNOWN,
+    depth=0,
+    reliability=Reliability.UNKNOWN,
+    durability=Durability.UNKNOWN,
+    liveliness=Liveliness.UNKNOWN,
+)
+"""Nothing is known; compatible with nothing for certain."""
+
+_BY_STRENGTH = (
+    UniqueRequirement.STRICTLY_REQUIRED,
+    UniqueRequirement.OPTIONALLY_REQUIRED,
+    UniqueRequirement.SYSTEM_DEFAULT,
+    UniqueRequirement.NOT_REQUIRED,
+)
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Actual:
+    """A declared endpoint and what was seen of it.
+
+    Attributes:
+        observed: what discovery shows; None if it does not show the endpoint.
+        report: what the node itself says; None if it says nothing of it.
+        unseen: discovery cannot be expected to show it to this observer; `observed` is what its
+            node says then.
+        beyond: its whole node is out of this observer's reach, and so is its report.
+    """
+
+    node: PlannedNode
+    planned: PlannedEndpoint
+    observed: ObservedEndpoint | None
+    report: EndpointReport | None
+    unseen: bool = False
+    beyond: bool = False
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Seen:
+    """An endpoint of the graph, declared or not, with all that is known of it.
+
+    Attributes:
+        node: fully qualified name of the node it belongs to, hidden participants resolved to
+            their node; empty while unknown.
+        planned: its declaration; None if there is none.
+    """
+
+    kind: EndpointKind
+    node: str
+    name: str
+    type: str
+    qos: QosProfile | None
+    report: EndpointReport | None
+    planned: PlannedEndpoint | None
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class FlowView:
+    """A planned flow and what was seen of its two ends.
+
+    Attributes:
+        publisher: fully qualified name of the publishing node.
+        subscription: fully qualified name of the subscribing node.
+        publishers: the publishing node's declared publishers of the topic; usually one.
+        subscriptions: likewise.
+        at: the subscription's declaration, else the publisher's.
+    """
+
+    planned: PlannedFlow
+    publisher: str
+    subscription: str
+    publishers: tuple[Actual, ...]
+    subscriptions: tuple[Actual, ...]
+    at: Position | None
+
+    @property
+    def subject(self) -> str:
+        """What findings call this flow."""
+        return f"{self.planned.topic}: {self.publisher} → {self.subscription}"
+
+    @property
+    def requirement(self) -> tuple[UniqueRequirement, UniqueRequirement]:
+        """The strongest requirement of each end: several endpoints of a node are one end."""
+        return _strongest(self.publishers), _strongest(self.subscriptions)
+
+    @property
+    def five_qi(self) -> int | None:
+        """The planned 5QI; None if none is, or several publishers differ."""
+        declared = {end.planned.five_qi for end in self.publishers}
+        return declared.pop() if len(declared) == 1 else None
+
+
+def _strongest(ends: Iterable[Actual]) -> UniqueRequirement:
+    asked = {end.planned.unique for end in ends} or {UniqueRequirement.NOT_REQUIRED}
+    return next(each for each in _BY_STRENGTH if each in asked)
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class View:
+    """The input of every rule.
+
+    Attributes:
+        machines: names of the machines whose nodes the caller brings up; None: all.
+        ahead: full names of the nodes that an earlier gate let through.
+        planned: nodes of the plan by full name, in plan order.
+        observed: nodes of the graph by full name, tools and hidden participants left out, sorted.
+        reported: every report, sorted by name.
+        configurations: reports by full node name; the first of several.
+        actual: every declared endpoint, in plan order.
+        actual_by_node: the same by full node name.
+        undeclared: endpoints of declared nodes that no declaration covers, sorted.
+        unattributed: endpoints whose node is not known, sorted.
+        foreign: endpoints of nodes that are not in the plan, sorted.
+        seen: every publisher and subscription of the graph, tools left out, sorted.
+        flows: every planned flow, in plan order.
+    """
+
+    plan: Plan
+    stage: Stage
+    machines: frozenset[str] | None = None
+    ahead: frozenset[str] = frozenset()
+    planned: dict[str, PlannedNode]
+    observed: dict[str, ObservedNode]
+    reported: tuple[NodeConfiguration, ...]
+    configurations: dict[str, NodeConfiguration]
+    actual: tuple[Actual, ...]
+    actual_by_node: dict[str, tuple[Actual, ...]]
+    undeclared: tuple[ObservedEndpoint, ...]
+    unattributed: tuple[ObservedEndpoint, ...]
+    foreign: tuple[ObservedEndpoint, ...]
+    seen: tuple[Seen, ...]
+    flows: tuple[FlowView, ...]
+
+    def is_absent(self, node: PlannedNode) -> bool:
+        """Tell whether nothing at all is seen of a node: then one finding says it all."""
+        if node.full_name in self.observed:
+            return False
+        return not any(each.observed for each in self.actual_by_node[node.full_name])
+
+    def is_beyond(self, node: PlannedNode) -> bool:
+        """Tell whether a node is out of reach: it talks by memory of a host that is not ours."""
+        return not self.brings_up(node) and only_shared_memory(node.connections)
+
+    def ours(self, node: PlannedNode) -> bool:
+        """Tell whether a node runs in our host, and so must report its configuration."""
+        return node.run.kind is RunKind.PYTHON
+
+    def brings_up(self, node: PlannedNode) -> bool:
+        """Tell whether the caller brings this node up, and so knows which state it must be in."""
+        return self.machines is None or node.machine in self.machines
+
+    @property
+    def addresses(self) -> dict[str, str]:
+        """Declared address of each node's machine, by full node name; only where there is one."""
+        machines = {each.name: each.address for each in self.plan.machines if each.address}
+        return {
+            name: machines[node.machine]
+            for name, node in self.planned.items()
+            if node.machine in machines
+        }
+
+    def identity(self, full_name: str) -> Identity | None:
+        """Return what a node says that it is; None if it says nothing."""
+        configuration = self.configurations.get(full_name)
+        return configuration.identity if configuration else None
+
+
+def only_shared_memory(connections: ParticipantConnections) -> bool:
+    """Tell whether a participant is known to have nothing but shared memory."""
+    scheme = f"{ConnectionTransport.SHM.value}:"
+    return bool(connections.urls) and all(url.startswith(scheme) for url in connections.urls)
+
+
+def may_hide(node: PlannedNode, endpoint: PlannedEndpoint) -> bool:
+    """Tell whether discovery need not show an endpoint to an observer.
+
+    That is so on every participant that was told how to connect: it announces itself to its peers
+    alone, or on a host or group that the observer is not part of; and with static endpoint
+    discovery it announces no endpoint at all.
+    """
+    for each in node.participants:
+        if each.name == endpoint.participant:
+            return bool(each.connections.urls or each.connections.static_participants)
+    return bool(node.connections.urls or node.connections.static_participants)
+
+
+def connection_of(node: PlannedNode, endpoint: PlannedEndpoint) -> str:
+    """Return the name of the connection that an endpoint is planned on; empty for none."""
+    for each in node.participants:
+        if each.name == endpoint.participant:
+            return each.connection
+    return ""
+
+
+def actual_qos(observed: QosProfile | None, reported: QosProfile | None) -> QosProfile | None:
+    """Combine what discovery announces with what the node says of itself.
+
+    Discovery wins where it knows a policy: it is what the other side acts on. Fast DDS does not
+    announce history and depth, so those come from the node.
+    """
+    if observed is None or reported is None:
+        return observed or reported
+    keeps = observed.history is not History.UNKNOWN
+    return QosProfile(
+        history=observed.history if keeps else reported.history,
+        depth=observed.depth if keeps else reported.depth,
+        reliability=(
+            reported.reliability
+            if observed.reliability is Reliability.UNKNOWN
+            else observed.reliability
+        ),
+        durability=(
+            reported.durability
+            if observed.durability is Durability.UNKNOWN
+            else observed.durability
+        ),
+        deadline_ns=observed.deadline_ns,
+        lifespan_ns=observed.lifespan_ns,
+        liveliness=(
+            reported.liveliness
+            if observed.liveliness is Liveliness.UNKNOWN
+            else observed.liveliness
+        ),
+        liveliness_lease_duration_ns=observed.liveliness_lease_duration_ns,
+    )
