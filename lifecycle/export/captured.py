@@ -1,0 +1,380 @@
+"""What a running graph tells of the system that it is: the input of a captured manifest.
+
+Owns: `CapturedSystem` and how an observation becomes one: tools left out, hidden participants given
+to their nodes, everything that the graph does not tell named as a gap. Pure.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Iterable, Mapping
+
+from lifecycle.manifest.model import DiscoveryRange, EndpointKind, ParameterValue
+from lifecycle.manifest.qos import History, QosProfile
+from lifecycle.network.nfe import InternetProtocol, UniqueRequirement
+from lifecycle.verify.noise import is_noise_endpoint, is_noise_node, known_node
+from lifecycle.verify.observation import (
+    EndpointReport,
+    NodeConfiguration,
+    Observation,
+    ObservedEndpoint,
+    ObservedNode,
+)
+
+_TYPE = re.compile(r"[a-zA-Z][a-zA-Z0-9_]*/(msg|srv|action)/[a-zA-Z][a-zA-Z0-9_]*")
+_NOISE_PARAMETERS = ("use_sim_time", "start_type_description_service")
+_NOISE_PARAMETER_PREFIX = "qos_overrides."
+"""Parameters that client libraries declare for every node (rclpy, rclcpp)."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class CapturedParameter:
+    """A parameter as its node describes it.
+
+    Attributes:
+        type: word of rcl_interfaces, see ParameterDeclaration; empty if it is not set.
+        value: at this moment; None where it is not set or cannot be written.
+    """
+
+    name: str
+    type: str
+    value: ParameterValue | None
+    description: str = ""
+    read_only: bool = False
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class CapturedEndpoint:
+    """An endpoint as the graph and its node tell.
+
+    Attributes:
+        name: fully qualified.
+        declared: as a node of ours spells it in its code; the full name where nobody tells.
+        qos: None for services and actions.
+        unique: as a node of ours reports; else NOT_REQUIRED.
+        dscp: likewise; None if it is not marked.
+    """
+
+    kind: EndpointKind
+    name: str
+    declared: str
+    type: str
+    qos: QosProfile | None = None
+    unique: UniqueRequirement = UniqueRequirement.NOT_REQUIRED
+    dscp: int | None = None
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class CapturedNode:
+    """One node.
+
+    Attributes:
+        key: for a manifest, unique in the system.
+        machine: name of its CapturedMachine; empty if there is only one or it is not known.
+        managed: it offers the lifecycle services.
+        state: lifecycle_msgs/State label; empty if not known.
+        parameters: None where it did not answer.
+        tells: its own configuration says more than discovery does.
+        gaps: what is not known of it, one phrase each.
+    """
+
+    key: str
+    name: str
+    namespace: str
+    machine: str
+    managed: bool
+    state: str
+    endpoints: tuple[CapturedEndpoint, ...]
+    repeated: tuple[CapturedEndpoint, ...]
+    parameters: tuple[CapturedParameter, ...] | None
+    tells: bool
+    process_id: int | None
+    gaps: tuple[str, ...]
+
+    @property
+    def full_name(self) -> str:
+        """Fully qualified node name."""
+        return f"{self.namespace.rstrip('/')}/{self.name}"
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class CapturedMachine:
+    """A machine that nodes of ours named; `address` is empty if none of them told one."""
+
+    name: str
+    machine_id: str
+    address: str
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class CapturedSystem:
+    """A whole running system.
+
+    Attributes:
+        system: name that the manifest gives it.
+        partial: nodes were left out on purpose.
+        gaps: what is not known of the whole, one sentence each.
+    """
+
+    system: str
+    domain_id: int
+    discovery_range: DiscoveryRange
+    machines: tuple[CapturedMachine, ...]
+    nodes: tuple[CapturedNode, ...]
+    partial: bool
+    gaps: tuple[str, ...]
+
+
+def capture(
+    observation: Observation,
+    parameters: Mapping[str, tuple[CapturedParameter, ...] | None],
+    *,
+    system: str,
+    domain_id: int,
+    discovery_range: DiscoveryRange,
+    namespaces: tuple[str, ...] = (),
+    unsettled: str = "",
+) -> CapturedSystem:
+    """Return what `observation` tells; the same for the same content in any order.
+
+    Args:
+        observation: of every node in the graph, configurations of ours included.
+        parameters: by full node name; None where a node did not answer, and no entry where it has
+            no parameter services.
+        system: name to give it.
+        domain_id: where it was looked.
+        discovery_range: likewise.
+        namespaces: take only nodes in or below one of these; empty takes all.
+        unsettled: what discovery still waited for; empty if it had settled.
+    """
+    configurations = {each.name: each for each in observation.configurations}
+    owners = _owners(configurations)
+    nodes = _counted(observation.nodes, owners)
+    chosen = {name: node for name, node in nodes.items() if _is_within(name, namespaces)}
+    endpoints: dict[str, list[ObservedEndpoint]] = {name: [] for name in chosen}
+    unknown: list[ObservedEndpoint] = []
+    for endpoint in observation.endpoints:
+        name = known_node(owners.get(endpoint.node, endpoint.node))
+        if is_noise_node(name) or is_noise_endpoint(
+            endpoint.kind, name, endpoint.name, endpoint.type, ours=name in configurations
+        ):
+            continue
+        if name in endpoints:
+            endpoints[name].append(endpoint)
+        elif not name or name not in nodes:
+            unknown.append(endpoint)
+    machines = _machines(configurations, chosen)
+    keys = _keys(chosen)
+    gaps = [unsettled] if unsettled else []
+    gaps += [
+        f"{node.count} nodes are named {name}; they cannot be told apart"
+        for name, node in chosen.items()
+        if node.count > 1
+    ]
+    gaps += [
+        f"nobody tells whose {each.kind.value.removesuffix('s').replace('_', ' ')} of {each.name} "
+        f"({each.type}) this is"
+        for each in sorted(set(unknown), key=_order)
+    ]
+    return CapturedSystem(
+        system=system,
+        domain_id=domain_id,
+        discovery_range=discovery_range,
+        machines=machines if len(machines) > 1 else (),
+        nodes=tuple(
+            _node(
+                node,
+                key=keys[name],
+                endpoints=endpoints[name],
+                configuration=configurations.get(name),
+                parameters=parameters.get(name),
+                why_not="it did not answer" if name in parameters else "it serves none",
+                machines=machines if len(machines) > 1 else (),
+            )
+            for name, node in chosen.items()
+        ),
+        partial=len(chosen) < len(nodes),
+        gaps=tuple(gaps),
+    )
+
+
+def _owners(configurations: Mapping[str, NodeConfiguration]) -> dict[str, str]:
+    """Return the node that each hidden participant stands for, as the nodes themselves tell."""
+    owners = {}
+    for name, configuration in configurations.items():
+        namespace = name.rpartition("/")[0]
+        hidden = [each.participant for each in configuration.endpoints]
+        hidden += [each.node_name for each in configuration.connections]
+        owners.update({f"{namespace}/{each}": name for each in hidden if each})
+    return owners
+
+
+def _counted(nodes: Iterable[ObservedNode], owners: Mapping[str, str]) -> dict[str, ObservedNode]:
+    found: dict[str, ObservedNode] = {}
+    for node in sorted(nodes, key=lambda each: each.full_name):
+        name = node.full_name
+        if not known_node(name) or is_noise_node(name) or name in owners:
+            continue
+        other = found.get(name)
+        count = node.count + (other.count if other else 0)
+        found[name] = dataclasses.replace(node, count=count)
+    return found
+
+
+def _is_within(name: str, namespaces: tuple[str, ...]) -> bool:
+    return not namespaces or any(
+        name.startswith(f"/{each.strip('/')}/" if each.strip("/") else "/") for each in namespaces
+    )
+
+
+def _keys(nodes: Iterable[str]) -> dict[str, str]:
+    """Return a key for each node: its base name, where several share one with their namespace."""
+    names = list(nodes)
+    bases = [name.rpartition("/")[2] for name in names]
+    keys: dict[str, str] = {}
+    for name, base in zip(names, bases, strict=True):
+        key = base if bases.count(base) == 1 else name.strip("/").replace("/", "_")
+        number = 2
+        free = key
+        while free in keys.values():
+            free = f"{key}_{number}"
+            number += 1
+        keys[name] = free
+    return keys
+
+
+def _machines(
+    configurations: Mapping[str, NodeConfiguration], chosen: Iterable[str]
+) -> tuple[CapturedMachine, ...]:
+    addresses: dict[str, str] = {}
+    for name in chosen:
+        configuration = configurations.get(name)
+        if configuration is None:
+            continue
+        machine = configuration.identity.machine_id
+        addresses[machine] = addresses.get(machine) or _address(configuration)
+    return tuple(
+        CapturedMachine(name=f"machine_{index}", machine_id=machine, address=address)
+        for index, (machine, address) in enumerate(sorted(addresses.items()), start=1)
+    )
+
+
+def _address(configuration: NodeConfiguration) -> str:
+    """Return an address that others reach the node's machine at, as its subscriptions tell."""
+    return next(
+        (
+            nfe.internet_address
+            for report in configuration.endpoints
+            for nfe in report.nfes or ()
+            if nfe.internet_protocol is InternetProtocol.IPV4
+            and not nfe.internet_address.startswith(("127.", "0."))
+        ),
+        "",
+    )
+
+
+def _node(
+    node: ObservedNode,
+    *,
+    key: str,
+    endpoints: Iterable[ObservedEndpoint],
+    configuration: NodeConfiguration | None,
+    parameters: tuple[CapturedParameter, ...] | None,
+    why_not: str,
+    machines: tuple[CapturedMachine, ...],
+) -> CapturedNode:
+    namespace, _, name = node.full_name.rpartition("/")
+    reports = configuration.endpoints if configuration else ()
+    gaps = []
+    taken: dict[tuple[EndpointKind, str], CapturedEndpoint] = {}
+    repeated = []
+    for endpoint in sorted(endpoints, key=_order):
+        if not _TYPE.fullmatch(endpoint.type):
+            gaps.append(f"{endpoint.kind.value}: {endpoint.name} has no ROS type: {endpoint.type}")
+            continue
+        captured = _endpoint(endpoint, reports)
+        if (captured.kind, captured.name) in taken:
+            repeated.append(captured)
+        taken.setdefault((captured.kind, captured.name), captured)
+    state = node.state or (configuration.state if configuration else "")
+    if node.managed and state != "active":
+        gaps.append(
+            f"it is {state or 'in an unknown state'}; lifecycle verify judges an active system"
+        )
+    if node.managed is None:
+        gaps.append("nobody tells whether it is managed")
+    if parameters is None:
+        gaps.append("its parameters are not known: " + why_not)
+    if unset := [each.name for each in parameters or () if not each.type]:
+        gaps.append(f"parameters that are declared and not set: {', '.join(sorted(unset))}")
+    machine = configuration.identity.machine_id if configuration else ""
+    if machines and not configuration:
+        gaps.append("its machine is not known")
+    return CapturedNode(
+        key=key,
+        name=name,
+        namespace=namespace or "/",
+        machine=next((each.name for each in machines if each.machine_id == machine), ""),
+        managed=bool(node.managed),
+        state=state,
+        endpoints=tuple(taken.values()),
+        repeated=tuple(repeated),
+        parameters=None
+        if parameters is None
+        else tuple(
+            sorted((each for each in parameters if _is_own(each)), key=lambda each: each.name)
+        ),
+        tells=configuration is not None,
+        process_id=configuration.identity.process_id if configuration else None,
+        gaps=tuple(gaps),
+    )
+
+
+def _is_own(parameter: CapturedParameter) -> bool:
+    if parameter.name == "use_sim_time":
+        return parameter.value is True
+    return parameter.name not in _NOISE_PARAMETERS and not parameter.name.startswith(
+        _NOISE_PARAMETER_PREFIX
+    )
+
+
+def _endpoint(endpoint: ObservedEndpoint, reports: Iterable[EndpointReport]) -> CapturedEndpoint:
+    report = _report_of(endpoint, reports)
+    qos = endpoint.qos
+    if qos is not None and report is not None and report.qos is not None:
+        told = qos.history is not History.UNKNOWN
+        qos = (
+            qos
+            if told
+            else dataclasses.replace(qos, history=report.qos.history, depth=report.qos.depth)
+        )
+    return CapturedEndpoint(
+        kind=endpoint.kind,
+        name=endpoint.name,
+        declared=(report.name if report else "") or endpoint.name,
+        type=endpoint.type,
+        qos=qos,
+        unique=report.unique if report else UniqueRequirement.NOT_REQUIRED,
+        # 0 is what nobody marked.
+        dscp=(report.dscp or None) if report else None,
+    )
+
+
+def _report_of(
+    endpoint: ObservedEndpoint, reports: Iterable[EndpointReport]
+) -> EndpointReport | None:
+    same = [
+        each
+        for each in reports
+        if each.kind is endpoint.kind and endpoint.name in (each.resolved, *each.aliases)
+    ]
+    exact = [each for each in same if each.gid and each.gid == endpoint.gid]
+    return next(iter([*exact, *same]), None)
+
+
+_KINDS = list(EndpointKind)
+
+
+def _order(endpoint: ObservedEndpoint) -> tuple[object, ...]:
+    return (_KINDS.index(endpoint.kind), endpoint.name, endpoint.type, endpoint.gid)

@@ -1,0 +1,271 @@
+"""A captured system as a manifest, and its nodes as NoDL v2 documents.
+
+Owns: how what a graph tells is written in the manifest's words, and `# gap:` on every line whose
+value it does not tell. What is written passes `lifecycle check`. Pure.
+"""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections.abc import Callable, Iterable, Mapping
+
+from lifecycle.export.captured import (
+    CapturedEndpoint,
+    CapturedNode,
+    CapturedParameter,
+    CapturedSystem,
+)
+from lifecycle.export.yaml_text import Noted, Scalar, Tree, comment, to_yaml
+from lifecycle.manifest.model import DiscoveryRange, EndpointKind, ParameterValue
+from lifecycle.manifest.names import expand
+from lifecycle.manifest.qos import INFINITE_NS, History, QosProfile
+from lifecycle.network.dscp import describe
+from lifecycle.network.nfe import UniqueRequirement
+
+SUFFIX = ".nodl.yaml"
+_Spell = Callable[[Scalar], Scalar]
+_WIDTH = 100
+_ANNOUNCED = "history and depth are not announced"
+_NOW = "its value now; the default is not told"
+_SERVICES = "the graph does not show the QoS of services"
+_UNTOLD = "SYSTEM_DEFAULT"
+
+
+def to_manifest(system: CapturedSystem, *, references: Mapping[str, str] | None = None) -> str:
+    """Return the manifest of a captured system.
+
+    Args:
+        system: what was captured.
+        references: by node key, what stands for the node's interface, `local://camera.nodl.yaml`;
+            interfaces are written out without it.
+    """
+    head = [
+        *_comments(
+            f"Captured from domain {system.domain_id}, discovery range "
+            f"{system.discovery_range.value}. What a graph does not tell is marked: gap."
+        ),
+        *(line for each in _gaps(system) for line in _comments(f"gap: {each}")),
+    ]
+    return "\n".join(head) + "\n" + to_yaml(_manifest(system, references or {}))
+
+
+def to_nodl(node: CapturedNode) -> str:
+    """Return the interface of one node as a NoDL v2 document."""
+    gaps = [line for each in node.gaps for line in _comments(f"gap: {each}")]
+    tree: dict[str, Tree] = {
+        "nodl_version": 2,
+        "description": f"Captured from {node.full_name}",
+        **_interface(node, spell=_as_it_is),
+    }
+    return "\n".join([*gaps, to_yaml(tree)])
+
+
+def _comments(text: str) -> Iterable[str]:
+    return map(comment, textwrap.wrap(text, _WIDTH - 2, break_on_hyphens=False))
+
+
+def _gaps(system: CapturedSystem) -> Iterable[str]:
+    yield from system.gaps
+    foreign = [each.full_name for each in system.nodes if not each.tells]
+    if foreign:
+        yield (
+            "not ours, so that machine, process, flows, DSCP, history and depth are not told: "
+            + ", ".join(foreign)
+        )
+    if foreign:
+        yield "remaps cannot be seen: names are those in the graph, not those in the nodes' code"
+
+
+def _manifest(system: CapturedSystem, references: Mapping[str, str]) -> dict[str, Tree]:
+    tree: dict[str, Tree] = {"manifest_version": 1, "system": system.system}
+    if system.machines:
+        tree["machines"] = {
+            each.name: {"address": each.address}
+            if each.address
+            else Noted(value={}, note="gap: its address is not told")
+            for each in system.machines
+        }
+    discovery: dict[str, Tree] = {"domain_id": system.domain_id}
+    if system.discovery_range is not DiscoveryRange.SYSTEM_DEFAULT:
+        discovery["range"] = system.discovery_range.value
+    tree["discovery"] = discovery
+    if policy := _policy(system):
+        tree["policy"] = policy
+    tree["nodes"] = {each.key: _node(each, references.get(each.key, "")) for each in system.nodes}
+    return tree
+
+
+def _policy(system: CapturedSystem) -> dict[str, Tree]:
+    policy: dict[str, Tree] = {}
+    if system.partial:
+        policy["undeclared_nodes"] = Noted(
+            value="open", note="gap: nodes of other namespaces were left out"
+        )
+    offered = {
+        (_OPPOSITE[each.kind], each.name)
+        for node in system.nodes
+        for each in node.endpoints
+        if each.kind in _OPPOSITE
+    }
+    waiting = sorted(
+        {
+            each.name
+            for node in system.nodes
+            for each in node.endpoints
+            if each.kind in _OPPOSITE.values() and (each.kind, each.name) not in offered
+        }
+    )
+    if waiting:
+        policy["unpublished"] = Noted(
+            value="warning", note=f"gap: nobody offers {', '.join(waiting)}"
+        )
+    return policy
+
+
+_OPPOSITE = {
+    EndpointKind.PUBLISHER: EndpointKind.SUBSCRIPTION,
+    EndpointKind.SERVICE_SERVER: EndpointKind.SERVICE_CLIENT,
+    EndpointKind.ACTION_SERVER: EndpointKind.ACTION_CLIENT,
+}
+
+
+def _node(node: CapturedNode, reference: str) -> Tree:
+    tree: dict[str, Tree] = {"run": {"attach": True}}
+    if node.key != node.name:
+        tree["name"] = node.name
+    if node.machine:
+        tree["machine"] = node.machine
+    if node.namespace != "/":
+        tree["namespace"] = node.namespace
+    tree["managed"] = node.managed
+    if node.repeated:
+        several = ", ".join(f"{each.kind.value} {each.name}" for each in node.repeated)
+        tree["endpoints"] = Noted(
+            value="open", note=f"gap: it has several {several}; a manifest names each once"
+        )
+    remap = {
+        each.declared: each.name
+        for each in node.endpoints
+        if expand(each.declared, node.name, node.namespace) != each.name
+    }
+    if remap:
+        tree["remap"] = remap
+    interface = reference or _interface(node, spell=_literal)
+    if interface:
+        tree["interface"] = interface
+    if flows := _flows(node):
+        tree["flows"] = flows
+    notes = [f"gap: {each}" for each in node.gaps]
+    if node.process_id is not None:
+        notes.insert(0, f"pid {node.process_id} when it was captured")
+    return Noted(value=tree, note="; ".join(notes)) if notes else tree
+
+
+def _interface(node: CapturedNode, *, spell: _Spell) -> dict[str, Tree]:
+    tree: dict[str, Tree] = {}
+    for kind in EndpointKind:
+        entries = [_endpoint(each) for each in node.endpoints if each.kind is kind]
+        if entries:
+            tree[kind.value] = entries
+    parameters = {each.name: _parameter(each, spell) for each in node.parameters or () if each.type}
+    if parameters:
+        tree["parameters"] = parameters
+    return tree
+
+
+def _endpoint(endpoint: CapturedEndpoint) -> Tree:
+    tree: dict[str, Tree] = {"name": endpoint.declared, "type": endpoint.type}
+    if endpoint.qos is not None:
+        tree["qos"] = _qos(endpoint.qos, endpoint.kind)
+    elif endpoint.kind in (EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT):
+        policies = ("history", "reliability", "durability", "liveliness")
+        tree["qos"] = Noted(value=dict.fromkeys(policies, _UNTOLD), note=f"gap: {_SERVICES}")
+    return tree
+
+
+def _qos(qos: QosProfile, kind: EndpointKind) -> dict[str, Tree]:
+    tree: dict[str, Tree] = {}
+    if qos.history is History.UNKNOWN:
+        tree["history"] = Noted(value=_UNTOLD, note=f"gap: {_ANNOUNCED}")
+    else:
+        tree["history"] = qos.history.value
+        if qos.history is History.KEEP_LAST:
+            tree["depth"] = qos.depth
+    for name in ("reliability", "durability"):
+        tree[name] = _policy_value(getattr(qos, name).value)
+    for name in ("deadline_ns", "lifespan_ns"):
+        duration = getattr(qos, name)
+        # A DataReader has no lifespan (DDS 1.4 §2.2.3.16).
+        is_reader = name == "lifespan_ns" and kind is EndpointKind.SUBSCRIPTION
+        if duration not in (None, 0, INFINITE_NS) and not is_reader:
+            tree[name] = duration
+    tree["liveliness"] = _policy_value(qos.liveliness.value)
+    if qos.liveliness_lease_duration_ns not in (None, 0, INFINITE_NS):
+        tree["liveliness_lease_duration_ns"] = qos.liveliness_lease_duration_ns
+    return tree
+
+
+def _policy_value(value: str) -> Tree:
+    if value == "UNKNOWN":
+        return Noted(value=_UNTOLD, note="gap: not announced")
+    return value
+
+
+def _parameter(parameter: CapturedParameter, spell: _Spell) -> Tree:
+    tree: dict[str, Tree] = {"type": parameter.type}
+    value = parameter.value
+    if value is not None and _is_finite(value):
+        written: Tree = list(map(spell, value)) if isinstance(value, tuple) else spell(value)
+        tree["default_value"] = Noted(value=written, note=f"gap: {_NOW}")
+    elif value is not None:
+        tree["type"] = Noted(value=parameter.type, note="gap: its value is not finite")
+    if parameter.description:
+        tree["description"] = str(spell(parameter.description))
+    if parameter.read_only:
+        tree["read_only"] = True
+    return tree
+
+
+def _is_finite(value: ParameterValue) -> bool:
+    values = value if isinstance(value, tuple) else (value,)
+    return all(not isinstance(each, float) or math.isfinite(each) for each in values)
+
+
+def _literal(value: Scalar) -> Scalar:
+    """Spell a text so that a manifest takes nothing in it for a substitution."""
+    return value.replace("$(", "$$(") if isinstance(value, str) else value
+
+
+def _as_it_is(value: Scalar) -> Scalar:
+    """Spell a text for NoDL, which knows no substitutions."""
+    return value
+
+
+def _flows(node: CapturedNode) -> dict[str, Tree]:
+    tree: dict[str, Tree] = {}
+    for kind in (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION):
+        needs = {
+            each.declared: need
+            for each in node.endpoints
+            if each.kind is kind and (need := _need(each))
+        }
+        if needs:
+            tree[kind.value] = needs
+    return tree
+
+
+def _need(endpoint: CapturedEndpoint) -> dict[str, Tree]:
+    need: dict[str, Tree] = {}
+    strict = endpoint.unique is UniqueRequirement.STRICTLY_REQUIRED
+    if strict and endpoint.kind is EndpointKind.PUBLISHER:
+        # A manifest may not ask that of a node that it only attaches to.
+        need["unique"] = Noted(
+            value=UniqueRequirement.OPTIONALLY_REQUIRED.value,
+            note="gap: it is strictly_required; only a node with run: python can be asked that",
+        )
+    elif endpoint.unique is not UniqueRequirement.NOT_REQUIRED:
+        need["unique"] = endpoint.unique.value
+    if endpoint.dscp is not None and endpoint.kind is EndpointKind.PUBLISHER:
+        need["dscp"] = Noted(value=endpoint.dscp, note=describe(endpoint.dscp))
+    return need

@@ -1,0 +1,37 @@
+"""Pictures of a plan, and of what runs beside it: text, Mermaid, DOT, SVG, HTML. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from lifecycle.export.picture.build import Supervised, build_picture, planned_picture
+from lifecycle.export.picture.dot import picture_to_dot
+from lifecycle.export.picture.html import picture_to_html
+from lifecycle.export.picture.mermaid import picture_to_mermaid
+from lifecycle.export.picture.model import NodeState, Picture, Presence
+from lifecycle.export.picture.svg import picture_to_svg
+from lifecycle.export.picture.text import picture_to_text
+
+WRITERS: Mapping[str, Callable[[Picture], str]] = {
+    "text": picture_to_text,
+    "mermaid": picture_to_mermaid,
+    "dot": picture_to_dot,
+    "svg": picture_to_svg,
+    "html": picture_to_html,
+}
+"""What writes a picture, by the word of `--format`."""
+
+__all__ = [
+    "WRITERS",
+    "NodeState",
+    "Picture",
+    "Presence",
+    "Supervised",
+    "build_picture",
+    "picture_to_dot",
+    "picture_to_html",
+    "picture_to_mermaid",
+    "picture_to_svg",
+    "picture_to_text",
+    "planned_picture",
+]
