@@ -1,0 +1,112 @@
+"""The only room that knows rcl, rmw and Fast DDS: endpoints, flows, graph, shared memory.
+
+Owns: every use of ctypes and of private rclpy names. Names load on first use, so that a verb that
+only asks for the /dev/shm sweep or for process control does not pay for importing rclpy.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from lifecycle.middleware.clients import NodeClients
+    from lifecycle.middleware.discovery_server import (
+        discovery_server_command,
+        discovery_server_listens,
+    )
+    from lifecycle.middleware.dscp import get_dscp
+    from lifecycle.middleware.graph import GraphObserver
+    from lifecycle.middleware.graph_guard import GraphGuard
+    from lifecycle.middleware.interface_types import UnknownInterfaceError, import_interface
+    from lifecycle.middleware.nfe import (
+        SHARED_MEMORY,
+        NetworkFlowEndpointsUnsupported,
+        get_network_flow_endpoints,
+        has_shared_memory,
+    )
+    from lifecycle.middleware.participant import FlowParticipant
+    from lifecycle.middleware.participant_profile import ParticipantSettings
+    from lifecycle.middleware.process import adopt_orphans, die_with_parent, exit_after
+    from lifecycle.middleware.profiles import discovery_environment
+    from lifecycle.middleware.qos import from_rclpy, to_rclpy
+    from lifecycle.middleware.service_calls import ServiceUnansweredError
+    from lifecycle.middleware.settings import participant_settings
+    from lifecycle.middleware.shm import leftovers, segments_of, sweep
+    from lifecycle.middleware.teardown import leave_and_exit
+    from lifecycle.middleware.unique import (
+        UniqueFlowNotFeasible,
+        create_publisher,
+        create_subscription,
+    )
+
+__all__ = [
+    "SHARED_MEMORY",
+    "FlowParticipant",
+    "GraphGuard",
+    "GraphObserver",
+    "NetworkFlowEndpointsUnsupported",
+    "NodeClients",
+    "ParticipantSettings",
+    "ServiceUnansweredError",
+    "UniqueFlowNotFeasible",
+    "UnknownInterfaceError",
+    "adopt_orphans",
+    "create_publisher",
+    "create_subscription",
+    "die_with_parent",
+    "discovery_environment",
+    "discovery_server_command",
+    "discovery_server_listens",
+    "exit_after",
+    "from_rclpy",
+    "get_dscp",
+    "get_network_flow_endpoints",
+    "has_shared_memory",
+    "import_interface",
+    "leave_and_exit",
+    "leftovers",
+    "participant_settings",
+    "segments_of",
+    "sweep",
+    "to_rclpy",
+]
+
+_HOME = {
+    "SHARED_MEMORY": "nfe",
+    "FlowParticipant": "participant",
+    "GraphGuard": "graph_guard",
+    "GraphObserver": "graph",
+    "NetworkFlowEndpointsUnsupported": "nfe",
+    "NodeClients": "clients",
+    "ParticipantSettings": "participant_profile",
+    "ServiceUnansweredError": "service_calls",
+    "UniqueFlowNotFeasible": "unique",
+    "UnknownInterfaceError": "interface_types",
+    "adopt_orphans": "process",
+    "create_publisher": "unique",
+    "create_subscription": "unique",
+    "die_with_parent": "process",
+    "discovery_environment": "profiles",
+    "discovery_server_command": "discovery_server",
+    "discovery_server_listens": "discovery_server",
+    "exit_after": "process",
+    "from_rclpy": "qos",
+    "get_dscp": "dscp",
+    "get_network_flow_endpoints": "nfe",
+    "has_shared_memory": "nfe",
+    "import_interface": "interface_types",
+    "leave_and_exit": "teardown",
+    "leftovers": "shm",
+    "participant_settings": "settings",
+    "segments_of": "shm",
+    "sweep": "shm",
+    "to_rclpy": "qos",
+}
+
+
+def __getattr__(name: str) -> object:
+    """Import the module that defines `name` (PEP 562)."""
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)

@@ -1,0 +1,331 @@
+"""The C ABI of rcl, rmw and rcutils that rclpy does not expose, seen through ctypes.
+
+Owns: the struct layouts, the function signatures, and the check that the loaded libraries are the
+ones these layouts were written for. Layouts are those of rcl 9 and rmw 7 (ROS 2 Jazzy); headers
+rcl/{publisher,subscription,wait,guard_condition}.h, rmw/{types,network_flow_endpoint}.h,
+rcutils/{allocator,error_handling}.h.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import importlib.metadata
+import re
+from collections.abc import Sequence
+from typing import Any
+
+from lifecycle.errors import MiddlewareError
+
+RCL_RET_OK = 0
+RCL_RET_UNSUPPORTED = 3
+RCL_RET_TIMEOUT = 2
+SUPPORTED_RCL_MAJOR = 9
+"""rcl 9 is ROS 2 Jazzy; another major may lay its structs out differently."""
+
+_ERROR_LOCATION = re.compile(r", at [^,]+?:\d+(?=,|$)")
+
+
+class Allocator(ctypes.Structure):
+    """rcutils_allocator_t."""
+
+    _fields_ = (
+        ("allocate", ctypes.c_void_p),
+        ("deallocate", ctypes.c_void_p),
+        ("reallocate", ctypes.c_void_p),
+        ("zero_allocate", ctypes.c_void_p),
+        ("state", ctypes.c_void_p),
+    )
+
+
+class Nfe(ctypes.Structure):
+    """rmw_network_flow_endpoint_t."""
+
+    _fields_ = (
+        ("transport_protocol", ctypes.c_int),
+        ("internet_protocol", ctypes.c_int),
+        ("transport_port", ctypes.c_uint16),
+        ("flow_label", ctypes.c_uint32),
+        ("dscp", ctypes.c_uint8),
+        ("internet_address", ctypes.c_char * 48),
+    )
+
+
+class NfeArray(ctypes.Structure):
+    """rmw_network_flow_endpoint_array_t."""
+
+    _fields_ = (
+        ("size", ctypes.c_size_t),
+        ("items", ctypes.POINTER(Nfe)),
+        ("allocator", ctypes.c_void_p),
+    )
+
+
+class Time(ctypes.Structure):
+    """rmw_time_t."""
+
+    _fields_ = (("sec", ctypes.c_uint64), ("nsec", ctypes.c_uint64))
+
+
+class Qos(ctypes.Structure):
+    """rmw_qos_profile_t."""
+
+    _fields_ = (
+        ("history", ctypes.c_int),
+        ("depth", ctypes.c_size_t),
+        ("reliability", ctypes.c_int),
+        ("durability", ctypes.c_int),
+        ("deadline", Time),
+        ("lifespan", Time),
+        ("liveliness", ctypes.c_int),
+        ("liveliness_lease_duration", Time),
+        ("avoid_ros_namespace_conventions", ctypes.c_bool),
+    )
+
+
+class _RmwSubscriptionOptions(ctypes.Structure):
+    _fields_ = (
+        ("payload", ctypes.c_void_p),
+        ("ignore_local_publications", ctypes.c_bool),
+        ("unique", ctypes.c_int),
+        ("content_filter_options", ctypes.c_void_p),
+    )
+
+
+class _RmwPublisherOptions(ctypes.Structure):
+    _fields_ = (("payload", ctypes.c_void_p), ("unique", ctypes.c_int))
+
+
+class SubscriptionOptions(ctypes.Structure):
+    """rcl_subscription_options_t."""
+
+    _fields_ = (
+        ("qos", Qos),
+        ("allocator", Allocator),
+        ("rmw", _RmwSubscriptionOptions),
+        ("disable_loaned_message", ctypes.c_bool),
+    )
+
+
+class PublisherOptions(ctypes.Structure):
+    """rcl_publisher_options_t."""
+
+    _fields_ = (
+        ("qos", Qos),
+        ("allocator", Allocator),
+        ("rmw", _RmwPublisherOptions),
+        ("disable_loaned_message", ctypes.c_bool),
+    )
+
+
+class WaitSet(ctypes.Structure):
+    """rcl_wait_set_t."""
+
+    _fields_ = (
+        ("subscriptions", ctypes.c_void_p),
+        ("size_of_subscriptions", ctypes.c_size_t),
+        ("guard_conditions", ctypes.POINTER(ctypes.c_void_p)),
+        ("size_of_guard_conditions", ctypes.c_size_t),
+        ("timers", ctypes.c_void_p),
+        ("size_of_timers", ctypes.c_size_t),
+        ("clients", ctypes.c_void_p),
+        ("size_of_clients", ctypes.c_size_t),
+        ("services", ctypes.c_void_p),
+        ("size_of_services", ctypes.c_size_t),
+        ("events", ctypes.c_void_p),
+        ("size_of_events", ctypes.c_size_t),
+        ("impl", ctypes.c_void_p),
+    )
+
+
+class _ErrorString(ctypes.Structure):
+    _fields_ = (("text", ctypes.c_char * 1024),)
+
+
+def _padded(options: type[ctypes.Structure]) -> type[ctypes.Structure]:
+    """Return `options` with room behind it, for a library whose struct turns out larger."""
+    return type(
+        f"Padded{options.__name__}",
+        (ctypes.Structure,),
+        {"_fields_": (("options", options), ("room", ctypes.c_ubyte * 1024))},
+    )
+
+
+class Rcl:
+    """The loaded libraries with every signature declared; get it from `load`.
+
+    Functions keep their C names. They release the GIL while they run, as ctypes.CDLL does.
+    """
+
+    def __init__(self) -> None:
+        version = rcl_version()
+        if version and version.partition(".")[0] != str(SUPPORTED_RCL_MAJOR):
+            raise MiddlewareError(
+                f"cannot reach network flows through rcl {version!r}: only rcl "
+                f"{SUPPORTED_RCL_MAJOR} (ROS 2 Jazzy) is known",
+                hint="install ros-jazzy-rclpy[fastrtps]",
+            )
+        pointer, size, integer = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int
+        rcutils, rmw, rcl = (_open(f"lib{name}.so") for name in ("rcutils", "rmw", "rcl"))
+        self._get_error_string = _bind(rcutils, "rcutils_get_error_string", _ErrorString)
+        self._reset_error = _bind(rcutils, "rcutils_reset_error", None)
+        self.default_allocator: Allocator = _bind(
+            rcutils, "rcutils_get_default_allocator", Allocator
+        )()
+        self.nfe_set_address = _bind(
+            rmw,
+            "rmw_network_flow_endpoint_set_internet_address",
+            integer,
+            (pointer, ctypes.c_char_p, size),
+        )
+        self.nfe_array_fini = _bind(
+            rmw, "rmw_network_flow_endpoint_array_fini", integer, (pointer,)
+        )
+        self.by_kind: dict[str, dict[str, Any]] = {}
+        for kind, options in (
+            ("publisher", PublisherOptions),
+            ("subscription", SubscriptionOptions),
+        ):
+            self.by_kind[kind] = {
+                "default_options": _bind(rcl, f"rcl_{kind}_get_default_options", _padded(options)),
+                "options": _bind(
+                    rcl, f"rcl_{kind}_get_options", ctypes.POINTER(options), (pointer,)
+                ),
+                "init": _bind(
+                    rcl,
+                    f"rcl_{kind}_init",
+                    integer,
+                    (pointer, pointer, pointer, ctypes.c_char_p, pointer),
+                ),
+                "fini": _bind(rcl, f"rcl_{kind}_fini", integer, (pointer, pointer)),
+                "nfes": _bind(
+                    rcl,
+                    f"rcl_{kind}_get_network_flow_endpoints",
+                    integer,
+                    (pointer, pointer, pointer),
+                ),
+            }
+        self.graph_guard = _bind(rcl, "rcl_node_get_graph_guard_condition", pointer, (pointer,))
+        self.zero_wait_set = _bind(rcl, "rcl_get_zero_initialized_wait_set", WaitSet)
+        self.wait_set_init = _bind(
+            rcl, "rcl_wait_set_init", integer, (pointer, *([size] * 6), pointer, Allocator)
+        )
+        self.wait_set_fini = _bind(rcl, "rcl_wait_set_fini", integer, (pointer,))
+        self.wait_set_clear = _bind(rcl, "rcl_wait_set_clear", integer, (pointer,))
+        self.wait_set_add_guard = _bind(
+            rcl, "rcl_wait_set_add_guard_condition", integer, (pointer, pointer, pointer)
+        )
+        self.wait = _bind(rcl, "rcl_wait", integer, (pointer, ctypes.c_int64))
+        self.rmw_context = _bind(rcl, "rcl_context_get_rmw_context", pointer, (pointer,))
+        self._check_layout(version)
+
+    def take_error(self) -> str:
+        """Return and clear this thread's rcl error, without the C file names it drags along."""
+        text: str = self._get_error_string().text.decode(errors="replace")
+        self._reset_error()
+        return _ERROR_LOCATION.sub("", text).strip() or "no reason given"
+
+    def _check_layout(self, version: str) -> None:
+        """Compare what the libraries put into our structs with what must be there.
+
+        The defaults are those of rmw_qos_profile_default and rcl_get_default_allocator; a field
+        that moved shows as a wrong default before anything is written through it.
+        """
+        expected = (1, 10, 1, 2, False, bytes(self.default_allocator), 0)
+        for kind, functions in self.by_kind.items():
+            options = functions["default_options"]().options
+            found = (
+                options.qos.history,
+                options.qos.depth,
+                options.qos.reliability,
+                options.qos.durability,
+                options.qos.avoid_ros_namespace_conventions,
+                bytes(options.allocator),
+                options.rmw.unique,
+            )
+            if found != expected or options.rmw.payload is not None:
+                raise _layout_error(f"rcl_{kind}_options_t", version)
+        # One spare element behind it, should the library's struct be longer.
+        probe = (Nfe * 2)()
+        self.nfe_set_address(ctypes.byref(probe), b"192.0.2.1", 9)
+        if probe[0].internet_address != b"192.0.2.1" or bytes(probe[1]).strip(b"\0"):
+            raise _layout_error("rmw_network_flow_endpoint_t", version)
+
+
+@functools.lru_cache(maxsize=1)
+def load() -> Rcl:
+    """Load and check the libraries once.
+
+    Raises:
+        MiddlewareError: a library or symbol is missing, or is not laid out as rcl 9.
+    """
+    return Rcl()
+
+
+def rcl_version() -> str:
+    """Return the version of rcl: of its wheel, else of its ament package; empty if unknown."""
+    try:
+        return importlib.metadata.version("ros-rcl")
+    except importlib.metadata.PackageNotFoundError:
+        return _ament_version()
+
+
+def type_support(message_type: object) -> int:
+    """Return the address of a message class's rosidl_message_type_support_t.
+
+    rclpy must have used the class before: that is when its type support is loaded.
+    """
+    capsule = type(message_type)._TYPE_SUPPORT  # type: ignore[attr-defined]  # noqa: SLF001
+    name = ctypes.pythonapi.PyCapsule_GetName
+    name.restype, name.argtypes = ctypes.c_char_p, (ctypes.py_object,)
+    pointer = ctypes.pythonapi.PyCapsule_GetPointer
+    pointer.restype, pointer.argtypes = ctypes.c_void_p, (ctypes.py_object, ctypes.c_char_p)
+    return int(pointer(capsule, name(capsule)))
+
+
+def _ament_version() -> str:
+    try:
+        from ament_index_python.packages import get_package_share_path
+
+        text = (get_package_share_path("rcl") / "package.xml").read_text(encoding="utf-8")
+    except (ImportError, LookupError, OSError):
+        return ""
+    found = re.search(r"<version>\s*([^<\s]+)\s*</version>", text)
+    return found.group(1) if found else ""
+
+
+def _open(library: str) -> ctypes.CDLL:
+    # Importing rclpy loads the very same libraries; dlopen then finds them by name wherever they
+    # are installed, and never a second copy.
+    try:
+        from rclpy.impl.implementation_singleton import rclpy_implementation  # noqa: F401
+    except ImportError as error:
+        raise MiddlewareError(
+            f"cannot import rclpy: {error}", hint="install ros-jazzy-rclpy[fastrtps]"
+        ) from error
+    try:
+        return ctypes.CDLL(library)
+    except OSError as error:
+        raise MiddlewareError(
+            f"cannot load {library!r}: {error}", hint="install ros-jazzy-rclpy[fastrtps]"
+        ) from error
+
+
+def _bind(library: ctypes.CDLL, symbol: str, result: Any, arguments: Sequence[Any] = ()) -> Any:
+    try:
+        function = getattr(library, symbol)
+    except AttributeError as error:
+        raise MiddlewareError(
+            f"cannot find {symbol!r} in the installed ROS libraries (rcl {rcl_version() or '?'})",
+            hint="install ros-jazzy-rclpy[fastrtps]",
+        ) from error
+    function.restype, function.argtypes = result, tuple(arguments)
+    return function
+
+
+def _layout_error(struct: str, version: str) -> MiddlewareError:
+    return MiddlewareError(
+        f"cannot use the installed rcl {version or '(version unknown)'}: its {struct} is not laid "
+        f"out as rcl {SUPPORTED_RCL_MAJOR}'s",
+        hint="install ros-jazzy-rclpy[fastrtps]",
+    )

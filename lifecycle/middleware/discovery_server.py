@@ -1,0 +1,105 @@
+"""Fast DDS's discovery server: how it is started, and when it listens.
+
+Owns: the command line and environment of `fast-discovery-server`, and the readiness test. Starting,
+watching and ending it is supervisor/'s. Must not import rclpy.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+import re
+import shutil
+import socket
+import struct
+import sysconfig
+from collections.abc import Mapping
+from pathlib import Path
+
+from lifecycle.errors import MiddlewareError
+from lifecycle.plan.model import PlannedServer
+
+PROGRAM = "fast-discovery-server"
+_PREFIX = re.compile(r"44\.53\.([0-9a-f]{2})\.5f\.45\.50\.52\.4f\.53\.49\.4d\.41")
+"""The GUID prefixes that the program can take: only the third byte can be chosen."""
+
+_LISTEN = "0A"  # TCP_LISTEN of linux/tcp_states.h
+
+
+def discovery_server_command(
+    server: PlannedServer, environment: Mapping[str, str] | None = None
+) -> tuple[tuple[str, ...], dict[str, str]]:
+    """Return the command line of a discovery server, and the whole environment it needs.
+
+    Args:
+        server: address, port, transport and GUID prefix; the address must be this host's.
+        environment: what it otherwise gets; None for this process's.
+
+    Raises:
+        MiddlewareError: the program is not installed, or cannot have that prefix.
+    """
+    found = _PREFIX.fullmatch(server.prefix.lower())
+    if found is None:
+        raise MiddlewareError(
+            f"cannot start a discovery server with GUID prefix {server.prefix!r}: allowed is "
+            "'44.53.XX.5f.45.50.52.4f.53.49.4d.41', XX the server's id in hex"
+        )
+    options = ("-t", server.address, "-q") if server.tcp else ("-l", server.address, "-p")
+    argv = (_program(), "-i", str(int(found.group(1), 16)), *options, str(server.port))
+    current = dict(os.environ if environment is None else environment)
+    # A profile or a server of the environment's would be applied to the server itself.
+    for variable in (
+        "FASTRTPS_DEFAULT_PROFILES_FILE",
+        "FASTDDS_DEFAULT_PROFILES_FILE",
+        "FASTDDS_BUILTIN_TRANSPORTS",
+        "ROS_DISCOVERY_SERVER",
+    ):
+        current.pop(variable, None)
+    current["SKIP_DEFAULT_XML"] = "1"
+    paths = [*_library_paths(), *filter(None, current.get("LD_LIBRARY_PATH", "").split(":"))]
+    current["LD_LIBRARY_PATH"] = ":".join(dict.fromkeys(paths))
+    return argv, current
+
+
+def discovery_server_listens(server: PlannedServer, pid: int | None = None) -> bool:
+    """Return whether the server's port is open on this host, as the kernel says.
+
+    Args:
+        server: address, port and transport.
+        pid: of the server, whose network is looked at; None for this process's.
+    """
+    owner = "self" if pid is None else str(pid)
+    table = Path(f"/proc/{owner}/net/{'tcp' if server.tcp else 'udp'}")
+    wanted = {_spelt(server.address, server.port), _spelt("0.0.0.0", server.port)}  # noqa: S104
+    try:
+        lines = table.read_text(encoding="ascii").splitlines()[1:]
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+    fields = [line.split() for line in lines]
+    return any(field[1] in wanted and (not server.tcp or field[3] == _LISTEN) for field in fields)
+
+
+def _spelt(address: str, port: int) -> str:
+    """Return how /proc/net spells an IPv4 address and a port: in the host's byte order."""
+    (word,) = struct.unpack("=I", socket.inet_aton(str(ipaddress.IPv4Address(address))))
+    return f"{word:08X}:{port:04X}"
+
+
+def _program() -> str:
+    for directory in (sysconfig.get_path("scripts"), None):
+        found = shutil.which(PROGRAM, path=directory)
+        if found is not None:
+            return found
+    raise MiddlewareError(
+        f"cannot find {PROGRAM!r}",
+        hint="it comes with Fast DDS: install ros-jazzy-rclpy[fastrtps], or set PATH",
+    )
+
+
+def _library_paths() -> list[str]:
+    """Return where the wheels keep Fast DDS and what it needs; what is not there is left out."""
+    places = (
+        Path(sysconfig.get_path("data")) / "lib",
+        Path(sysconfig.get_path("purelib")) / "ros_fastrtps.libs",
+    )
+    return [str(place) for place in places if place.is_dir()]

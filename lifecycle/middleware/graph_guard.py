@@ -1,0 +1,103 @@
+"""Waiting for graph changes without polling.
+
+Owns: a thread that sleeps on rcl's graph guard condition, which rclpy does not expose, and on one
+guard condition of its own by which it is stopped. A change wakes it within a millisecond.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import threading
+from collections.abc import Callable
+
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+
+from lifecycle.errors import MiddlewareError
+from lifecycle.middleware import abi
+
+_logger = logging.getLogger(__name__)
+_FOR_EVER = -1
+_STOP = 1
+_GUARDS = 2
+
+
+class GraphGuard:
+    """Calls `on_change` in its own thread whenever discovery changes the graph that `node` sees.
+
+    Changes that come while `on_change` runs are folded into one further call: level-triggered.
+
+    Args:
+        node: its context must outlive the guard; call `stop` before destroying either.
+        on_change: quick; an exception it raises is logged and ends nothing.
+    """
+
+    def __init__(self, node: Node, on_change: Callable[[], None]) -> None:
+        self._rcl = abi.load()
+        self._node = node
+        self._on_change = on_change
+        with node.context.handle:
+            self._stop_guard = rclpy_implementation.GuardCondition(node.context.handle)
+        self._wait_set = self._rcl.zero_wait_set()
+        self._check(
+            self._rcl.wait_set_init(
+                ctypes.byref(self._wait_set),
+                *(0, _GUARDS, 0, 0, 0, 0),
+                node.context.handle.pointer,
+                self._rcl.default_allocator,
+            )
+        )
+        self._stopping = False
+        self.failure: MiddlewareError | None = None
+        """Why the thread gave up; None while it works."""
+        self._thread = threading.Thread(target=self._run, name="graph-guard", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the thread and free the wait set; again is harmless, from `on_change` an error."""
+        if self._stopping:
+            return
+        self._stopping = True
+        with self._stop_guard:
+            self._stop_guard.trigger_guard_condition()
+        self._thread.join()
+        self._rcl.wait_set_fini(ctypes.byref(self._wait_set))
+        self._stop_guard.destroy_when_not_in_use()
+
+    def _run(self) -> None:
+        # Holding the handles keeps rclpy from freeing what the C code below points at.
+        with self._node.context.handle, self._node.handle, self._stop_guard:
+            graph = self._rcl.graph_guard(self._node.handle.pointer)
+            try:
+                while self._wait(graph):
+                    self._notify()
+            except MiddlewareError as error:
+                _logger.exception("the graph is no longer watched")
+                self.failure = error
+                self._notify()
+
+    def _wait(self, graph: int) -> bool:
+        """Block until the graph changed (True) or `stop` was called (False)."""
+        wait_set = ctypes.byref(self._wait_set)
+        while True:
+            self._check(self._rcl.wait_set_clear(wait_set))
+            self._check(self._rcl.wait_set_add_guard(wait_set, graph, None))
+            self._check(self._rcl.wait_set_add_guard(wait_set, self._stop_guard.pointer, None))
+            result = self._rcl.wait(wait_set, _FOR_EVER)
+            if self._stopping or self._wait_set.guard_conditions[_STOP]:
+                return False
+            if result == abi.RCL_RET_OK:
+                return True
+            if result != abi.RCL_RET_TIMEOUT:
+                self._check(result)
+
+    def _notify(self) -> None:
+        try:
+            self._on_change()
+        except Exception:
+            _logger.exception("cannot handle a graph change")
+
+    def _check(self, result: int) -> None:
+        if result != abi.RCL_RET_OK:
+            raise MiddlewareError(f"cannot wait for graph changes: {self._rcl.take_error()}")

@@ -1,0 +1,64 @@
+"""QoS profiles between the manifest's words and rclpy's objects.
+
+Owns: the conversion both ways. Policies go by name: both sides use rmw's. Infinite durations are
+None on our side; rmw spells them RMW_DURATION_UNSPECIFIED (0, what a default profile holds) or
+RMW_DURATION_INFINITE (what discovery shows), which mean the same on Fast DDS.
+"""
+
+from __future__ import annotations
+
+from rclpy.duration import Duration
+from rclpy.qos import (
+    DurabilityPolicy,
+    HistoryPolicy,
+    LivelinessPolicy,
+    QoSProfile,
+    ReliabilityPolicy,
+)
+
+from lifecycle.manifest.qos import Durability, History, Liveliness, QosProfile, Reliability
+
+_UNSPECIFIED_NS = 0
+_INFINITE_NS = 2**63 - 1
+
+
+def to_rclpy(qos: QosProfile | QoSProfile) -> QoSProfile:
+    """Return rclpy's profile for ours, for creating an endpoint with; its own as it is."""
+    if isinstance(qos, QoSProfile):
+        return qos
+    return QoSProfile(
+        history=HistoryPolicy[qos.history.value],
+        depth=qos.depth,
+        reliability=ReliabilityPolicy[qos.reliability.value],
+        durability=DurabilityPolicy[qos.durability.value],
+        deadline=_duration(qos.deadline_ns),
+        lifespan=_duration(qos.lifespan_ns),
+        liveliness=LivelinessPolicy[qos.liveliness.value],
+        liveliness_lease_duration=_duration(qos.liveliness_lease_duration_ns),
+    )
+
+
+def from_rclpy(qos: QoSProfile) -> QosProfile:
+    """Return our profile for rclpy's, of a local endpoint or as discovery shows a remote one.
+
+    What discovery does not carry (history and depth on Fast DDS) comes back as UNKNOWN and 0.
+    """
+    return QosProfile(
+        history=History[qos.history.name],
+        depth=qos.depth,
+        reliability=Reliability[qos.reliability.name],
+        durability=Durability[qos.durability.name],
+        deadline_ns=_nanoseconds(qos.deadline),
+        lifespan_ns=_nanoseconds(qos.lifespan),
+        liveliness=Liveliness[qos.liveliness.name],
+        liveliness_lease_duration_ns=_nanoseconds(qos.liveliness_lease_duration),
+    )
+
+
+def _duration(nanoseconds: int | None) -> Duration:
+    return Duration(nanoseconds=_UNSPECIFIED_NS if nanoseconds is None else nanoseconds)
+
+
+def _nanoseconds(duration: Duration) -> int | None:
+    value = int(duration.nanoseconds)
+    return None if value in (_UNSPECIFIED_NS, _INFINITE_NS) else value
