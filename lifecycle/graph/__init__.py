@@ -1,0 +1,121 @@
+"""The graph interface: what runs, told by its participants, and what an observer sees of it.
+
+Owns: graph messages and how they travel, the events made of them, and the state with its queries
+(docs/graph_interface.md); and observations for the supervisor and `lifecycle verify`. Must not use
+ctypes or private rclpy names; those live in middleware/. Names that need rclpy load on first use.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING
+
+from lifecycle.graph.endpoints import EndpointChange
+from lifecycle.graph.event import EventKind, GraphEvent, Member, NodeLiveliness
+from lifecycle.graph.events import FORGET_AFTER_S, SILENT_AFTER_S, GraphEvents
+from lifecycle.graph.links import End, Link
+from lifecycle.graph.memory import InMemoryNetwork, InMemoryTransport
+from lifecycle.graph.messages import (
+    AliveNotice,
+    ConfigurationChanged,
+    ConnectionEstablished,
+    ConnectionLost,
+    GraphKind,
+    GraphMessage,
+    GraphMessageError,
+    Heartbeat,
+    Joined,
+    Left,
+    MappingEstablished,
+    MappingLost,
+    SilentNotice,
+    StateChanged,
+    StuckNotice,
+    decode,
+    encode,
+    new_incarnation,
+)
+from lifecycle.graph.observer import Observer
+from lifecycle.graph.reporter import HEARTBEAT_PERIOD_S, Every, GraphReporter
+from lifecycle.graph.running import Running
+from lifecycle.graph.scheduler import (
+    LoopScheduler,
+    ManualScheduler,
+    Scheduler,
+    ThreadScheduler,
+    every,
+)
+from lifecycle.graph.state import Fetch, GraphState
+from lifecycle.graph.transport import GraphTransport, Remove
+from lifecycle.graph.view import GraphChange, NodeView
+
+if TYPE_CHECKING:
+    from lifecycle.graph.dds import GRAPH_QOS, DdsTransport, steady_timer
+    from lifecycle.graph.facade import Graph
+
+__all__ = [
+    "FORGET_AFTER_S",
+    "GRAPH_QOS",
+    "HEARTBEAT_PERIOD_S",
+    "SILENT_AFTER_S",
+    "AliveNotice",
+    "ConfigurationChanged",
+    "ConnectionEstablished",
+    "ConnectionLost",
+    "DdsTransport",
+    "End",
+    "EndpointChange",
+    "EventKind",
+    "Every",
+    "Fetch",
+    "Graph",
+    "GraphChange",
+    "GraphEvent",
+    "GraphEvents",
+    "GraphKind",
+    "GraphMessage",
+    "GraphMessageError",
+    "GraphReporter",
+    "GraphState",
+    "GraphTransport",
+    "Heartbeat",
+    "InMemoryNetwork",
+    "InMemoryTransport",
+    "Joined",
+    "Left",
+    "Link",
+    "LoopScheduler",
+    "ManualScheduler",
+    "MappingEstablished",
+    "MappingLost",
+    "Member",
+    "NodeLiveliness",
+    "NodeView",
+    "Observer",
+    "Remove",
+    "Running",
+    "Scheduler",
+    "SilentNotice",
+    "StateChanged",
+    "StuckNotice",
+    "ThreadScheduler",
+    "decode",
+    "encode",
+    "every",
+    "new_incarnation",
+    "steady_timer",
+]
+
+_HOME = {
+    "GRAPH_QOS": "dds",
+    "DdsTransport": "dds",
+    "Graph": "facade",
+    "steady_timer": "dds",
+}
+
+
+def __getattr__(name: str) -> object:
+    """Import the module that defines `name` (PEP 562)."""
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)

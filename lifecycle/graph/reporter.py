@@ -1,0 +1,239 @@
+"""The sending side of one node: what it tells the graph about itself.
+
+Owns: a node's incarnation, its sequence numbers, and what its heartbeats repeat. Imports no ROS:
+the transport and the timer are given.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import typing
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+from lifecycle.errors import LifecycleError
+from lifecycle.graph.messages import (
+    AliveNotice,
+    ConfigurationChanged,
+    ConnectionEstablished,
+    ConnectionLost,
+    GraphMessage,
+    Heartbeat,
+    Joined,
+    Left,
+    MappingEstablished,
+    MappingLost,
+    SilentNotice,
+    StateChanged,
+    StuckNotice,
+    encode,
+    new_incarnation,
+)
+from lifecycle.graph.transport import GraphTransport, Remove
+
+_logger = logging.getLogger(__name__)
+
+HEARTBEAT_PERIOD_S = 2.0
+"""Heartbeats repair what was lost; whoever must notice a death sooner has other means."""
+
+
+class Every(Protocol):
+    """A timer: calls back periodically until what it returned is called."""
+
+    def __call__(self, period_s: float, callback: Callable[[], None], /) -> Remove:
+        """Call `callback` every `period_s` seconds, first after one period."""
+
+
+@typing.final
+class GraphReporter:
+    """Tells the graph what becomes of one node instance. Every method: any thread.
+
+    Before `joined` and after `left` nothing is sent, but states and checksums are kept. A message
+    that the transport does not take is logged, never raised: a node works without the graph.
+
+    Args:
+        transport: where to send; it is not closed by the reporter.
+        node: fully qualified name.
+        every: the heartbeats' timer.
+        period_s: of the heartbeats, > 0.
+        incarnation: of this node instance; by default a new one.
+    """
+
+    def __init__(
+        self,
+        transport: GraphTransport,
+        node: str,
+        *,
+        every: Every,
+        period_s: float = HEARTBEAT_PERIOD_S,
+        incarnation: str | None = None,
+    ) -> None:
+        self.node = node
+        self.incarnation = incarnation or new_incarnation()
+        self._transport = transport
+        self._every = every
+        self._period_s = period_s
+        self._lock = threading.RLock()
+        self._sequence = 0
+        self._state, self._connected, self._checksum = "", False, ""
+        self._notices: dict[str, type[GraphMessage]] = {}
+        self._stop: tuple[Remove, ...] = ()
+        self._left = False
+
+    @property
+    def sequence(self) -> int:
+        """Sequence number of the last message; 0 before the first."""
+        return self._sequence
+
+    @property
+    def is_member(self) -> bool:
+        """Whether `joined` was called and `left` was not."""
+        return bool(self._stop) and not self._left
+
+    def joined(self, state: str = "", *, connected: bool = False, checksum: str = "") -> None:
+        """Become part of the graph and begin the heartbeats; once, again only says it again.
+
+        Args:
+            state: lifecycle_msgs/State label; empty for a node that is not managed.
+            connected: the data layer is made.
+            checksum: of the node configuration; empty if the node serves none.
+        """
+        with self._lock:
+            self._state, self._connected, self._checksum = state, connected, checksum
+            if self._left:
+                return
+            if not self._stop:
+                self._stop = (
+                    self._transport.on_peer(self.announce),
+                    self._every(self._period_s, self.announce),
+                )
+            self._tell(Joined, state=state, connected=connected, checksum=checksum)
+
+    def left(self, reason: str = "") -> None:
+        """Say farewell and stop the heartbeats; again is harmless."""
+        with self._lock:
+            self._tell(Left, reason=reason)
+            self._left = True
+            for stop in self._stop:
+                stop()
+            self._stop = ()
+
+    def state_changed(self, state: str, *, connected: bool) -> None:
+        """Tell the lifecycle state and whether the data layer is made; nothing if both are told."""
+        with self._lock:
+            if (state, connected) == (self._state, self._connected):
+                return
+            self._state, self._connected = state, connected
+            self._tell(StateChanged, state=state, connected=connected)
+
+    def configuration_changed(self, checksum: str) -> None:
+        """Tell that the node configuration is to be read again; nothing if the checksum is told."""
+        with self._lock:
+            if checksum == self._checksum:
+                return
+            self._checksum = checksum
+            self._tell(ConfigurationChanged, checksum=checksum)
+
+    def connection_established(self, connection: str, urls: Sequence[str] = ()) -> None:
+        """Tell that a connection works; `connection` is empty for the node's own participant."""
+        self._tell(ConnectionEstablished, connection=connection, urls=tuple(urls))
+
+    def connection_lost(self, connection: str, urls: Sequence[str] = (), error: str = "") -> None:
+        """Tell that a connection was unmade (no error) or that it no longer works."""
+        self._tell(ConnectionLost, connection=connection, urls=tuple(urls), error=error)
+
+    def mapping_established(
+        self, endpoint: str, connection: str = "", *, matched: int | None = None
+    ) -> None:
+        """Tell that an endpoint (`publishers/video`) is on a connection, or matched a peer more."""
+        self._tell(MappingEstablished, endpoint=endpoint, connection=connection, matched=matched)
+
+    def mapping_lost(
+        self,
+        endpoint: str,
+        connection: str = "",
+        *,
+        matched: int | None = None,
+        error: str = "",
+    ) -> None:
+        """Tell that an endpoint was taken off a connection, or lost a matched peer.
+
+        Args:
+            endpoint: `publishers/video`.
+            connection: name of the connection.
+            matched: None if it was taken off; else how many peers it has left.
+            error: why; empty if that was asked for.
+        """
+        self._tell(
+            MappingLost, endpoint=endpoint, connection=connection, matched=matched, error=error
+        )
+
+    def silent(self, about: str, reason: str = "") -> None:
+        """Tell everybody that nothing is heard of another node (fully qualified) any more.
+
+        The heartbeats repeat it until `alive`.
+        """
+        self._notice(SilentNotice, about, reason)
+
+    def stuck(self, about: str, reason: str = "") -> None:
+        """Tell everybody that another node is there and does not do its work."""
+        self._notice(StuckNotice, about, reason)
+
+    def alive(self, about: str, reason: str = "") -> None:
+        """Take back what `silent` or `stuck` told of another node."""
+        self._notice(AliveNotice, about, reason)
+
+    def announce(self) -> None:
+        """Send a heartbeat now, besides those of the timer."""
+        with self._lock:
+            if self.is_member:
+                self._send(
+                    Heartbeat(
+                        node=self.node,
+                        incarnation=self.incarnation,
+                        sequence=self._sequence,
+                        state=self._state,
+                        connected=self._connected,
+                        checksum=self._checksum,
+                        silent=self._noticed(SilentNotice),
+                        stuck=self._noticed(StuckNotice),
+                    )
+                )
+
+    def _notice(
+        self,
+        type_: type[SilentNotice | StuckNotice | AliveNotice],
+        about: str,
+        reason: str,
+    ) -> None:
+        with self._lock:
+            if type_ is AliveNotice:
+                self._notices.pop(about, None)
+            else:
+                self._notices[about] = type_
+            self._tell(type_, about=about, reason=reason)
+
+    def _noticed(self, type_: type[GraphMessage]) -> tuple[str, ...]:
+        return tuple(about for about, kind in self._notices.items() if kind is type_)
+
+    def _tell(self, type_: type[GraphMessage], **fields: Any) -> None:
+        # Under the lock until it is sent: what leaves first has the lower number.
+        with self._lock:
+            if not self.is_member:
+                return
+            self._sequence += 1
+            self._send(
+                type_(
+                    node=self.node,
+                    incarnation=self.incarnation,
+                    sequence=self._sequence,
+                    **fields,
+                )
+            )
+
+    def _send(self, message: GraphMessage) -> None:
+        try:
+            self._transport.send(encode(message))
+        except LifecycleError as error:
+            _logger.warning("%s could not tell %s: %s", self.node, message.kind.value, error)
