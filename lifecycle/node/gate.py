@@ -1,0 +1,233 @@
+"""The gate: publishers, subscriptions and timers work only while their node is active.
+
+Owns: what "gated" means for each kind of entity. A gate swaps a method instead of asking a
+question: while the node is active `publisher.publish` *is* rclpy's own method, so an open gate
+costs nothing per call, and a closed one less than any publish. Entities that tools rely on
+(`/rosout`, `/parameter_events`, `~/transition_event`, `/clock`) never pass through here.
+"""
+
+from __future__ import annotations
+
+import collections
+import inspect
+from collections.abc import Callable, Coroutine
+from typing import TYPE_CHECKING, Any, Protocol
+
+if TYPE_CHECKING:
+    from rclpy.publisher import Publisher
+    from rclpy.subscription import Subscription
+    from rclpy.timer import Timer
+
+
+Later = Callable[[Callable[[], Coroutine[Any, Any, None] | None]], object]
+"""Runs a function, sync or async, in the node's executor, soon; false if nobody spins the node."""
+
+
+class Gated(Protocol):
+    """Something that opens when its node becomes active and closes when it no longer is."""
+
+    def open(self) -> None:
+        """Let data through."""
+
+    def close(self) -> None:
+        """Stop data."""
+
+
+class Gate:
+    """All gated entities of one node; closed until the node is active."""
+
+    def __init__(self) -> None:
+        self._entities: dict[int, Gated] = {}
+        self._workers: dict[int, Gated] = {}
+        self._is_open = False
+
+    @property
+    def is_open(self) -> bool:
+        """Data may flow."""
+        return self._is_open
+
+    def add(self, entity: object, gated: Gated) -> None:
+        """Put `gated` in charge of `entity`, in the gate's present position."""
+        self._entities[id(entity)] = gated
+        if self._is_open:
+            gated.open()
+        else:
+            gated.close()
+
+    def add_worker(self, entity: object, worker: Gated) -> None:
+        """Put `worker` in charge of `entity`; it is closed first, so that its last words pass."""
+        self._workers[id(entity)] = worker
+
+    def add_subscription(self, subscription: Subscription, later: Later) -> None:
+        """Gate a subscription, unless its creation already did."""
+        if id(subscription) not in self._entities:
+            self.add(subscription, GatedSubscription(subscription, later))
+
+    def hand_to(self, subscription: Subscription, callback: Callable[..., Any]) -> None:
+        """Let another callback have a gated subscription's messages from now on."""
+        gated = self._entities.get(id(subscription))
+        if isinstance(gated, GatedSubscription):
+            gated.hand_to(callback)
+
+    def callback_of(self, subscription: Subscription) -> Callable[..., Any] | None:
+        """Return who has a gated subscription's messages while the gate is open."""
+        gated = self._entities.get(id(subscription))
+        if not isinstance(gated, GatedSubscription):
+            return None
+        return gated.callback
+
+    def release(self, entity: object) -> None:
+        """Ungate an entity: something else stands in front of it."""
+        gated = self._entities.pop(id(entity), None)
+        if gated is not None:
+            gated.open()
+
+    def remove(self, entity: object) -> None:
+        """Forget an entity that is being destroyed."""
+        self._entities.pop(id(entity), None)
+        self._workers.pop(id(entity), None)
+
+    def open(self) -> None:
+        """Open every entity; the node became active."""
+        self._is_open = True
+        for gated in tuple(self._entities.values()):
+            gated.open()
+
+    def close(self) -> None:
+        """Close every entity; the node is no longer active."""
+        self._is_open = False
+        for gated in (*self._workers.values(), *self._entities.values()):
+            gated.close()
+
+
+class GatedPublisher:
+    """Drops what is published while closed; says so once per inactive period."""
+
+    def __init__(self, publisher: Publisher, warn: Callable[[str], None]) -> None:
+        self._publisher = publisher
+        self._warn = warn
+        self._warned = False
+
+    def open(self) -> None:
+        """Take the override away: `publish` is the class's own method again."""
+        vars(self._publisher).pop("publish", None)
+
+    def close(self) -> None:
+        """Override `publish` on this one publisher."""
+        self._warned = False
+        self._publisher.publish = self._drop
+
+    def _drop(self, msg: object) -> None:  # noqa: ARG002 - the signature of Publisher.publish
+        if not self._warned:
+            self._warned = True
+            self._warn(
+                f"cannot publish on {self._publisher.topic!r}: the node is not active, so the "
+                "message is dropped, and so are those that follow until it is active"
+            )
+
+
+class GatedSubscription:
+    """Takes and drops messages while closed, so that old ones do not wait for activation.
+
+    A TRANSIENT_LOCAL sample is state, not news: its publisher, activated before us, sends it once.
+    So the last `depth` of those are kept while closed and given to the callback when opened.
+    """
+
+    def __init__(self, subscription: Subscription, later: Later) -> None:
+        self._subscription = subscription
+        self._callback: Callable[..., Any] = subscription.callback
+        self._later = later
+        qos = subscription.qos_profile
+        self._keeps = qos.durability.name == "TRANSIENT_LOCAL"
+        self._kept: collections.deque[tuple[object, ...]] = collections.deque(
+            maxlen=qos.depth or None
+        )
+        # The same number of arguments as the user's: rclpy decides by signature, once per message,
+        # whether to pass the message info, and a swap in between must not change the answer.
+        self._takes = 1 if takes_one(self._callback) else 2
+        self._drop = self._take_message if self._takes == 1 else self._take_message_with_info
+
+    @property
+    def callback(self) -> Callable[..., Any]:
+        """Who has the messages while open."""
+        return self._callback
+
+    def open(self) -> None:
+        """Give messages to the user's callback, those first that were kept."""
+        self._subscription.callback = self._callback
+        if self._kept:
+            self._later(self._deliver)
+
+    def close(self) -> None:
+        """Give messages to nobody."""
+        self._subscription.callback = self._drop
+
+    def hand_to(self, callback: Callable[..., Any]) -> None:
+        """Let `callback` have the messages from now on, those first that were kept."""
+        was_open = self._subscription.callback == self._callback
+        takes = 1 if takes_one(callback) else 2
+        if takes > self._takes:
+            self._kept.clear()  # without the info that it wants
+        self._callback, self._takes = callback, takes
+        self._drop = self._take_message if takes == 1 else self._take_message_with_info
+        self._subscription.callback = callback if was_open else self._drop
+
+    def _take_message(self, message: object) -> None:
+        if self._keeps:
+            self._kept.append((message,))
+
+    def _take_message_with_info(self, message: object, info: object) -> None:
+        if self._keeps:
+            self._kept.append((message, info))
+
+    async def _deliver(self) -> None:
+        # Closed again before this ran: then what was kept stays kept.
+        while self._kept and self._subscription.callback == self._callback:
+            returned = self._callback(*self._kept.popleft()[: self._takes])
+            if inspect.isawaitable(returned):
+                await returned
+
+
+class GatedTimer:
+    """Runs while open unless the user cancelled it; calls to cancel and reset keep their meaning.
+
+    A timer starts its period anew when the node becomes active.
+    """
+
+    def __init__(self, timer: Timer, *, wanted: bool) -> None:
+        self._timer = timer
+        self._wanted = wanted
+        self._is_open = False
+        self._cancel = timer.cancel
+        self._reset = timer.reset
+        timer.cancel = self._user_cancel
+        timer.reset = self._user_reset
+
+    def open(self) -> None:
+        """Start the period now, if the timer is wanted."""
+        self._is_open = True
+        if self._wanted:
+            self._reset()
+
+    def close(self) -> None:
+        """Stop; the executor does not wake for it any more."""
+        self._is_open = False
+        self._cancel()
+
+    def _user_cancel(self) -> None:
+        self._wanted = False
+        self._cancel()
+
+    def _user_reset(self) -> None:
+        self._wanted = True
+        if self._is_open:
+            self._reset()
+
+
+def takes_one(callback: Callable[..., Any]) -> bool:
+    """Tell whether rclpy gives a subscription's callback the message alone."""
+    try:
+        inspect.signature(callback).bind(object())
+    except TypeError:
+        return False
+    return True

@@ -1,0 +1,316 @@
+"""Decorators that tie a method to a declared endpoint, and the matching of the two.
+
+Owns: `@on_message`, `@on_service`, `@on_action`, `@on_goal`, `@on_timer`, and the rule that every
+declared subscription, service server and action server has exactly one handler and every handler
+an endpoint. Pure: knows no rclpy.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+from collections.abc import Callable, Iterable
+from typing import Any, TypeVar
+
+from lifecycle.errors import LifecycleError
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.plan.model import PlannedEndpoint
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+_ATTRIBUTE = "__lifecycle_handlers__"
+_WORDS = {
+    EndpointKind.SUBSCRIPTION: ("subscription", "@on_message"),
+    EndpointKind.SERVICE_SERVER: ("service server", "@on_service"),
+    EndpointKind.ACTION_SERVER: ("action server", "@on_action"),
+}
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class _Mark:
+    """What a decorator leaves on a function."""
+
+    kind: EndpointKind | None  # None for a timer
+    name: str = ""
+    period_s: float = 0.0
+    decides: bool = False  # on an action's goals, instead of executing them
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class TimerHandler:
+    """A method to be called every `period_s` seconds while the node is active."""
+
+    method: str
+    period_s: float
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class ActionHandler:
+    """What an action server gives its goals to.
+
+    Attributes:
+        execute: works on a goal that was accepted; takes rclpy's ServerGoalHandle.
+        accept: decides on a goal, given the goal; None takes all.
+    """
+
+    execute: Callable[..., Any]
+    accept: Callable[..., Any] | None = None
+
+    def __call__(self, goal_handle: Any) -> Any:
+        """Execute a goal."""
+        return self.execute(goal_handle)
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Handlers:
+    """The handlers of one node: (kind, declared name) → method name, and its timers.
+
+    Attributes:
+        deciders: action → method that decides on its goals, where there is one.
+    """
+
+    methods: tuple[tuple[EndpointKind, str, str], ...]
+    timers: tuple[TimerHandler, ...]
+    deciders: tuple[tuple[str, str], ...] = ()
+
+    def method(self, endpoint: PlannedEndpoint) -> str:
+        """Return the name of the method that handles `endpoint`, which must be a matched one."""
+        for kind, name, method in self.methods:
+            if kind is endpoint.kind and name == endpoint.name:
+                return method
+        raise KeyError(endpoint.name)
+
+    def bound(self, node: object, endpoint: PlannedEndpoint) -> Callable[..., Any]:
+        """Return what handles `endpoint`, a matched one, as methods of `node`."""
+        method: Callable[..., Any] = getattr(node, self.method(endpoint))
+        if endpoint.kind is not EndpointKind.ACTION_SERVER:
+            return method
+        decider = dict(self.deciders).get(endpoint.name)
+        return ActionHandler(execute=method, accept=getattr(node, decider) if decider else None)
+
+
+def on_message(subscription: str) -> Callable[[F], F]:
+    """Let a method receive a declared subscription's messages, only while the node is active.
+
+    Args:
+        subscription: the name as the manifest declares it, before remapping.
+
+    Example:
+        >>> class Viewer(LifecycleNode):
+        ...     @on_message("/robot/video")
+        ...     def show(self, image):
+        ...         self.get_logger().info(f"{len(image.data)} bytes")
+
+    The method may be `async def`, and may take rclpy's message info as a second argument.
+    """
+    return _marker(_Mark(kind=EndpointKind.SUBSCRIPTION, name=subscription))
+
+
+def on_service(service: str) -> Callable[[F], F]:
+    """Let a method answer a declared service server, from connect until disconnect.
+
+    ROS has no way to refuse a request politely, so a service answers in inactive/connected too;
+    a handler that must not is free to look at `self.is_active`.
+
+    Example:
+        >>> class Base(LifecycleNode):
+        ...     @on_service("reset")
+        ...     def reset(self, request, response):
+        ...         response.success = True
+        ...         return response
+
+    The method may be `async def`, and may return None when it has filled in `response`.
+    """
+    return _marker(_Mark(kind=EndpointKind.SERVICE_SERVER, name=service))
+
+
+def on_action(action: str) -> Callable[[F], F]:
+    """Let a method execute the goals of a declared action server.
+
+    Goals are rejected unless the node is active, and by `@on_goal` if there is one. Requests to
+    cancel are accepted; the method sees them as `goal_handle.is_cancel_requested`. It says what
+    became of the goal by `succeed()`, `abort()` or `canceled()`, and returns the result, or None
+    for an empty one. A goal that it leaves undecided is aborted, and so is one whose method raises;
+    the traceback is logged.
+
+    Example:
+        >>> class Base(LifecycleNode):
+        ...     @on_action("dock")
+        ...     async def dock(self, goal_handle):
+        ...         while (distance := self.distance()) > 0.01:
+        ...             if goal_handle.is_cancel_requested:
+        ...                 goal_handle.canceled()
+        ...                 return None
+        ...             goal_handle.publish_feedback(Dock.Feedback(distance=distance))
+        ...             await self.sleep(0.1)
+        ...         goal_handle.succeed()
+        ...         return Dock.Result()
+
+    Write it as `async def` unless it returns at once: a sync one keeps its node, and all nodes of
+    its process, from everything else, so that no request to cancel gets through either. Several
+    goals are executed at a time.
+
+    When the node leaves the active state, or the action is taken off its connection, what is being
+    executed ends: `GoalInterruptedError` is raised in an `async def` method where it awaits, its
+    goal is aborted unless the method says otherwise on its way out, and clients have their answer
+    before on_deactivate or on_shutdown runs. Publishers still publish meanwhile:
+
+        ...         except GoalInterruptedError:
+        ...             self.publisher("cmd_vel").publish(Twist())
+        ...             raise
+    """
+    return _marker(_Mark(kind=EndpointKind.ACTION_SERVER, name=action))
+
+
+def on_goal(action: str) -> Callable[[F], F]:
+    """Let a method decide on the goals of a declared action server; without one all are accepted.
+
+    It is given the goal and returns whether to accept it; only while the node is active. It may be
+    `async def`.
+
+    Example:
+        >>> class Base(LifecycleNode):
+        ...     @on_goal("dock")
+        ...     def may_dock(self, goal):
+        ...         return goal.station in self.stations
+    """
+    return _marker(_Mark(kind=EndpointKind.ACTION_SERVER, name=action, decides=True))
+
+
+def on_timer(*, period_s: float) -> Callable[[F], F]:
+    """Call a method every `period_s` seconds (> 0) while the node is active.
+
+    Example:
+        >>> class Talker(LifecycleNode):
+        ...     @on_timer(period_s=0.1)
+        ...     def tick(self):
+        ...         self.publisher("chatter").publish(String(data="hello"))
+
+    Raises:
+        LifecycleError: `period_s` is not positive.
+    """
+    if not period_s > 0:
+        raise LifecycleError(f"cannot call a method every {period_s!r} s; period_s must be > 0")
+    return _marker(_Mark(kind=None, period_s=period_s))
+
+
+def _marker(mark: _Mark) -> Callable[[F], F]:
+    def decorate(function: F) -> F:
+        setattr(function, _ATTRIBUTE, (*getattr(function, _ATTRIBUTE, ()), mark))
+        return function
+
+    return decorate
+
+
+def _marks(node_class: type) -> list[tuple[str, _Mark]]:
+    """Return (method name, mark) of a class; an override inherits what it overrides."""
+    found: dict[str, tuple[_Mark, ...]] = {}
+    for base in node_class.__mro__:
+        for name, value in vars(base).items():
+            marks = getattr(value, _ATTRIBUTE, None) if callable(value) else None
+            if marks and name not in found:
+                found[name] = marks
+    return [(name, mark) for name, marks in found.items() for mark in marks]
+
+
+def needs_handler(kind: EndpointKind) -> bool:
+    """Whether endpoints of a kind give something to a method."""
+    return kind in _WORDS
+
+
+def match(node_class: type, endpoints: Iterable[PlannedEndpoint], *, node: str) -> Handlers:
+    """Pair the decorated methods of `node_class` with the endpoints that need a handler.
+
+    Args:
+        node_class: a class with decorated methods, its own or inherited.
+        endpoints: every declared endpoint; only the kinds that need a handler are looked at.
+        node: fully qualified node name, for messages.
+
+    Raises:
+        LifecycleError: with every endpoint without a handler, every handler without an endpoint
+            and every endpoint with two, each with the nearest spelling.
+    """
+    wanted = {(e.kind, e.name): e for e in endpoints if e.kind in _WORDS}
+    methods: dict[tuple[EndpointKind, str], str] = {}
+    deciders: dict[tuple[EndpointKind, str], str] = {}
+    timers: list[TimerHandler] = []
+    problems: list[str] = []
+    for method, mark in _marks(node_class):
+        if mark.kind is None:
+            timers.append(TimerHandler(method=method, period_s=mark.period_s))
+            continue
+        key = (mark.kind, mark.name)
+        if key not in wanted:
+            problems.append(_without_endpoint(node_class, node, method, mark, list(wanted)))
+            continue
+        taken = deciders if mark.decides else methods
+        if key in taken:
+            noun = _WORDS[mark.kind][0]
+            what = f"decide on goals of {noun}" if mark.decides else f"handle {noun}"
+            problems.append(
+                f"cannot {what} {mark.name!r} of {node} twice: "
+                f"{node_class.__name__}.{taken[key]} and {node_class.__name__}.{method}"
+            )
+        else:
+            taken[key] = method
+    unused = [
+        (mark.kind, mark.name)
+        for _, mark in _marks(node_class)
+        if mark.kind and not mark.decides and (mark.kind, mark.name) not in wanted
+    ]
+    for (kind, name), endpoint in wanted.items():
+        if (kind, name) not in methods:
+            problems.append(_without_handler(node_class, node, endpoint, unused))
+    if problems:
+        raise LifecycleError("\n".join(problems))
+    return Handlers(
+        methods=tuple((kind, name, method) for (kind, name), method in methods.items()),
+        timers=tuple(timers),
+        deciders=tuple((name, method) for (_, name), method in deciders.items()),
+    )
+
+
+def _without_endpoint(
+    node_class: type,
+    node: str,
+    method: str,
+    mark: _Mark,
+    wanted: list[tuple[EndpointKind, str]],
+) -> str:
+    assert mark.kind is not None
+    noun, decorator = _WORDS[mark.kind]
+    decorator = "@on_goal" if mark.decides else decorator
+    declared = [name for kind, name in wanted if kind is mark.kind]
+    return (
+        f"cannot use handler {node_class.__name__}.{method}: {decorator}({mark.name!r}) names no "
+        f"{noun} that {node} declares; {alternatives(mark.name, declared)}"
+    )
+
+
+def _without_handler(
+    node_class: type,
+    node: str,
+    endpoint: PlannedEndpoint,
+    unused: list[tuple[EndpointKind, str]],
+) -> str:
+    noun, decorator = _WORDS[endpoint.kind]
+    near = nearest(endpoint.name, [name for kind, name in unused if kind is endpoint.kind])
+    hint = f"; did you mean it where {decorator}({near!r}) stands?" if near else ""
+    return (
+        f"cannot serve {noun} {endpoint.name!r} of {node}: no method of {node_class.__name__} is "
+        f"decorated with {decorator}({endpoint.name!r}){hint}"
+    )
+
+
+def nearest(name: str, candidates: Iterable[str]) -> str:
+    """Return the candidate spelt most like `name`, or "" if none is near."""
+    found = difflib.get_close_matches(name, list(candidates), n=1, cutoff=0.6)
+    return found[0] if found else ""
+
+
+def alternatives(name: str, declared: Iterable[str]) -> str:
+    """Return "did you mean 'x'? declared: …", the end of a message about an unknown `name`."""
+    names = list(declared)
+    near = nearest(name, names)
+    listed = ", ".join(repr(each) for each in names) or "none"
+    return (f"did you mean {near!r}? " if near else "") + f"declared: {listed}"

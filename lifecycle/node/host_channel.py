@@ -1,0 +1,66 @@
+"""A host's end of the control channel (control.py).
+
+Owns: reading and writing its lines, and the descriptors that come beside the first byte.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+import sys
+import threading
+import traceback
+from typing import NoReturn
+
+from lifecycle import codec
+from lifecycle.errors import LifecycleError
+from lifecycle.node.control import SIGN_DESCRIPTORS, Event
+
+
+class HostChannel:
+    """JSON lines both ways; written from two threads, read from one.
+
+    Attributes:
+        descriptors: of the busy sign, beside the first byte; none if nobody watches.
+    """
+
+    def __init__(self, control: socket.socket) -> None:
+        control.setblocking(True)
+        self._control = control
+        try:
+            self._first, found, _, _ = socket.recv_fds(control, 1, SIGN_DESCRIPTORS)
+        except ConnectionError:  # as at end of file
+            self._first, found = b"", []
+        self.descriptors = tuple(found)
+        for descriptor in found:
+            os.set_inheritable(descriptor, False)
+        self._reader = control.makefile("rb")
+        self._lock = threading.Lock()
+
+    def read(self) -> bytes | None:
+        """Return the next line, or None at end of file."""
+        try:
+            first, self._first = self._first, b""
+            return first + self._reader.readline() or None
+        except OSError:  # a supervisor that was killed resets the connection
+            return None
+
+    def write(self, event: Event) -> None:
+        """Send one event; a supervisor that has gone is noticed by the reader, not here."""
+        with self._lock:
+            try:
+                self._control.sendall(codec.to_json(event) + b"\n")
+            except OSError as error:
+                logging.getLogger(__name__).debug("cannot tell the supervisor: %s", error)
+
+
+def give_up(channel: HostChannel, node: str, error: Exception) -> NoReturn:
+    """Tell the supervisor why there is nothing to host, leave the trace in the log, and go."""
+    traceback.print_exception(type(error), error, error.__traceback__)
+    sys.stderr.flush()
+    reason = str(error) if isinstance(error, LifecycleError) else f"{type(error).__name__}: {error}"
+    channel.write(Event(kind="failed", node=node, ok=False, error=reason))
+    from lifecycle.middleware.teardown import leave_and_exit
+
+    leave_and_exit(1)

@@ -1,0 +1,138 @@
+"""What a node is told about itself before it is built: its PlannedNode, and where it lives.
+
+Owns: the construction context through which a host hands a class its part of the plan, so that
+`Camera()` works under the supervisor, alone with a manifest, and alone without one; and the plan
+of a node that has no manifest, filled by its own `declare_…` calls. Imports no rclpy.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import contextvars
+import dataclasses
+import enum
+import inspect
+import re
+import sys
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from lifecycle.errors import LifecycleError
+from lifecycle.manifest.diagnostics import Position
+from lifecycle.manifest.model import EndpointPolicy, Run, RunKind, Timeouts
+from lifecycle.plan.model import PlannedNode
+
+if TYPE_CHECKING:
+    from rclpy.context import Context
+
+
+class Mode(enum.Enum):
+    """Who drives a node's transitions."""
+
+    MANUAL = "manual"  # somebody else: a supervisor, `ros2 lifecycle`, launch_ros, nav2
+    AUTO = "auto"  # it configures, connects and activates itself
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Construction:
+    """What a host says to the node that it is about to construct.
+
+    Attributes:
+        spec: the node's part of the plan; None for a node without a manifest.
+        mode: who drives it; None leaves that to the node's own code. A host that says something
+            also does it: the node does not bring itself up.
+        context: the rclpy context to live in; None for the default one.
+        use_global_arguments: take remaps from the process's own --ros-args.
+    """
+
+    spec: PlannedNode | None
+    mode: Mode | None = None
+    context: Context | None = None
+    use_global_arguments: bool = False
+
+
+_CURRENT: contextvars.ContextVar[Construction | None] = contextvars.ContextVar(
+    "lifecycle_construction", default=None
+)
+
+
+@contextlib.contextmanager
+def constructing(construction: Construction) -> Iterator[None]:
+    """Make the next LifecycleNode that is constructed inside the block this one."""
+    token = _CURRENT.set(construction)
+    try:
+        yield
+    finally:
+        _CURRENT.reset(token)
+
+
+def take_construction() -> Construction | None:
+    """Return the pending construction once; a second node made by the first gets None."""
+    construction = _CURRENT.get()
+    if construction is not None:
+        _CURRENT.set(None)
+    return construction
+
+
+def parse_mode(word: str) -> Mode:
+    """Return the Mode that `lifecycle=` spells.
+
+    Raises:
+        LifecycleError: neither "manual" nor "auto".
+    """
+    try:
+        return Mode(word)
+    except ValueError as error:
+        raise LifecycleError(f"cannot use lifecycle={word!r}; allowed: 'manual', 'auto'") from error
+
+
+def default_name(node_class: type) -> str:
+    """Return a node name for a class: `FrontCamera` → `front_camera`."""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", node_class.__name__).lower()
+
+
+def calling_position(*, depth: int) -> Position:
+    """Return the file and line `depth` calls above this function's caller."""
+    frame = inspect.currentframe()
+    for _ in range(depth + 1):
+        frame = frame.f_back if frame is not None else None
+    if frame is None:
+        return Position(file="<code>", line=1, column=1)
+    return Position(file=frame.f_code.co_filename, line=frame.f_lineno, column=1)
+
+
+def plan_without_manifest(node_class: type, *, name: str, namespace: str) -> PlannedNode:
+    """Return the plan of a node that nobody planned: no endpoints yet, default deadlines."""
+    module = sys.modules.get(node_class.__module__)
+    at = Position(file=getattr(module, "__file__", None) or "<code>", line=1, column=1)
+    return PlannedNode(
+        key=name,
+        name=name,
+        namespace=namespace,
+        machine="",
+        process=name,
+        managed=True,
+        run=Run(kind=RunKind.ATTACH),
+        endpoints=(),
+        declared_parameters=(),
+        parameters=(),
+        parameter_files=(),
+        remap=(),
+        participants=(),
+        after=(),
+        timeouts=Timeouts(),
+        endpoint_policy=EndpointPolicy.OPEN,
+        log_level="",
+        events=True,
+        at=at,
+    )
+
+
+def ros_arguments(spec: PlannedNode) -> list[str]:
+    """Return the `--ros-args …` of one node: remaps and parameter files, as rcl applies them."""
+    words: list[str] = []
+    for source, target in spec.remap:
+        words += ["-r", f"{source}:={target}"]
+    for file in spec.parameter_files:
+        words += ["--params-file", file]
+    return ["--ros-args", *words] if words else []
