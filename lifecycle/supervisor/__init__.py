@@ -1,0 +1,73 @@
+"""Brings a system up behind the gate, watches it, and takes it down: processes, order, rollback.
+
+Owns: everything between a plan and a running system. Public: `up` and what it takes and tells,
+`status` and `down` of a running one, `judge_running` for a system that somebody else runs. Names
+load on first use: the zygote, which is of this room, must start without the rest of it.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from lifecycle.supervisor.attach import follow_running, judge_running
+    from lifecycle.supervisor.events import Emitter, Event, Listener, to_record
+    from lifecycle.supervisor.options import Until, UpOptions, UpResult
+    from lifecycle.supervisor.remote import down, find_run, running, status
+    from lifecycle.supervisor.run import Forerunner, up
+    from lifecycle.supervisor.rundir import AlreadyRunningError, run_name, runtime_root
+    from lifecycle.supervisor.status import NodeStatus, SystemStatus
+
+__all__ = [
+    "AlreadyRunningError",
+    "Emitter",
+    "Event",
+    "Forerunner",
+    "Listener",
+    "NodeStatus",
+    "SystemStatus",
+    "Until",
+    "UpOptions",
+    "UpResult",
+    "down",
+    "find_run",
+    "follow_running",
+    "judge_running",
+    "run_name",
+    "running",
+    "runtime_root",
+    "status",
+    "to_record",
+    "up",
+]
+
+_HOME = {
+    "AlreadyRunningError": "rundir",
+    "Emitter": "events",
+    "Event": "events",
+    "Forerunner": "run",
+    "Listener": "events",
+    "NodeStatus": "status",
+    "SystemStatus": "status",
+    "Until": "options",
+    "UpOptions": "options",
+    "UpResult": "options",
+    "down": "remote",
+    "find_run": "remote",
+    "follow_running": "attach",
+    "judge_running": "attach",
+    "run_name": "rundir",
+    "running": "remote",
+    "runtime_root": "rundir",
+    "status": "remote",
+    "to_record": "events",
+    "up": "run",
+}
+
+
+def __getattr__(name: str) -> object:
+    """Import the module that defines `name` (PEP 562)."""
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)

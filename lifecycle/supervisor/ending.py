@@ -1,0 +1,115 @@
+"""Signals that end a run, from before there is a session until after the last of it is swept.
+
+Owns: `Ending`, which no SIGINT, SIGTERM or SIGHUP escapes. By default SIGTERM would kill a
+supervisor whose participant already has files in /dev/shm, and a KeyboardInterrupt that is raised
+in a destructor or while a module is imported is printed and forgotten. Imports next to nothing:
+it stands before the imports of everything else.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+from collections.abc import Callable, Iterator
+from types import FrameType
+
+from lifecycle.errors import ExitCode
+
+ENDED_BY: dict[int, tuple[str, ExitCode]] = {
+    signal.SIGINT: ("interrupted", ExitCode.INTERRUPTED),
+    signal.SIGTERM: ("terminated", ExitCode.OK),
+    signal.SIGHUP: ("the terminal was closed", ExitCode.OK),
+}
+"""What each signal is called as the reason of an end, and the exit code of a clean one."""
+
+
+class Ended(KeyboardInterrupt):
+    """Somebody asked the run to end before it had a session; raised where it then was.
+
+    Attributes:
+        number: the signal.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__(signal.Signals(number).name)
+        self.number = number
+
+    @property
+    def exit_code(self) -> ExitCode:
+        """Of a run that ended so."""
+        return ENDED_BY[self.number][1]
+
+
+class Ending:
+    """Use it in a `with`, in the main thread; what it found is there again afterwards.
+
+    Attributes:
+        number: the first signal that came, and None before.
+    """
+
+    def __init__(self) -> None:
+        self.number: int | None = None
+        self._raises = True
+        self._found: dict[int, Callable[[int, FrameType | None], object] | int | None] = {}
+
+    def __enter__(self) -> Ending:  # noqa: PYI034 - typing.Self is not in Python 3.10
+        for number in ENDED_BY:
+            found = signal.getsignal(number)
+            if number == signal.SIGHUP and found is signal.SIG_IGN:
+                continue  # nohup(1): the run is to outlive its terminal
+            self._found[number] = found
+            signal.signal(number, self._take)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, found in self._found.items():
+            signal.signal(number, found)
+
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        """The signals that end a run: those that nobody had ignored."""
+        return tuple(self._found)
+
+    def check(self) -> None:
+        """Raise for a signal whose exception was lost on its way.
+
+        Raises:
+            Ended: one has come.
+        """
+        if self.number is not None:
+            raise Ended(self.number)
+
+    @contextlib.contextmanager
+    def noted(self) -> Iterator[None]:
+        """Within, a signal is only noted: what is being made or taken down must come to its end."""
+        raises, self._raises = self._raises, False
+        try:
+            yield
+        finally:
+            self._raises = raises
+
+    @contextlib.contextmanager
+    def raised(self) -> Iterator[None]:
+        """Within, a signal is raised again, also one that was noted: what waits must not go on.
+
+        Raises:
+            Ended: a signal has come, or comes.
+        """
+        raises, self._raises = self._raises, True
+        try:
+            self.check()
+            yield
+        finally:
+            self._raises = raises
+
+    def resume(self) -> None:
+        """Take the signals back from a loop, which leaves them with their default actions."""
+        for number in self._found:
+            signal.signal(number, self._take)
+
+    def _take(self, number: int, frame: FrameType | None) -> None:
+        del frame
+        if self.number is None:
+            self.number = number
+        if self._raises:
+            raise Ended(number)

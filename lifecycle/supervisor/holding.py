@@ -1,0 +1,144 @@
+"""Holding a system that is up: watched, and ordered about from outside.
+
+Owns: `Holding`: for how long, what ends it, and how orders (pause, resume, restart) come in and are
+answered. What an order does is regulate.py's.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from lifecycle.errors import UsageError
+from lifecycle.supervisor.events import Emitter, Notice
+from lifecycle.supervisor.failure import StepFailedError
+from lifecycle.supervisor.gate import VerificationError
+from lifecycle.supervisor.judge import Changes, Judge
+from lifecycle.supervisor.orders import HELD, PAUSED, Done, Mailbox, Order, Pending, check_order
+from lifecycle.supervisor.regulate import Regulator
+from lifecycle.supervisor.system import System
+from lifecycle.supervisor.together import ended
+from lifecycle.supervisor.vigil import Vigil
+from lifecycle.supervisor.watch import Watch
+from lifecycle.verify.verdict import Stage
+
+
+class Holding:
+    """The hold phase of one run.
+
+    Args:
+        system: what is held.
+        judge: judges it at every change.
+        changes: what it waits for.
+        regulator: carries out orders, and knows the phase.
+        vigil: over the processes.
+        emit: where events go.
+        note_segments: called when processes may be new.
+        keep_going: a process that ends is told of, and does not end the run.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        *,
+        judge: Judge,
+        changes: Changes,
+        regulator: Regulator,
+        vigil: Vigil,
+        emit: Emitter,
+        note_segments: Callable[[], Awaitable[None]],
+        keep_going: bool,
+    ) -> None:
+        self._system = system
+        self._judge = judge
+        self._changes = changes
+        self._regulator = regulator
+        self._vigil = vigil
+        self._emit = emit
+        self._note_segments = note_segments
+        self._keep_going = keep_going
+        self._mailbox = Mailbox()
+
+    async def hold(self, stage: Stage, hold_s: float | None) -> bool:
+        """Keep the system as it is, or as it is ordered; return whether it was violated.
+
+        Args:
+            stage: what it has come to; a violation counts only of an active system, and only if it
+                stood for longer than a passing moment.
+            hold_s: seconds, ≥ 0; None for ever.
+
+        Raises:
+            StepFailedError: a process ended, or an order failed.
+            VerificationError: an order could not be carried out behind the gate.
+        """
+        await self._note_segments()
+        deadline = None if hold_s is None else asyncio.get_running_loop().time() + hold_s
+        violated = False
+        while True:
+            watch = Watch(self._judge, self._changes, stage)
+            watching = asyncio.ensure_future(watch.run())
+            try:
+                pending = await self._until_ordered(deadline, watching)
+            finally:
+                await ended(watching)
+            violated = violated or (watch.violated and stage is Stage.ACTIVE)
+            if pending is None:
+                return violated
+            await self._carry_out(pending)
+            stage = self._regulator.stage
+
+    async def ordered(self, order: Order) -> Done:
+        """Take an order from outside, if it fits what the system is doing; return its outcome."""
+        try:
+            check_order(order, self._system, self._regulator.phase)
+        except UsageError as error:
+            return Done(exit_code=error.exit_code, error=str(error))
+        return await self._mailbox.place(order)
+
+    def close(self, reason: str) -> None:
+        """Answer every order that is still open, and those to come, with `reason`."""
+        self._mailbox.close(reason)
+
+    async def _carry_out(self, pending: Pending) -> None:
+        """Carry an order out and tell who gave it; what ends the run is raised."""
+        try:
+            # Another order may have come first.
+            check_order(pending.order, self._system, self._regulator.phase)
+            await self._regulator.carry_out(pending.order)
+            await self._note_segments()
+        except (UsageError, VerificationError, StepFailedError) as error:
+            pending.finish(Done(exit_code=error.exit_code, error=str(error)))
+            held = self._regulator.phase in (PAUSED, HELD)
+            if not isinstance(error, UsageError) and not (
+                held and isinstance(error, VerificationError)
+            ):
+                raise
+            if isinstance(error, VerificationError):
+                self._emit(Notice(message=str(error)))
+        else:
+            pending.finish(Done())
+
+    async def _until_ordered(
+        self, deadline: float | None, watching: asyncio.Task[None]
+    ) -> Pending | None:
+        """Wait for an order; None once the time is over."""
+        loop = asyncio.get_running_loop()
+        while True:
+            death = asyncio.ensure_future(self._vigil.next_death())
+            order = asyncio.ensure_future(self._mailbox.next())
+            try:
+                left = None if deadline is None else max(0.0, deadline - loop.time())
+                waits: set[asyncio.Future[Any]] = {death, watching, order}
+                await asyncio.wait(waits, timeout=left, return_when=asyncio.FIRST_COMPLETED)
+                if watching.done():
+                    watching.result()
+                if not death.done():
+                    return order.result() if order.done() else None
+                failure = death.result()
+                if not self._keep_going:
+                    raise failure
+                self._emit(failure.event())
+                self._system.touched.set()
+            finally:
+                await ended(death, order)

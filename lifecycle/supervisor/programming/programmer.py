@@ -1,0 +1,242 @@
+"""Keeps networks in step with the verified flows of one system.
+
+Owns: `Programmer`: from flow reports to rules to targets, again whenever the reports change, and
+everything removed in the end. Blocking: the supervisor calls it from a thread.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+from lifecycle.errors import LifecycleError
+from lifecycle.export.rules import FlowRule, LeftOut, RuleSet, SourceAddress, flow_rules
+from lifecycle.network.five_qi_dscp import DscpMapping
+from lifecycle.plan.model import Plan
+from lifecycle.supervisor.programming.changes import Changes, Target
+from lifecycle.supervisor.programming.errors import PartlyError
+from lifecycle.supervisor.programming.ledger import Ledger
+from lifecycle.supervisor.programming.sources import RouteSources
+from lifecycle.supervisor.programming.targets import TargetOptions, Targets
+from lifecycle.supervisor.rundir import run_name, runtime_root
+from lifecycle.verify.verdict import FlowReport, Outcome
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Treatment:
+    """What flows get beyond what the manifest says.
+
+    Attributes:
+        mapping: gives the DSCP of flows that have a 5QI and no DSCP; None gives none.
+        label_flows: each IPv6 flow gets a flow label of its own.
+    """
+
+    mapping: DscpMapping | None = None
+    label_flows: bool = False
+
+
+class Programmer:
+    """Programs targets with the verified flows of one system.
+
+    Args:
+        plan: of the system.
+        targets: to keep in step.
+        ledger: of the system, which the targets write to.
+        source_address: observes where publishers send from; None believes the manifest only.
+        treatment: what flows get beyond what the manifest says.
+        made_by: what to close in the end.
+    """
+
+    def __init__(
+        self,
+        plan: Plan,
+        targets: Sequence[Target],
+        ledger: Ledger,
+        *,
+        source_address: SourceAddress | None = None,
+        treatment: Treatment | None = None,
+        made_by: Targets | None = None,
+    ) -> None:
+        self._plan = plan
+        self._targets = tuple(targets)
+        self._ledger = ledger
+        self._source_address = source_address
+        self._treatment = treatment or Treatment()
+        self._made_by = made_by
+        self._applied: tuple[FlowRule, ...] | None = None
+        self.left_out: tuple[LeftOut, ...] = ()
+
+    def rules(self, flows: Iterable[FlowReport]) -> RuleSet:
+        """Return what may be programmed of these flows, and what may not."""
+        return flow_rules(
+            flows,
+            self._plan,
+            source_address=self._source_address,
+            mapping=self._treatment.mapping,
+            label_flows=self._treatment.label_flows,
+        )
+
+    def diff(self, flows: Iterable[FlowReport]) -> tuple[Changes, ...]:
+        """Return what `update` would do; changes no network."""
+        rules = self._take(flows)
+        with self._ledger.locked():
+            return tuple(each.plan(rules) for each in self._targets)
+
+    def dry_run(self, flows: Iterable[FlowReport]) -> str:
+        """Return what `update` would send if nothing were there, checked where that is possible."""
+        rules = self._take(flows)
+        return "\n".join(each.dry_run(rules) for each in self._targets)
+
+    def update(self, flows: Iterable[FlowReport], *, hold: bool = False) -> tuple[Changes, ...]:
+        """Bring every target up to date with these flows.
+
+        Args:
+            flows: as last verified.
+            hold: a flow that was programmed and is not verified at this moment keeps its rule
+                until it is verified again or is no longer declared: while a node restarts, its old
+                rule harms nobody, and a session of a mobile network is costly to make again.
+
+        Returns:
+            What was done, per target; nothing if the rules are the same as last time.
+
+        Raises:
+            PartlyError: one target or several could not be brought up to date; others are.
+        """
+        reports = tuple(flows)
+        rules = self._take(reports)
+        if hold and self._applied is not None:
+            rules = _with_held(rules, self._applied, reports)
+        if rules == self._applied:
+            return ()
+        # Forgotten first: if a target fails, the next call must not take it for done.
+        self._applied = None
+        with self._ledger.locked():
+            done = _each(self._targets, lambda target: target.apply(rules))
+        self._applied = rules
+        return done
+
+    def renew(self) -> float | None:
+        """Prolong what would expire; return seconds until the next time, None if never."""
+        with self._ledger.locked():
+            due = [each.renew() for each in self._targets]
+        return min((each for each in due if each is not None), default=None)
+
+    def close(self) -> tuple[Changes, ...]:
+        """Remove everything that the ledger lists, by whichever target it was made."""
+        try:
+            return remove_all(self._ledger, self._made_by)
+        finally:
+            self.release()
+
+    def release(self) -> None:
+        """Close connections and leave in the networks what was made."""
+        self._applied = None
+        if self._made_by is not None:
+            self._made_by.close()
+
+    def _take(self, flows: Iterable[FlowReport]) -> tuple[FlowRule, ...]:
+        found = self.rules(flows)
+        self.left_out = found.left_out
+        return found.rules
+
+
+def ledger_of(
+    plan: Plan, environment: Mapping[str, str], *, machine: str = "", owned: bool = False
+) -> Ledger:
+    """Return the ledger of a system on this host; it need not exist yet."""
+    directory: Path = runtime_root(environment) / run_name(plan, machine)
+    return Ledger(directory, plan.system, owned=owned)
+
+
+def open_programmer(
+    plan: Plan,
+    options: Sequence[TargetOptions],
+    *,
+    environment: Mapping[str, str],
+    machine: str = "",
+    owned: bool = False,
+    treatment: Treatment | None = None,
+) -> Programmer:
+    """Return a programmer for this host.
+
+    Args:
+        plan: of the system.
+        options: one per target.
+        environment: says where run directories are.
+        machine: the machine that this host is; empty to tell by its addresses.
+        owned: the caller is the supervisor whose end is to end what is made.
+        treatment: see Treatment.
+
+    Raises:
+        UsageError: options or settings cannot be used.
+    """
+    ledger = ledger_of(plan, environment, machine=machine, owned=owned)
+    targets = Targets(ledger)
+    try:
+        made = [targets.make(each) for each in options]
+    except LifecycleError:
+        targets.close()
+        raise
+    return Programmer(
+        plan,
+        made,
+        ledger,
+        source_address=RouteSources(plan, machine),
+        treatment=treatment,
+        made_by=targets,
+    )
+
+
+def remove_all(ledger: Ledger, targets: Targets | None = None) -> tuple[Changes, ...]:
+    """Remove everything that a ledger lists.
+
+    Raises:
+        PartlyError: something could not be removed; it stays listed.
+    """
+    own = targets or Targets(ledger)
+    try:
+        with ledger.locked():
+            records = ledger.read().targets
+            return _each(records, lambda record: own.restore(record).remove())
+    finally:
+        if targets is None:
+            own.close()
+
+
+def _with_held(
+    rules: tuple[FlowRule, ...], applied: tuple[FlowRule, ...], reports: Sequence[FlowReport]
+) -> tuple[FlowRule, ...]:
+    unsure = {
+        (each.topic, each.publisher, each.subscription)
+        for each in reports
+        if each.outcome is not Outcome.OK or not each.source or not each.destination
+    }
+    keys = {each.key for each in rules}
+    held = tuple(
+        each
+        for each in applied
+        if each.key not in keys and all(map(unsure.__contains__, each.names))
+    )
+    return tuple(sorted((*rules, *held), key=lambda each: each.key))
+
+
+_T = TypeVar("_T")
+
+
+def _each(things: Iterable[_T], do: Callable[[_T], Changes]) -> tuple[Changes, ...]:
+    """Do it to each, whatever becomes of the others."""
+    every = tuple(things)
+    done: list[Changes] = []
+    errors: list[LifecycleError] = []
+    for each in every:
+        try:
+            done.append(do(each))
+        except LifecycleError as error:  # noqa: PERF203 - the other targets go on
+            errors.append(error)
+    if len(errors) == 1:
+        raise errors[0]
+    if errors:
+        raise PartlyError("targets", len(every), [("", error) for error in errors])
+    return tuple(done)

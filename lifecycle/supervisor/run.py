@@ -1,0 +1,265 @@
+"""`up`: everything around a session that must be there before it and be gone after it.
+
+Owns: the run directory and what a killed supervisor left in it, the environment of the run, the
+zygote, the supervisor's own participant and the sweep of shared memory. Must not import rclpy.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+from collections.abc import Awaitable, Callable, Iterable, Mapping
+
+from lifecycle.errors import ExitCode, LifecycleError
+from lifecycle.manifest.model import Authority, DataLayerSource, EndpointPolicy, RunKind
+from lifecycle.middleware.process import adopt_orphans, exit_after
+from lifecycle.middleware.profiles import discovery_environment
+from lifecycle.plan.model import Plan
+from lifecycle.supervisor import discovery_server
+from lifecycle.supervisor.ending import Ending
+from lifecycle.supervisor.events import Emitter, Listener, Notice, RunStarted
+from lifecycle.supervisor.eyes import Eyes
+from lifecycle.supervisor.failure import NOT_JUDGED, StepFailedError, with_failure
+from lifecycle.supervisor.logs import log_directory
+from lifecycle.supervisor.networks import open_networks
+from lifecycle.supervisor.options import (
+    UpOptions,
+    UpResult,
+    local_processes,
+    observer_connections,
+    own_machines,
+)
+from lifecycle.supervisor.orphans import end_run, sweep_of
+from lifecycle.supervisor.rundir import (
+    RUN_VARIABLE,
+    RunDirectory,
+    RunRecord,
+    new_run_id,
+    run_name,
+    runtime_root,
+)
+from lifecycle.supervisor.session import Session
+from lifecycle.supervisor.status import SystemStatus
+from lifecycle.supervisor.system import System
+from lifecycle.supervisor.zygote import Zygote, ZygoteProcess
+
+LEAVE_S = 10.0
+"""A participant leaves within 0.2 s, over connections that nobody answers within 4 s."""
+
+
+class Forerunner:
+    """A zygote that is started before the manifest is read, to import while we do.
+
+    Attributes:
+        run_id: of the run that it is for.
+    """
+
+    def __init__(self, *, preload: bool = True) -> None:
+        self.run_id = new_run_id()
+        self.process = ZygoteProcess(
+            preload=preload, environment={**os.environ, RUN_VARIABLE: self.run_id}
+        )
+
+    def close(self) -> None:
+        """End it; harmless if a run has ended it already."""
+        self.process.close()
+
+
+def up(
+    plan: Plan,
+    options: UpOptions,
+    listeners: Iterable[Listener] = (),
+    *,
+    forerunner: Forerunner | None = None,
+    ending: Ending | None = None,
+    on_start: Callable[[Callable[[], SystemStatus]], None] | None = None,
+) -> UpResult:
+    """Bring a system up, hold it, take it down. Blocks; call it from the main thread.
+
+    It changes this process for good: orphans of its children become its own children, and the
+    variables that place the system in the graph are set in its environment.
+
+    Args:
+        plan: what to bring up.
+        options: how.
+        listeners: told every event, in this thread.
+        forerunner: used and ended.
+        ending: has been told of signals since before this call; entered by the caller.
+        on_start: given the way to ask for the status, once there is a system.
+
+    Raises:
+        AlreadyRunningError: another supervisor has this system in this domain.
+        UsageError: the plan has nothing for this host, the run directory or the options of a
+            network to program cannot be used.
+        MiddlewareError: no participant can be made in the plan's domain.
+        Ended: a signal asked for it before there was a session; nothing is left.
+    """
+    if ending is None:
+        with Ending() as ours:
+            return up(
+                plan, options, listeners, forerunner=forerunner, ending=ours, on_start=on_start
+            )
+    with ending.noted():
+        return _up(
+            plan, options, listeners, forerunner=forerunner, ending=ending, on_start=on_start
+        )
+
+
+def _up(
+    plan: Plan,
+    options: UpOptions,
+    listeners: Iterable[Listener],
+    *,
+    forerunner: Forerunner | None,
+    ending: Ending,
+    on_start: Callable[[Callable[[], SystemStatus]], None] | None,
+) -> UpResult:
+    """Do what `up` says, where a signal is only noted."""
+    processes = local_processes(plan, options.machine)
+    emit = Emitter()
+    for listener in listeners:
+        emit.listen(listener)
+    python = any(each.run.kind is RunKind.PYTHON for each in processes)
+    forerunner = forerunner or Forerunner(preload=python)
+    try:
+        directory = RunDirectory.acquire(
+            runtime_root(os.environ),
+            run_name(plan, options.machine),
+            forerunner.run_id,
+            domain_id=plan.domain_id,
+        )
+    except LifecycleError:
+        forerunner.close()
+        raise
+    session: Session | None = None
+    try:
+        if directory.previous is not None:
+            _clean_up_after(directory.previous, emit)
+        networks = open_networks(plan, options, directory, emit, environment=os.environ)
+        adopt_orphans()
+        _enter_graph(plan, directory)
+
+        async def run(leaving: contextlib.ExitStack) -> UpResult:
+            nonlocal session
+            logs = log_directory(os.environ, plan.system)
+            system = System(
+                plan,
+                emit=emit,
+                logs=logs,
+                processes=processes,
+                variables=_graph_variables(os.environ),
+            )
+            zygote = Zygote(forerunner.process)
+            try:
+                # Before any participant: who asks a server that is not there waits to ask again.
+                with ending.raised():
+                    await discovery_server.begin(system, zygote, ours=_serves(plan, options))
+                eyes = _eyes(plan, options)
+                leaving.callback(eyes.destroy)
+                emit(_started(system, eyes, str(logs)))
+                session = Session(
+                    system,
+                    options,
+                    directory=directory,
+                    zygote=zygote,
+                    eyes=eyes,
+                    networks=networks,
+                    emit=emit,
+                    ending=ending,
+                )
+                if on_start is not None:
+                    on_start(session.status)
+                return await session.run()
+            except StepFailedError as failure:
+                emit(failure.event())
+                verdict = with_failure(NOT_JUDGED, failure)
+                return UpResult(exit_code=failure.exit_code, verdict=verdict)
+            finally:
+                await discovery_server.end(system, asyncio.Event())
+                await zygote.close()
+
+        result = asyncio.run(_leaving_last(run))
+    finally:
+        forerunner.close()
+        segments = session.segments if session else ()
+        swept = sweep_of(directory.began_s, segments, plan.domain_id)
+        directory.release()
+    if swept and result.exit_code == ExitCode.OK:
+        emit(Notice(message=f"removed shared memory left in /dev/shm: {', '.join(swept)}"))
+    return result
+
+
+async def _leaving_last(run: Callable[[contextlib.ExitStack], Awaitable[UpResult]]) -> UpResult:
+    """Run, and leave the graph once nothing of the system runs any more, bounded.
+
+    Fast DDS can hang there with the GIL held: then the process ends with the code all the same, and
+    the next `up` cleans up what it could not.
+    """
+    with contextlib.ExitStack() as leaving:
+        result = await run(leaving)
+        live_on = exit_after(LEAVE_S, result.exit_code)
+        leaving.pop_all().close()
+        live_on()
+    return result
+
+
+def _serves(plan: Plan, options: UpOptions) -> bool:
+    server = plan.server
+    return server is not None and server.machine in own_machines(plan, options.machine)
+
+
+def _eyes(plan: Plan, options: UpOptions) -> Eyes:
+    layer = plan.data_layer
+    dynamic = layer.source is DataLayerSource.DYNAMIC
+    wires = layer.authority is Authority.SUPERVISOR
+    return Eyes.open(
+        plan.domain_id,
+        observer_connections(plan, options.machine),
+        guests=wires and dynamic and plan.policy.undeclared_nodes is EndpointPolicy.OPEN,
+        events=wires and (dynamic or layer.events),
+    )
+
+
+def _started(system: System, eyes: Eyes, logs: str) -> RunStarted:
+    return RunStarted(
+        system=system.plan.system,
+        domain_id=system.plan.domain_id,
+        rmw=eyes.rmw,
+        discovery_range=system.plan.discovery_range.value,
+        nodes=tuple(each.name for each in system.nodes.values()),
+        processes=tuple(system.processes),
+        log_directory=logs,
+    )
+
+
+_GRAPH_VARIABLES = (
+    "ROS_DOMAIN_ID",
+    "ROS_AUTOMATIC_DISCOVERY_RANGE",
+    "FASTRTPS_DEFAULT_PROFILES_FILE",
+)
+
+
+def _enter_graph(plan: Plan, directory: RunDirectory) -> None:
+    """Place this process where the plan's nodes will be, and have participants found quickly."""
+    os.environ["ROS_DOMAIN_ID"] = str(plan.domain_id)
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = plan.discovery_range.name
+    os.environ.update(discovery_environment(directory.path))
+
+
+def _graph_variables(environment: Mapping[str, str]) -> tuple[tuple[str, str], ...]:
+    """What a zygote that was started before `_enter_graph` has to hand on."""
+    return tuple((name, environment[name]) for name in _GRAPH_VARIABLES if name in environment)
+
+
+def _clean_up_after(record: RunRecord, emit: Emitter) -> None:
+    """Sweep what a supervisor left that had no chance to do it itself."""
+    ended = end_run(record)
+    swept = sweep_of(record.began_s, record.segments, record.domain_id)
+    if ended or swept:
+        emit(
+            Notice(
+                message=f"cleaned up after supervisor {record.supervisor.pid}, which was killed: "
+                f"{len(ended)} processes, {len(swept)} files in /dev/shm"
+            )
+        )

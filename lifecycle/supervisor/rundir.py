@@ -1,0 +1,246 @@
+"""The directory of one supervised system: lock, record, control socket.
+
+Owns: where it is, that only one supervisor has it, and what it says about the processes, so that
+the next `up` can find what a killed supervisor left behind. Must not import rclpy.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import fcntl
+import os
+import re
+import socket
+import stat
+import tempfile
+import time
+import uuid
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+
+from lifecycle.codec import from_json, to_json
+from lifecycle.errors import UsageError
+from lifecycle.plan.model import Plan
+
+RUN_VARIABLE = "LIFECYCLE_RUN"
+"""Set in every process of a run, with the run's id: what proves that a process is ours."""
+
+LEDGER_NAME = "programmed.json"
+"""File in a run directory that lists what is ours in networks, see programming/ledger.py."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class ChildRecord:
+    """One process of ours.
+
+    Attributes:
+        start_ticks: field 22 of /proc/PID/stat, see proc(5): with the pid it names one process
+            of this boot for ever.
+    """
+
+    name: str
+    pid: int
+    start_ticks: int
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class RunRecord:
+    """What a supervisor writes down of its run.
+
+    Attributes:
+        run_id: value of LIFECYCLE_RUN in every process of the run.
+        boot_id: of the kernel; a record of an earlier boot names no living process.
+        began_s: seconds since the epoch.
+        segments: names of the shared memory files that the processes were seen to use.
+        domain_id: where the system is; None if it was not written down.
+    """
+
+    run_id: str
+    boot_id: str
+    began_s: float
+    supervisor: ChildRecord
+    children: tuple[ChildRecord, ...] = ()
+    segments: tuple[str, ...] = ()
+    domain_id: int | None = None
+
+
+def new_run_id() -> str:
+    """Return a fresh value for RUN_VARIABLE."""
+    return uuid.uuid4().hex
+
+
+class AlreadyRunningError(UsageError):
+    """Another supervisor has this system."""
+
+
+def runtime_root(environment: Mapping[str, str]) -> Path:
+    """Return where run directories are: $XDG_RUNTIME_DIR/lifecycle, else /tmp/lifecycle-UID."""
+    base = environment.get("XDG_RUNTIME_DIR")
+    if base and Path(base).is_dir():
+        return Path(base) / "lifecycle"
+    return Path(tempfile.gettempdir()) / f"lifecycle-{os.getuid()}"
+
+
+def run_name(plan: Plan, machine: str = "") -> str:
+    """Return the directory's name: the system, its domain, and the machine if it is only one."""
+    name = f"{plan.system}@{plan.domain_id}" + (f".{machine}" if machine else "")
+    return re.sub(r"[^A-Za-z0-9_.@-]", "_", name)
+
+
+def boot_id() -> str:
+    """Return the id of this boot, random(4)."""
+    return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+
+
+def start_ticks(pid: int) -> int | None:
+    """Return when a process started, in clock ticks since boot; None if it does not live."""
+    try:
+        text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
+    except (FileNotFoundError, ProcessLookupError):
+        return None
+    # The command stands in parentheses and may hold any character; the state follows it.
+    fields = text.rpartition(")")[2].split()
+    return None if fields[0] in "ZX" else int(fields[19])
+
+
+class RunDirectory:
+    """One run's directory, held by an exclusive lock as long as this object is open.
+
+    Attributes:
+        run_id: see RUN_VARIABLE.
+        previous: what the supervisor before us wrote, if it did not leave in order.
+    """
+
+    def __init__(self, path: Path, run_id: str, domain_id: int | None = None) -> None:
+        self.path = path
+        self.run_id = run_id
+        self.domain_id = domain_id
+        self.began_s = time.time()
+        self.previous: RunRecord | None = None
+        self._lock: int | None = None
+
+    @classmethod
+    def acquire(
+        cls, root: Path, name: str, run_id: str, *, domain_id: int | None = None
+    ) -> RunDirectory:
+        """Take the directory for the run `run_id`, in the domain `domain_id`.
+
+        Raises:
+            AlreadyRunningError: another supervisor has it.
+            UsageError: the directory belongs to somebody else, or is writable by others.
+        """
+        _private_directory(root)
+        directory = cls(root / name, run_id, domain_id)
+        _private_directory(directory.path)
+        lock = os.open(directory.path / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(lock)
+            record = read_record(directory.path)
+            pid = f" (pid {record.supervisor.pid})" if record else ""
+            raise AlreadyRunningError(
+                f"cannot bring up {name!r}: another supervisor{pid} runs it already",
+                hint=f"end it first: lifecycle down {name}",
+            ) from None
+        directory._lock = lock
+        directory.previous = read_record(directory.path)
+        directory.record(())
+        return directory
+
+    @property
+    def socket_path(self) -> Path:
+        """Where `lifecycle down` and `status` reach the supervisor."""
+        return self.path / "control"
+
+    def record(self, children: tuple[ChildRecord, ...], segments: Iterable[str] = ()) -> None:
+        """Write down what runs, in one piece."""
+        record = RunRecord(
+            run_id=self.run_id,
+            boot_id=boot_id(),
+            began_s=self.began_s,
+            supervisor=ChildRecord(
+                name="supervisor", pid=os.getpid(), start_ticks=start_ticks(os.getpid()) or 0
+            ),
+            children=children,
+            segments=tuple(sorted(segments)),
+            domain_id=self.domain_id,
+        )
+        part = self.path / ".record.json"
+        part.write_bytes(to_json(record))
+        part.replace(self.path / "record.json")
+
+    def release(self) -> None:
+        """Remove what is in the directory and give up the lock; nothing of ours may run."""
+        for name in ("record.json", "control"):
+            (self.path / name).unlink(missing_ok=True)
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
+
+
+def read_record(path: Path) -> RunRecord | None:
+    """Return the record in a run directory; None if there is none that can be read."""
+    try:
+        return from_json((path / "record.json").read_bytes(), RunRecord)
+    except (FileNotFoundError, ValueError):
+        return None
+
+
+def is_held(path: Path) -> bool:
+    """Whether a supervisor holds this run directory now."""
+    try:
+        lock = os.open(path / "lock", os.O_RDWR | os.O_CLOEXEC)
+    except FileNotFoundError:
+        return False
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(lock)
+    return False
+
+
+@contextlib.contextmanager
+def short_path(path: Path) -> Iterator[str]:
+    """Give a name of `path` that fits in a socket address, 107 bytes (unix(7)), however deep."""
+    descriptor = os.open(path.parent, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        yield f"/proc/self/fd/{descriptor}/{path.name}"
+    finally:
+        os.close(descriptor)
+
+
+def connect(path: Path) -> socket.socket:
+    """Connect to a control socket.
+
+    Raises:
+        ConnectionRefusedError: nobody listens there any more.
+        FileNotFoundError: nobody ever did.
+    """
+    sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        with short_path(path) as name:
+            sock.connect(name)
+    except OSError:
+        sock.close()
+        raise
+    return sock
+
+
+def _private_directory(path: Path) -> None:
+    """Make `path` if need be, and insist that nobody else can put things into it."""
+    path.mkdir(mode=0o700, parents=True, exist_ok=True)
+    status = path.lstat()
+    if (
+        not stat.S_ISDIR(status.st_mode)
+        or status.st_uid != os.getuid()
+        or status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    ):
+        raise UsageError(
+            f"cannot use {str(path)!r} as run directory: it must be a directory of this user that "
+            "others cannot write",
+            hint="remove it, or set XDG_RUNTIME_DIR",
+        )

@@ -1,0 +1,229 @@
+"""The supervisor's control socket: what `lifecycle status`, `down`, `pause` and others ask.
+
+Owns: the requests and replies, one JSON object per line, on both sides. Must not import rclpy.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import dataclasses
+import enum
+import socket
+from collections.abc import Awaitable, Callable, Iterator
+from pathlib import Path
+
+from lifecycle.codec import from_json, to_json
+from lifecycle.plan.model import Plan
+from lifecycle.supervisor.orders import Done, Order, OrderKind
+from lifecycle.supervisor.rundir import connect, short_path
+from lifecycle.supervisor.status import SystemStatus
+from lifecycle.verify.observation import Observation
+from lifecycle.verify.verdict import Verdict
+
+_BURST_S = 0.05
+_ORDERS = {each.value: each for each in OrderKind}
+
+
+class Ask(enum.Enum):
+    """What a supervisor can be asked."""
+
+    STATUS = "status"
+    DOWN = "down"
+    LOOK = "look"
+    FOLLOW = "follow"
+    PAUSE = "pause"
+    RESUME = "resume"
+    RESTART = "restart"
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Question:
+    """Client → supervisor.
+
+    Attributes:
+        node: for RESTART, manifest key or fully qualified name; empty for the whole system.
+    """
+
+    ask: Ask
+    node: str = ""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Look:
+    """All that a supervisor knows at one moment.
+
+    Attributes:
+        observation: what its last verdict was judged by; empty before the first.
+        verdict: None before the first.
+    """
+
+    plan: Plan
+    status: SystemStatus
+    observation: Observation
+    verdict: Verdict | None
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Answer:
+    """Supervisor → client.
+
+    Attributes:
+        status: for STATUS.
+        exit_code: for DOWN, of the supervisor, sent once nothing of the system runs any more; for
+            an order, what came of it.
+        error: why an order was not carried out; empty if it was.
+        look: for LOOK; for FOLLOW one at once and one after each change.
+    """
+
+    status: SystemStatus | None = None
+    exit_code: int | None = None
+    error: str = ""
+    look: Look | None = None
+
+
+class ControlServer:
+    """Answers on the control socket while the supervisor lives.
+
+    Args:
+        path: of the socket.
+        status: for STATUS.
+        down: for DOWN.
+        look: for LOOK and FOLLOW.
+        order: carries out an order.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        status: Callable[[], SystemStatus],
+        down: Callable[[], None],
+        *,
+        look: Callable[[], Look] | None = None,
+        order: Callable[[Order], Awaitable[Done]] | None = None,
+    ) -> None:
+        self._path = path
+        self._status = status
+        self._down = down
+        self._look = look
+        self._order = order
+        self._changed = asyncio.Event()
+        self._server: asyncio.AbstractServer | None = None
+        self._open: set[asyncio.StreamWriter] = set()
+        self._waiting: set[asyncio.StreamWriter] = set()
+
+    async def open(self) -> None:
+        """Listen.
+
+        Raises:
+            OSError: the socket cannot be made.
+        """
+        self._path.unlink(missing_ok=True)
+        sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        with short_path(self._path) as name:
+            sock.bind(name)
+        self._server = await asyncio.start_unix_server(self._serve, sock=sock)
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self._open.add(writer)
+        try:
+            while line := await reader.readline():
+                question = from_json(line, Question)
+                if question.ask is Ask.DOWN:
+                    self._waiting.add(writer)
+                    self._down()
+                elif question.ask is Ask.FOLLOW:
+                    await self._follow(reader, writer)
+                else:
+                    await _say(writer, await self._answer(question))
+        except (ConnectionError, ValueError):
+            # A client that went away or speaks another language ends its own connection only.
+            pass
+        finally:
+            if writer not in self._waiting:
+                self._open.discard(writer)
+                writer.close()
+
+    def changed(self) -> None:
+        """Tell those who follow that there is something new to see."""
+        self._changed.set()
+        self._changed = asyncio.Event()
+
+    async def _answer(self, question: Question) -> Answer:
+        if question.ask is Ask.LOOK and self._look is not None:
+            return Answer(look=self._look())
+        if self._order is not None and question.ask.value in _ORDERS:
+            order = Order(kind=_ORDERS[question.ask.value], node=question.node)
+            done = await self._order(order)
+            return Answer(exit_code=done.exit_code, error=done.error)
+        return Answer(status=self._status())
+
+    async def _follow(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Send what is known now and after each change, until the client goes away."""
+        gone = asyncio.ensure_future(reader.read())
+        try:
+            while self._look is not None and not gone.done():
+                changed = self._changed
+                await _say(writer, Answer(look=self._look()))
+                waiting = asyncio.ensure_future(changed.wait())
+                await asyncio.wait({gone, waiting}, return_when=asyncio.FIRST_COMPLETED)
+                waiting.cancel()
+                # Changes come in bursts; nobody reads pictures faster than this.
+                await asyncio.wait({gone}, timeout=_BURST_S)
+        finally:
+            gone.cancel()
+
+    async def close(self, exit_code: int) -> None:
+        """Tell those who asked for it that all is over, and stop listening."""
+        if self._server is None:
+            return
+        self._server.close()
+        for writer in self._waiting:
+            with contextlib.suppress(ConnectionError):
+                writer.write(to_json(Answer(exit_code=exit_code)) + b"\n")
+                await writer.drain()
+        for writer in tuple(self._open):
+            writer.close()
+            with contextlib.suppress(ConnectionError):
+                await writer.wait_closed()
+        self._server = None
+
+
+async def _say(writer: asyncio.StreamWriter, answer: Answer) -> None:
+    writer.write(to_json(answer) + b"\n")
+    await writer.drain()
+
+
+def ask(path: Path, question: Ask, timeout_s: float, *, node: str = "") -> Answer | None:
+    """Ask the supervisor that listens at `path`.
+
+    Returns:
+        Its answer; None if it ended without one.
+
+    Raises:
+        TimeoutError: no answer within `timeout_s`.
+        OSError: nobody listens there.
+    """
+    with connect(path) as sock:
+        sock.settimeout(timeout_s)
+        sock.sendall(to_json(Question(ask=question, node=node)) + b"\n")
+        with sock.makefile("rb") as stream:
+            line = stream.readline()
+    return from_json(line, Answer) if line else None
+
+
+def follow(path: Path) -> Iterator[Look]:
+    """Yield what the supervisor that listens at `path` knows, now and after each change.
+
+    It ends with the supervisor.
+
+    Raises:
+        OSError: nobody listens there.
+    """
+    with connect(path) as sock:
+        sock.sendall(to_json(Question(ask=Ask.FOLLOW)) + b"\n")
+        with sock.makefile("rb") as stream:
+            for line in stream:
+                look = from_json(line, Answer).look
+                if look is not None:
+                    yield look
