@@ -1,0 +1,93 @@
+"""The command line: one file per verb, thin. Owns argument parsing and the one error boundary.
+
+A verb's module is imported only when it is used, so that ROS-free verbs start fast. Each module
+`lifecycle.cli.verb_NAME` holds one click command named `command` whose function returns an exit
+code (None means 0).
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import traceback
+
+import click
+
+from lifecycle.errors import ExitCode, LifecycleError
+
+VERBS: dict[str, str] = {
+    "check": "check a manifest without running anything; needs no ROS",
+    "plan": "show the computational graph, participants, ports and bring-up order",
+    "up": "start, configure, connect, verify, and only then activate; Ctrl-C ends",
+    "pause": "deactivate a running system in reverse order: data stops",
+    "resume": "verify a paused system again, and activate it",
+    "restart": "take one node or all of a running system down, and up again through the gate",
+    "down": "end a running system in reverse order",
+    "status": "show what a running supervisor sees",
+    "verify": "judge a running system, started by anyone; for CI",
+    "flows": "show every network flow and how unique it is",
+    "graph": "picture of what runs, beside what was declared",
+    "capture": "write a manifest from a running system, gaps marked",
+    "run": "run one node of a manifest in this terminal, without a supervisor",
+    "ports": "DDS port arithmetic and platform limits",
+}
+
+
+class _Verbs(click.Group):
+    """Loads a verb's module on first use."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 - click's signature
+        """Verbs in the order of the pipeline."""
+        return list(VERBS)
+
+    def get_command(
+        self,
+        ctx: click.Context,  # noqa: ARG002 - click's signature
+        cmd_name: str,
+    ) -> click.Command | None:
+        """Import `lifecycle.cli.verb_<cmd_name>`."""
+        if cmd_name not in VERBS:
+            return None
+        command: click.Command = importlib.import_module(f"lifecycle.cli.verb_{cmd_name}").command
+        return command
+
+    def format_commands(
+        self,
+        ctx: click.Context,  # noqa: ARG002 - click's signature
+        formatter: click.HelpFormatter,
+    ) -> None:
+        """List verbs without importing them."""
+        with formatter.section("Verbs"):
+            formatter.write_dl(list(VERBS.items()))
+
+
+@click.command(cls=_Verbs, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(package_name="ros-lifecycle-manifests")
+def cli() -> None:
+    """Declare a ROS 2 system, start it, and activate it only once it is verified."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line; the one place where exceptions become exit codes.
+
+    Returns:
+        The exit code, see `lifecycle.errors.ExitCode`.
+    """
+    try:
+        result = cli.main(args=arguments, prog_name="lifecycle", standalone_mode=False)
+    except click.ClickException as error:
+        error.show()
+        return ExitCode.USAGE
+    except (click.Abort, KeyboardInterrupt):
+        return ExitCode.INTERRUPTED
+    except LifecycleError as error:
+        click.echo(str(error), err=True)
+        return error.exit_code
+    except BrokenPipeError:
+        sys.stderr.close()
+        return ExitCode.OK
+    except Exception:  # noqa: BLE001 - the boundary: report our bug, whatever it is
+        traceback.print_exc()
+        click.echo("this is a bug in lifecycle: please report it with the trace above", err=True)
+        return ExitCode.INTERNAL
+    return int(result or 0)

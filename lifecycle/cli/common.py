@@ -1,0 +1,72 @@
+"""Options that several verbs share. Owns: `MANIFEST [name:=value …]`, `--format`, loading."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+from lifecycle.errors import UsageError
+
+if TYPE_CHECKING:
+    from lifecycle.manifest import Loaded
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def manifest_arguments(function: F) -> F:
+    """Add `MANIFEST [NAME:=VALUE …]` to a verb."""
+    function = click.argument("assignments", nargs=-1, metavar="[NAME:=VALUE]...")(function)
+    return click.argument("manifest", metavar="MANIFEST")(function)
+
+
+def format_option(*formats: str) -> Callable[[F], F]:
+    """Add `--format`; the first is the default."""
+    return click.option(
+        "--format", "format_", type=click.Choice(formats), default=formats[0], show_default=True
+    )
+
+
+def timeout_option(default_s: float, help_: str, *, or_0: bool = False) -> Callable[[F], F]:
+    """Add `--timeout SECONDS`, more than 0, or at least 0 with `or_0`."""
+    return click.option(
+        "--timeout",
+        type=click.FloatRange(min=0, min_open=not or_0),
+        default=default_s,
+        show_default=True,
+        metavar="SECONDS",
+        help=help_,
+    )
+
+
+def parse_assignments(assignments: tuple[str, ...]) -> dict[str, str]:
+    """Parse `name:=value` words, as `ros2 launch` spells them.
+
+    Raises:
+        UsageError: a word without `:=` or with an empty name, or a name given twice.
+    """
+    values: dict[str, str] = {}
+    for word in assignments:
+        name, separator, value = word.partition(":=")
+        if not separator or not name:
+            raise UsageError(f"cannot read argument {word!r}; write name:=value")
+        if name in values:
+            raise UsageError(f"cannot set argument {name!r} twice")
+        values[name] = value
+    return values
+
+
+def load_manifest(path: str, assignments: tuple[str, ...], *, quiet: bool = False) -> Loaded:
+    """Load and check a manifest; print warnings to stderr unless `quiet`.
+
+    Raises:
+        ManifestError: with every diagnostic.
+    """
+    from lifecycle.manifest import load
+
+    loaded = load(path, parse_assignments(assignments))
+    if not quiet:
+        for warning in loaded.warnings:
+            click.echo(str(warning), err=True)
+    return loaded

@@ -1,0 +1,261 @@
+"""What `lifecycle up` shows: JSON lines, plain lines, or a live table on a terminal.
+
+Owns: the choice between them and the two line formats; the table is live.py's. Everything comes
+from the supervisor's events.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import json
+import sys
+from collections.abc import Callable, Iterator
+from typing import Protocol, TextIO
+
+from lifecycle.node.control import Operation
+from lifecycle.supervisor.events import (
+    Event,
+    Failure,
+    GateOpened,
+    LogLine,
+    MachineConnection,
+    NodeAlive,
+    NodeChanged,
+    NodeSilent,
+    Notice,
+    ProcessChanged,
+    Reach,
+    RunStarted,
+    Stopped,
+    Stopping,
+    SystemReached,
+    VerdictChanged,
+    WiringChanged,
+    WiringLost,
+    to_record,
+)
+from lifecycle.supervisor.options import UpResult
+from lifecycle.supervisor.status import SystemStatus
+from lifecycle.verify import Outcome, Stage, Verdict, missing, not_ok, render_text, to_json
+
+
+class Output(Protocol):
+    """A listener that also shows how the run ended."""
+
+    def __call__(self, event: Event) -> None:
+        """Show one event."""
+
+    def watch(self, status: Callable[[], SystemStatus]) -> None:
+        """Take the way to ask for the status, once there is something to tell."""
+
+    def finish(self, result: UpResult) -> None:
+        """Show the result."""
+
+
+@contextlib.contextmanager
+def output(format_: str) -> Iterator[Output]:
+    """Give the output for `format_`, and for text what suits the terminal."""
+    if format_ == "json":
+        yield JsonLines(sys.stdout)
+    elif sys.stdout.isatty():
+        from lifecycle.cli.live import Live
+
+        with Live() as live:
+            yield live
+    else:
+        yield PlainLines(sys.stdout)
+
+
+class JsonLines:
+    """One JSON object per line; `event` names its kind, and the last one is the verdict."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def watch(self, status: Callable[[], SystemStatus]) -> None:
+        """Need nothing more than the events."""
+
+    def __call__(self, event: Event) -> None:
+        """Write one event."""
+        self._write(json.dumps(to_record(event), ensure_ascii=False, separators=(",", ":")))
+
+    def finish(self, result: UpResult) -> None:
+        """Write the verdict."""
+        self._write(to_json(result.verdict))
+
+    def _write(self, line: str) -> None:
+        self._stream.write(line + "\n")
+        self._stream.flush()
+
+
+class PlainLines:
+    """One line per event, for logs and pipes."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+        self._reached: dict[str, Reach] = {}
+        self._stopping = False
+        self._judged: str | None = None
+        self._active = False
+
+    def watch(self, status: Callable[[], SystemStatus]) -> None:
+        """Need nothing more than the events."""
+
+    def __call__(self, event: Event) -> None:
+        """Write one event, if it has something to tell a person."""
+        self._stopping = self._stopping or isinstance(event, Stopping)
+        if isinstance(event, NodeChanged) and self._is_on_the_way(event):
+            return
+        if isinstance(event, SystemReached):
+            self._active = event.reached == "active"
+        line = describe(event)
+        if isinstance(event, VerdictChanged):
+            if event.stage is Stage.ACTIVE and not self._active and missing(event.verdict):
+                # Not a system that broke: nodes become active one by one, and host by host.
+                line = f"not active yet; {missing(event.verdict)}"
+            # A verdict changes with every count in it; a person is told what reads differently.
+            if line == self._judged:
+                return
+            self._judged = line
+        if line is not None:
+            self._stream.write(line + "\n")
+            self._stream.flush()
+
+    def _is_on_the_way(self, event: NodeChanged) -> bool:
+        """Whether a change is one of the many between two steps, which a log need not hold."""
+        before = self._reached.get(event.node)
+        self._reached[event.node] = event.reach
+        by_somebody_else = event.reach is Reach.ACTIVE and event.state != "active"
+        return before is event.reach and (self._stopping or not by_somebody_else)
+
+    def finish(self, result: UpResult) -> None:
+        """Write the verdict, in full where it is not ok."""
+        whole = result.verdict.verdict is not Outcome.OK
+        self._stream.write(render_text(result.verdict, flows=not whole))
+        self._stream.flush()
+
+
+@functools.singledispatch
+def describe(event: Event) -> str | None:
+    """Return the line that tells a person of `event`; None if it has none."""
+    del event
+    return None
+
+
+@describe.register
+def _(event: RunStarted) -> str:
+    return (
+        f"{event.system}: {_count(len(event.nodes), 'node')} in "
+        f"{_count(len(event.processes), 'process')}, domain {event.domain_id}, {event.rmw}, "
+        f"discovery range {event.discovery_range}; logs in {event.log_directory}"
+    )
+
+
+@describe.register
+def _(event: ProcessChanged) -> str:
+    pid = f" (pid {event.pid})" if event.pid else ""
+    return f"process {event.process}: {event.state.value}{pid}" + (
+        f", {event.detail}" if event.detail else ""
+    )
+
+
+@describe.register
+def _(event: NodeChanged) -> str:
+    same = not event.state or event.reach is not Reach.ACTIVE or event.state == "active"
+    return f"{event.node}: {event.reach.value}" + ("" if same else f", but {event.state}")
+
+
+@describe.register
+def _(event: WiringChanged) -> str:
+    again = f" (try {event.attempt})" if event.attempt > 1 else ""
+    if event.error:
+        return event.error + again
+    where = f"connection {event.connection}" if event.connection else "its own participant"
+    if event.operation is Operation.CONNECT_TO:
+        return f"{event.node}: connected to {event.connection}, {', '.join(event.urls)}{again}"
+    if event.operation is Operation.MAP_TO:
+        return f"{event.node}: {event.endpoint} mapped onto {where}{again}"
+    return f"{event.node}: disconnected from {event.connection}"
+
+
+@describe.register
+def _(event: WiringLost) -> str:
+    what = f"{event.endpoint} on " if event.endpoint else ""
+    return f"{event.node}: lost {what}{event.connection or 'its own participant'}"
+
+
+@describe.register
+def _(event: NodeSilent) -> str:
+    return f"{event.node}: silent; {event.message}"
+
+
+@describe.register
+def _(event: NodeAlive) -> str:
+    return f"{event.node}: alive again after {event.silent_s:.1f} s"
+
+
+@describe.register
+def _(event: MachineConnection) -> str:
+    if not event.established:
+        return f"machine {event.machine}: connection lost"
+    again = f" again after {event.lost_s:.1f} s" if event.lost_s else ""
+    return f"machine {event.machine}: connected{again}"
+
+
+@describe.register
+def _(event: LogLine) -> str:
+    return f"[{event.process}] {event.line}"
+
+
+@describe.register
+def _(event: VerdictChanged) -> str:
+    waits = missing(event.verdict)
+    if waits and event.stage is Stage.CONNECTED:
+        return f"not verified yet; {waits}"
+    return f"{event.stage.value}: {verdict_line(event.verdict)}"
+
+
+@describe.register
+def _(event: GateOpened) -> str:
+    return f"gate open on verdict {event.outcome}: activating {_count(len(event.nodes), 'node')}"
+
+
+@describe.register
+def _(event: SystemReached) -> str:
+    return f"system {event.reached} after {event.elapsed_s:.2f} s"
+
+
+@describe.register
+def _(event: Failure) -> str:
+    tail = "".join(f"\n    | {line}" for line in event.log_tail)
+    return f"{event.rule}: {event.message}{tail}"
+
+
+@describe.register
+def _(event: Notice) -> str:
+    return event.message
+
+
+@describe.register
+def _(event: Stopping) -> str:
+    return f"stopping: {event.reason}"
+
+
+@describe.register
+def _(event: Stopped) -> str:
+    return f"stopped after {event.elapsed_s:.2f} s"
+
+
+def verdict_line(verdict: Verdict) -> str:
+    """Return a verdict in one line, with what keeps it from being ok."""
+    text = f"verdict {verdict.verdict.value}"
+    why = not_ok(verdict)
+    if why:
+        return f"{text}; {why}"
+    return f"{text}, {_count(len(verdict.flows), 'flow')}" if verdict.flows else text
+
+
+def _count(number: int, noun: str) -> str:
+    ending = "" if number == 1 else "es" if noun.endswith("s") else "s"
+    return f"{number} {noun}{ending}"

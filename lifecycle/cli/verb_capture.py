@@ -1,0 +1,135 @@
+"""`lifecycle capture`: write a manifest from a running system, gaps marked."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from lifecycle.errors import ExitCode, UsageError
+
+if TYPE_CHECKING:
+    from lifecycle.export.captured import CapturedSystem
+
+
+@click.command("capture")
+@click.option(
+    "--domain",
+    type=click.IntRange(0, 232),
+    metavar="N",
+    help="ROS domain to look at; default: ROS_DOMAIN_ID, else 0.",
+)
+@click.option(
+    "--output",
+    type=click.Path(dir_okay=False, path_type=Path),
+    metavar="FILE",
+    help="Write the manifest there instead of printing it.",
+)
+@click.option(
+    "--nodl-dir",
+    type=click.Path(file_okay=False, path_type=Path),
+    metavar="DIR",
+    help="Write each node's interface as a NoDL document there; the manifest refers to them.",
+)
+@click.option(
+    "--namespace",
+    "namespaces",
+    multiple=True,
+    metavar="NAMESPACE",
+    help="Take only nodes in or below it; may be given several times.",
+)
+@click.option("--system", default="captured", show_default=True, help="Name to give the system.")
+@click.option(
+    "--wait",
+    type=click.FloatRange(min=0, min_open=True),
+    default=5.0,
+    show_default=True,
+    metavar="SECONDS",
+    help="How long discovery may take to settle.",
+)
+def command(
+    *,
+    domain: int | None,
+    output: Path | None,
+    nodl_dir: Path | None,
+    namespaces: tuple[str, ...],
+    system: str,
+    wait: float,
+) -> int:
+    """Write a manifest of whatever runs in a domain, started by anyone.
+
+    Nodes are attached to, with the interfaces and QoS that discovery shows. What a graph does not
+    tell stands beside a comment: `# gap: …`. The result passes `lifecycle check`, and `lifecycle
+    verify` of the same system is ok. Exits with 4 if no node is there.
+    """
+    from lifecycle.export.manifest_yaml import to_manifest
+    from lifecycle.manifest.model import Discovery
+    from lifecycle.plan.build import effective_domain, effective_range
+    from lifecycle.supervisor.capturing import capture_running
+
+    _check_name(system)
+    discovery = Discovery(domain_id=domain)
+    captured = capture_running(
+        system=system,
+        domain_id=effective_domain(discovery, os.environ),
+        discovery_range=effective_range(discovery, os.environ),
+        namespaces=namespaces,
+        wait_s=wait,
+    )
+    if not captured.nodes:
+        below = f" in or below {', '.join(namespaces)}" if namespaces else ""
+        click.echo(
+            f"no node{below}; looked in ROS domain {captured.domain_id}, discovery range "
+            f"{captured.discovery_range.value}\n"
+            "nodes that only listed peers, a discovery server or shared memory lead to are not "
+            "found so: `discovery: mode:` of their manifest says which; it is what to verify them "
+            "by",
+            err=True,
+        )
+        _say_gaps(captured)
+        return ExitCode.VIOLATED
+    references = {} if nodl_dir is None else _write_nodl(captured, nodl_dir, output)
+    text = to_manifest(captured, references=references)
+    if output is None:
+        click.echo(text, nl=False)
+    else:
+        _write(output, text)
+    _say_gaps(captured)
+    return ExitCode.OK
+
+
+def _say_gaps(captured: CapturedSystem) -> None:
+    for gap in captured.gaps:
+        click.echo(f"gap: {gap}", err=True)
+
+
+def _check_name(system: str) -> None:
+    import re
+
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_-]*", system):
+        raise UsageError(
+            f"cannot name a system {system!r}; use letters, digits, '_' and '-', a letter first"
+        )
+
+
+def _write_nodl(captured: CapturedSystem, folder: Path, output: Path | None) -> dict[str, str]:
+    """Write a document for each node; return what the manifest calls them, relative to itself."""
+    from lifecycle.export.manifest_yaml import SUFFIX, to_nodl
+
+    base = Path.cwd() if output is None else output.parent
+    references = {}
+    for node in captured.nodes:
+        path = folder / f"{node.key}{SUFFIX}"
+        _write(path, to_nodl(node))
+        references[node.key] = f"local://{os.path.relpath(path, base)}"
+    return references
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise UsageError(f"cannot write {str(path)!r}: {error.strerror}") from error

@@ -1,0 +1,162 @@
+"""`lifecycle graph`: picture of what runs, beside what was declared."""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from lifecycle.cli.common import format_option, timeout_option
+from lifecycle.cli.target import target_arguments
+from lifecycle.errors import ExitCode, UsageError
+
+if TYPE_CHECKING:
+    from lifecycle.export.picture import Picture
+    from lifecycle.plan import Plan
+
+_CLEAR = "\x1b[H\x1b[2J"
+
+
+@click.command("graph")
+@target_arguments
+@format_option("text", "mermaid", "dot", "svg", "html", "json")
+@click.option(
+    "--output",
+    type=click.Path(dir_okay=False, path_type=Path),
+    metavar="FILE",
+    help="Write the picture there instead of printing it.",
+)
+@click.option("--watch", is_flag=True, help="Draw it again at every change; Ctrl-C ends.")
+@timeout_option(
+    2.0,
+    "How long what is not as declared may still become so, where no supervisor is asked.",
+    or_0=True,
+)
+def command(
+    *,
+    target: str,
+    assignments: tuple[str, ...],
+    machine: str,
+    format_: str,
+    output: Path | None,
+    watch: bool,
+    timeout: float,
+) -> int:
+    """Draw the computational graph and the data layer graph as they run.
+
+    TARGET is a manifest, or the name of a running system. A supervisor of it is asked; without one,
+    whatever runs is looked at from outside. What is declared but missing is dashed and red, what is
+    there but not declared dotted and orange; findings stand at what they name. With --watch, text
+    is drawn again on the terminal, and a file is replaced in one piece.
+    """
+    draw = _drawing(format_, output, watch=watch)
+    path, plan = _found(target, assignments, machine)
+    if path is not None:
+        _supervised(path, draw, watch=watch)
+    elif plan is not None:
+        from lifecycle.supervisor.looking import attached_picture, attached_pictures
+
+        if watch:
+            attached_pictures(plan, draw)
+        else:
+            picture = attached_picture(plan, timeout_s=timeout)
+            draw(picture)
+            _say_if_empty(picture, plan)
+    return ExitCode.OK
+
+
+def _say_if_empty(picture: Picture, plan: Plan) -> None:
+    from lifecycle.export.picture import NodeState
+
+    if all(node.state is NodeState.ABSENT for node in picture.nodes()):
+        click.echo(
+            f"no node in the graph; looked in ROS domain {plan.domain_id}, discovery range "
+            f"{plan.discovery_range.value}",
+            err=True,
+        )
+
+
+def _found(
+    target: str, assignments: tuple[str, ...], machine: str
+) -> tuple[Path | None, Plan | None]:
+    """Return the run of a supervisor, or the plan to look for without one."""
+    from lifecycle.cli.target import target_run
+
+    if not Path(target).is_file():
+        return target_run(os.environ, target, assignments, machine), None
+    from lifecycle.cli.common import load_manifest
+    from lifecycle.plan import build_plan
+    from lifecycle.supervisor.looking import supervisor_of
+
+    plan = build_plan(load_manifest(target, assignments, quiet=True).manifest)
+    return supervisor_of(os.environ, plan, machine), plan
+
+
+def _supervised(path: Path, draw: Callable[[Picture], None], *, watch: bool) -> None:
+    from lifecycle.supervisor.looking import supervised_picture, supervised_pictures
+
+    try:
+        if not watch:
+            draw(supervised_picture(path))
+            return
+        for picture in supervised_pictures(path):
+            draw(picture)
+    except TimeoutError as error:
+        raise UsageError(f"cannot ask {path.name!r}: its supervisor does not answer") from error
+    except (FileNotFoundError, ConnectionRefusedError) as error:
+        raise UsageError(
+            f"cannot ask {path.name!r}: its supervisor was killed",
+            hint=f"clean up after it: lifecycle down {path.name}",
+        ) from error
+    click.echo(f"{path.name}: its supervisor has ended", err=True)
+
+
+def _drawing(format_: str, output: Path | None, *, watch: bool) -> Callable[[Picture], None]:
+    """Return what shows or writes one picture.
+
+    Raises:
+        UsageError: a picture that is no text would be drawn over and over on one stream.
+    """
+    if watch and output is None and format_ not in ("text", "json"):
+        raise UsageError(
+            f"cannot print one {format_} picture after another", hint="give --output FILE"
+        )
+    clear = _CLEAR if watch and format_ == "text" and sys.stdout.isatty() else ""
+
+    def draw(picture: Picture) -> None:
+        text = render(picture, format_)
+        if output is not None:
+            _replace(output, text)
+        else:
+            click.echo(clear + text.rstrip("\n"))
+
+    return draw
+
+
+def render(picture: Picture, format_: str) -> str:
+    """Return a picture in one of the formats of `--format`."""
+    if format_ == "json":
+        from lifecycle.codec import to_json
+
+        return to_json(picture).decode()
+    from lifecycle.export.picture import WRITERS
+
+    return WRITERS[format_](picture)
+
+
+def _replace(path: Path, text: str) -> None:
+    """Write a file so that whoever reads it sees the old one or the new one, whole."""
+    try:
+        with tempfile.NamedTemporaryFile(
+            "w", dir=path.parent, prefix=f".{path.name}.", encoding="utf-8", delete=False
+        ) as part:
+            part.write(text.rstrip("\n") + "\n")
+        Path(part.name).chmod(0o644)
+        Path(part.name).replace(path)
+    except OSError as error:
+        raise UsageError(f"cannot write {str(path)!r}: {error.strerror}") from error

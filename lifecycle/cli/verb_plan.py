@@ -1,0 +1,39 @@
+"""`lifecycle plan`: show the computational graph, participants, ports and bring-up order."""
+
+from __future__ import annotations
+
+import shutil
+
+import click
+
+from lifecycle import codec
+from lifecycle.cli.common import format_option, load_manifest, manifest_arguments
+from lifecycle.errors import ExitCode
+from lifecycle.plan import Plan, build_plan
+from lifecycle.plan.render import render_text
+
+
+@click.command("plan")
+@manifest_arguments
+@format_option("text", "json", "mermaid", "dot", "svg", "html")
+def command(manifest: str, assignments: tuple[str, ...], format_: str) -> int:
+    """Show what a manifest becomes: processes, order, nodes, participants, flows, ports.
+
+    Starts nothing and needs no ROS. The other formats draw it, as `lifecycle graph` draws what runs
+    beside it: mermaid for Markdown, dot for Graphviz, svg and html for a browser.
+    """
+    loaded = load_manifest(manifest, assignments)
+    plan = build_plan(loaded.manifest)
+    click.echo(render(plan, format_).rstrip("\n"))
+    return ExitCode.OK
+
+
+def render(plan: Plan, format_: str) -> str:
+    """Return the plan in one of the formats of `--format`."""
+    if format_ == "text":
+        return render_text(plan, width=shutil.get_terminal_size((100, 24)).columns)
+    if format_ == "json":
+        return codec.to_json(plan).decode()
+    from lifecycle.export.picture import WRITERS, planned_picture
+
+    return WRITERS[format_](planned_picture(plan))

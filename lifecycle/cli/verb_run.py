@@ -1,0 +1,104 @@
+"""`lifecycle run MANIFEST NODE`: one node of a manifest in this terminal, without a supervisor.
+
+Owns: finding the node in the plan; a node that is not a Python class replaces this process.
+"""
+
+from __future__ import annotations
+
+import os
+from typing import NoReturn
+
+import click
+
+from lifecycle.cli.common import load_manifest
+from lifecycle.errors import ExitCode, UsageError
+from lifecycle.manifest.model import DiscoveryRange, RunKind
+from lifecycle.plan import Plan, PlannedNode, build_plan
+
+_ROS_ARGUMENTS = "--ros-args"
+
+
+@click.command("run", context_settings={"ignore_unknown_options": True})
+@click.argument("manifest", metavar="MANIFEST")
+@click.argument("node", metavar="NODE")
+@click.argument(
+    "words",
+    nargs=-1,
+    type=click.UNPROCESSED,
+    metavar=f"[NAME:=VALUE]... [{_ROS_ARGUMENTS} ...]",
+)
+@click.option(
+    "--auto/--manual",
+    "auto",
+    default=True,
+    show_default=True,
+    help="bring the node up, or leave its transitions to `ros2 lifecycle` and others",
+)
+def command(manifest: str, node: str, words: tuple[str, ...], *, auto: bool) -> int:
+    """Run NODE of MANIFEST in this terminal until Ctrl-C; nothing is verified.
+
+    NODE is a key under `nodes:` or a fully qualified name. What follows --ros-args goes to ROS.
+    """
+    split = words.index(_ROS_ARGUMENTS) if _ROS_ARGUMENTS in words else len(words)
+    plan = build_plan(load_manifest(manifest, words[:split]).manifest)
+    planned = find_node(plan, node)
+    environment = {"ROS_DOMAIN_ID": str(plan.domain_id)}
+    if plan.discovery_range is not DiscoveryRange.SYSTEM_DEFAULT:
+        environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] = plan.discovery_range.value.upper()
+    os.environ.update({**environment, **dict(planned.run.environment)})
+    if planned.run.kind is RunKind.ATTACH:
+        raise UsageError(
+            f"cannot run {planned.full_name}: the manifest attaches to it, somebody else starts it"
+        )
+    if planned.run.kind is RunKind.COMMAND:
+        _replace_process(plan, planned, words[split:])
+    return _run_class(plan, planned, list(words[split:]), lifecycle="auto" if auto else "manual")
+
+
+def find_node(plan: Plan, name: str) -> PlannedNode:
+    """Return the node with this key or fully qualified name.
+
+    Raises:
+        UsageError: there is none; says which there are.
+    """
+    for each in plan.nodes:
+        if name in {each.key, each.full_name}:
+            return each
+    known = ", ".join(each.key for each in plan.nodes) or "none"
+    raise UsageError(f"cannot find node {name!r} in {plan.manifest_path}; its nodes: {known}")
+
+
+def _run_class(plan: Plan, planned: PlannedNode, arguments: list[str], *, lifecycle: str) -> int:
+    # Late: everything before this works without ROS, and says what is wrong without it.
+    from lifecycle.node.loading import load_class
+    from lifecycle.node.node import LifecycleNode
+    from lifecycle.node.standalone import run
+
+    if planned.run.working_directory:
+        os.chdir(planned.run.working_directory)
+    node_class = load_class(planned.run.python)
+    if not issubclass(node_class, LifecycleNode):
+        raise UsageError(
+            f"cannot run {planned.full_name}: {planned.run.python!r} is not a LifecycleNode"
+        )
+    run(
+        node_class,
+        lifecycle=lifecycle,
+        spec=planned,
+        domain_id=plan.domain_id,
+        arguments=arguments,
+        say=click.echo,
+        interrupted=ExitCode.INTERRUPTED,
+    )
+
+
+def _replace_process(plan: Plan, planned: PlannedNode, arguments: tuple[str, ...]) -> NoReturn:
+    process = next(each for each in plan.processes if each.name == planned.process)
+    if planned.run.working_directory:
+        os.chdir(planned.run.working_directory)
+    os.environ.update(dict(process.environment))
+    argv = [*process.argv, *arguments]
+    try:
+        os.execvp(argv[0], argv)  # noqa: S606 - the manifest's own command
+    except OSError as error:
+        raise UsageError(f"cannot run {argv[0]!r}: {error.strerror}") from error
