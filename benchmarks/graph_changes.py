@@ -1,0 +1,178 @@
+"""What one change costs in systems of 10 to 10,000 endpoints: `python benchmarks/graph_changes.py`.
+
+One reader (`GraphEvents` and `GraphState`) holds a simulated system whose nodes have ten endpoints
+each. Prints the median time from a message's sending until subscribers have been told, for each
+kind of change, and the time of a query; each also as a ratio to the smallest system. Nothing but
+the reader is measured: messages travel in memory, and nodes answer at once.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import statistics
+import sys
+import time
+from collections.abc import Callable
+
+from lifecycle.graph import (
+    ConfigurationChanged,
+    GraphEvents,
+    GraphMessage,
+    GraphState,
+    Heartbeat,
+    InMemoryNetwork,
+    Joined,
+    ManualScheduler,
+    MappingEstablished,
+    StateChanged,
+    encode,
+)
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.verify.observation import EndpointReport, Identity, NodeConfiguration
+
+SIZES = (10, 100, 1_000, 10_000)
+PER_NODE = 10
+CHANGES = 400
+
+
+class System:
+    """A reader and the nodes that it reads."""
+
+    def __init__(self, endpoints: int) -> None:
+        self.scheduler = ManualScheduler()
+        network = InMemoryNetwork(self.scheduler)
+        self.wire = network.transport()
+        self.configurations: dict[str, NodeConfiguration] = {}
+        self.sequences: dict[str, int] = {}
+        self.told = 0
+        events = GraphEvents(network.transport(), self.scheduler)
+        self.state = GraphState(events, lambda name, done: done(self.configurations[name]))
+        self.state.on_change(self._count)
+        for number in range(max(1, endpoints // PER_NODE)):
+            name = f"/robot/node_{number}"
+            self.configurations[name] = configuration(name, number)
+            self.sequences[name] = 0
+            self.wire.send(self.message(Joined, name, state="inactive", checksum="0"))
+        assert sum(len(each.endpoints) for each in self.state.nodes()) == endpoints
+
+    def message(self, type_: type[GraphMessage], name: str, **fields: object) -> bytes:
+        """Return the next message of a node."""
+        self.sequences[name] += type_ is not Heartbeat
+        header = {"node": name, "incarnation": "1", "sequence": self.sequences[name]}
+        return encode(type_(**header, **fields))  # type: ignore[arg-type]
+
+    def _count(self, _: object) -> None:
+        self.told += 1
+
+
+def configuration(name: str, number: int) -> NodeConfiguration:
+    return NodeConfiguration(
+        identity=Identity(machine_id="m", process_id=number, node_id=name),
+        name=name,
+        state="inactive",
+        connected=False,
+        rmw="rmw_fastrtps_cpp",
+        transports=("udpv4",),
+        serializations=("cdr",),
+        paradigms=("publish-subscribe",),
+        endpoints=tuple(
+            EndpointReport(
+                kind=(EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION)[index % 2],
+                name=f"e{index}",
+                resolved=f"/topic_{number}_{index // 2}",
+                type="std_msgs/msg/String",
+                mapped=True,
+                matched=0,
+            )
+            for index in range(PER_NODE)
+        ),
+        checksum="0",
+    )
+
+
+def change_state(system: System, name: str, turn: int) -> bytes:
+    state = ("active", "inactive")[turn // len(system.sequences) % 2]
+    return system.message(StateChanged, name, state=state, connected=True)
+
+
+def change_mapping(system: System, name: str, turn: int) -> bytes:
+    return system.message(MappingEstablished, name, endpoint="publishers/e0", matched=turn + 1)
+
+
+def change_configuration(system: System, name: str, turn: int) -> bytes:
+    """One endpoint more, or one less: the node is read again."""
+    before = system.configurations[name]
+    one_more = len(before.endpoints) == PER_NODE
+    extra = dataclasses.replace(before.endpoints[0], name="extra", resolved="/extra")
+    system.configurations[name] = dataclasses.replace(
+        before,
+        endpoints=(*before.endpoints, extra) if one_more else before.endpoints[:PER_NODE],
+        checksum=str(turn + 1),
+    )
+    return system.message(ConfigurationChanged, name, checksum=str(turn + 1))
+
+
+def heartbeat(system: System, name: str, _: int) -> bytes:
+    held = system.state.node(name)
+    assert held is not None
+    assert held.configuration is not None
+    return system.message(
+        Heartbeat,
+        name,
+        state=held.state,
+        connected=held.connected,
+        checksum=held.configuration.checksum,
+    )
+
+
+def measure(system: System, make: Callable[[System, str, int], bytes], *, tells: bool) -> float:
+    """Return the median microseconds of one change; nodes take turns."""
+    names = list(system.sequences)
+    before, took_us = system.told, []
+    for turn in range(CHANGES):
+        message = make(system, names[turn % len(names)], turn)
+        began = time.perf_counter()
+        system.wire.send(message)
+        took_us.append((time.perf_counter() - began) * 1e6)
+    assert system.told - before == (CHANGES if tells else 0), "a change was not told"
+    return statistics.median(took_us)
+
+
+def measure_query(system: System) -> float:
+    took_us = []
+    for number in range(CHANGES):
+        topic = f"/topic_{number % len(system.sequences)}_0"
+        began = time.perf_counter()
+        found = system.state.publishers_of(topic)
+        took_us.append((time.perf_counter() - began) * 1e6)
+        assert len(found) == 1
+    return statistics.median(took_us)
+
+
+MEASURED: dict[str, Callable[[System], float]] = {
+    "state changed": functools.partial(measure, make=change_state, tells=True),
+    "mapping established": functools.partial(measure, make=change_mapping, tells=True),
+    "endpoint added or removed": functools.partial(measure, make=change_configuration, tells=True),
+    "heartbeat, nothing new": functools.partial(measure, make=heartbeat, tells=False),
+    "who publishes a topic?": measure_query,
+}
+
+
+def main() -> int:
+    """Print one line for each kind of change."""
+    for cost in MEASURED.values():
+        cost(System(SIZES[0]))  # what is slow the first time is not to be measured
+    costs: dict[str, list[float]] = {title: [] for title in MEASURED}
+    for size in SIZES:
+        for title, cost in MEASURED.items():
+            costs[title].append(cost(System(size)))
+    print(f"{'µs per change, system of':28}" + "".join(f"{size:>18,}" for size in SIZES))
+    for title, found in costs.items():
+        cells = (f"{each:9.1f} ({each / found[0]:5.2f} x)" for each in found)
+        print(f"{title:28}" + "".join(f"{cell:>18}" for cell in cells))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

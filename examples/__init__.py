@@ -1,0 +1,1 @@
+"""Small whole systems to start from."""

@@ -1,0 +1,1 @@
+"""The nodes of the nine systems; their manifests are in manifests/."""
