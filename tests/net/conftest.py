@@ -1,0 +1,28 @@
+"""What every test on several hosts shares: they are skipped, with the reason, where none can be."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.net.hosts import Hosts, lacking
+
+
+@pytest.fixture
+def hosts() -> Iterator[Hosts]:
+    """Hosts that end with the test."""
+    with Hosts() as hosts:
+        yield hosts
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark everything below tests/net as `net`, and skip it where no host can be made."""
+    here = Path(__file__).parent
+    mine = [item for item in items if here in item.path.parents]
+    reason = lacking() if mine else ""
+    for item in mine:
+        item.add_marker(pytest.mark.net)
+        if reason:
+            item.add_marker(pytest.mark.skip(reason=reason))

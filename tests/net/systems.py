@@ -1,0 +1,71 @@
+"""Node classes of the tests on several hosts.
+
+N1 and N2 are the example of *Unique Network Flows*: N1 publishes video and battery state, N2 takes
+both. `LateListener` stands in for one of the nine systems'. The environment of a process may ask
+for more: HOLD_CONFIGURE_FILE holds configure until that file is there, and FAIL_CONFIGURE makes it
+fail.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+from std_msgs.msg import String
+
+from examples.nine_systems.nodes import Listener
+from lifecycle import LifecycleNode, on_message
+
+_PERIOD_S = 0.02
+_HOLD_S = 20.0
+
+
+def configure() -> None:
+    hold = os.environ.get("HOLD_CONFIGURE_FILE", "")
+    end = time.monotonic() + _HOLD_S
+    while hold and not Path(hold).exists() and time.monotonic() < end:
+        time.sleep(0.01)
+    if os.environ.get("FAIL_CONFIGURE"):
+        raise RuntimeError("no screen")
+
+
+class Source(LifecycleNode):
+    """N1."""
+
+    def on_configure(self, state):
+        configure()
+        self.create_timer(_PERIOD_S, self._tick)
+
+    def _tick(self) -> None:
+        self.publisher("video").publish(String(data="v" * 500))
+        self.publisher("battery").publish(String(data="b" * 100))
+
+
+class Sink(LifecycleNode):
+    """N2."""
+
+    _heard: frozenset[str] = frozenset()
+
+    def on_configure(self, state):
+        configure()
+
+    @on_message("video")
+    def see(self, message: String) -> None:
+        self._note("video")
+
+    @on_message("battery")
+    def gauge(self, message: String) -> None:
+        self._note("battery")
+
+    def _note(self, topic: str) -> None:
+        if topic not in self._heard:
+            self._heard |= {topic}
+            print("heard both" if len(self._heard) == 2 else f"heard {topic}", flush=True)
+
+
+class LateListener(Listener):
+    """Is not configured before it may be."""
+
+    def on_configure(self, state):
+        configure()

@@ -1,0 +1,308 @@
+"""The owned qdisc in real network namespaces: made, idempotent, queueing by flow, removed."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import shutil
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from lifecycle.export.rules import FlowRule
+from lifecycle.export.tc_settings import TcFeatures, TcMatch, TcSettings
+from lifecycle.supervisor.programming import tc
+from lifecycle.supervisor.programming.changes import ChangeKind, Changes
+from lifecycle.supervisor.programming.errors import (
+    MissingFeatureError,
+    NotOursError,
+    PrivilegeError,
+    ProgrammingError,
+)
+from lifecycle.supervisor.programming.ledger import Ledger
+from lifecycle.supervisor.programming.tc import TcTarget, probe_features
+from lifecycle.supervisor.programming.tool import HostTool
+from tests.net.hosts import Host, Hosts, lacking
+from tests.unit.supervisor.programming.samples import ledger_in, rule
+
+pytestmark = pytest.mark.net
+
+EF, AF11, REST = "12e", "10a", "fff"
+"""Minor numbers of the classes."""
+
+
+@dataclasses.dataclass
+class Bench:
+    """Two hosts on one switch, and a device of the first one."""
+
+    one: Host
+    other: Host
+    ledger: Ledger
+
+    def target(self, device: str = "e0", system: str = "robot", **settings: object) -> TcTarget:
+        chosen = TcSettings(device=device, **{"link_kbit": 20_000, **settings})
+        return TcTarget(system, chosen, self.ledger, HostTool(self.one.command()))
+
+    def rule(
+        self, topic: str = "/video", port: int = 17900, dscp: int = 46, **ends: str
+    ) -> FlowRule:
+        every = {"source": self.one.ipv4, "destination": self.other.ipv4, **ends}
+        return rule(topic, port, dscp=dscp, five_qi=None, **every)
+
+    def root(self) -> str:
+        return self.one.run("tc", "qdisc", "show", "dev", "e0").partition(" root")[0]
+
+    def sent(self, minor: str) -> int:
+        """Packets that went through a class."""
+        text = self.one.run("tc", "-s", "class", "show", "dev", "e0")
+        found = re.search(rf"class htb 1f10:{minor} .*\n Sent \d+ bytes (\d+) pkt", text)
+        return int(found[1]) if found else 0
+
+    def classes(self) -> list[str]:
+        text = self.one.run("tc", "class", "show", "dev", "e0")
+        return sorted(re.findall(r"class htb 1f10:([0-9a-f]+) ", text))
+
+    def send(self, *, port: int, count: int = 3, v6: bool = False, tos: int = 0) -> None:
+        """Send datagrams from `port`, and know that the device has them."""
+        family = socket.AF_INET6 if v6 else socket.AF_INET
+        address = (self.other.ipv6 if v6 else self.other.ipv4, 17910)
+        with (
+            self.other.socket(family, socket.SOCK_DGRAM) as receiver,
+            self.one.socket(family, socket.SOCK_DGRAM) as sender,
+        ):
+            receiver.settimeout(30)
+            receiver.bind(address)
+            sender.bind(("", port))
+            if tos:
+                sender.setsockopt(socket.IPPROTO_IP, socket.IP_TOS, tos)
+            for _ in range(count):
+                sender.sendto(b"x", address)
+                receiver.recv(16)
+
+
+@pytest.fixture(scope="module")
+def hosts() -> Iterator[tuple[Host, Host]]:
+    """Two hosts on one switch."""
+    if reason := lacking():
+        pytest.skip(reason)
+    if shutil.which("tc") is None and not Path("/usr/sbin/tc").exists():
+        pytest.skip("tc is not installed; install iproute2")
+    features = probe_features(HostTool())
+    if features is None or "htb" not in features.qdiscs or not features.classifiers:
+        pytest.skip(f"this kernel lacks htb, or both flower and u32: {features}")
+    with Hosts() as made:
+        one, other = made.bridged("one", "other")
+        yield one, other
+
+
+@pytest.fixture
+def bench(hosts: tuple[Host, Host], tmp_path: Path) -> Iterator[Bench]:
+    """The hosts, their device as the kernel made it."""
+    one, other = hosts
+    yield Bench(one, other, ledger_in(tmp_path))
+    one.run("tc", "qdisc", "del", "dev", "e0", "root", check=False)
+
+
+def kinds(changes: Changes) -> list[str]:
+    return [each.kind.value for each in changes.changes]
+
+
+def everything(host: Host) -> str:
+    return "".join(
+        host.run("tc", kind, "show", "dev", "e0") for kind in ("qdisc", "class", "filter")
+    )
+
+
+def test_each_flow_has_its_queue_and_a_second_apply_changes_nothing(bench: Bench) -> None:
+    rules = [bench.rule(), bench.rule("/lidar", 17901, dscp=10)]
+    bench.target().apply(rules)
+    before = everything(bench.one)
+
+    again = bench.target().apply(rules)
+
+    assert kinds(again) == ["keep", "keep"]
+    assert everything(bench.one) == before
+    assert bench.root() == "qdisc htb 1f10:"
+    assert bench.classes() == ["1", AF11, EF, REST]
+
+
+def test_packets_of_a_flow_go_through_its_class_and_others_through_the_rest(bench: Bench) -> None:
+    bench.target().apply([bench.rule(), bench.rule("/lidar", 17901, dscp=10)])
+
+    bench.send(port=17900, count=3)
+    bench.send(port=17901, count=2)
+    rest = bench.sent(REST)
+    bench.send(port=17902, count=4)
+
+    assert (bench.sent(EF), bench.sent(AF11)) == (3, 2)
+    assert bench.sent(REST) >= rest + 4
+
+
+def test_ipv6_flows_have_their_queue_too(bench: Bench) -> None:
+    bench.target().apply(
+        [bench.rule(source=bench.one.ipv6, destination=bench.other.ipv6), bench.rule("/v4", 17999)]
+    )
+
+    bench.send(port=17900, v6=True)
+    bench.send(port=17901, v6=True)
+
+    assert bench.sent(EF) == 3
+
+
+def test_a_port_that_changed_moves_its_filter_and_drops_no_queue(bench: Bench) -> None:
+    bench.target().apply([bench.rule(port=17900)])
+    bench.send(port=17900)
+
+    changes = bench.target().apply([bench.rule(port=18000)])
+    bench.send(port=17900)
+    bench.send(port=18000)
+
+    assert kinds(changes) == ["update"]
+    # The class and its counter have outlived the change.
+    assert bench.sent(EF) == 6
+
+
+def test_a_class_that_nothing_needs_any_more_is_deleted_with_its_filter(bench: Bench) -> None:
+    bench.target().apply([bench.rule(), bench.rule("/lidar", 17901, dscp=10)])
+
+    changes = bench.target().apply([bench.rule()])
+
+    assert sorted(kinds(changes)) == ["delete", "update"]
+    assert bench.classes() == ["1", EF, REST]
+    bench.send(port=17901)
+    assert bench.sent(EF) == 0
+    assert kinds(bench.target().plan([bench.rule()])) == ["keep"]
+
+
+def test_marked_packets_have_their_queue_whatever_flow_they_are_of(bench: Bench) -> None:
+    bench.target(match=TcMatch.MARK).apply([bench.rule()])
+
+    bench.send(port=17999, tos=0xB8)
+
+    assert bench.sent(EF) == 3
+
+
+def test_a_rate_that_changed_is_a_change(bench: Bench) -> None:
+    bench.target(link_kbit=20_000).apply([bench.rule()])
+
+    target = bench.target(link_kbit=10_000)
+    changes = target.apply([bench.rule()])
+
+    assert [(each.kind, each.detail) for each in changes.changes] == [
+        (ChangeKind.UPDATE, "the classes change")
+    ]
+    assert "ceil 10Mbit" in bench.one.run("tc", "class", "show", "dev", "e0")
+    assert not target.plan([bench.rule()]).pending
+
+
+def test_what_others_changed_below_our_qdisc_is_noticed_and_made_anew(bench: Bench) -> None:
+    target = bench.target()
+    target.apply([bench.rule()])
+    bench.one.run("tc", "filter", "del", "dev", "e0", "parent", "1f10:")
+
+    (change,) = target.apply([bench.rule()]).changes
+
+    assert (change.kind, change.detail) == (ChangeKind.UPDATE, "it was changed by others")
+    bench.send(port=17900)
+    assert bench.sent(EF) == 3
+
+
+def test_a_qdisc_that_is_gone_is_made_again(bench: Bench) -> None:
+    bench.target().apply([bench.rule()])
+    bench.one.run("tc", "qdisc", "del", "dev", "e0", "root")
+
+    (change,) = bench.target().apply([bench.rule()]).changes
+
+    assert (change.kind, change.detail) == (ChangeKind.CREATE, "the qdisc was gone")
+    assert bench.root() == "qdisc htb 1f10:"
+
+
+def test_removal_leaves_the_device_as_the_kernel_made_it(bench: Bench) -> None:
+    before = everything(bench.one)
+    bench.target().apply([bench.rule()])
+
+    changes = bench.target().remove()
+
+    assert kinds(changes) == ["delete"]
+    assert everything(bench.one) == before
+    assert bench.ledger.read().targets == ()
+    assert kinds(bench.target().remove()) == []
+
+
+def test_a_root_qdisc_of_somebody_else_is_refused_and_stays(bench: Bench) -> None:
+    bench.one.run("tc", "qdisc", "add", "dev", "e0", "root", "handle", "7:", "htb")
+    before = everything(bench.one)
+
+    with pytest.raises(NotOursError) as caught:
+        bench.target().apply([bench.rule()])
+
+    assert str(caught.value) == (
+        "cannot use tc on e0: it has a root qdisc of somebody else, htb 7:; "
+        "use another device, or remove it: tc qdisc del dev e0 root"
+    )
+    assert kinds(bench.target().remove()) == []
+    assert everything(bench.one) == before
+
+
+def test_two_systems_do_not_share_a_device(bench: Bench, tmp_path: Path) -> None:
+    bench.target().apply([bench.rule()])
+    other = Bench(bench.one, bench.other, ledger_in(tmp_path, "arm"))
+
+    with pytest.raises(NotOursError, match="made by lifecycle, but not for system 'arm'"):
+        other.target(system="arm").apply([bench.rule()])
+    other.target(system="arm").remove()
+
+    assert bench.root() == "qdisc htb 1f10:"
+
+
+def test_a_device_that_does_not_exist_is_one_clear_error(bench: Bench) -> None:
+    with pytest.raises(ProgrammingError) as caught:
+        bench.target("nope0").plan([bench.rule()])
+
+    assert str(caught.value) == "cannot find device 'nope0' on this host; see: ip link"
+
+
+def test_what_the_kernel_lacks_is_said_before_anything_is_touched(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    features = TcFeatures(qdiscs=("htb",), classifiers=())
+    monkeypatch.setattr(tc, "probe_features", lambda _: features)
+
+    with pytest.raises(MissingFeatureError) as caught:
+        bench.target().apply([bench.rule()])
+
+    assert str(caught.value) == (
+        "cannot find a classifier in this kernel: flower or u32 would do; "
+        "load the module cls_flower or cls_u32, or use a kernel that has it"
+    )
+    assert bench.ledger.read().targets == ()
+
+
+def test_without_a_rate_prio_is_needed_and_its_absence_is_said(bench: Bench) -> None:
+    features = probe_features(HostTool())
+    assert features is not None
+    target = bench.target(link_kbit=None)
+    if "prio" in features.qdiscs:
+        target.apply([bench.rule()])
+        assert bench.root() == "qdisc prio 1f10:"
+        return
+    with pytest.raises(MissingFeatureError, match="prio would do; load the module sch_prio"):
+        target.apply([bench.rule()])
+
+
+def test_without_privilege_one_line_says_what_is_needed(bench: Bench) -> None:
+    nobody = ("setpriv", "--reuid=65534", "--regid=65534", "--clear-groups", "--")
+    settings = TcSettings(device="e0", link_kbit=20_000)
+    target = TcTarget("robot", settings, bench.ledger, HostTool(bench.one.command(*nobody)))
+
+    # Looking needs no privilege.
+    assert kinds(target.plan([bench.rule()])) == ["create"]
+    with pytest.raises(PrivilegeError) as caught:
+        target.apply([bench.rule()])
+
+    assert str(caught.value) == (
+        "cannot program tc on e0: 'tc -batch -' needs CAP_NET_ADMIN in this network namespace; "
+        "run this command as root"
+    )

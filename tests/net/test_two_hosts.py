@@ -1,0 +1,174 @@
+"""One system on two hosts: two supervisors, one verdict, and each activates only its own."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from lifecycle.errors import ExitCode
+from lifecycle.supervisor.remote import down, status
+from tests.net.hosts import Host, Hosts
+from tests.net.running import UNIQUE, article, run_directory, up_on, up_on_both
+from tests.ros.supervisor.running import BOUND_S, Up
+
+_NODE_OF = {"a": "/n1", "b": "/n2"}
+
+
+@pytest.fixture
+def pair(hosts: Hosts) -> tuple[Host, Host]:
+    """Hosts A and B on one switch."""
+    one, other = hosts.bridged("A", "B")
+    return one, other
+
+
+def _driven(up: Up) -> set[str]:
+    return {each["node"] for each in up.of_kind("request")}
+
+
+def _doing(runtime: Path, machine: str) -> str:
+    (node,) = status(run_directory(runtime, machine)).nodes
+    return node.doing
+
+
+def test_both_supervisors_activate_their_own_on_the_same_verified_flows(
+    pair: tuple[Host, Host], tmp_path: Path
+) -> None:
+    manifest = article(tmp_path, pair[0].ipv4, pair[1].ipv4, edit=UNIQUE)
+    with up_on_both(*pair, manifest, runtime=tmp_path) as ups:
+        for up in ups:
+            up.until("system", reached="active")
+        ups[1].met("log", line="heard both")
+        flows = ups[0].of_kind("verdict")[-1]["verdict"]["flows"]
+        # Each looks at its own time; what they come to is the same.
+        ups[1].until_verdict(lambda verdict: verdict["flows"] == flows)
+        for up in ups:
+            up.signal(signal.SIGTERM)
+        assert [up.finish() for up in ups] == [ExitCode.OK, ExitCode.OK]
+    for up, machine in zip(ups, "ab", strict=True):
+        up.assert_gate_held()
+        up.assert_nothing_left()
+        assert _driven(up) == {_NODE_OF[machine]}
+    assert [(each["topic"], each["unique"], each["outcome"]) for each in flows] == [
+        ("/video", "strongly", "ok"),
+        ("/battery", "strongly", "ok"),
+    ]
+    assert {each["effective_transport"] for each in flows} == {"udpv4"}
+
+
+def test_the_gate_on_one_host_waits_for_the_nodes_of_the_other(
+    pair: tuple[Host, Host], tmp_path: Path
+) -> None:
+    go = tmp_path / "go"
+    held = {**UNIQUE, "nodes/n2/run/environment": {"HOLD_CONFIGURE_FILE": str(go)}}
+    manifest = article(tmp_path, pair[0].ipv4, pair[1].ipv4, edit=held)
+    with up_on_both(*pair, manifest, runtime=tmp_path) as (up_a, up_b):
+        up_a.until("system", reached="connected")
+        up_b.until("request", operation="configure")
+        # A sees that B's node is there; what it does not say of itself is not believed.
+        up_a.until_found("config.missing-report", "/n2")
+        assert up_a.of_kind("gate") == []
+        go.touch()
+        gate = up_a.until("gate")
+        assert gate["outcome"] == "ok"
+        # One that leaves before the other has judged would be missed by it.
+        for up in (up_a, up_b):
+            up.until("system", reached="active")
+        for up in (up_a, up_b):
+            up.signal(signal.SIGTERM)
+        assert (up_a.finish(), up_b.finish()) == (ExitCode.OK, ExitCode.OK)
+    up_a.assert_gate_held()
+    up_b.assert_gate_held()
+
+
+def test_a_step_waits_for_a_node_on_another_host(pair: tuple[Host, Host], tmp_path: Path) -> None:
+    go = tmp_path / "go"
+    edit = {
+        "nodes/n1/run/environment": {"HOLD_CONFIGURE_FILE": str(go)},
+        "nodes/n2/after": {"n1": "configured"},
+    }
+    manifest = article(tmp_path, pair[0].ipv4, pair[1].ipv4, edit=edit)
+    with up_on_both(*pair, manifest, runtime=tmp_path) as (up_a, up_b):
+        up_a.until("request", operation="configure")
+        up_b.until("node", reach="started")
+        deadline = time.monotonic() + BOUND_S
+        while _doing(tmp_path / "b", "b") != "waits to configure until /n1 is configured":
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        assert up_b.of_kind("request") == []
+        go.touch()
+        up_b.until("request", operation="configure")
+        for up in (up_a, up_b):
+            up.until("system", reached="active")
+        assert [down(run_directory(tmp_path / each, each), BOUND_S) for each in "ab"] == [
+            ExitCode.OK,
+            ExitCode.OK,
+        ]
+        assert (up_a.finish(), up_b.finish()) == (ExitCode.OK, ExitCode.OK)
+
+
+def test_no_host_activates_when_a_node_of_one_fails(
+    pair: tuple[Host, Host], tmp_path: Path
+) -> None:
+    edit = {"nodes/n2/run/environment": {"FAIL_CONFIGURE": "1"}}
+    manifest = article(tmp_path, pair[0].ipv4, pair[1].ipv4, edit=edit)
+    with up_on_both(*pair, manifest, "--timeout", "6", runtime=tmp_path) as (up_a, up_b):
+        assert up_b.finish() == ExitCode.BRING_UP_FAILED
+        assert up_a.finish() == ExitCode.VIOLATED
+    for up in (up_a, up_b):
+        assert "activate" not in {each["operation"] for each in up.of_kind("request")}
+        up.assert_nothing_left()
+    missing = {
+        each["subject"]: each["hint"]
+        for each in up_a.verdict["findings"]
+        if each["rule"] == "graph.missing-node"
+    }
+    assert missing == {
+        "/n2": "its machine has a supervisor of its own: lifecycle up MANIFEST --machine b"
+    }
+
+
+def test_a_host_that_is_held_reports_when_the_other_one_leaves(
+    pair: tuple[Host, Host], tmp_path: Path
+) -> None:
+    manifest = article(tmp_path, pair[0].ipv4, pair[1].ipv4)
+    with up_on_both(*pair, manifest, runtime=tmp_path) as (up_a, up_b):
+        for up in (up_a, up_b):
+            up.until("system", reached="active")
+        since = len(up_b.events)
+        up_a.signal(signal.SIGTERM)
+        assert up_a.finish() == ExitCode.OK
+        up_b.until_found("graph.missing-node", "/n1", since=since)
+        assert up_b.of_kind("stopping") == []
+        up_b.signal(signal.SIGTERM)
+        assert up_b.finish() == ExitCode.OK
+
+
+def test_without_a_machine_named_a_host_runs_those_that_have_its_address(
+    pair: tuple[Host, Host], tmp_path: Path
+) -> None:
+    manifest = article(tmp_path, pair[0].ipv4, pair[1].ipv4)
+    with contextlib.ExitStack() as stack:
+        ups = [
+            stack.enter_context(up_on(host, manifest, runtime=tmp_path / host.name))
+            for host in pair
+        ]
+        for up in ups:
+            up.until("system", reached="active")
+        for up in ups:
+            up.signal(signal.SIGTERM)
+        assert [up.finish() for up in ups] == [ExitCode.OK, ExitCode.OK]
+    assert [_driven(up) for up in ups] == [{"/n1"}, {"/n2"}]
+
+
+def test_hosts_leave_nothing_behind(tmp_path: Path) -> None:
+    with Hosts() as hosts:
+        one, _ = hosts.bridged("A", "B")
+        sleeping = one.popen("sleep", "600")
+        network = Path(f"/proc/{one.pid}/ns/net").stat().st_ino
+    assert sleeping.wait(BOUND_S) == -signal.SIGKILL
+    alive = [int(each.name) for each in Path("/proc").iterdir() if each.name.isdigit()]
+    assert network not in {Host._network(pid) for pid in alive}

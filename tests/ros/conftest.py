@@ -1,0 +1,179 @@
+"""What every test on real DDS shares: a domain of its own, loopback only, nothing left behind.
+
+A domain is claimed by an abstract socket, so that test processes on one machine never meet: two
+runs side by side, or the workers of one run. The socket, and with it the claim, goes with the
+process. `LIFECYCLE_TEST_DOMAINS=10-19` narrows the pool.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import socket
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+with warnings.catch_warnings():
+    # rclpy imports lark through its type supports, and lark a module that is deprecated.
+    warnings.simplefilter("ignore", DeprecationWarning)
+    import rclpy
+    import rosidl_generator_py  # noqa: F401
+
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+
+from lifecycle.middleware import discovery_environment, leftovers, segments_of
+
+# Their ports lie outside Linux's ephemeral range (32768–60999), where any socket may be in the way.
+_POOL = (*range(215, 232), *range(70, 102))
+
+BOUND_S = 30.0
+"""Seconds that a wait for an event may take on a busy machine; it ends with the event."""
+
+
+def _pool() -> tuple[int, ...]:
+    first, _, last = os.environ.get("LIFECYCLE_TEST_DOMAINS", "").partition("-")
+    return tuple(range(int(first), int(last or first) + 1)) if first else _POOL
+
+
+@contextlib.contextmanager
+def _claimed_domain() -> Iterator[int]:
+    with contextlib.ExitStack() as stack:
+        claim = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
+        for domain in _pool():
+            try:
+                claim.bind(f"\0lifecycle-test-domain-{domain}")
+            except OSError:
+                continue
+            yield domain
+            return
+    pytest.fail(f"all test domains {_pool()} are taken by other test processes")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def domain_id(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
+    """The ROS domain of this test process; the environment is set for it and for its children."""
+    with _claimed_domain() as domain, pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROS_DOMAIN_ID", str(domain))
+        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        patch.setenv("ROS_LOG_DIR", str(tmp_path_factory.mktemp("ros_log")))
+        patch.delenv("FASTRTPS_DEFAULT_PROFILES_FILE", raising=False)
+        profiles = discovery_environment(tmp_path_factory.mktemp("profiles"))
+        for name, value in profiles.items():
+            patch.setenv(name, value)
+        yield domain
+
+
+@pytest.fixture
+def fresh_domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
+    """A domain for one test alone: nodes killed in it haunt the graph for 20 s, and nobody else."""
+    with _claimed_domain() as domain:
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
+        yield domain
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _shared_memory() -> Iterator[set[str]]:
+    """Fail the run if a segment that it made is left and unused at its end."""
+    seen: set[str] = set()
+    yield seen
+    # Unique ports (7000–7399) are the same in every domain: another run may have one by now.
+    left = [name for name in leftovers(only=seen) if not re.search(r"port7[0-3]\d\d(?!\d)", name)]
+    assert left == [], "shared memory files were left behind"
+
+
+@pytest.fixture(autouse=True)
+def _note_shared_memory(_shared_memory: set[str]) -> Iterator[None]:
+    """Note what is used, and fail the test whose participants would haunt those that follow."""
+    me = psutil.Process()
+    before = segments_of([me.pid])
+    yield
+    after = segments_of([me.pid])
+    _shared_memory |= after | segments_of([child.pid for child in me.children(recursive=True)])
+    assert after - before == set(), (
+        "a participant of this test is still there: destroy all that belongs to it"
+    )
+
+
+@pytest.fixture
+def context(domain_id: int) -> Iterator[rclpy.Context]:
+    """An rclpy context in the test's domain."""
+    context = rclpy.Context()
+    context.init(args=[], domain_id=domain_id)
+    yield context
+    context.try_shutdown()
+    context.destroy()
+
+
+@pytest.fixture
+def make_node(context: rclpy.Context) -> Iterator[Callable[..., Node]]:
+    """Make nodes that go with the test: `make_node("talker", namespace="/robot")`."""
+    nodes: list[Node] = []
+
+    def make(name: str, **options: Any) -> Node:
+        nodes.append(Node(name, context=context, **{"enable_rosout": False, **options}))
+        return nodes[-1]
+
+    yield make
+    for node in nodes:
+        node.destroy_node()
+
+
+SpinUntil = Callable[..., None]
+
+
+@pytest.fixture
+def spin_until(context: rclpy.Context) -> Iterator[SpinUntil]:
+    """Spin nodes until something holds: `spin_until(lambda: got, node, other)`."""
+
+    def spin(holds: Callable[[], object], *nodes: Node, timeout_s: float = BOUND_S) -> None:
+        executor = SingleThreadedExecutor(context=context)
+        for node in nodes:
+            executor.add_node(node)
+        deadline = time.monotonic() + timeout_s
+        try:
+            while not holds():
+                assert time.monotonic() < deadline, f"not within {timeout_s} s"
+                executor.spin_once(timeout_sec=0.02)
+        finally:
+            for node in nodes:
+                executor.remove_node(node)
+            executor.shutdown()
+
+    return spin
+
+
+@pytest.fixture
+def wait_until() -> Callable[..., None]:
+    """Wait, without spinning, until something holds that no event tells of."""
+
+    def wait(holds: Callable[[], object], *, timeout_s: float = BOUND_S) -> None:
+        deadline = time.monotonic() + timeout_s
+        while not holds():
+            assert time.monotonic() < deadline, f"not within {timeout_s} s"
+            time.sleep(0.005)
+
+    return wait
+
+
+_DROPPED_REPLY = "ignore:failed to send response:RuntimeWarning"
+"""rclpy warns of a reply whose reader the server does not know yet, and who asked asks again.
+
+As an error it would end the executor, and the thread, of a server in this process.
+"""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark everything below tests/ros as `ros`."""
+    here = Path(__file__).parent
+    for item in items:
+        if here in item.path.parents:
+            item.add_marker(pytest.mark.ros)
+            item.add_marker(pytest.mark.filterwarnings(_DROPPED_REPLY))

@@ -1,0 +1,3 @@
+"""A module that cannot be imported because something that it needs is missing."""
+
+import no_such_driver  # noqa: F401

@@ -1,0 +1,433 @@
+"""Every fault of the suite, grouped by the stage that must catch it."""
+
+from __future__ import annotations
+
+import sys
+
+from lifecycle.errors import ExitCode
+from tests.ros.faults.system import NODES, Fault, foreign
+
+TALKER = "nodes/talker"
+LISTENER = "nodes/listener"
+
+
+def _command(*arguments: str) -> dict[str, object]:
+    """Edits that make the talker a foreign command instead of a class of ours."""
+    return {
+        f"{TALKER}/run": {"command": foreign(*arguments)},
+        f"{TALKER}/managed": False,
+        f"{TALKER}/interface": {
+            "publishers": [{"name": "/chatter", "type": "std_msgs/msg/String"}]
+        },
+    }
+
+
+def _docked(*arguments: str) -> dict[str, object]:
+    """Edits that add a foreign command, which declares an action server."""
+    dock = {
+        "run": {"command": foreign("dock", *arguments)},
+        "managed": False,
+        "interface": {"action_servers": [{"name": "/dock", "type": "test_msgs/action/Fibonacci"}]},
+    }
+    return {"nodes/dock": dock}
+
+
+def _misbehave(node: str, way: str, **timeouts: float) -> dict[str, object]:
+    edits: dict[str, object] = {f"nodes/{node}/parameters/misbehave": way}
+    edits.update({f"nodes/{node}/timeouts/{step}": seconds for step, seconds in timeouts.items()})
+    return edits
+
+
+def _run(node: str, name: str) -> dict[str, object]:
+    return {f"nodes/{node}/run": {"python": name if ":" in name else f"{NODES}:{name}"}}
+
+
+STATIC = (
+    Fault(
+        name="two types on one topic",
+        edits={f"{LISTENER}/interface/subscriptions/0/type": "std_msgs/msg/Int32"},
+        exit_code=ExitCode.MANIFEST_INVALID,
+        subject="/chatter",
+        message="std_msgs/msg/Int32",
+    ),
+    Fault(
+        name="a remap leads the subscription to a topic that nobody publishes",
+        edits={f"{LISTENER}/remap": {"chatter": "/chattter"}, "links": []},
+        exit_code=ExitCode.MANIFEST_INVALID,
+        subject="/chattter",
+    ),
+    Fault(
+        name="the declared QoS profiles are incompatible",
+        edits={
+            f"{TALKER}/interface/publishers/0/qos": "sensor_data",
+            f"{LISTENER}/interface/subscriptions/0/qos": {"reliability": "RELIABLE"},
+        },
+        exit_code=ExitCode.MANIFEST_INVALID,
+        subject="/chatter",
+        message="reliability",
+    ),
+    Fault(
+        name="a link names a topic that its node does not publish",
+        edits={"links/0/topic": "/chat"},
+        exit_code=ExitCode.MANIFEST_INVALID,
+        subject="/chat",
+    ),
+    Fault(
+        name="two nodes are declared under one name",
+        edits={f"{LISTENER}/name": "talker"},
+        exit_code=ExitCode.MANIFEST_INVALID,
+        subject="/talker",
+    ),
+    Fault(
+        name="two nodes wait for each other",
+        edits={
+            f"{LISTENER}/after": {"talker": "active"},
+            f"{TALKER}/after": {"listener": "active"},
+        },
+        exit_code=ExitCode.MANIFEST_INVALID,
+        subject="talker",
+        message="listener",
+    ),
+    Fault(
+        name="a parameter is set that the interface does not declare",
+        edits={f"{TALKER}/parameters": {"misbehav": ""}},
+        exit_code=ExitCode.MANIFEST_INVALID,
+        subject="misbehav",
+    ),
+    Fault(
+        name="a flow is asked of an endpoint that does not exist",
+        edits={f"{TALKER}/flows": {"publishers": {"chat": {"unique": "strictly_required"}}}},
+        exit_code=ExitCode.MANIFEST_INVALID,
+        subject="chat",
+    ),
+    Fault(
+        name="a link demands a unique flow that no endpoint asks for",
+        edits={"links/0/unique": "strongly"},
+        exit_code=ExitCode.MANIFEST_INVALID,
+        subject="/chatter",
+    ),
+    Fault(
+        name="a strictly unique publisher is asked of a command",
+        edits={
+            **_command("talker"),
+            f"{TALKER}/flows": {"publishers": {"/chatter": {"unique": "strictly_required"}}},
+        },
+        exit_code=ExitCode.MANIFEST_INVALID,
+        subject="/chatter",
+        message="no RMW does that for a publisher",
+    ),
+)
+
+START = (
+    Fault(
+        name="the module cannot be imported",
+        edits=_run("talker", "tests.ros.faults.no_such_module:Talker"),
+        exit_code=ExitCode.BRING_UP_FAILED,
+        subject="talker",
+        message="tests.ros.faults.no_such_module",
+    ),
+    Fault(
+        name="the module raises while it is imported",
+        edits=_run("talker", "tests.ros.faults.broken_import:Talker"),
+        exit_code=ExitCode.BRING_UP_FAILED,
+        subject="talker",
+        message="no_such_driver",
+    ),
+    Fault(
+        name="the module has no such class",
+        edits=_run("talker", "Talkre"),
+        exit_code=ExitCode.BRING_UP_FAILED,
+        subject="talker",
+        message="Talkre",
+    ),
+    Fault(
+        name="the class is no LifecycleNode",
+        edits=_run("talker", "NotALifecycleNode"),
+        exit_code=ExitCode.BRING_UP_FAILED,
+        subject="talker",
+        message="NotALifecycleNode",
+    ),
+    Fault(
+        name="the constructor raises",
+        edits=_run("talker", "RaisesInConstructor"),
+        exit_code=ExitCode.BRING_UP_FAILED,
+        subject="talker",
+        message="no such serial port",
+    ),
+    Fault(
+        name="the process dies while the node is constructed",
+        edits=_run("talker", "DiesInConstructor"),
+        exit_code=ExitCode.BRING_UP_FAILED,
+        subject="talker",
+        message=" died while starting: exit status 9",
+    ),
+    Fault(
+        name="the constructor hangs",
+        edits={**_run("talker", "HangsInConstructor"), f"{TALKER}/timeouts/start_s": 1.0},
+        exit_code=ExitCode.BRING_UP_FAILED,
+        subject="talker",
+        message="1 s",
+    ),
+    Fault(
+        name="the command does not exist",
+        edits={**_command("talker"), f"{TALKER}/run": {"command": ["/no/such/program"]}},
+        exit_code=ExitCode.BRING_UP_FAILED,
+        subject="talker",
+        message="/no/such/program",
+    ),
+    Fault(
+        name="the command exits with status 3",
+        edits=_command("talker", "--exit", "3"),
+        exit_code=ExitCode.BRING_UP_FAILED,
+        subject="talker",
+        message="exit status 3",
+    ),
+    Fault(
+        name="a node that somebody else should start is not there",
+        edits={f"{LISTENER}/run": {"attach": True}, f"{LISTENER}/timeouts/start_s": 1.0},
+        exit_code=ExitCode.BRING_UP_FAILED,
+        subject="/listener",
+    ),
+)
+
+TRANSITIONS = (
+    Fault(
+        name="a declared subscription has no handler",
+        edits=_run("listener", "WithoutHandler"),
+        exit_code=ExitCode.BRING_UP_FAILED,
+        subject="/listener",
+        message="@on_message('chatter')",
+    ),
+    Fault(
+        name="a handler names no declared subscription",
+        edits=_run("listener", "WithMisspeltHandler"),
+        exit_code=ExitCode.BRING_UP_FAILED,
+        subject="/listener",
+        message="@on_message('chater')",
+    ),
+    *(
+        Fault(
+            name=f"on_{step} raises",
+            edits=_misbehave("talker", f"{step}:raise"),
+            exit_code=ExitCode.BRING_UP_FAILED,
+            subject="/talker",
+            message="the sensor is on fire",
+            activates=step == "activate",
+        )
+        for step in ("configure", "connect", "activate")
+    ),
+    *(
+        Fault(
+            name=f"on_{step} returns FAILURE",
+            edits=_misbehave("listener", f"{step}:failure"),
+            exit_code=ExitCode.BRING_UP_FAILED,
+            subject="/listener",
+            message="FAILURE",
+            activates=step == "activate",
+        )
+        for step in ("configure", "connect", "activate")
+    ),
+    Fault(
+        name="on_configure returns ERROR",
+        edits=_misbehave("listener", "configure:error"),
+        exit_code=ExitCode.BRING_UP_FAILED,
+        subject="/listener",
+        message="ERROR",
+    ),
+    Fault(
+        name="on_connect returns something that is no result",
+        edits=_misbehave("listener", "connect:nonsense"),
+        exit_code=ExitCode.BRING_UP_FAILED,
+        subject="/listener",
+        message="'done'",
+    ),
+    *(
+        Fault(
+            name=f"the process dies in on_{step}",
+            edits=_misbehave("talker", f"{step}:{way}"),
+            exit_code=ExitCode.BRING_UP_FAILED,
+            subject="talker",
+            message=how,
+            activates=step == "activate",
+        )
+        for step, way, how in (
+            ("configure", "exit", " died while configuring: exit status 9"),
+            ("connect", "kill", " died while connecting: killed by SIGKILL"),
+            ("activate", "exit", " died while activating: exit status 9"),
+        )
+    ),
+    *(
+        Fault(
+            name=f"on_{step} hangs",
+            edits=_misbehave("listener", f"{step}:hang", **{f"{step}_s": 0.4}),
+            exit_code=ExitCode.BRING_UP_FAILED,
+            subject="/listener",
+            message=f"still {step.removesuffix('e')}ing",
+            activates=step == "activate",
+        )
+        for step in ("configure", "connect", "activate")
+    ),
+    Fault(
+        name="an async on_configure awaits for ever",
+        edits={
+            **_run("talker", "HangsAsync"),
+            **_misbehave("talker", "configure:await", configure_s=0.4),
+        },
+        exit_code=ExitCode.BRING_UP_FAILED,
+        subject="/talker",
+        message="0.4 s",
+    ),
+    Fault(
+        name="the whole bring-up takes too long",
+        edits=_misbehave("talker", "configure:hang", configure_s=60),
+        options=("--timeout", "1.5"),
+        exit_code=ExitCode.BRING_UP_FAILED,
+        subject="/talker",
+        message="1.5 s",
+    ),
+)
+
+GRAPH = (
+    Fault(
+        name="a node makes a publisher that it does not declare",
+        edits=_misbehave("talker", "configure:publisher"),
+        exit_code=ExitCode.VIOLATED,
+        rule="graph.undeclared-publisher",
+        subject="/undeclared_out",
+        message="/talker",
+    ),
+    Fault(
+        name="a node makes a subscription that it does not declare",
+        edits=_misbehave("talker", "connect:subscription"),
+        exit_code=ExitCode.VIOLATED,
+        rule="graph.undeclared-subscription",
+        subject="/undeclared_in",
+        message="/talker",
+    ),
+    Fault(
+        name="a command publishes with another QoS than declared",
+        edits=_command("talker", "--publish", "/chatter:std_msgs/msg/String:BEST_EFFORT"),
+        exit_code=ExitCode.VIOLATED,
+        rule="graph.qos-incompatible",
+        subject="/chatter",
+        message="reliability",
+    ),
+    Fault(
+        name="a command publishes another type than declared",
+        edits=_command("talker", "--publish", "/chatter:std_msgs/msg/Int32:RELIABLE"),
+        exit_code=ExitCode.VIOLATED,
+        rule="graph.type-mismatch",
+        subject="/chatter",
+        message="std_msgs/msg/Int32",
+    ),
+    Fault(
+        name="a command does not make the publisher that it declares",
+        edits=_command("talker"),
+        exit_code=ExitCode.VIOLATED,
+        rule="graph.missing-endpoint",
+        options=("--timeout", "6"),  # all of it is waited for, and it has to come up in it
+        subject="/chatter",
+        message="/talker",
+    ),
+    Fault(
+        name="a command offers an action of another type than declared",
+        edits=_docked("--serve", "/dock:test_msgs/action/NestedMessage"),
+        exit_code=ExitCode.VIOLATED,
+        rule="graph.type-mismatch",
+        subject="/dock",
+        message="test_msgs/action/NestedMessage",
+    ),
+    Fault(
+        name="a command does not make the action server that it declares",
+        edits=_docked(),
+        exit_code=ExitCode.VIOLATED,
+        rule="graph.missing-endpoint",
+        options=("--timeout", "6"),
+        subject="/dock",
+        message="cannot find the action server of /dock that /dock declares",
+    ),
+    Fault(
+        name="a command ignores its remap and publishes elsewhere",
+        edits=_command("talker", "--publish", "/chattter:std_msgs/msg/String:RELIABLE"),
+        exit_code=ExitCode.VIOLATED,
+        rule="graph.undeclared-publisher",
+        subject="/chattter",
+    ),
+    Fault(
+        name="a command never makes its node",
+        edits={
+            **_command("talker"),
+            f"{TALKER}/run": {"command": [sys.executable, "-c", "import time; time.sleep(60)"]},
+        },
+        exit_code=ExitCode.VIOLATED,
+        rule="graph.missing-node",
+        options=("--timeout", "5"),
+        subject="/talker",
+    ),
+    Fault(
+        name="a node that nobody declared is in the domain",
+        edits={},
+        intruder=("stranger", "--publish", "/noise:std_msgs/msg/String:RELIABLE"),
+        exit_code=ExitCode.VIOLATED,
+        rule="graph.undeclared-node",
+        subject="/stranger",
+    ),
+    Fault(
+        name="a foreign node has the name of one of ours",
+        edits={},
+        intruder=("talker",),
+        exit_code=ExitCode.VIOLATED,
+        rule="graph.duplicate-node",
+        subject="/talker",
+    ),
+)
+
+FLOWS = (
+    Fault(
+        name="a strictly unique subscription on a transport without network flows",
+        edits={
+            f"{LISTENER}/flows": {"subscriptions": {"chatter": {"unique": "strictly_required"}}},
+            f"{LISTENER}/run/environment": {
+                "FASTRTPS_DEFAULT_PROFILES_FILE": "$(env FAULT_SHARED_MEMORY_ONLY)"
+            },
+            "discovery/range": "off",  # localhost would add UDP again
+        },
+        exit_code=ExitCode.BRING_UP_FAILED,
+        subject="/listener",
+        message="chatter",
+    ),
+    Fault(
+        name="a foreign node does not tell its queue depth and the manifest insists",
+        edits={
+            **_command("talker", "--publish", "/chatter:std_msgs/msg/String:RELIABLE"),
+            "policy/unverifiable": "block",
+        },
+        exit_code=ExitCode.UNVERIFIABLE,
+        rule="graph.qos-unverifiable",
+        subject="/chatter",
+        message="depth",
+    ),
+)
+
+ACTIVE = (
+    Fault(
+        name="a process dies after the system is active",
+        edits=_misbehave("talker", "active:kill"),
+        exit_code=ExitCode.BRING_UP_FAILED,
+        subject="talker",
+        message=" died: killed by SIGKILL",
+        options=("--stop-after", "20"),  # it is over as soon as the process dies
+        activates=True,
+    ),
+    Fault(
+        name="a node makes an undeclared publisher once it is active",
+        edits=_misbehave("talker", "active:publisher"),
+        exit_code=ExitCode.VIOLATED,
+        rule="graph.undeclared-publisher",
+        subject="/undeclared_out",
+        options=("--stop-after", "3"),
+        activates=True,
+    ),
+)
+
+FAULTS = STATIC + START + TRANSITIONS + GRAPH + FLOWS + ACTIVE

@@ -1,0 +1,86 @@
+"""A node in a process of its own that reports to the graph: joined, heartbeats, and SIGTERM: left.
+
+    python reporting_node.py NAME TOPIC
+
+It serves `~/get_configuration` with one publisher of TOPIC, and makes it on the ordinary graph too.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from lifecycle import codec
+from lifecycle.graph import DdsTransport, GraphReporter, steady_timer
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.middleware import leave_and_exit
+from lifecycle.verify.observation import EndpointReport, Identity, NodeConfiguration
+
+
+class ReportingNode:
+    """An ordinary rclpy node with a reporter and the configuration service."""
+
+    def __init__(self, node: Node, topic: str, *, period_s: float = 0.2) -> None:
+        self.node = node
+        self.name = node.get_fully_qualified_name()
+        self.configuration = NodeConfiguration(
+            identity=Identity(machine_id="m", process_id=1, node_id=self.name),
+            name=self.name,
+            state="inactive",
+            connected=True,
+            rmw="rmw_fastrtps_cpp",
+            transports=("shm", "udpv4"),
+            serializations=("cdr",),
+            paradigms=("publish-subscribe",),
+            endpoints=(
+                EndpointReport(
+                    kind=EndpointKind.PUBLISHER,
+                    name="out",
+                    resolved=topic,
+                    type="std_msgs/msg/String",
+                    mapped=True,
+                    matched=0,
+                ),
+            ),
+            checksum="1",
+        )
+        self.asked = 0
+        node.create_publisher(String, topic, 1)
+        node.create_service(Trigger, "~/get_configuration", self._serve)
+        self.transport = DdsTransport(node)
+        self.reporter = GraphReporter(
+            self.transport, self.name, every=steady_timer(node), period_s=period_s
+        )
+        self.reporter.joined("inactive", connected=True, checksum="1")
+
+    def _serve(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self.asked += 1
+        response.success = True
+        response.message = codec.to_json(self.configuration).decode()
+        return response
+
+
+def main() -> None:
+    """Report until SIGTERM."""
+    rclpy.init(signal_handler_options=rclpy.SignalHandlerOptions.NO)
+    node = Node(sys.argv[1], enable_rosout=False)
+    reporting = ReportingNode(node, sys.argv[2])
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    threading.Thread(target=executor.spin, daemon=True).start()
+    print("reporting", flush=True)
+    signal.sigwait({signal.SIGTERM})
+    reporting.reporter.left("asked to")
+    leave_and_exit(0, nodes=[node], contexts=[rclpy.get_default_context()], deadline_s=5)
+
+
+if __name__ == "__main__":
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
+    main()

@@ -1,0 +1,316 @@
+"""Silent nodes on real DDS: what is noticed, how soon, in which order, and when it heals."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from lifecycle.middleware.healing import tell_names
+from tests.ros.supervisor.running import ROOT, Event, Up, environment, up, verb
+from tests.stalls import Stalls, assert_in_time, noted_stalls
+
+NODES = "benchmarks.liveliness_nodes"
+WITHIN_S = 1.0
+"""What is promised."""
+
+BUSY_MACHINE_S = 0.5
+"""For work that a busy machine takes longer for, beside the stalls that are noted."""
+
+SILENT_S = 0.8
+"""`timeouts.silent_s` where a manifest does not say."""
+
+LASTS_S = 3.0
+"""So long that it is noticed before its end even on a busy machine."""
+
+
+@pytest.fixture
+def stalls() -> Iterator[Stalls]:
+    """What the machine loses during the test."""
+    with noted_stalls() as stalls:
+        yield stalls
+
+
+@pytest.fixture
+def system(tmp_path: Path, fresh_domain: int) -> Callable[..., Path]:
+    """Write the manifest of a node that hangs when told to, and a quiet one."""
+
+    def write(hanging: Mapping[str, Any] | None = None) -> Path:
+        file = tmp_path / "silence.lifecycle.yaml"
+        run = {
+            "python": f"{NODES}:Hanging",
+            "environment": {"HANG_FILE": str(tmp_path / "hang")},
+        }
+        file.write_text(
+            yaml.safe_dump(
+                {
+                    "manifest_version": 1,
+                    "system": "silence",
+                    "discovery": {"domain_id": fresh_domain, "range": "localhost"},
+                    "nodes": {
+                        "hanging": hanging or {"run": run},
+                        "quiet": {"run": {"python": f"{NODES}:Quiet"}},
+                    },
+                }
+            )
+        )
+        return file
+
+    return write
+
+
+@pytest.fixture
+def start(tmp_path: Path, system: Callable[..., Path]) -> Iterator[Callable[..., Up]]:
+    """Bring such a system up: `start(timeouts={...})`; it ends with the test."""
+    with contextlib.ExitStack() as stack:
+
+        def begin(*options: str, hanging: Mapping[str, Any] | None = None, **keys: Any) -> Up:
+            file = system(hanging)
+            if keys:
+                document = yaml.safe_load(file.read_text())
+                document["nodes"]["hanging"].update(keys)
+                file.write_text(yaml.safe_dump(document))
+            return stack.enter_context(up(file, *options, runtime=tmp_path))
+
+        yield begin
+
+
+def hang(directory: Path, way: str, seconds: float = LASTS_S) -> None:
+    """Have the node hang; whole, whenever it looks."""
+    part = directory / "part"
+    part.write_text(f"{way} {seconds}", encoding="ascii")
+    part.rename(directory / "hang")
+
+
+def at(running: Up, kind: str, **fields: object) -> float:
+    """Return when an event came."""
+    running.until(kind, **fields)
+    return time.monotonic()
+
+
+def until_verdict(running: Up, outcome: str) -> Event:
+    """Read on until the verdict is this, and return it."""
+    since = len(running.events)
+    return running.until_verdict(lambda verdict: verdict["verdict"] == outcome, since=since)
+
+
+def said(running: Up, word: str, since: int) -> float:
+    """Return when the node did what it says in its log, which may come a little later."""
+    prefix = f"{word} "
+    for event in running.events[since:]:
+        if event.get("event") == "log" and event["line"].startswith(prefix):
+            return float(event["line"].removeprefix(prefix))
+    while not (line := running.until("log")["line"]).startswith(prefix):
+        pass
+    return float(line.removeprefix(prefix))
+
+
+def turns(running: Up, node: str, since: int = 0) -> list[str]:
+    """Return what was said of a node, and how the verdict turned, in order."""
+    found: list[str] = []
+    for event in running.events[since:]:
+        if event.get("event") in ("silent", "alive") and event["node"] == node:
+            found.append(event["event"])
+        elif event.get("event") == "verdict" and [event["verdict"]["verdict"]] != found[-1:]:
+            found.append(event["verdict"]["verdict"])
+    return found
+
+
+def joined(running: Up) -> list[str]:
+    """Return the nodes that came into the graph, in the order they were seen."""
+    return [event["node"] for event in running.of_kind("joined")]
+
+
+def silences(running: Up, node: str) -> list[Event]:
+    """Return what was said of the silence of a node."""
+    return [event for event in running.of_kind("silent") if event["node"] == node]
+
+
+@pytest.mark.parametrize("way", ["sleep", "busy", "locked"])
+def test_a_hung_executor_is_noticed_within_a_second_and_so_is_its_end(
+    start: Callable[..., Up], tmp_path: Path, way: str, stalls: Stalls
+) -> None:
+    running = start()
+    running.until("system", reached="active")
+    pid = running.pid_of("hanging")
+
+    def late_s() -> float:
+        since = len(running.events)
+        asked = time.monotonic()
+        hang(tmp_path, way)
+        silent = at(running, "silent", node="/hanging", cause="hung")
+        verdict = until_verdict(running, "violated")
+        violated = time.monotonic()
+        alive = at(running, "alive", node="/hanging")
+        until_verdict(running, "ok")
+        began, ended = said(running, "hangs", since), said(running, "is back", since)
+        # Not before its time, and not before it ended. The callback began before it said so, and
+        # if the machine stood still meanwhile, before it was asked to hang.
+        assert silent - asked >= SILENT_S / 2
+        assert ended <= alive
+        assert turns(running, "/hanging", since) == ["silent", "violated", "alive", "ok"]
+        (finding,) = [each for each in verdict["findings"] if each["node"] == "/hanging"]
+        assert finding["rule"] == "run.silent-node"
+        assert finding["message"] == (
+            f"cannot rely on '/hanging': a callback in its process 'hanging' (pid {pid}) has been "
+            "running for 0.8 s"
+        )
+        return max(
+            stalls.taken(began, violated) - WITHIN_S - BUSY_MACHINE_S,
+            stalls.taken(ended, alive) - WITHIN_S,
+        )
+
+    assert_in_time(late_s)
+
+
+def test_a_stopped_process_is_noticed_at_once_and_so_is_its_continuation(
+    start: Callable[..., Up], stalls: Stalls
+) -> None:
+    running = start()
+    running.until("system", reached="active")
+    pid = running.pid_of("quiet")
+
+    def late_s() -> float:
+        since = len(running.events)
+        began = time.monotonic()
+        os.kill(pid, signal.SIGSTOP)
+        silent = at(running, "silent", node="/quiet", cause="stopped")
+        until_verdict(running, "violated")
+        ended = time.monotonic()
+        os.kill(pid, signal.SIGCONT)
+        alive = at(running, "alive", node="/quiet")
+        until_verdict(running, "ok")
+        assert turns(running, "/quiet", since) == ["silent", "violated", "alive", "ok"]
+        return max(stalls.taken(began, silent), stalls.taken(ended, alive)) - WITHIN_S
+
+    assert_in_time(late_s)
+
+
+def test_status_says_which_node_is_silent_and_why(start: Callable[..., Up], tmp_path: Path) -> None:
+    running = start()
+    running.until("system", reached="active")
+    pid = running.pid_of("quiet")
+    os.kill(pid, signal.SIGSTOP)
+    running.until("silent", node="/quiet")
+    told = verb("status", "silence", runtime=tmp_path)
+    os.kill(pid, signal.SIGCONT)
+    (line,) = [each for each in told.stdout.splitlines() if each.startswith("/quiet")]
+    assert line.endswith(f"silent: its process 'quiet' (pid {pid}) was stopped by a signal")
+
+
+def test_a_system_with_a_stopped_node_is_taken_down_without_waiting_for_it(
+    start: Callable[..., Up],
+) -> None:
+    running = start()
+    running.until("system", reached="active")
+    os.kill(running.pid_of("quiet"), signal.SIGSTOP)
+    running.until("silent", node="/quiet")
+    running.signal(signal.SIGINT)
+    running.until("stopping")
+    before = len(running.events)
+    running.finish()
+    asked = [each["node"] for each in running.events[before:] if each.get("event") == "request"]
+    assert set(asked) == {"/hanging"}
+    # A stopped process takes no other signal.
+    ends = {each["process"]: each["detail"] for each in running.of_kind("process")}
+    assert ends["quiet"] == "killed by SIGKILL"
+    running.assert_nothing_left()
+
+
+def test_a_killed_node_is_dead_and_not_silent(start: Callable[..., Up], stalls: Stalls) -> None:
+    running = start("--keep-going")
+    running.until("system", reached="active")
+    before = len(running.events)
+    began = time.monotonic()
+    os.kill(running.pid_of("quiet"), signal.SIGKILL)
+    exited = at(running, "process", process="quiet", state="exited")
+    running.until_found("graph.missing-node", "/quiet", since=before)
+    # A process dies once, so there is no second try.
+    assert stalls.taken(began, exited) <= WITHIN_S + BUSY_MACHINE_S
+    assert silences(running, "/quiet") == []
+
+
+def test_a_callback_may_take_as_long_as_the_manifest_allows(
+    start: Callable[..., Up], tmp_path: Path
+) -> None:
+    running = start(timeouts={"silent_s": 10})
+    running.until("system", reached="active")
+    hang(tmp_path, "busy", 1.5)
+    said(running, "is back", 0)
+    running.signal(signal.SIGINT)
+    running.finish()
+    assert silences(running, "/hanging") == []
+
+
+def test_a_transition_that_takes_long_is_not_a_hang(start: Callable[..., Up]) -> None:
+    slow = {"run": {"python": "tests.ros.liveliness.nodes:Slow"}}
+    running = start("--stop-after", "0", hanging=slow)
+    assert running.finish() == 0
+    assert silences(running, "/hanging") == []
+
+
+def test_nodes_join_and_leave_the_graph_as_events(start: Callable[..., Up]) -> None:
+    running = start("--keep-going")
+    running.until("system", reached="active")
+    # Two processes start side by side, so either may be first.
+    assert sorted(joined(running)) == ["/hanging", "/quiet"]
+    os.kill(running.pid_of("quiet"), signal.SIGTERM)
+    running.until("left", node="/quiet")
+
+
+def test_a_node_that_somebody_else_runs_is_heard_by_whoever_attaches_to_it(
+    start: Callable[..., Up], tmp_path: Path, stalls: Stalls
+) -> None:
+    code = f"import lifecycle, {NODES} as nodes; lifecycle.run(nodes.Hanging)"
+    node = subprocess.Popen(
+        [sys.executable, "-c", code],
+        cwd=ROOT,
+        env={**environment(tmp_path, ""), "HANG_FILE": str(tmp_path / "hang")},
+        stdout=subprocess.DEVNULL,
+    )
+    try:
+        running = start(hanging={"attach": True})
+        running.until("system", reached="active")
+        hang(tmp_path, "sleep")
+        running.until("silent", node="/hanging", cause="told")
+        running.until("alive", node="/hanging")
+
+        def late_s() -> float:
+            began = time.monotonic()
+            node.send_signal(signal.SIGSTOP)
+            silent = at(running, "silent", node="/hanging", cause="lost")
+            ended = time.monotonic()
+            node.send_signal(signal.SIGCONT)
+            alive = at(running, "alive", node="/hanging")
+            return max(stalls.taken(began, silent), stalls.taken(ended, alive)) - limit_s
+
+        limit_s = WITHIN_S + BUSY_MACHINE_S
+        assert_in_time(late_s)
+        began = time.monotonic()
+        node.kill()
+        silent = at(running, "silent", node="/hanging", cause="lost")
+        # A process dies once, so there is no second try.
+        assert stalls.taken(began, silent) <= 2 * limit_s
+    finally:
+        node.kill()
+        node.wait(10)
+
+
+def test_telling_names_anew_adds_nothing_to_the_graph(
+    make_node: Callable[..., Any], wait_until: Callable[..., None]
+) -> None:
+    node, other = make_node("teller"), make_node("listener")
+    wait_until(lambda: ("teller", "/") in other.get_node_names_and_namespaces())
+    before = sorted(node.get_topic_names_and_types())
+    tell_names([node])
+    wait_until(lambda: sorted(other.get_topic_names_and_types()) == before)
+    assert node.count_publishers("/parameter_events") == 2

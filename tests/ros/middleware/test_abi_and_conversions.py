@@ -1,0 +1,252 @@
+"""What stands between us and the C libraries: refusals in words, and conversions both ways."""
+
+from __future__ import annotations
+
+import ctypes
+import itertools
+from collections.abc import Callable
+from types import SimpleNamespace
+
+import pytest
+from rclpy.node import Node
+from rclpy.qos import qos_profile_sensor_data, qos_profile_services_default
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from lifecycle.errors import MiddlewareError
+from lifecycle.manifest.qos import Durability, History, Liveliness, QosProfile, Reliability
+from lifecycle.middleware import (
+    NetworkFlowEndpointsUnsupported,
+    UniqueFlowNotFeasible,
+    UnknownInterfaceError,
+    abi,
+    create_subscription,
+    from_rclpy,
+    get_network_flow_endpoints,
+    import_interface,
+    to_rclpy,
+)
+from lifecycle.network.nfe import UniqueRequirement
+
+MakeNode = Callable[..., Node]
+INSTALL = "install ros-jazzy-rclpy[fastrtps]"
+
+
+def ignore(_: String) -> None:
+    pass
+
+
+def test_the_installed_libraries_are_laid_out_as_known() -> None:
+    abi.Rcl()
+
+
+def test_another_major_of_rcl_is_refused_before_anything_is_called(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(abi, "rcl_version", lambda: "10.1.0")
+    monkeypatch.setattr(abi, "_open", lambda _: pytest.fail("a library was loaded"))
+    with pytest.raises(MiddlewareError) as refused:
+        abi.Rcl()
+    assert str(refused.value) == (
+        "cannot reach network flows through rcl '10.1.0': only rcl 9 (ROS 2 Jazzy) is known; "
+        f"{INSTALL}"
+    )
+
+
+def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(abi.ctypes, "CDLL", lambda _: ctypes.cdll.LoadLibrary("libno.so"))
+    with pytest.raises(MiddlewareError) as refused:
+        abi.Rcl()
+    assert str(refused.value) == (
+        "cannot load 'librcutils.so': libno.so: cannot open shared object file: No such file or "
+        f"directory; {INSTALL}"
+    )
+
+
+def test_a_missing_symbol_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(abi, "_open", lambda _: ctypes.CDLL(None))
+    monkeypatch.setattr(abi, "rcl_version", lambda: "")
+    with pytest.raises(MiddlewareError) as refused:
+        abi._bind(ctypes.CDLL(None), "rcl_of_the_future", None)
+    assert str(refused.value) == (
+        "cannot find 'rcl_of_the_future' in the installed ROS libraries (rcl ?); " + INSTALL
+    )
+
+
+@pytest.mark.parametrize("kind", ["publisher", "subscription"])
+def test_a_struct_that_is_laid_out_otherwise_is_refused(kind: str) -> None:
+    rcl = abi.Rcl()
+    shifted = rcl.by_kind[kind]["default_options"]()
+    shifted.options.qos.depth = 0
+    rcl.by_kind[kind]["default_options"] = lambda: shifted
+    with pytest.raises(MiddlewareError) as refused:
+        rcl._check_layout("9.9.9")
+    assert str(refused.value) == (
+        f"cannot use the installed rcl 9.9.9: its rcl_{kind}_options_t is not laid out as rcl 9's; "
+        f"{INSTALL}"
+    )
+
+
+@pytest.fixture
+def other_rmw(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An RMW without network flow endpoints that ignores the creation option, as Cyclone's."""
+    rcl = abi.load()
+    for functions in rcl.by_kind.values():
+        monkeypatch.setitem(functions, "nfes", lambda *_: abi.RCL_RET_UNSUPPORTED)
+    monkeypatch.setattr(rcl, "take_error", lambda: "not supported by rmw_other")
+
+
+@pytest.mark.usefixtures("other_rmw")
+def test_an_rmw_without_network_flow_endpoints_says_so_in_its_own_words(
+    make_node: MakeNode,
+) -> None:
+    publisher = make_node("node").create_publisher(String, "/a", 10)
+    with pytest.raises(NetworkFlowEndpointsUnsupported) as refused:
+        get_network_flow_endpoints(publisher)
+    assert refused.value.reason == "not supported by rmw_other"
+    assert str(refused.value) == (
+        "cannot read the network flow endpoints of a publisher: not supported by rmw_other; set "
+        "RMW_IMPLEMENTATION=rmw_fastrtps_cpp"
+    )
+
+
+@pytest.mark.usefixtures("other_rmw")
+def test_an_rmw_that_only_pretends_to_be_strict_is_refused(make_node: MakeNode) -> None:
+    node = make_node("node")
+    strictly = UniqueRequirement.STRICTLY_REQUIRED
+    with pytest.raises(UniqueFlowNotFeasible) as refused:
+        create_subscription(node, String, "/a", ignore, QosProfile(), unique=strictly)
+    assert str(refused.value) == (
+        "cannot create subscription '/a' with network flow endpoints strictly_required: not "
+        "supported by rmw_other; ask for optionally_required, or set "
+        "RMW_IMPLEMENTATION=rmw_fastrtps_cpp"
+    )
+    assert list(node.subscriptions) == []
+    assert node.count_subscribers("/a") == 0
+
+
+def test_an_endpoint_that_listens_nowhere_is_refused(
+    make_node: MakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(abi.load().by_kind["subscription"], "nfes", lambda *_: abi.RCL_RET_OK)
+    strictly = UniqueRequirement.STRICTLY_REQUIRED
+    with pytest.raises(UniqueFlowNotFeasible) as refused:
+        create_subscription(make_node("n"), String, "/a", ignore, QosProfile(), unique=strictly)
+    assert refused.value.reason == "the RMW lists no network flow endpoint for it"
+
+
+def test_errors_lose_the_places_in_c_files_and_are_used_up() -> None:
+    rcl = abi.load()
+    assert rcl.wait_set_fini(None) != abi.RCL_RET_OK
+    reason = rcl.take_error()
+    assert reason == "wait_set argument is null"
+    assert rcl.take_error() == "error not set"
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs"),
+    [
+        (
+            QosProfile(
+                depth=5,
+                reliability=Reliability.BEST_EFFORT,
+                liveliness=Liveliness.SYSTEM_DEFAULT,
+            ),
+            qos_profile_sensor_data,
+        ),
+        (QosProfile(liveliness=Liveliness.SYSTEM_DEFAULT), qos_profile_services_default),
+    ],
+)
+def test_presets_of_ros_convert_both_ways(ours: QosProfile, theirs: object) -> None:
+    assert from_rclpy(theirs) == ours
+    assert to_rclpy(ours) == theirs
+
+
+def test_every_policy_survives_the_way_there_and_back() -> None:
+    policies = itertools.product(
+        History, Reliability, Durability, Liveliness, (None, 1, 2**62, 2**63 - 2)
+    )
+    for history, reliability, durability, liveliness, duration_ns in policies:
+        qos = QosProfile(
+            history=history,
+            depth=7,
+            reliability=reliability,
+            durability=durability,
+            deadline_ns=duration_ns,
+            lifespan_ns=duration_ns,
+            liveliness=liveliness,
+            liveliness_lease_duration_ns=duration_ns,
+        )
+        assert from_rclpy(to_rclpy(qos)) == qos
+
+
+def test_infinite_reads_as_none_however_rmw_spells_it() -> None:
+    profile = to_rclpy(QosProfile())
+    assert profile.deadline.nanoseconds == 0
+    profile.deadline = type(profile.deadline)(nanoseconds=2**63 - 1)
+    assert from_rclpy(profile).deadline_ns is None
+
+
+def test_interfaces_are_found_by_their_ros_names() -> None:
+    assert import_interface("std_msgs/msg/String") is String
+    assert import_interface("std_srvs/srv/Trigger") is Trigger
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        (
+            "std_msgs/String",
+            (
+                "cannot read interface type 'std_msgs/String': write package/msg/Type, "
+                "package/srv/Type or package/action/Type"
+            ),
+        ),
+        (
+            "std_msgs/msg/Strin",
+            (
+                "cannot find interface type 'std_msgs/msg/Strin': package 'std_msgs' has no msg "
+                "'Strin'; did you mean std_msgs/msg/String?"
+            ),
+        ),
+        (
+            "my_robot/msg/Arm",
+            (
+                "cannot find interface type 'my_robot/msg/Arm': no package 'my_robot' with msg "
+                "interfaces is installed; install my_robot, or source the workspace that has it"
+            ),
+        ),
+        (
+            "std_msgs/srv/Reset",
+            (
+                "cannot find interface type 'std_msgs/srv/Reset': no package 'std_msgs' with srv "
+                "interfaces is installed; install std_msgs, or source the workspace that has it"
+            ),
+        ),
+        (
+            "os/msg/../../System",
+            (
+                "cannot read interface type 'os/msg/../../System': write package/msg/Type, "
+                "package/srv/Type or package/action/Type"
+            ),
+        ),
+    ],
+)
+def test_an_interface_that_cannot_be_had_says_why(name: str, message: str) -> None:
+    with pytest.raises(UnknownInterfaceError) as refused:
+        import_interface(name)
+    assert str(refused.value) == message
+
+
+def test_a_package_that_fails_to_import_is_not_said_to_be_missing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def import_module(_: str) -> object:
+        raise ModuleNotFoundError("No module named 'numpy'", name="numpy")
+
+    monkeypatch.setattr(
+        "lifecycle.middleware.interface_types.importlib",
+        SimpleNamespace(import_module=import_module),
+    )
+    with pytest.raises(ModuleNotFoundError, match="numpy"):
+        import_interface("std_msgs/msg/String")

@@ -1,0 +1,266 @@
+"""What the observer sees of a real graph, and how soon it is told of changes."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import psutil
+import pytest
+import rclpy
+from managed_node import ManagedNode
+from rclpy.node import Node
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from lifecycle.errors import MiddlewareError
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.manifest.qos import Durability, History, QosProfile, Reliability
+from lifecycle.middleware import FlowParticipant, GraphObserver, to_rclpy
+from lifecycle.verify.observation import ObservedNode
+from tests.stalls import assert_in_time
+
+MakeNode = Callable[..., Node]
+WaitUntil = Callable[..., None]
+
+
+@pytest.fixture
+def observer(domain_id: int) -> Iterator[GraphObserver]:
+    with GraphObserver(domain_id) as observer:
+        yield observer
+
+
+def nodes(observer: GraphObserver) -> dict[str, ObservedNode]:
+    return {node.full_name: node for node in observer.snapshot()[0]}
+
+
+def endpoints(observer: GraphObserver) -> list[tuple[EndpointKind, str, str, str]]:
+    return [(each.kind, each.node, each.name, each.type) for each in observer.snapshot()[1]]
+
+
+def test_an_empty_graph_has_neither_the_observer_nor_what_it_brings(
+    observer: GraphObserver, wait_until: WaitUntil
+) -> None:
+    wait_until(lambda: observer.snapshot() == ((), ()))
+
+
+def test_endpoints_show_with_node_type_and_qos_and_without_the_noise(
+    observer: GraphObserver, make_node: MakeNode, wait_until: WaitUntil
+) -> None:
+    node = make_node("camera", namespace="/robot", enable_rosout=True)
+    qos = QosProfile(
+        depth=3,
+        reliability=Reliability.BEST_EFFORT,
+        durability=Durability.TRANSIENT_LOCAL,
+        deadline_ns=100_000_000,
+    )
+    node.create_publisher(String, "video", to_rclpy(qos))
+    node.create_subscription(String, "/cmd", lambda _: None, 10)
+    node.create_service(Trigger, "~/reset", lambda _, response: response)
+    node.create_client(Trigger, "/dock")
+    expected = [
+        (EndpointKind.PUBLISHER, "/robot/camera", "/robot/video", "std_msgs/msg/String"),
+        (EndpointKind.SERVICE_CLIENT, "/robot/camera", "/dock", "std_srvs/srv/Trigger"),
+        (
+            EndpointKind.SERVICE_SERVER,
+            "/robot/camera",
+            "/robot/camera/reset",
+            "std_srvs/srv/Trigger",
+        ),
+        (EndpointKind.SUBSCRIPTION, "/robot/camera", "/cmd", "std_msgs/msg/String"),
+    ]
+    wait_until(lambda: endpoints(observer) == expected)
+    publisher = observer.snapshot()[1][0]
+    # Fast DDS does not announce history and depth.
+    assert publisher.qos == QosProfile(
+        history=History.UNKNOWN,
+        depth=0,
+        reliability=Reliability.BEST_EFFORT,
+        durability=Durability.TRANSIENT_LOCAL,
+        deadline_ns=100_000_000,
+    )
+    assert len(bytes.fromhex(publisher.gid)) == 16
+
+
+def test_two_nodes_of_one_name_count_twice(
+    observer: GraphObserver, make_node: MakeNode, wait_until: WaitUntil
+) -> None:
+    make_node("twin")
+    make_node("twin")
+    wait_until(
+        lambda: (
+            nodes(observer).get("/twin") == ObservedNode(full_name="/twin", count=2, managed=False)
+        )
+    )
+
+
+def test_a_managed_node_is_told_by_its_services(
+    observer: GraphObserver, context: rclpy.Context, wait_until: WaitUntil
+) -> None:
+    node = ManagedNode("managed", context=context)
+    wait_until(lambda: "/managed" in nodes(observer) and nodes(observer)["/managed"].managed)
+    node.destroy_node()
+
+
+def test_the_parts_of_an_action_server_show_as_one_endpoint(
+    observer: GraphObserver, make_node: MakeNode, wait_until: WaitUntil
+) -> None:
+    # No action package can be presumed: the parts are what rcl_action makes, under other types.
+    node = make_node("dock")
+    for part in ("send_goal", "cancel_goal", "get_result"):
+        node.create_service(Trigger, f"/dock/go/_action/{part}", lambda _, response: response)
+    for part in ("feedback", "status"):
+        node.create_publisher(String, f"/dock/go/_action/{part}", 10)
+    expected = (EndpointKind.ACTION_SERVER, "/dock", "/dock/go", "std_srvs/srv/Trigger")
+    wait_until(lambda: endpoints(observer) == [expected])
+
+
+def test_nodes_named_as_a_tool_are_only_shown_when_asked_for(
+    observer: GraphObserver, make_node: MakeNode, wait_until: WaitUntil
+) -> None:
+    make_node("launch_ros_42").create_publisher(String, "/a", 10)
+    make_node("seen")
+    wait_until(lambda: "/seen" in nodes(observer))
+
+    def kept() -> bool:
+        found, shown = observer.snapshot(keep=["/launch_ros_42"])
+        return "/launch_ros_42" in {node.full_name for node in found} and any(
+            each.name == "/a" for each in shown
+        )
+
+    wait_until(kept)
+    assert "/launch_ros_42" not in nodes(observer)
+    assert not [each for each in endpoints(observer) if each[2] == "/a"]
+
+
+def test_a_flow_participant_shows_as_its_hidden_node(
+    observer: GraphObserver, domain_id: int, wait_until: WaitUntil
+) -> None:
+    with FlowParticipant("_camera_flow_0", "/robot", domain_id) as participant:
+        participant.create_publisher(String, "/robot/video", QosProfile())
+        expected = (
+            EndpointKind.PUBLISHER,
+            "/robot/_camera_flow_0",
+            "/robot/video",
+            "std_msgs/msg/String",
+        )
+        wait_until(lambda: endpoints(observer) == [expected])
+        wait_until(lambda: list(nodes(observer)) == ["/robot/_camera_flow_0"])
+    wait_until(lambda: endpoints(observer) == [])
+
+
+def test_the_guard_wakes_for_a_new_publisher_and_again_when_it_goes(
+    observer: GraphObserver, make_node: MakeNode, wait_until: WaitUntil
+) -> None:
+    node = make_node("talker")
+    wait_until(lambda: "/talker" in nodes(observer))
+    shown: list[bool] = []
+    woken = threading.Condition()
+
+    def look() -> None:
+        with woken:
+            shown.append("/new" in {each[2] for each in endpoints(observer)})
+            woken.notify()
+
+    remove = observer.on_change(look)
+
+    def late_s() -> float:
+        shown.clear()
+        began = time.monotonic()
+        publisher = node.create_publisher(String, "/new", 10)
+        with woken:
+            assert woken.wait_for(lambda: True in shown, timeout=30)
+        taken_s = time.monotonic() - began
+        node.destroy_publisher(publisher)
+        with woken:
+            assert woken.wait_for(lambda: shown[-1] is False, timeout=30)
+        return taken_s - 2.0  # Fast DDS repeats what was lost only after 3 s
+
+    assert_in_time(late_s)
+
+    remove()
+    seen_by_another: list[set[str]] = []
+    observer.on_change(lambda: seen_by_another.append({each[2] for each in endpoints(observer)}))
+    # Told of the first, the one that was taken away is called no more: it may have been just then.
+    node.create_publisher(String, "/newer", 10)
+    wait_until(lambda: seen_by_another and "/newer" in seen_by_another[-1])
+    looks = len(shown)
+    node.create_publisher(String, "/newest", 10)
+    wait_until(lambda: "/newest" in seen_by_another[-1])
+    assert len(shown) == looks
+
+
+def test_an_exception_of_a_callback_is_logged_and_ends_nothing(
+    observer: GraphObserver,
+    make_node: MakeNode,
+    wait_until: WaitUntil,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    def breaks() -> None:
+        raise ValueError("broken")
+
+    observer.on_change(breaks)
+    make_node("one")
+    wait_until(lambda: "cannot handle a graph change" in caplog.text)
+    wait_until(lambda: "/one" in nodes(observer))
+
+
+def test_a_snapshot_of_ten_nodes_is_quick(
+    observer: GraphObserver, context: rclpy.Context, wait_until: WaitUntil
+) -> None:
+    made = [ManagedNode(f"node{number}", context=context) for number in range(10)]
+    for node in made:
+        for topic in "abcd":
+            node.create_publisher(String, f"/{topic}", 10)
+            node.create_subscription(String, f"/{topic}", lambda _: None, 10)
+    wait_until(lambda: len(endpoints(observer)) == 80)
+    took_s = []
+    for _ in range(10):
+        began = time.thread_time()  # while others run, nothing is taken
+        observer.snapshot()
+        took_s.append(time.thread_time() - began)
+    assert min(took_s) < 0.05  # 5 ms where nothing else runs
+    for node in made:
+        node.destroy_node()
+
+
+def test_watching_a_still_graph_costs_nothing(
+    observer: GraphObserver, make_node: MakeNode, wait_until: WaitUntil
+) -> None:
+    make_node("still")
+    wait_until(lambda: "/still" in nodes(observer))
+    calls: list[None] = []
+    observer.on_change(lambda: calls.append(None))
+    thread = next(each for each in threading.enumerate() if each.name == "graph-guard")
+
+    def used_s() -> float:
+        return sum(
+            each.user_time + each.system_time
+            for each in psutil.Process().threads()
+            if each.id == thread.native_id
+        )
+
+    def still_and_idle() -> bool:
+        calls.clear()
+        before = used_s()
+        time.sleep(0.3)  # a span to measure, not a wait
+        return not calls and used_s() == before
+
+    wait_until(still_and_idle)
+
+
+def test_an_observer_that_lost_its_guard_says_so(
+    observer: GraphObserver, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    failure = MiddlewareError("cannot wait for graph changes: out of memory")
+    monkeypatch.setattr(observer._guard, "failure", failure)
+    with pytest.raises(MiddlewareError, match="cannot wait for graph changes: out of memory"):
+        observer.snapshot()
+
+
+def test_destroying_twice_is_harmless(domain_id: int) -> None:
+    observer = GraphObserver(domain_id)
+    observer.destroy()
+    observer.destroy()
+    assert not [each for each in threading.enumerate() if each.name == "graph-guard"]

@@ -1,0 +1,144 @@
+"""Leaving a process that had participants: at once, bounded, and without a trace."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import pytest
+from fast_dds_words import without_fast_dds
+
+from lifecycle.middleware import GraphObserver, leftovers, segments_of, sweep
+
+WaitUntil = Callable[..., None]
+
+_PROCESS = """
+import sys
+import rclpy
+from rclpy.action import ActionServer
+from rclpy.lifecycle import LifecycleNode
+from rclpy.node import Node
+from lifecycle_msgs.srv import ChangeState
+from std_msgs.msg import String
+from lifecycle.middleware import leave_and_exit
+
+context = rclpy.Context()
+context.init(args=[])
+node = Node("plain", context=context)
+managed = LifecycleNode("managed", context=context)
+held = node.create_publisher(String, "/a", 10)
+print("up", flush=True)
+sys.stdin.readline()
+leave_and_exit(5, nodes=[node, managed], contexts=[context])
+"""
+
+
+def start() -> subprocess.Popen[str]:
+    process = subprocess.Popen(
+        [sys.executable, "-c", _PROCESS],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "up\n"
+    return process
+
+
+@pytest.fixture
+def observer(fresh_domain: int) -> GraphObserver:
+    with GraphObserver(fresh_domain) as observer:
+        yield observer
+
+
+def names(observer: GraphObserver) -> list[str]:
+    return [node.full_name for node in observer.snapshot()[0]]
+
+
+def domains_own(files: Iterable[str]) -> set[str]:
+    """Leave out ports 7000–7399: free ones are taken at once by processes of every domain."""
+    return {name for name in files if not re.search(r"port7[0-3]\d\d(?!\d)", name)}
+
+
+def test_leaving_tells_the_graph_and_leaves_no_shared_memory(
+    observer: GraphObserver, wait_until: WaitUntil
+) -> None:
+    with start() as process:
+        wait_until(lambda: names(observer) == ["/managed", "/plain"])
+        ours = segments_of([process.pid])
+        _, errors = process.communicate("leave\n", timeout=30)
+    assert (process.returncode, without_fast_dds(errors)) == (5, [])
+    # Told by the leaving process: an unannounced death would show after 20 s.
+    wait_until(lambda: names(observer) == [], timeout_s=10)
+    # The segment went with its owner; a port goes with the last that has it, the observer.
+    assert ours
+    assert not [name for name in ours if "port" not in name and Path("/dev/shm", name).exists()]
+    observer.destroy()
+    assert not [name for name in domains_own(ours) if Path("/dev/shm", name).exists()]
+
+
+def test_a_process_that_hangs_with_the_gil_held_still_ends_with_its_code() -> None:
+    hang = (
+        "import ctypes\n"
+        "from lifecycle.middleware import leave_and_exit\n"
+        "class Hangs:\n"
+        "    def destroy(self): ctypes.PyDLL(None).sleep(60)\n"
+        "leave_and_exit(6, participants=[Hangs()], deadline_s=0.2)\n"
+    )
+    assert subprocess.run([sys.executable, "-c", hang], check=False, timeout=50).returncode == 6
+
+
+def test_an_exception_while_leaving_is_logged_and_the_rest_still_destroyed() -> None:
+    leave = (
+        "import logging\n"
+        "from lifecycle.middleware import leave_and_exit\n"
+        "logging.basicConfig(format='%(message)s')\n"
+        "class Breaks:\n"
+        "    def destroy(self): raise OSError('broken')\n"
+        "class Works:\n"
+        "    def destroy(self): print('destroyed')\n"
+        "leave_and_exit(0, participants=[Breaks(), Works()])\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", leave], check=True, capture_output=True, text=True, timeout=30
+    )
+    assert done.stdout == "destroyed\n"
+    assert "cannot destroy" in done.stderr
+    assert done.stderr.endswith("OSError: broken\n")
+
+
+def test_the_sweep_spares_a_living_process_and_clears_up_after_a_killed_one(
+    observer: GraphObserver, wait_until: WaitUntil
+) -> None:
+    with start() as process:
+        wait_until(lambda: "/plain" in names(observer))
+        ours = segments_of([process.pid])
+        kinds = {re.sub(r"[0-9a-f]{16}|\d+", "#", name) for name in ours}
+        assert kinds == {
+            "fastrtps_#",
+            "fastrtps_#_el",
+            "fastrtps_port#",
+            "fastrtps_port#_el",
+            # Neither mapped nor open while its port is in use: only its group tells.
+            "sem.fastrtps_port#_mutex",
+        }
+        assert sweep(only=ours) == ()
+        assert all(Path("/dev/shm", name).exists() for name in ours)
+        process.kill()
+        process.communicate(timeout=30)
+    # The observer still sends to the port; the segment's owner is dead. Subsets, because a
+    # supervisor that ends meanwhile, in another test process, may have swept it already.
+    segment = {name for name in ours if "port" not in name}
+    assert set(leftovers(only=ours)) <= segment
+    assert sweep(only=ours, created_after_s=time.time() + 60) == ()
+    assert set(sweep(only=ours)) <= segment
+    assert not any(Path("/dev/shm", name).exists() for name in segment)
+    assert all(Path("/dev/shm", name).exists() for name in domains_own(ours) - segment)
+    observer.destroy()
+    assert domains_own(sweep(only=ours)) <= domains_own(ours) - segment
+    assert not any(Path("/dev/shm", name).exists() for name in domains_own(ours))

@@ -1,0 +1,72 @@
+"""Node classes that a host imports as `hosted:Class`."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from rclpy.node import Node
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from lifecycle import LifecycleNode, on_message
+
+
+class Good(LifecycleNode):
+    """Does everything right."""
+
+
+class Echo(LifecycleNode):
+    """Says on `out` what it hears on `in`."""
+
+    @on_message("in")
+    def receive(self, message: String) -> None:
+        self.publisher("out").publish(message)
+
+
+class Raising(LifecycleNode):
+    def __init__(self) -> None:
+        super().__init__()
+        raise OSError("no such camera")
+
+
+class Stuck(LifecycleNode):
+    """Awaits for ever in on_configure."""
+
+    async def on_configure(self) -> None:
+        await self.create_client(Trigger, "/nobody").call_async(Trigger.Request())
+
+
+class Blocking(LifecycleNode):
+    """Blocks the executor for ever in on_configure."""
+
+    def on_configure(self) -> None:
+        time.sleep(3600)
+
+
+class BlockingConstructor(LifecycleNode):
+    def __init__(self) -> None:
+        super().__init__()
+        time.sleep(3600)
+
+
+class Failing(LifecycleNode):
+    def on_configure(self) -> None:
+        raise OSError("no such camera")
+
+
+class Touchy(LifecycleNode):
+    """Raises on its first message."""
+
+    @on_message("in")
+    def receive(self, message: String) -> None:
+        raise ValueError(f"cannot stand {message.data}")
+
+
+class Plain(Node):
+    def __init__(self, **options: Any) -> None:
+        super().__init__("its_own_name", **options)
+        self.create_publisher(String, "out", 10)
+
+
+NOT_A_CLASS = 1

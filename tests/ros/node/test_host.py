@@ -1,0 +1,257 @@
+"""The host process: told what to host by a socket, obeying it, gone when it ends."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import psutil
+import pytest
+from host_process import HostProcess, driver_in, hosted
+from planning import publisher, subscription
+from std_msgs.msg import String
+
+from lifecycle import codec
+from lifecycle.manifest.model import DiscoveryRange, Timeouts
+from lifecycle.node.control import Event, HostSpec, Operation
+
+HERE = Path(__file__).parent
+CONFIGURE, CONNECT, ACTIVATE = Operation.CONFIGURE, Operation.CONNECT, Operation.ACTIVATE
+Start = Callable[..., HostProcess]
+
+
+def test_two_nodes_in_one_process_are_brought_up_and_end_with_the_channel(start: Start) -> None:
+    host = start(
+        hosted("one", "Good", publisher("out")),
+        hosted("two", "Good", publisher("out"), namespace="/robot"),
+    )
+    assert host.read() == Event(kind="ready")
+    for node in ("/one", "/robot/two"):
+        configured = host.do(node, CONFIGURE)
+        assert (configured.ok, configured.state, configured.connected) == (True, "inactive", False)
+        connected = host.do(node, CONNECT)
+        assert (connected.ok, connected.state, connected.connected) == (True, "inactive", True)
+        assert connected.configuration is not None
+        assert connected.configuration.endpoints[0].gid
+        active = host.do(node, ACTIVATE)
+        assert (active.ok, active.state, active.connected) == (True, "active", True)
+        assert active.configuration is None
+    told = host.do("/one", Operation.GET_CONFIGURATION).configuration
+    assert told is not None
+    assert (told.name, told.identity.process_id) == ("/one", host.process.pid)
+    host.hang_up()
+    assert host.wait() == 0
+
+
+def test_every_change_of_state_is_told_before_the_reply(start: Start) -> None:
+    host = start(hosted("one", "Good"))
+    host.until("ready")
+    host.ask("/one", CONFIGURE)
+    reply, before = host.until("reply")
+    states = [event.state for event in before if event.kind == "state"]
+    assert states == ["configuring", "inactive"]
+    assert reply.state == "inactive"
+
+
+def test_a_transition_that_somebody_else_caused_is_told_too(
+    start: Start, fresh_domain: int
+) -> None:
+    host = start(hosted("one", "Good"))
+    host.until("ready")
+    with driver_in(fresh_domain) as driver:
+        assert driver.set("/one", "configure")
+    assert host.states(2) == ["configuring", "inactive"]
+
+
+def test_a_refused_command_is_answered_with_the_reason_and_the_node_lives(start: Start) -> None:
+    host = start(hosted("one", "Good"))
+    host.until("ready")
+    reply = host.do("/one", ACTIVATE)
+    assert (reply.ok, reply.state) == (False, "unconfigured")
+    assert reply.error == (
+        "cannot activate in state 'unconfigured'; allowed here: configure, shutdown"
+    )
+    assert host.do("/one", CONFIGURE).ok
+
+
+def test_a_command_to_a_node_that_is_not_here_is_answered(start: Start) -> None:
+    host = start(hosted("one", "Good"))
+    host.until("ready")
+    reply = host.do("/two", CONFIGURE)
+    assert (reply.ok, reply.error) == (
+        False,
+        "cannot find node '/two'; this process hosts /one",
+    )
+
+
+def test_an_exception_in_a_callback_is_told_and_its_traceback_is_in_the_log(start: Start) -> None:
+    host = start(hosted("one", "Failing"))
+    host.until("ready")
+    reply = host.do("/one", CONFIGURE)
+    assert (reply.ok, reply.state) == (False, "unconfigured")
+    assert reply.error == "/one: on_configure raised OSError: no such camera"
+    assert 'raise OSError("no such camera")' in host.log.read_text()
+
+
+@pytest.mark.parametrize(
+    ("class_", "reason"),
+    [
+        ("Raising", "OSError: no such camera"),
+        (
+            "Goood",
+            "cannot use 'hosted:Goood': hosted has no 'Goood'; did you mean 'Good'?",
+        ),
+        (
+            "Plain",
+            (
+                "cannot manage /one: 'hosted:Plain' is not a LifecycleNode; subclass "
+                "lifecycle.LifecycleNode, or say `managed: false`"
+            ),
+        ),
+    ],
+)
+def test_a_node_that_cannot_be_constructed_ends_the_process_with_the_reason(
+    start: Start, class_: str, reason: str
+) -> None:
+    host = start(hosted("one", class_))
+    assert host.read() == Event(kind="failed", node="/one", ok=False, error=reason)
+    assert host.wait() == 1
+    assert "Traceback" in host.log.read_text()
+
+
+def test_a_module_that_does_not_exist_is_named(start: Start) -> None:
+    spec = hosted("one", "Good")
+    run = dataclasses.replace(spec.run, python="nowhere.nodes:Camera")
+    host = start(dataclasses.replace(spec, run=run))
+    assert host.read().error == (
+        "cannot import 'nowhere.nodes:Camera': no module 'nowhere'; "
+        f"it is looked for in {HERE} and in what is installed"
+    )
+    assert host.wait() == 1
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_the_process_well(start: Start, number: signal.Signals) -> None:
+    host = start(hosted("one", "Good"))
+    host.until("ready")
+    host.do("/one", CONFIGURE)
+    os.kill(host.process.pid, number)
+    assert host.states(2) == ["shuttingdown", "finalized"]
+    assert host.wait() == 0
+
+
+def test_an_async_callback_that_waits_does_not_keep_the_process(start: Start) -> None:
+    host = start(hosted("one", "Stuck"))
+    host.until("ready")
+    host.ask("/one", CONFIGURE)
+    assert host.states(1) == ["configuring"]
+    host.hang_up()
+    assert host.wait() == 0  # 1 would say that it was given up
+    assert "cannot go on with /one: on_configure" in host.log.read_text()
+
+
+def test_a_callback_that_blocks_does_not_keep_the_process_beyond_its_bound(start: Start) -> None:
+    classes = ("Blocking", "BlockingConstructor")
+    hosts = [start(hosted("one", each, timeouts=Timeouts(shutdown_s=0.1))) for each in classes]
+    hosts[0].until("ready")
+    hosts[0].ask("/one", CONFIGURE)
+    assert hosts[0].states(1) == ["configuring"]
+    for host in hosts:
+        host.hang_up()
+    for host in hosts:
+        assert host.wait() == 1
+        assert "a callback blocks; the process ends without it" in host.log.read_text()
+
+
+def test_an_exception_in_a_message_handler_ends_the_process_with_its_traceback(
+    start: Start, fresh_domain: int
+) -> None:
+    host = start(hosted("one", "Touchy", subscription("in")))
+    host.until("ready")
+    for operation in (CONFIGURE, CONNECT, ACTIVATE):
+        assert host.do("/one", operation).ok
+    with driver_in(fresh_domain) as driver:
+        sender = driver.node.create_publisher(String, "/in", 10)
+        driver.spin_until(lambda: sender.get_subscription_count() == 1)
+        sender.publish(String(data="this"))
+        driver.spin_until(lambda: host.process.poll() is not None)
+        assert host.wait() == 1
+    assert "ValueError: cannot stand this" in host.log.read_text()
+
+
+def test_a_plain_node_gets_its_planned_name_when_alone(start: Start, fresh_domain: int) -> None:
+    host = start(
+        hosted("one", "Plain", managed=False, namespace="/robot", remap=(("out", "there"),))
+    )
+    host.until("ready")
+    with driver_in(fresh_domain) as driver:
+        driver.spin_until(lambda: driver.node.count_publishers("/robot/there") == 1)
+        driver.spin_until(lambda: "one" in driver.node.get_node_names())
+    host.hang_up()
+    assert host.wait() == 0
+
+
+def test_a_supervisor_that_goes_before_it_speaks_leaves_nothing(tmp_path: Path) -> None:
+    ours, theirs = socket.socketpair()
+    with theirs:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "lifecycle.node.host", f"--control-fd={theirs.fileno()}"],
+            pass_fds=[theirs.fileno()],
+        )
+    ours.close()
+    assert process.wait(30) == 0
+
+
+def test_importing_the_host_needs_no_ros_and_preloading_starts_nothing() -> None:
+    code = """
+import sys, threading
+from lifecycle.node import host
+assert not [name for name in sys.modules if name.startswith("rclpy")], "host imports rclpy"
+host.preload()
+import rclpy
+assert not rclpy.ok()
+assert threading.active_count() == 1
+import os
+files = ["/proc/self/fd/" + name for name in os.listdir("/proc/self/fd")]
+links = [os.readlink(file) for file in files if os.path.lexists(file)]
+assert not [link for link in links if link.startswith("socket")], links
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=30)
+
+
+def test_a_fork_of_a_preloaded_process_can_host(fresh_domain: int, tmp_path: Path) -> None:
+    ours, theirs = socket.socketpair()
+    ours.settimeout(20)
+    code = f"""
+import gc, os
+from lifecycle.node import host
+host.preload()
+gc.freeze()
+if os.fork() == 0:
+    host.main({theirs.fileno()})
+os._exit(os.waitstatus_to_exitcode(os.wait()[1]))
+"""
+    with theirs:
+        process = subprocess.Popen(
+            [sys.executable, "-c", code], pass_fds=[theirs.fileno()], cwd=HERE
+        )
+    spec = HostSpec(
+        system="test",
+        process="p",
+        domain_id=fresh_domain,
+        discovery_range=DiscoveryRange.LOCALHOST,
+        nodes=(hosted("one", "Good"),),
+    )
+    with ours, ours.makefile("rb") as reader:
+        ours.sendall(codec.to_json(spec) + b"\n")
+        assert codec.from_json(reader.readline(), Event) == Event(kind="ready")
+        children = psutil.Process(process.pid).children()
+        assert len(children) == 1
+        ours.shutdown(socket.SHUT_RDWR)
+    assert process.wait(30) == 0

@@ -1,0 +1,558 @@
+"""LifecycleNode as its author and its neighbours see it, on real DDS."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import rclpy
+from lifecycle_driver import Driver
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from planning import AT, built_with, client, planned, publisher, server, subscription
+from rcl_interfaces.msg import ParameterEvent
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.task import Future
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from lifecycle import ERROR, FAILURE, LifecycleNode, on_message, on_service, on_timer
+from lifecycle.errors import LifecycleError
+from lifecycle.manifest.model import EndpointPolicy, ParameterDeclaration, Timeouts
+from lifecycle.manifest.qos import Durability, QosProfile
+from lifecycle.middleware import to_rclpy
+from lifecycle.node.endpoint_names import UnknownEndpointError
+from lifecycle.node.machine import NodeState
+from lifecycle.plan.model import PlannedNode
+
+Build = Callable[..., Any]
+
+
+@pytest.fixture
+def build(driver: Driver, context: rclpy.Context) -> Build:
+    """Construct a class from a plan and spin it."""
+
+    def build(node_class: type[LifecycleNode], spec: PlannedNode) -> LifecycleNode:
+        with built_with(spec, context):
+            node = node_class()
+        driver.add(node)
+        return node
+
+    return build
+
+
+class Chatty(LifecycleNode):
+    """One of each; writes down what it receives."""
+
+    def __init__(self) -> None:
+        super().__init__("a_name_that_the_plan_overrules")
+        self.heard: list[str] = []
+        self.ticks = 0
+
+    @on_message("in")
+    def receive(self, message: String) -> None:
+        self.heard.append(message.data)
+
+    @on_service("reset")
+    def reset(self, request: Trigger.Request, response: Trigger.Response) -> None:
+        response.message = "done"
+
+    @on_timer(period_s=0.01)
+    def tick(self) -> None:
+        self.ticks += 1
+
+
+CHATTY = planned("chatty", publisher("out"), subscription("in"), server("reset"), client("other"))
+
+
+@pytest.fixture
+def chatty(build: Build) -> Chatty:
+    node: Chatty = build(Chatty, CHATTY)
+    return node
+
+
+def up(driver: Driver, *labels: str, node: str = "/chatty") -> None:
+    for label in labels:
+        assert driver.set(node, label)
+
+
+def test_the_plans_name_wins_over_the_constructors(chatty: Chatty) -> None:
+    assert chatty.get_fully_qualified_name() == "/chatty"
+
+
+def test_endpoints_exist_from_connect_until_disconnect(driver: Driver, chatty: Chatty) -> None:
+    def counts() -> tuple[int, int]:
+        return driver.node.count_publishers("/out"), driver.node.count_subscribers("/in")
+
+    up(driver, "configure")
+    assert counts() == (0, 0)
+    up(driver, "connect")
+    assert counts() == (1, 1)
+    up(driver, "disconnect")
+    assert counts() == (0, 0)
+    up(driver, "activate")
+    assert counts() == (1, 1)
+    up(driver, "deactivate")
+    assert counts() == (1, 1)
+    up(driver, "cleanup")
+    assert counts() == (0, 0)
+    up(driver, "configure", "connect", "shutdown")
+    assert counts() == (0, 0)
+
+
+def test_what_is_published_flows_only_while_active(driver: Driver, chatty: Chatty) -> None:
+    received: list[str] = []
+    driver.node.create_subscription(String, "/out", lambda m: received.append(m.data), 10)
+    up(driver, "configure")
+    out = chatty.publisher("out")
+    out.publish(String(data="configured"))
+    up(driver, "connect")
+    out.publish(String(data="connected"))
+    driver.spin_until(lambda: out.get_subscription_count() == 1)
+    up(driver, "activate")
+    out.publish(String(data="active"))
+    up(driver, "deactivate")
+    out.publish(String(data="inactive"))
+    up(driver, "activate")
+    out.publish(String(data="active again"))
+    driver.spin_until(lambda: "active again" in received)
+    assert received == ["active", "active again"]
+
+
+def test_messages_are_received_only_while_active(driver: Driver, chatty: Chatty) -> None:
+    sender = driver.node.create_publisher(String, "/in", 10)
+    up(driver, "configure", "connect")
+    driver.spin_until(lambda: sender.get_subscription_count() == 1)
+    sender.publish(String(data="early"))
+    driver.settle()
+    up(driver, "activate")
+    sender.publish(String(data="now"))
+    driver.spin_until(lambda: chatty.heard)
+    up(driver, "deactivate")
+    sender.publish(String(data="late"))
+    driver.settle()
+    up(driver, "activate")
+    sender.publish(String(data="again"))
+    driver.spin_until(lambda: "again" in chatty.heard)
+    assert chatty.heard == ["now", "again"]
+
+
+def test_timers_run_only_while_active(driver: Driver, chatty: Chatty) -> None:
+    up(driver, "configure", "connect")
+    timers = [timer for timer in chatty.timers if not timer.is_canceled()]
+    assert timers == []
+    up(driver, "activate")
+    driver.spin_until(lambda: chatty.ticks >= 3)
+    up(driver, "deactivate")
+    assert [timer for timer in chatty.timers if not timer.is_canceled()] == []
+    up(driver, "cleanup")
+    assert list(chatty.timers) == []
+
+
+def test_what_the_author_makes_with_rclpys_factories_is_gated_too(
+    driver: Driver, build: Build
+) -> None:
+    class Own(LifecycleNode):
+        def on_configure(self) -> None:
+            self.heard: list[String] = []
+            self.ticks = 0
+            self.out = self.create_publisher(String, "own", 10)
+            self.create_subscription(String, "own", self.heard.append, 10)
+            self.create_timer(0.01, self.tick)
+
+        def tick(self) -> None:
+            self.ticks += 1
+
+    node = build(Own, planned("own"))
+    up(driver, "configure", node="/own")
+    node.out.publish(String(data="inactive"))
+    up(driver, "activate", node="/own")
+    node.out.publish(String(data="active"))
+    driver.spin_until(lambda: node.heard and node.ticks)
+    assert [message.data for message in node.heard] == ["active"]
+
+
+def test_parameter_events_are_not_gated(driver: Driver, chatty: Chatty) -> None:
+    events: list[ParameterEvent] = []
+    driver.node.create_subscription(ParameterEvent, "/parameter_events", events.append, 10)
+    # Declared by rclpy, before it is configured.
+    driver.spin_until(
+        lambda: (
+            chatty.set_parameters([Parameter("use_sim_time", value=False)])
+            and any(event.node == "/chatty" for event in events)
+        )
+    )
+    assert driver.state("/chatty") == (1, "unconfigured")
+
+
+def test_a_declared_service_answers_and_may_return_nothing(driver: Driver, chatty: Chatty) -> None:
+    up(driver, "configure", "connect")
+    assert driver.call(Trigger, "/reset", Trigger.Request()).message == "done"
+
+
+def test_an_unknown_endpoint_is_a_key_error_that_lists_what_is_declared(
+    driver: Driver, chatty: Chatty
+) -> None:
+    up(driver, "configure", "connect")
+    with pytest.raises(UnknownEndpointError) as unknown:
+        chatty.publisher("outt")
+    assert str(unknown.value) == (
+        "cannot find publisher 'outt' of /chatty; did you mean 'out'? declared: 'out'"
+    )
+    with pytest.raises(KeyError):
+        chatty.client("nothing")
+
+
+def test_a_client_before_connect_is_an_error_that_says_when(driver: Driver, chatty: Chatty) -> None:
+    up(driver, "configure")
+    with pytest.raises(LifecycleError) as error:
+        chatty.client("other")
+    assert str(error.value) == (
+        "cannot use service client 'other': /chatty is not connected; endpoints exist from "
+        "connect until disconnect"
+    )
+
+
+@pytest.mark.parametrize(
+    ("spec", "error"),
+    [
+        (
+            planned("chatty", subscription("in")),
+            (
+                "cannot use handler Chatty.reset: @on_service('reset') names no service server "
+                "that /chatty declares; declared: none"
+            ),
+        ),
+        (
+            dataclasses.replace(CHATTY, endpoints=(*CHATTY.endpoints, subscription("inn"))),
+            (
+                "cannot serve subscription 'inn' of /chatty: no method of Chatty is decorated with "
+                "@on_message('inn')"
+            ),
+        ),
+        (
+            dataclasses.replace(
+                CHATTY, endpoints=(*CHATTY.endpoints, publisher("x", "std_msgs/msg/Strong"))
+            ),
+            (
+                "publisher 'x': cannot find interface type 'std_msgs/msg/Strong': package "
+                "'std_msgs' has no msg 'Strong'; did you mean std_msgs/msg/String?"
+            ),
+        ),
+    ],
+)
+def test_a_node_that_does_not_fit_its_interface_fails_to_configure(
+    driver: Driver, build: Build, spec: PlannedNode, error: str
+) -> None:
+    node = build(Chatty, spec)
+    results = run_task(driver, node.lifecycle.change, "configure")
+    assert results[0].error == error
+    assert driver.state("/chatty") == (1, "unconfigured")
+
+
+def run_task(driver: Driver, function: Callable[..., Any], *arguments: object) -> list[Any]:
+    """Run a coroutine function in the executor; returns its result once it has ended."""
+    future = driver.executor.create_task(function, *arguments)
+    driver.spin_until(future.done)
+    return [future.result()]
+
+
+class Server(Node):
+    """Another node, whose service a callback waits for."""
+
+    def __init__(self, context: rclpy.Context) -> None:
+        super().__init__("server", context=context, enable_rosout=False)
+        self.create_service(Trigger, "/other", self._answer)
+
+    def _answer(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success = True
+        return response
+
+
+def test_callbacks_may_await_another_nodes_service_in_the_same_executor(
+    driver: Driver, build: Build, context: rclpy.Context
+) -> None:
+    class Asking(LifecycleNode):
+        answers: list[bool]
+
+        async def on_configure(self) -> None:
+            self.answers = []
+            own = self.create_client(Trigger, "/other")
+            self.answers.append((await own.call_async(Trigger.Request())).success)
+
+        async def on_activate(self) -> None:
+            declared = self.client("other")
+            self.answers.append((await declared.call_async(Trigger.Request())).success)
+
+    node = build(Asking, planned("asking", client("other")))
+    other = Server(context)
+    driver.executor.add_node(other)
+    driver.spin_until(lambda: driver.node.count_services("/other") == 1)
+    up(driver, "configure", "activate", node="/asking")
+    assert node.answers == [True, True]
+    driver.executor.remove_node(other)
+    other.destroy_node()
+
+
+def test_a_message_handler_may_await_a_service_too(
+    driver: Driver, build: Build, context: rclpy.Context
+) -> None:
+    class Asking(LifecycleNode):
+        answers: list[bool]
+
+        @on_message("in")
+        async def ask(self, message: String) -> None:
+            self.answers = [(await self.client("other").call_async(Trigger.Request())).success]
+
+    node = build(Asking, planned("asking", client("other"), subscription("in")))
+    node.answers = []
+    other = Server(context)
+    driver.executor.add_node(other)
+    sender = driver.node.create_publisher(String, "/in", 10)
+    up(driver, "configure", "activate", node="/asking")
+    driver.spin_until(lambda: sender.get_subscription_count() == 1)
+    sender.publish(String())
+    driver.spin_until(lambda: node.answers == [True])
+    driver.executor.remove_node(other)
+    other.destroy_node()
+
+
+def test_a_blocking_call_in_a_callback_is_an_error_and_not_a_deadlock(
+    driver: Driver, build: Build
+) -> None:
+    class Blocking(LifecycleNode):
+        def on_activate(self) -> None:
+            self.client("other").call(Trigger.Request())
+
+    node = build(Blocking, planned("it", client("other")))
+    up(driver, "configure", "connect", node="/it")
+    (result,) = run_task(driver, node.lifecycle.change, "activate")
+    assert result.error == (
+        "cannot wait for service 'other' in a callback: the answer comes by the executor that "
+        "waits for this callback; write `async def` and `await client.call_async(request)`"
+    )
+
+
+def test_a_latched_sample_that_came_before_activation_is_received_at_activation(
+    driver: Driver, build: Build
+) -> None:
+    latched = QosProfile(depth=1, durability=Durability.TRANSIENT_LOCAL)
+    node = build(Latching, planned("it", subscription("in", qos=latched)))
+    node.heard = []
+    driver.node.create_publisher(String, "/in", to_rclpy(latched)).publish(String(data="map"))
+    up(driver, "configure", "connect", node="/it")
+    driver.spin_until(lambda: driver.node.count_subscribers("/in") == 1)
+    driver.settle()
+    assert node.heard == []
+    up(driver, "activate", node="/it")
+    driver.spin_until(lambda: node.heard == ["map"])
+
+
+class Latching(LifecycleNode):
+    heard: list[str]
+
+    @on_message("in")
+    def receive(self, message: String) -> None:
+        self.heard.append(message.data)
+
+
+def test_an_endpoint_declared_after_configure_is_refused_where_the_manifest_fixes_them(
+    driver: Driver, build: Build
+) -> None:
+    class Late(LifecycleNode):
+        def on_configure(self) -> None:
+            self.declare_publisher("late", String)
+
+    node = build(Late, planned("it", endpoint_policy=EndpointPolicy.DECLARED))
+    (result,) = run_task(driver, node.lifecycle.change, "configure")
+    assert result.error == (
+        "cannot declare publisher 'late' while /it is 'configuring': nodes.it.endpoints is "
+        "'declared' in its manifest, which fixes them at configure; write nodes.it.endpoints: "
+        "open, or declare it in the manifest"
+    )
+
+
+class Waiting(LifecycleNode):
+    """Waits in on_configure for a service that nobody serves."""
+
+    async def on_configure(self) -> None:
+        await self.create_client(Trigger, "/nobody").call_async(Trigger.Request())
+
+
+def test_an_async_callback_beyond_its_deadline_is_an_error(driver: Driver, build: Build) -> None:
+    spec = planned("waiting", timeouts=Timeouts(configure_s=0.2))
+    node = build(Waiting, spec)
+    (result,) = run_task(driver, node.lifecycle.change, "configure")
+    assert result.error == ("cannot finish /waiting: on_configure within its deadline of 0.2 s")
+    driver.settle()
+    assert [goal for _, _, _, goal in driver.heard("/waiting")] == [
+        "configuring",
+        "errorprocessing",
+        "unconfigured",
+    ]
+
+
+def test_a_request_while_a_transition_runs_is_refused_and_the_state_can_be_read(
+    driver: Driver, build: Build
+) -> None:
+    class Held(LifecycleNode):
+        async def on_configure(self) -> object:
+            return await self.go_on
+
+    node = build(Held, planned("waiting"))
+    node.go_on = Future()
+    request = ChangeState.Request(transition=Transition(id=1))
+    first = driver.start(ChangeState, "/waiting/change_state", request)
+    driver.spin_until(lambda: driver.state("/waiting") == (10, "configuring"))
+    assert driver.change("/waiting", label="shutdown") is False
+    assert not first.done()
+    node.go_on.set_result(FAILURE)
+    driver.spin_until(first.done)
+    assert first.result().success is False
+    assert driver.state("/waiting") == (1, "unconfigured")
+
+
+@pytest.mark.parametrize("returned", [True, "SUCCESS", 0, object])
+def test_a_callback_that_returns_nonsense_is_an_error_and_the_node_lives(
+    driver: Driver, build: Build, returned: object
+) -> None:
+    class Odd(LifecycleNode):
+        def on_configure(self) -> object:
+            return returned
+
+    build(Odd, planned("odd"))
+    assert driver.change("/odd", label="configure") is False
+    assert driver.state("/odd") == (1, "unconfigured")
+
+
+def test_activate_from_disconnected_that_fails_to_connect_stays_disconnected(
+    driver: Driver, build: Build
+) -> None:
+    class Refusing(LifecycleNode):
+        def on_connect(self) -> object:
+            return FAILURE
+
+    node = build(Refusing, planned("refusing", publisher("out")))
+    up(driver, "configure", node="/refusing")
+    assert driver.change("/refusing", label="activate") is False
+    assert node.lifecycle.state is NodeState.INACTIVE_DISCONNECTED
+    assert driver.node.count_publishers("/out") == 0
+
+
+def test_an_error_in_connect_takes_the_data_layer_down(driver: Driver, build: Build) -> None:
+    class Broken(LifecycleNode):
+        def on_connect(self) -> object:
+            return ERROR
+
+    build(Broken, planned("broken", publisher("out")))
+    up(driver, "configure", node="/broken")
+    assert driver.change("/broken", label="connect") is False
+    assert driver.state("/broken") == (1, "unconfigured")
+    assert driver.node.count_publishers("/out") == 0
+
+
+PARAMETERS = (
+    ParameterDeclaration(name="rate_hz", type="double", default=15.0, at=AT),
+    ParameterDeclaration(name="width", type="int", default=320, read_only=True, at=AT),
+    ParameterDeclaration(name="gains", type="double_array", at=AT),
+    ParameterDeclaration(name="mask", type="byte_array", default=(1, 255), at=AT),
+)
+
+
+def test_parameters_are_declared_with_the_plans_values(driver: Driver, build: Build) -> None:
+    spec = planned(
+        "it",
+        declared_parameters=PARAMETERS,
+        parameters=(("rate_hz", 30), ("gains", (1, 2.5))),
+    )
+    node = build(LifecycleNode, spec)
+    up(driver, "configure", node="/it")
+    values = {p.name: node.get_parameter(p.name).value for p in PARAMETERS}
+    assert values["rate_hz"] == 30.0
+    assert isinstance(values["rate_hz"], float)
+    assert values["width"] == 320
+    assert list(values["gains"]) == [1.0, 2.5]
+    assert values["mask"] == [b"\x01", b"\xff"]
+    (changed,) = node.set_parameters([Parameter("width", value=640)])
+    assert not changed.successful
+    up(driver, "cleanup", "configure", node="/it")
+
+
+def test_a_parameter_of_the_wrong_type_fails_to_configure(driver: Driver, build: Build) -> None:
+    spec = planned("it", declared_parameters=PARAMETERS, parameters=(("width", "wide"),))
+    node = build(LifecycleNode, spec)
+    (result,) = run_task(driver, node.lifecycle.change, "configure")
+    assert result.error.startswith(
+        "test.lifecycle.yaml:7:5: cannot declare parameter 'width' as int: "
+    )
+    assert driver.state("/it") == (1, "unconfigured")
+
+
+def test_a_node_without_a_manifest_declares_in_code_and_drives_itself(
+    driver: Driver, context: rclpy.Context
+) -> None:
+    class Alone(LifecycleNode):
+        def __init__(self) -> None:
+            super().__init__("alone", lifecycle="auto", namespace="/here", context=context)
+            self.declare_publisher("out", String)
+            self.declare_subscription("out", String, 10)
+            self.declare_service("reset", Trigger)
+            self.declare_client("reset", Trigger)
+            self.heard: list[String] = []
+
+        @on_timer(period_s=0.01)
+        def speak(self) -> None:
+            self.publisher("out").publish(String(data="hello"))
+
+        @on_message("out")
+        def hear(self, message: String) -> None:
+            self.heard.append(message)
+
+        @on_service("reset")
+        def reset(self, request: Trigger.Request, response: Trigger.Response) -> None: ...
+
+    node = Alone()
+    driver.add(node)
+    driver.spin_until(lambda: node.heard)
+    assert node.is_active
+    assert driver.node.count_publishers("/here/out") == 1
+
+
+def test_declaring_twice_in_code_names_both_places(context: rclpy.Context) -> None:
+    node = LifecycleNode("twice", context=context)
+    node.declare_publisher("out", String)
+    with pytest.raises(LifecycleError) as error:
+        node.declare_publisher("out", String)
+    file = __file__
+    line = _line_of('node.declare_publisher("out", String)')
+    assert str(error.value) == (
+        f"{file}:{line + 2}: cannot declare 'out' in publishers as std_msgs/msg/String: "
+        f"{file}:{line} declares it as std_msgs/msg/String already"
+    )
+    node.destroy_node()
+
+
+def _line_of(text: str) -> int:
+    with open(__file__, encoding="utf-8") as file:  # noqa: PTH123
+        return 1 + [line.strip() for line in file].index(text)
+
+
+def test_a_mode_that_does_not_exist_is_refused(context: rclpy.Context) -> None:
+    with pytest.raises(LifecycleError) as error:
+        LifecycleNode("it", lifecycle="automatic", context=context)
+    assert str(error.value) == ("cannot use lifecycle='automatic'; allowed: 'manual', 'auto'")
+
+
+def test_remaps_of_the_plan_reach_declared_and_own_endpoints(driver: Driver, build: Build) -> None:
+    class Both(LifecycleNode):
+        def on_configure(self) -> None:
+            self.create_publisher(String, "own", 10)
+
+    spec = planned("both", publisher("out"), remap=(("out", "/there"), ("own", "elsewhere")))
+    build(Both, spec)
+    up(driver, "configure", "connect", node="/both")
+    assert driver.node.count_publishers("/there") == 1
+    assert driver.node.count_publishers("/elsewhere") == 1

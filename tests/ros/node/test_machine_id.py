@@ -1,0 +1,34 @@
+"""What a node says of the machine that it runs on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from lifecycle.node.machine_id import machine_id
+
+
+@pytest.fixture(autouse=True)
+def _forgotten() -> Iterator[None]:
+    machine_id.cache_clear()
+    yield
+    machine_id.cache_clear()
+
+
+def test_a_machine_id_that_is_given_stands_for_the_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LIFECYCLE_MACHINE_ID", "container-1")
+    assert machine_id() == "container-1"
+
+
+@pytest.mark.parametrize("given", [None, ""])
+def test_without_one_the_files_say_which_machine_it_is(
+    monkeypatch: pytest.MonkeyPatch, given: str | None
+) -> None:
+    monkeypatch.delenv("LIFECYCLE_MACHINE_ID", raising=False)
+    if given is not None:
+        monkeypatch.setenv("LIFECYCLE_MACHINE_ID", given)
+    files = ("/etc/machine-id", "/proc/sys/kernel/random/boot_id")
+    texts = (Path(file).read_text().strip() for file in files if Path(file).exists())
+    assert machine_id() == next(text for text in texts if text)

@@ -1,0 +1,66 @@
+"""Node classes of the supervisor's tests: a healthy pair, and one that misbehaves as told.
+
+The environment variable of the process, MISBEHAVE=step:way, names the callback and the way.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import threading
+
+from std_msgs.msg import String
+
+from lifecycle import LifecycleNode, on_message
+
+
+def misbehave(step: str) -> None:
+    wanted, _, way = os.environ.get("MISBEHAVE", "").partition(":")
+    if step != wanted:
+        return
+    print(f"about to {way} in {step}", flush=True)
+    if way == "kill":
+        os.kill(os.getpid(), signal.SIGKILL)
+    if way == "exit":
+        os._exit(9)
+    if way == "hang":
+        threading.Event().wait()
+    if way == "raise":
+        raise RuntimeError("the sensor is on fire")
+    if way == "fork":
+        # A grandchild in a session of its own that outlives whoever made it.
+        subprocess.Popen(["sleep", "300"], start_new_session=True)
+
+
+class Talker(LifecycleNode):
+    def __init__(self) -> None:
+        misbehave("construct")
+        super().__init__()
+
+    def on_configure(self, state):
+        self.create_timer(0.02, self._tick)
+        misbehave("configure")
+
+    def on_connect(self, state):
+        misbehave("connect")
+
+    def on_activate(self, state):
+        misbehave("activate")
+
+    def on_deactivate(self, state):
+        misbehave("deactivate")
+
+    def _tick(self) -> None:
+        misbehave("active")
+        self.publisher("chatter").publish(String(data="hello"))
+
+
+class Listener(LifecycleNode):
+    _heard = False
+
+    @on_message("chatter")
+    def hear(self, message: String) -> None:
+        if not self._heard:
+            self._heard = True
+            print(f"heard {message.data}", flush=True)

@@ -1,0 +1,68 @@
+"""`lifecycle verify` and `flows` on a system that runs, and reports of runs that failed."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+from lifecycle.errors import ExitCode
+from tests.ros.supervisor.running import ENOUGH, pair, up, verb
+
+
+def test_a_running_system_is_judged_from_outside(tmp_path: Path, fresh_domain: int) -> None:
+    manifest = pair(tmp_path, fresh_domain)
+    with up(manifest, runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        judged = verb(
+            "verify", str(manifest), *ENOUGH, "--format", "json", "--strict", runtime=tmp_path
+        )
+        assert (judged.returncode, judged.stderr) == (ExitCode.OK, "")
+        assert json.loads(judged.stdout)["verdict"] == "ok"
+        flows = verb("flows", str(manifest), "--format", "csv", runtime=tmp_path)
+        assert flows.returncode == ExitCode.OK
+        rows = list(csv.DictReader(io.StringIO(flows.stdout)))
+        assert [(row["topic"], row["publisher"], row["subscription"]) for row in rows] == [
+            ("/chatter", "/talker", "/listener")
+        ]
+        assert rows[0]["transport_protocol"] == "udp"
+        assert rows[0]["outcome"] == "ok"
+
+        other = pair(tmp_path, fresh_domain, edit={"nodes/third": _THIRD})
+        missing = verb(
+            "verify", str(other), "--format", "json", "--timeout", "0.5", runtime=tmp_path
+        )
+        assert missing.returncode == ExitCode.VIOLATED
+        findings = json.loads(missing.stdout)["findings"]
+        assert ("graph.missing-node", "/third") in {(e["rule"], e["subject"]) for e in findings}
+
+
+_THIRD = {"run": {"attach": True}, "managed": False}
+
+
+def test_an_empty_graph_says_where_it_looked(tmp_path: Path, fresh_domain: int) -> None:
+    manifest = pair(tmp_path, fresh_domain)
+    judged = verb("verify", str(manifest), "--timeout", "0.2", runtime=tmp_path)
+    assert judged.returncode == ExitCode.VIOLATED
+    assert judged.stderr == (
+        f"no node in the graph; looked in ROS domain {fresh_domain} with rmw_fastrtps_cpp, "
+        "discovery range localhost\n"
+    )
+
+
+def test_the_report_of_a_failed_run_names_the_failure(tmp_path: Path, fresh_domain: int) -> None:
+    report = tmp_path / "report.xml"
+    manifest = pair(tmp_path, fresh_domain, misbehave="configure:raise")
+    with up(manifest, "--report", str(report), runtime=tmp_path) as run:
+        assert run.finish() == ExitCode.BRING_UP_FAILED
+        finding = run.verdict["findings"][0]
+        assert finding["rule"] == "run.transition-failed"
+        assert "the sensor is on fire" in finding["message"]
+    failed = [
+        (case.get("classname"), case.get("name"))
+        for case in ET.parse(report).getroot().iter("testcase")
+        if case.find("failure") is not None
+    ]
+    assert ("run.transition-failed", "/talker") in failed

@@ -1,0 +1,270 @@
+"""`lifecycle pause`, `resume` and `restart` of a running system, on real DDS."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import json
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import rclpy
+import yaml
+from rclpy.node import Node
+
+from lifecycle.errors import ExitCode
+from tests.ros.supervisor.running import BOUND_S, ENOUGH, Up, pair, up, verb
+
+Intruders = Callable[[int], Callable[[], None]]
+
+
+def requests(run: Up, since: int) -> list[tuple[str, str]]:
+    """Node and operation of every request after the first `since` events."""
+    return [
+        (each["node"], each["operation"])
+        for each in run.events[since:]
+        if each.get("event") == "request" and each["operation"] != "get_configuration"
+    ]
+
+
+def phases(runtime: Path) -> tuple[str, dict[str, str]]:
+    """Phase of the system and state of each node, as `lifecycle status` shows them."""
+    told = verb("status", "pair", "--format", "json", runtime=runtime)
+    status = json.loads(told.stdout)
+    return status["phase"], {each["node"]: each["state"] for each in status["nodes"]}
+
+
+def resume(runtime: Path) -> None:
+    """Resume as soon as the gate allows it: who has left is seen a little later."""
+    deadline = time.monotonic() + BOUND_S
+    while (done := verb("resume", "pair", runtime=runtime)).returncode != ExitCode.OK:
+        assert "graph.undeclared-node" in done.stderr
+        assert time.monotonic() < deadline
+
+
+def assert_no_activate_before_a_new_gate(run: Up, since: int) -> None:
+    kinds = [
+        "activate" if each.get("operation") == "activate" else each.get("event")
+        for each in run.events[since:]
+    ]
+    assert "gate" in kinds
+    assert "activate" in kinds
+    assert kinds.index("gate") < kinds.index("activate")
+
+
+def test_a_paused_system_is_silent_and_resumes_only_through_the_gate(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    with up(pair(tmp_path, fresh_domain), runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        begun = len(run.events)
+        paused = verb("pause", "pair", runtime=tmp_path)
+        assert (paused.returncode, paused.stderr) == (ExitCode.OK, "")
+        run.until("system", reached="paused")
+        assert requests(run, begun) == [("/listener", "deactivate"), ("/talker", "deactivate")]
+        assert phases(tmp_path) == ("paused", {"/talker": "inactive", "/listener": "inactive"})
+
+        again = verb("pause", "pair", runtime=tmp_path)
+        assert again.returncode == ExitCode.USAGE
+        assert again.stderr == (
+            "cannot pause 'pair': it is paused; only an active system can be paused\n"
+        )
+
+        begun = len(run.events)
+        resumed = verb("resume", str(tmp_path / "pair.lifecycle.yaml"), runtime=tmp_path)
+        assert (resumed.returncode, resumed.stderr) == (ExitCode.OK, "")
+        run.until("system", reached="active")
+        assert_no_activate_before_a_new_gate(run, begun)
+        assert phases(tmp_path) == ("active", {"/talker": "active", "/listener": "active"})
+        again = verb("resume", "pair", runtime=tmp_path)
+        assert again.returncode == ExitCode.USAGE
+        assert again.stderr == (
+            "cannot resume 'pair': it is active; only a paused system can be resumed\n"
+        )
+        assert verb("down", "pair", runtime=tmp_path).returncode == ExitCode.OK
+        assert run.finish() == ExitCode.OK
+        run.assert_nothing_left()
+
+
+def test_a_paused_system_that_is_not_ok_stays_paused(
+    tmp_path: Path, fresh_domain: int, make_intruder: Intruders
+) -> None:
+    with up(pair(tmp_path, fresh_domain), runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        assert verb("pause", "pair", runtime=tmp_path).returncode == ExitCode.OK
+        run.until("system", reached="paused")
+        begun = len(run.events)
+        intruder = make_intruder(fresh_domain)
+        run.until_found("graph.undeclared-node", since=begun)
+        refused = verb("resume", "pair", runtime=tmp_path)
+        assert refused.returncode == ExitCode.VIOLATED
+        assert refused.stderr.startswith("cannot activate: the verdict is violated\n")
+        assert "graph.undeclared-node" in refused.stderr
+        assert phases(tmp_path)[0] == "paused"
+        run.until("notice")
+        assert requests(run, begun) == []
+
+        intruder()
+        resume(tmp_path)
+        assert phases(tmp_path)[0] == "active"
+
+
+@pytest.fixture
+def make_intruder() -> Iterator[Callable[[int], Callable[[], None]]]:
+    """A node that nobody declared; what is returned takes it away."""
+    with contextlib.ExitStack() as whole:
+
+        def make(domain_id: int) -> Callable[[], None]:
+            context = rclpy.Context()
+            context.init(args=[], domain_id=domain_id)
+            own = whole.enter_context(contextlib.ExitStack())
+            own.callback(gc.collect)  # what a cycle holds stays in the graph until it is found
+            own.callback(context.destroy)
+            own.callback(context.try_shutdown)
+            own.callback(Node("intruder", context=context, enable_rosout=False).destroy_node)
+            return own.close
+
+        yield make
+
+
+def test_one_node_restarts_behind_the_gate_while_the_other_stays_active(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    with up(pair(tmp_path, fresh_domain), runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        old, kept = run.pid_of("talker"), run.pid_of("listener")
+        begun = len(run.events)
+        restarted = verb("restart", "pair", "talker", runtime=tmp_path)
+        assert (restarted.returncode, restarted.stderr) == (ExitCode.OK, "")
+        run.until("system", reached="active")
+        assert [each for each in requests(run, begun) if each[0] == "/listener"] == []
+        assert [operation for _, operation in requests(run, begun)] == [
+            "deactivate",
+            "disconnect",
+            "cleanup",
+            "shutdown",
+            "configure",
+            "connect",
+            "activate",
+        ]
+        assert_no_activate_before_a_new_gate(run, begun)
+        assert run.pid_of("talker") != old
+        assert run.pid_of("listener") == kept
+        assert phases(tmp_path) == ("active", {"/talker": "active", "/listener": "active"})
+        manifest = tmp_path / "pair.lifecycle.yaml"
+        judged = verb("verify", str(manifest), *ENOUGH, runtime=tmp_path)
+        assert judged.returncode == ExitCode.OK, judged.stdout
+        run.note_segments()
+        assert verb("down", "pair", runtime=tmp_path).returncode == ExitCode.OK
+        assert run.finish() == ExitCode.OK
+        run.assert_nothing_left()
+
+
+def test_a_whole_system_restarts_through_the_same_gate(tmp_path: Path, fresh_domain: int) -> None:
+    with up(pair(tmp_path, fresh_domain), runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        old = {run.pid_of("talker"), run.pid_of("listener")}
+        begun = len(run.events)
+        restarted = verb("restart", "pair", runtime=tmp_path)
+        assert (restarted.returncode, restarted.stderr) == (ExitCode.OK, "")
+        run.until("system", reached="active")
+        reached = [e["reached"] for e in run.events[begun:] if e.get("event") == "system"]
+        assert reached == ["connected", "verified", "active"]
+        assert_no_activate_before_a_new_gate(run, begun)
+        assert not old & {run.pid_of("talker"), run.pid_of("listener")}
+        run.met("log", since=begun, line="heard hello")
+        run.note_segments()
+        assert verb("down", "pair", runtime=tmp_path).returncode == ExitCode.OK
+        assert run.finish() == ExitCode.OK
+        run.assert_nothing_left()
+
+
+def test_what_restarts_in_a_paused_system_stays_paused(tmp_path: Path, fresh_domain: int) -> None:
+    with up(pair(tmp_path, fresh_domain), runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        assert verb("pause", "pair", runtime=tmp_path).returncode == ExitCode.OK
+        run.until("system", reached="paused")
+        begun = len(run.events)
+        # Its full name will do as well as its key.
+        assert verb("restart", "pair", "/talker", runtime=tmp_path).returncode == ExitCode.OK
+        run.until("system", reached="connected")
+        run.until("system", reached="paused")
+        assert "activate" not in [operation for _, operation in requests(run, begun)]
+        assert phases(tmp_path) == ("paused", {"/talker": "inactive", "/listener": "inactive"})
+        assert verb("resume", "pair", runtime=tmp_path).returncode == ExitCode.OK
+
+
+def test_a_node_that_comes_back_different_waits_at_the_gate(
+    tmp_path: Path, fresh_domain: int, make_intruder: Intruders
+) -> None:
+    with up(pair(tmp_path, fresh_domain), runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        begun = len(run.events)
+        intruder = make_intruder(fresh_domain)
+        run.until_found("graph.undeclared-node", since=begun)
+        refused = verb("restart", "pair", "talker", runtime=tmp_path)
+        assert refused.returncode == ExitCode.VIOLATED
+        assert phases(tmp_path) == ("held", {"/talker": "inactive", "/listener": "active"})
+        intruder()
+        resume(tmp_path)
+        assert phases(tmp_path) == ("active", {"/talker": "active", "/listener": "active"})
+
+
+def test_a_node_that_dies_while_it_restarts_ends_the_run(tmp_path: Path, fresh_domain: int) -> None:
+    with up(pair(tmp_path, fresh_domain, misbehave="deactivate:kill"), runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        paused = verb("pause", "pair", runtime=tmp_path)
+        assert paused.returncode == ExitCode.BRING_UP_FAILED
+        assert "/talker" in paused.stderr
+        assert "killed by SIGKILL" in paused.stderr
+        assert run.finish() == ExitCode.BRING_UP_FAILED
+        run.assert_nothing_left()
+
+
+def test_orders_that_name_nothing_are_refused(tmp_path: Path, fresh_domain: int) -> None:
+    refusals = {
+        ("restart", "pair", "talkre"): (
+            "cannot restart 'talkre': this supervisor runs no such node; "
+            "it runs: /listener, /talker\n"
+        ),
+        ("restart", "pair", "talker", "listener"): (
+            "cannot restart talker, listener at once; name one node, or none\n"
+        ),
+        ("pause", "pear"): (
+            f"cannot find a running system 'pear'; running: pair@{fresh_domain}; "
+            "start it: lifecycle up MANIFEST\n"
+        ),
+    }
+    with up(pair(tmp_path, fresh_domain), runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        for words, said in refusals.items():
+            refused = verb(*words, runtime=tmp_path)
+            assert (refused.returncode, refused.stderr) == (ExitCode.USAGE, said)
+
+
+def test_a_system_on_its_way_up_takes_no_orders(tmp_path: Path, fresh_domain: int) -> None:
+    manifest = pair(tmp_path, fresh_domain, misbehave="configure:hang")
+    with up(manifest, runtime=tmp_path) as run:
+        run.until("log", line="about to hang in configure")
+        refused = verb("pause", "pair", runtime=tmp_path)
+        assert refused.returncode == ExitCode.USAGE
+        assert refused.stderr == (
+            "cannot pause 'pair': it is connecting; only an active system can be paused\n"
+        )
+
+
+def test_a_node_of_somebody_else_is_not_restarted(
+    tmp_path: Path, fresh_domain: int, make_intruder: Intruders
+) -> None:
+    manifest = pair(tmp_path, fresh_domain)
+    document = yaml.safe_load(manifest.read_text())
+    document["nodes"]["intruder"] = {"run": {"attach": True}, "managed": False}
+    manifest.write_text(yaml.safe_dump(document, sort_keys=False))
+    make_intruder(fresh_domain)
+    with up(manifest, runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        refused = verb("restart", "pair", "intruder", runtime=tmp_path)
+        assert refused.returncode == ExitCode.USAGE
+        assert refused.stderr == "cannot restart '/intruder': somebody else runs it\n"

@@ -1,0 +1,86 @@
+"""`lifecycle restart` where participants are connected by TCP, and a discovery server that dies."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+from pathlib import Path
+from typing import Any
+
+from lifecycle.errors import ExitCode
+from tests.ros.supervisor.contacts import restarts_by_tcp, up_by_tcp
+from tests.ros.supervisor.running import Up, pair, verb
+
+
+def by_tcp(directory: Path, domain_id: int, **discovery: str) -> Path:
+    """Write the manifest of the pair, connected by TCP on ports that nobody has."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        free = server.getsockname()[1]
+    how: dict[str, Any] = {"domain_id": domain_id, "first_port": 20000 + free % 10000, **discovery}
+    return pair(directory, domain_id, edit={"discovery": how})
+
+
+def violations(run: Up) -> set[tuple[str, str, str]]:
+    """Rule, subject and message of every finding of every verdict so far."""
+    return {
+        (each["rule"], each["subject"], each["message"])
+        for event in run.of_kind("verdict")
+        for each in event["verdict"]["findings"]
+    }
+
+
+def ends_with_nothing_left(run: Up, runtime: Path) -> None:
+    assert verb("down", "pair", runtime=runtime).returncode == ExitCode.OK
+    assert run.finish() == ExitCode.OK
+    run.assert_nothing_left()
+
+
+def test_each_end_of_a_tcp_connection_is_found_again_after_its_restart(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    manifest = by_tcp(tmp_path, fresh_domain, mode="static", transport="tcpv4")
+    with up_by_tcp(manifest, runtime=tmp_path) as run:
+        restarts_by_tcp(run, tmp_path, "talker")
+        begun = len(run.events)
+        restarts_by_tcp(run, tmp_path, "listener")
+        run.met("log", since=begun, line="heard hello")
+        # Whoever looks on is told where they listen now.
+        judged = verb("verify", str(manifest), "--timeout", "20", runtime=tmp_path)
+        assert judged.returncode == ExitCode.OK, judged.stdout
+        ends_with_nothing_left(run, tmp_path)
+
+
+def test_clients_of_a_discovery_server_are_found_again_after_their_restart(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    with up_by_tcp(by_tcp(tmp_path, fresh_domain, mode="server"), runtime=tmp_path) as run:
+        begun = len(run.events)
+        restarts_by_tcp(run, tmp_path, "listener")
+        run.met("log", since=begun, line="heard hello")
+        restarts_by_tcp(run, tmp_path)
+        ends_with_nothing_left(run, tmp_path)
+
+
+def test_a_discovery_server_that_dies_is_a_violation_for_as_long_as_the_system_runs(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    manifest = by_tcp(tmp_path, fresh_domain, mode="server")
+    with up_by_tcp(manifest, "--keep-going", runtime=tmp_path) as run:
+        pid = run.pid_of("discovery_server")
+        os.kill(pid, signal.SIGKILL)
+        died = f"cannot keep process 'discovery_server' running: pid {pid} died: killed by SIGKILL"
+        told = ("run.process-died", "discovery_server", died)
+        while told not in violations(run):
+            run.until("verdict")
+        for words, what in ((("pair",), "pair"), (("pair", "talker"), "talker")):
+            refused = verb("restart", *words, runtime=tmp_path)
+            assert refused.returncode == ExitCode.USAGE
+            assert refused.stderr == (
+                f"cannot restart {what!r}: the discovery server has died, and without it nobody "
+                "who comes again is found; start the system again: lifecycle down, then "
+                "lifecycle up\n"
+            )
+        assert verb("down", "pair", runtime=tmp_path).returncode == ExitCode.OK
+        assert run.finish() == ExitCode.OK
+        run.assert_nothing_left()

@@ -1,0 +1,120 @@
+"""`lifecycle flows --export` and the options of `up --program`, without ROS."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from lifecycle.cli import verb_flows, verb_up
+from lifecycle.cli.flows_export import NAMES, Export
+from lifecycle.errors import UsageError
+from lifecycle.export import EXPORTS
+from tests.unit.export.samples import plan, report
+from tests.unit.supervisor.programming.samples import nef_settings, settings_file
+
+NOTHING = {"device": "", "rate": "", "guarantees": (), "match": "flow", "config": ""}
+
+
+def export(name: str, *, mapping: str = "", **given: object) -> Export:
+    return Export(name, mapping=mapping, flow_labels=False, **{**NOTHING, **given})
+
+
+def test_every_export_can_be_asked_for() -> None:
+    assert tuple(EXPORTS) == NAMES
+
+
+def test_verified_flows_are_exported_as_nft_takes_them(capsys: pytest.CaptureFixture[str]) -> None:
+    export("nft").write(plan(), [report()])
+
+    assert "table inet flowqos_" in capsys.readouterr().out
+
+
+def test_a_device_comes_from_its_option(capsys: pytest.CaptureFixture[str]) -> None:
+    export("tc", device="e0", rate="20mbit").write(plan(), [report()])
+
+    assert " dev e0 " in capsys.readouterr().out
+
+
+def test_bodies_take_the_settings_of_their_server(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = settings_file(tmp_path, nef=nef_settings("https://nef.test", devices=["10.77.0.1"]))
+
+    export("nef", config=file).write(plan(), [report()])
+
+    (subscription,) = json.loads(capsys.readouterr().out)["subscriptions"]
+    assert subscription["body"]["ueIpv4Addr"] == "10.77.0.1"
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        (
+            "tc",
+            (
+                "cannot export tc: nothing says the network device; give tc its settings; "
+                "give --device eth0"
+            ),
+        ),
+        (
+            "nef",
+            (
+                "cannot export nef: nothing says devices and a notification destination; "
+                "give nef its settings; give --config FILE"
+            ),
+        ),
+    ],
+)
+def test_an_export_without_what_it_needs_is_refused(name: str, message: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        export(name).write(plan(), [report()])
+
+    assert str(caught.value) == message
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--export", "csv", "--watch"], "cannot use --export with --watch; export once"),
+        (
+            ["--export", "nft", "--device", "e0"],
+            "cannot use --device, --rate or --guarantee without --export tc",
+        ),
+        (
+            ["--device", "e0"],
+            (
+                "cannot say how to treat flows that are only shown; give --export, or use "
+                "lifecycle flows apply"
+            ),
+        ),
+    ],
+)
+def test_flows_refuses_options_that_do_not_fit(options: list[str], message: str) -> None:
+    result = CliRunner().invoke(verb_flows.command, ["m.yaml", *options])
+
+    assert str(result.exception) == message
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--device", "e0"], "cannot use --device, --rate or --guarantee without --program tc"),
+        (["--flow-labels"], "cannot use --dscp-from-5qi or --flow-labels without --program"),
+        (
+            ["--program", "tc"],
+            (
+                "cannot program tc without a device; only devices that are named are touched; "
+                "give --device eth0"
+            ),
+        ),
+    ],
+)
+def test_up_refuses_options_that_do_not_fit(options: list[str], message: str) -> None:
+    manifest = Path(__file__).parents[3] / "manifests" / "first_node.lifecycle.yaml"
+
+    result = CliRunner().invoke(verb_up.command, [str(manifest), *options])
+
+    assert str(result.exception) == message

@@ -1,0 +1,145 @@
+"""`lifecycle flows apply|diff|remove`: options, dispatch and exit codes, without ROS."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from lifecycle.cli import flows_program
+from lifecycle.errors import ExitCode, UsageError
+from lifecycle.supervisor.programming import TargetOptions
+from tests.unit.export.samples import nfe, plan, report
+from tests.unit.supervisor.programming.samples import nef_settings, settings_file
+from tests.unit.supervisor.programming.servers import TOKEN, NefServer
+
+NOTHING = {"device": "", "rate": "", "guarantees": (), "match": "flow", "config": ""}
+
+
+@pytest.fixture
+def options(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[TargetOptions, ...]:
+    """A NEF that is named in the environment's own run directory; its server is not there."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setenv("TEST_TOKEN", TOKEN)
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+    return ()
+
+
+def nef_options(tmp_path: Path, url: str) -> tuple[TargetOptions, ...]:
+    settings = nef_settings(url, devices=["10.77.0.1"])
+    return (TargetOptions(kind="nef", settings=settings_file(tmp_path, nef=settings)),)
+
+
+@click.command("flows")
+@click.argument("manifest")
+@click.option("--watch", is_flag=True)
+def show(manifest: str, watch: bool) -> int:
+    """Show flows."""
+    click.echo(f"shown {manifest} {watch}")
+    return 5
+
+
+def test_flows_of_a_manifest_are_shown_and_a_subcommand_is_a_subcommand() -> None:
+    flows = flows_program.with_subcommands(show)
+    run = CliRunner()
+
+    assert run.invoke(flows, ["a.yaml", "--watch"], standalone_mode=False).return_value == 5
+    assert run.invoke(flows, ["a.yaml", "--watch"]).output == "shown a.yaml True\n"
+    assert "Missing argument 'MANIFEST'" in run.invoke(flows, []).output
+    for verb in ("apply", "diff", "remove"):
+        assert "MANIFEST" in run.invoke(flows, [verb, "-h"]).output or "--help" in (
+            run.invoke(flows, [verb, "--help"]).output
+        )
+    listed = run.invoke(flows, ["--help"]).output
+    assert "apply" in listed
+    assert "--watch" in listed
+
+
+def test_it_can_be_mounted_below_other_groups() -> None:
+    group = click.Group("lifecycle", commands=[flows_program.with_subcommands(show)])
+
+    result = CliRunner().invoke(group, ["flows", "a.yaml"], standalone_mode=False)
+
+    assert (result.output, result.return_value) == ("shown a.yaml False\n", 5)
+
+
+def test_options_of_tc_are_read_with_their_units() -> None:
+    (options,) = flows_program.chosen(
+        ["tc"], **{**NOTHING, "device": "e0", "rate": "20mbit", "guarantees": ("ef=2mbit",)}
+    )
+
+    assert (options.device, options.link_kbit) == ("e0", 20_000)
+    assert options.guaranteed_kbit == {"ef": 2_000}
+
+
+@pytest.mark.parametrize(
+    ("targets", "given", "message"),
+    [
+        (
+            ["nft"],
+            {"device": "e0"},
+            "cannot use --device, --rate or --guarantee without --target tc",
+        ),
+        (["nft"], {"config": "f"}, "cannot use --config without --target nef or camara"),
+        (["tc"], {"device": "e0", "rate": "fast"}, "cannot use rate 'fast'"),
+        (
+            ["tc"],
+            {"device": "e0", "guarantees": ("ef",)},
+            "cannot read guarantee 'ef'; write CLASS=",
+        ),
+        (["tc"], {}, "cannot program tc without a device"),
+    ],
+)
+def test_options_that_do_not_fit_are_refused(
+    targets: list[str], given: dict[str, object], message: str
+) -> None:
+    with pytest.raises(UsageError) as caught:
+        flows_program.chosen(targets, **{**NOTHING, **given})
+
+    assert str(caught.value).startswith(message)
+
+
+def test_a_5qi_mapping_is_one_of_ours_or_a_file(tmp_path: Path) -> None:
+    file = tmp_path / "mapping.json"
+    file.write_text('{"name": "own", "source": "us", "values": {"85": "EF"}}')
+
+    own = flows_program.treatment_of(mapping=str(file), flow_labels=True)
+
+    assert own.label_flows
+    assert own.mapping is not None
+    assert own.mapping.dscp_for(85) == 46
+    with pytest.raises(UsageError, match="cannot find 5QI to DSCP mapping 'nope'"):
+        flows_program.treatment_of(mapping="nope", flow_labels=False)
+
+
+@pytest.mark.usefixtures("options")
+def test_apply_diff_and_remove_go_together(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with NefServer() as server:
+        options = nef_options(tmp_path, server.url)
+        flows = [report(), report("/robot/status", source=(nfe("0.0.0.0", 45009),))]
+        name = f"nef at {server.url}/3gpp-as-session-with-qos/v1/robots"
+
+        assert flows_program.diff(plan(), flows, options) is ExitCode.VIOLATED
+        assert flows_program.apply(plan(), flows, options, dry_run=True) is ExitCode.OK
+        assert server.subscriptions == {}
+        assert flows_program.apply(plan(), flows, options, dry_run=False) is ExitCode.OK
+        capsys.readouterr()
+        assert flows_program.diff(plan(), flows, options) is ExitCode.OK
+        out, err = capsys.readouterr()
+        assert flows_program.remove(plan()) is ExitCode.OK
+        removed = capsys.readouterr().out
+        assert flows_program.remove(plan()) is ExitCode.OK
+
+        assert out.partition("\n")[0] == f"{name}: 1 unchanged"
+        assert err == (
+            "left out: /robot/status /robot/camera → /viewer: neither a dscp nor a five_qi\n"
+        )
+        assert removed.partition("\n")[0] == f"{name}: 1 deleted, 0 unchanged"
+        assert capsys.readouterr().out == "nothing of system robot is in any network\n"
+        assert server.subscriptions == {}
+        assert not list(Path(os.environ["XDG_RUNTIME_DIR"]).rglob("programmed.json"))

@@ -1,0 +1,146 @@
+"""`lifecycle check`: text, JSON, exit codes, and no ROS."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import jsonschema
+import pytest
+
+from lifecycle.cli import main
+from lifecycle.manifest.schema import read_schema
+
+CORPUS = Path(__file__).parents[2] / "corpus"
+
+
+@pytest.fixture
+def corpus(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(CORPUS)
+
+
+@pytest.mark.usefixtures("corpus")
+def test_a_good_manifest_is_summed_up_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", "valid/teleop.lifecycle.yaml"]) == 0
+    assert capsys.readouterr().out == "teleop: 2 nodes, 4 endpoints, 1 link: ok\n"
+
+
+@pytest.mark.usefixtures("corpus")
+def test_every_finding_of_a_bad_manifest_comes_before_the_summary(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["check", "invalid/qos_of_a_wrong_type.lifecycle.yaml"]) == 3
+    path = "invalid/qos_of_a_wrong_type.lifecycle.yaml"
+    publishers = "nodes.talker.interface.publishers"
+    wanted = "it must be a string or a mapping"
+    assert capsys.readouterr().out.splitlines() == [
+        f"{path}:8:53: {publishers}[0].qos: cannot use qos 10; {wanted}",
+        f"{path}:9:53: {publishers}[1].qos: cannot use a list as qos; {wanted}",
+        f"{path}: not ok (2 errors)",
+    ]
+
+
+@pytest.mark.usefixtures("corpus")
+def test_warnings_fail_only_when_strict(capsys: pytest.CaptureFixture[str]) -> None:
+    path = "valid/include_only.lifecycle.yaml"
+    assert main(["check", path]) == 0
+    relaxed = capsys.readouterr().out.splitlines()
+    assert main(["check", path, "--strict"]) == 3
+    strict = capsys.readouterr().out.splitlines()
+    assert relaxed[-1] == "include_only: 2 nodes, 2 endpoints, 0 links: ok (2 warnings)"
+    assert strict[-1] == "include_only: 2 nodes, 2 endpoints, 0 links: not ok (2 warnings)"
+    assert relaxed[:-1] == strict[:-1]
+
+
+@pytest.mark.usefixtures("corpus")
+def test_arguments_are_handed_on(capsys: pytest.CaptureFixture[str]) -> None:
+    path = "valid/every_key.lifecycle.yaml"
+    assert main(["check", path, "rate:=20"]) == 0
+    assert main(["check", path, "rate:=30"]) == 3
+    assert capsys.readouterr().out.splitlines()[-2] == (
+        f"{path}:6:9: arguments.rate: cannot set rate to '30'; allowed: 10, 20"
+    )
+    assert main(["check", path, "rate"]) == 2
+    assert capsys.readouterr().err == "cannot read argument 'rate'; write name:=value\n"
+
+
+@pytest.mark.usefixtures("corpus")
+@pytest.mark.parametrize(
+    ("path", "code", "rules"),
+    [
+        ("valid/teleop.lifecycle.yaml", 0, []),
+        ("valid/yaml_1_1_booleans.lifecycle.yaml", 0, ["manifest.yaml-1.1-boolean"]),
+        ("invalid/yaml_nul_byte.lifecycle.yaml", 3, ["yaml.file"]),
+        ("nowhere.lifecycle.yaml", 3, ["yaml.file"]),
+    ],
+)
+def test_json_fits_its_schema(
+    path: str, code: int, rules: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["check", path, "--format", "json"]) == code
+    report = json.loads(capsys.readouterr().out)
+    jsonschema.validate(report, read_schema("check.v1.schema.json"))
+    assert report["ok"] is (code == 0)
+    assert report["manifest"] == path
+    assert [each["rule"] for each in report["diagnostics"]] == rules
+
+
+def test_checking_imports_nothing_of_ros() -> None:
+    program = f"""
+import sys
+from lifecycle.cli import main
+code = main(["check", {str(CORPUS / "valid" / "teleop.lifecycle.yaml")!r}])
+heavy = ("rclpy", "rcl_interfaces", "lifecycle_msgs", "sensor_msgs", "std_msgs", "ctypes.util")
+print(sorted(name for name in heavy if name in sys.modules))
+sys.exit(code)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.stdout.splitlines() == ["teleop: 2 nodes, 4 endpoints, 1 link: ok", "[]"]
+    assert done.returncode == 0
+
+
+def test_what_cannot_be_planned_is_found_too(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "apart.lifecycle.yaml"
+    path.write_text(
+        """manifest_version: 1
+system: apart
+discovery: {mode: static, transport: shm}
+nodes:
+  called:
+    run: {python: "demo:Called"}
+    interface: {service_servers: [{name: /reset, type: std_srvs/srv/Trigger}]}
+    connections: {net: {urls: ["udpv4://127.0.0.1:9001?multicast=off"], map: all}}
+  caller:
+    run: {python: "demo:Caller"}
+    interface: {service_clients: [{name: /reset, type: std_srvs/srv/Trigger}]}
+""",
+        encoding="utf-8",
+    )
+    assert main(["check", str(path)]) == 3
+    assert capsys.readouterr().out.splitlines() == [
+        (
+            f"{path}:11:35: nodes.caller.interface.service_clients[0]: cannot call service "
+            "'/reset' of 'called' from 'caller': the client's participant has shm, the server's "
+            "udpv4, and they are on one host; map both ends onto connections that have a "
+            "transport in common"
+        ),
+        f"{path}: not ok (1 error)",
+    ]
+
+
+@pytest.mark.usefixtures("corpus")
+def test_a_domain_of_the_environment_that_is_none_is_refused_as_up_refuses_it(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ROS_DOMAIN_ID", "233")
+    assert main(["check", "valid/smallest.lifecycle.yaml"]) == 2
+    assert capsys.readouterr().err == (
+        "cannot use ROS_DOMAIN_ID='233': a domain is a number from 0 to 232; unset it, or set "
+        "discovery.domain_id in the manifest\n"
+    )

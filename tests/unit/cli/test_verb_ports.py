@@ -1,0 +1,178 @@
+"""`lifecycle ports` as a person and as a script see it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from lifecycle.cli import main
+from lifecycle.errors import ExitCode
+
+SYSTEM = """\
+manifest_version: 1
+system: pair
+machines:
+  robot: {address: "10.0.0.1"}
+  operator: {address: "%s"}
+discovery: {domain_id: %s}
+nodes:
+  talker:
+    run: {python: "pair:Talker"}
+    machine: robot
+    interface:
+      publishers: [{name: chatter, type: std_msgs/msg/String}]
+    flows:
+      publishers: {chatter: {unique: strictly_required}}
+  listener:
+    run: {python: "pair:Listener"}
+    machine: operator
+    interface:
+      subscriptions: [{name: chatter, type: std_msgs/msg/String}]
+    flows:
+      subscriptions: {chatter: {unique: strictly_required}}
+"""
+
+
+def manifest(directory: Path, *, operator: str = "10.0.0.2", domain: int = 7) -> str:
+    path = directory / "pair.lifecycle.yaml"
+    path.write_text(SYSTEM % (operator, domain), encoding="utf-8")
+    return str(path)
+
+
+def test_the_four_ports_the_safe_domains_and_what_fits_are_printed(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    code = main(["ports", "--domain", "101", "--participant", "53", "--platform", "linux"])
+    assert code == ExitCode.OK
+    assert (
+        capsys.readouterr().out
+        == """\
+domain 101, participant 53
+  discovery multicast   32650
+  user multicast        32651
+  discovery unicast     32766
+  user unicast          32767
+  unique subscriptions  7000–7399 (Fast DDS; shared by all domains of a host)
+linux: ephemeral ports 32768–60999
+  safe domains          0–101, 215–232
+  fit in domain 101     54 participants per host, then the ephemeral ports 32768–60999
+"""
+    )
+
+
+def test_an_overlap_with_the_next_domain_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    main(["ports", "--domain", "1", "--participant", "120", "--platform", "linux"])
+    assert capsys.readouterr().out.splitlines()[6:8] == [
+        "  overlaps with         discovery multicast of domain 2",
+        "  overlaps with         user multicast of domain 2",
+    ]
+
+
+def test_json_holds_the_same_for_a_script(capsys: pytest.CaptureFixture[str]) -> None:
+    code = main(["ports", "--domain", "166", "--platform", "macos", "--format", "json"])
+    assert code == ExitCode.OK
+    assert json.loads(capsys.readouterr().out) == {
+        "domain_id": 166,
+        "participant_id": 0,
+        "ports": {
+            "discovery_multicast": 48900,
+            "user_multicast": 48901,
+            "discovery_unicast": 48910,
+            "user_unicast": 48911,
+        },
+        "overlaps": [],
+        "platform": "macos",
+        "ephemeral": {"first": 49152, "last": 65535},
+        "safe_domains": [[0, 166]],
+        "capacity": {"participants": 120, "limit": "the ports of domain 167, from 49150"},
+        "unique_subscription_ports": [7000, 7399],
+        "needs": [],
+    }
+
+
+@pytest.mark.parametrize(("count", "code"), [("54", ExitCode.OK), ("55", ExitCode.VIOLATED)])
+def test_a_script_learns_from_the_exit_code_whether_so_many_fit(
+    count: str, code: ExitCode, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert (
+        main(["ports", "--domain", "101", "--participants", count, "--platform", "linux"]) == code
+    )
+    said = "fit" if code is ExitCode.OK else "do not fit"
+    assert f"--participants: {count} participants: {said}\n" in capsys.readouterr().out
+
+
+def test_the_domain_comes_from_the_environment_where_nothing_names_one(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ROS_DOMAIN_ID", "42")
+    main(["ports"])
+    assert capsys.readouterr().out.startswith("domain 42, participant 0\n")
+
+
+def test_this_machines_own_ephemeral_ports_are_read(capsys: pytest.CaptureFixture[str]) -> None:
+    first, last = Path("/proc/sys/net/ipv4/ip_local_port_range").read_text("ascii").split()
+    main(["ports", "--domain", "0"])
+    assert f"this machine: ephemeral ports {first}–{last}\n" in capsys.readouterr().out
+
+
+def test_each_host_of_a_manifest_lists_its_participants(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["ports", manifest(tmp_path), "--platform", "linux"]) == ExitCode.OK
+    assert capsys.readouterr().out.splitlines()[-8:] == [
+        "  fit in domain 7       120 participants per host, then the ports of domain 8, from 9400",
+        "robot: 3 participants: fit",
+        "  supervisor",
+        "  talker",
+        "  /_talker_flow_0",
+        "operator: 2 participants, 1 unique subscription: fit",
+        "  supervisor",
+        "  listener",
+    ]
+
+
+def test_machines_with_one_address_share_one_hosts_ports(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    main(["ports", manifest(tmp_path, operator="10.0.0.1")])
+    assert (
+        "robot, operator: 4 participants, 1 unique subscription: fit\n" in capsys.readouterr().out
+    )
+
+
+def test_a_manifest_whose_system_does_not_fit_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code = main(["ports", manifest(tmp_path), "--domain", "120", "--platform", "linux"])
+    assert code == ExitCode.MANIFEST_INVALID
+    assert (
+        "  cannot run 3 participants in domain 120 on one host: none fits before the ephemeral "
+        "ports 32768–60999: they hold its multicast ports; "
+    ) in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            ["--domain", "233"],
+            "cannot use domain id 233: its ports would lie outside 1 to 65535; use 0 to 232\n",
+        ),
+        (["--participant", "-1"], "cannot use participant id -1; use 0 or more\n"),
+        (
+            ["--participants", "-1"],
+            "cannot count -1 participants or subscriptions; use 0 or more\n",
+        ),
+        (
+            ["x.lifecycle.yaml", "--participants", "3"],
+            "cannot use --participants with a MANIFEST: its plan says how many\n",
+        ),
+    ],
+)
+def test_a_question_without_an_answer_is_a_usage_error(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["ports", "--domain", "0", *arguments]) == ExitCode.USAGE
+    assert capsys.readouterr().err == message

@@ -1,0 +1,239 @@
+"""A simulated system whose nodes are reported through the real reporters, over a bad network."""
+
+from __future__ import annotations
+
+import dataclasses
+import random
+
+from lifecycle.graph import (
+    GraphEvents,
+    GraphReporter,
+    GraphState,
+    InMemoryNetwork,
+    InMemoryTransport,
+    ManualScheduler,
+    every,
+)
+from lifecycle.graph.state import Fetch
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.node.checksum import checksum
+from lifecycle.verify.observation import (
+    ConnectionReport,
+    EndpointReport,
+    Identity,
+    NodeConfiguration,
+)
+
+PERIOD_S = 2.0
+SILENT_AFTER_S = 7.0
+ANSWER_S = 0.03
+TIMEOUT_S = 1.0
+KINDS = (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION, EndpointKind.SERVICE_SERVER)
+
+
+def endpoint(number: int, topic: str, kind: EndpointKind = KINDS[0]) -> EndpointReport:
+    return EndpointReport(
+        kind=kind,
+        name=f"e{number}",
+        resolved=topic,
+        type="std_msgs/msg/String",
+        mapped=True,
+        matched=0,
+    )
+
+
+def configuration(
+    name: str,
+    *endpoints: EndpointReport,
+    process_id: int = 1,
+    state: str = "inactive",
+    connections: tuple[ConnectionReport, ...] = (),
+) -> NodeConfiguration:
+    made = NodeConfiguration(
+        identity=Identity(machine_id="m", process_id=process_id, node_id=f"{name}@{process_id}"),
+        name=name,
+        state=state,
+        connected=True,
+        rmw="rmw_fastrtps_cpp",
+        transports=("udpv4",),
+        serializations=("cdr",),
+        paradigms=("publish-subscribe",),
+        endpoints=endpoints,
+        connections=connections,
+    )
+    return dataclasses.replace(made, checksum=checksum(made))
+
+
+class SimulatedNode:
+    """One instance of a node: it changes, and its reporter tells."""
+
+    def __init__(self, system: System, name: str, instance: int, endpoints: int) -> None:
+        self.system = system
+        self.name = name
+        self.transport = system.network.transport()
+        self.truth = configuration(
+            name,
+            *(
+                endpoint(number, f"/t{(instance + number) % 50}", KINDS[number % len(KINDS)])
+                for number in range(endpoints)
+            ),
+            process_id=instance,
+        )
+        self._made = endpoints
+        self.reporter = GraphReporter(
+            self.transport,
+            name,
+            every=every(system.scheduler),
+            period_s=PERIOD_S,
+            incarnation=f"{instance:06d}",
+        )
+        self.reporter.joined(
+            self.truth.state, connected=self.truth.connected, checksum=self.truth.checksum
+        )
+
+    def change_state(self, state: str) -> None:
+        self.truth = dataclasses.replace(self.truth, state=state)
+        self.reporter.state_changed(state, connected=True)
+
+    def add_endpoint(self, topic: str) -> None:
+        self._made += 1
+        self._configure(endpoints=(*self.truth.endpoints, endpoint(self._made, topic)))
+
+    def remove_endpoint(self) -> None:
+        self._configure(endpoints=self.truth.endpoints[1:])
+
+    def connect(self, name: str) -> None:
+        report = ConnectionReport(name=name, urls=("shm://",), established=True)
+        others = tuple(each for each in self.truth.connections if each.name != name)
+        self.reporter.connection_established(name, report.urls)
+        self._configure(connections=(*others, report))
+
+    def lose_connection(self, name: str) -> None:
+        if any(each.name == name for each in self.truth.connections):
+            self.reporter.connection_lost(name, error="unplugged")
+            self._configure(
+                connections=tuple(
+                    dataclasses.replace(each, established=False, error="unplugged")
+                    if each.name == name
+                    else each
+                    for each in self.truth.connections
+                )
+            )
+
+    def disconnect(self, name: str) -> None:
+        if any(each.name == name for each in self.truth.connections):
+            self.reporter.connection_lost(name)
+            self._configure(
+                connections=tuple(each for each in self.truth.connections if each.name != name)
+            )
+
+    def match(self, matched: int) -> None:
+        """A peer more or less: told by an event only, the checksum stays."""
+        if self.truth.endpoints:
+            first = self.truth.endpoints[0]
+            if matched > (first.matched or 0):
+                tell = self.reporter.mapping_established
+            else:
+                tell = self.reporter.mapping_lost
+            changed = dataclasses.replace(first, matched=matched)
+            self.truth = dataclasses.replace(
+                self.truth, endpoints=(changed, *self.truth.endpoints[1:])
+            )
+            tell(f"{first.kind.value}/{first.name}", "", matched=matched)
+
+    def leave(self) -> None:
+        self.reporter.left("asked to")
+        self.transport.close()
+
+    def kill(self) -> None:
+        """As SIGKILL does: nobody is told."""
+        self.transport.close()
+        self.reporter.left()
+
+    def _configure(self, **changes: object) -> None:
+        changed = dataclasses.replace(self.truth, **changes)  # type: ignore[arg-type]
+        self.truth = dataclasses.replace(changed, checksum=checksum(changed))
+        self.reporter.configuration_changed(self.truth.checksum)
+
+
+class Reader:
+    """Somebody who keeps the state of the graph."""
+
+    def __init__(self, system: System) -> None:
+        self.transport = system.network.transport()
+        self.events = GraphEvents(
+            self.transport, system.scheduler, silent_after_s=SILENT_AFTER_S, forget_after_s=60.0
+        )
+        self.state = GraphState(self.events, system.fetch_from(self.transport))
+
+
+class System:
+    """Nodes by name, on one network."""
+
+    def __init__(self, seed: int = 0) -> None:
+        self.scheduler = ManualScheduler()
+        self.network = InMemoryNetwork(self.scheduler, seed=seed)
+        self.nodes: dict[str, SimulatedNode] = {}
+        self.islands: tuple[tuple[InMemoryTransport, ...], ...] = ()
+        self._random = random.Random(seed)
+        self._instances = 0
+
+    def start(self, name: str, endpoints: int = 0) -> SimulatedNode:
+        """Start a node, or restart it: the old instance is killed."""
+        if name in self.nodes:
+            self.nodes[name].kill()
+        self._instances += 1
+        self.nodes[name] = SimulatedNode(self, name, self._instances, endpoints)
+        return self.nodes[name]
+
+    def kill(self, name: str) -> None:
+        if name in self.nodes:
+            self.nodes.pop(name).kill()
+
+    def leave(self, name: str) -> None:
+        if name in self.nodes:
+            self.nodes.pop(name).leave()
+
+    def partition(self, *groups: tuple[InMemoryTransport, ...]) -> None:
+        self.islands = groups
+        self.network.partition(*groups)
+
+    def heal(self) -> None:
+        self.islands = ()
+        self.network.heal()
+
+    def fetch_from(self, reader: InMemoryTransport) -> Fetch:
+        """Return how `reader` asks nodes: a while later, from the instance that is there then."""
+
+        def fetch(name: str, done: object) -> None:
+            assert callable(done)
+            now_s = self.scheduler.now_s()
+
+            def answer() -> None:
+                node = self.nodes.get(name)
+                lost = self._random.random() < self.network.loss
+                if node is None or lost or not self._together(node.transport, reader):
+                    self.scheduler.call_at(now_s + TIMEOUT_S, lambda: done(None))
+                    return
+                document = node.truth
+                back_s = self.scheduler.now_s() + self._random.uniform(0, ANSWER_S)
+                self.scheduler.call_at(back_s, lambda: done(document))
+
+            self.scheduler.call_at(now_s + self._random.uniform(0, ANSWER_S), answer)
+
+        return fetch
+
+    def calm(self) -> None:
+        """No more accidents, and time for heartbeats to tell what was lost."""
+        self.heal()
+        self.network.loss = self.network.duplication = 0.0
+        self.scheduler.advance(SILENT_AFTER_S + 2 * PERIOD_S + TIMEOUT_S)
+
+    def _together(self, one: InMemoryTransport, other: InMemoryTransport) -> bool:
+        def island(transport: InMemoryTransport) -> int:
+            for number, group in enumerate(self.islands):
+                if transport in group:
+                    return number
+            return -1
+
+        return island(one) == island(other)

@@ -1,0 +1,123 @@
+"""Everything in one place, one after another, and nothing polls."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import threading
+
+import pytest
+
+from lifecycle.graph import LoopScheduler, ManualScheduler, ThreadScheduler, every
+from lifecycle.graph.deadlines import Deadlines
+
+LIMIT_S = 5.0
+
+
+def test_manual_time_runs_what_is_due_in_its_order() -> None:
+    scheduler, ran = ManualScheduler(), []
+    scheduler.call_at(2.0, lambda: ran.append(("late", scheduler.now_s())))
+    scheduler.call_at(1.0, lambda: ran.append(("early", scheduler.now_s())))
+    scheduler.call_at(1.5, lambda: ran.append(("never", 0.0)))()
+    scheduler.advance(3.0)
+    assert ran == [("early", 1.0), ("late", 2.0)]
+    assert scheduler.now_s() == 3.0
+
+
+def test_what_is_posted_while_something_runs_runs_after_it() -> None:
+    scheduler, ran = ManualScheduler(), []
+
+    def outer() -> None:
+        scheduler.post(lambda: ran.append("inner"))
+        ran.append("outer")
+
+    scheduler.post(outer)
+    assert ran == ["outer", "inner"]
+
+
+def test_a_periodic_timer_runs_until_it_is_stopped_even_by_itself() -> None:
+    scheduler, ran = ManualScheduler(), []
+    stop = every(scheduler)(1.0, lambda: ran.append(scheduler.now_s()))
+    scheduler.advance(3.5)
+    stop()
+    scheduler.advance(10.0)
+    assert ran == [1.0, 2.0, 3.0]
+    stops = []
+    stops.append(every(scheduler)(1.0, lambda: (ran.append("once"), stops[0]())))
+    scheduler.advance(10.0)
+    assert ran[3:] == ["once"]
+
+
+def test_a_thread_runs_posts_and_timers_and_survives_an_exception(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    scheduler, done = ThreadScheduler("test"), threading.Event()
+    ran: list[str] = []
+
+    def fail() -> None:
+        raise ValueError("mine")
+
+    with caplog.at_level(logging.ERROR):
+        scheduler.post(fail)
+        scheduler.post(lambda: ran.append(threading.current_thread().name))
+        scheduler.call_at(scheduler.now_s() + 0.01, lambda: ran.append("never"))()
+        scheduler.call_at(scheduler.now_s() + 0.02, done.set)
+        assert done.wait(LIMIT_S)
+    assert ran == ["test"]
+    assert caplog.messages == ["cannot handle a graph event"]
+    scheduler.post(scheduler.close)  # from inside
+    scheduler.close()
+    scheduler.close()
+    assert "test" not in [each.name for each in threading.enumerate()]
+
+
+def test_a_loop_runs_what_other_threads_post_and_drops_what_comes_too_late() -> None:
+    async def posted() -> str:
+        loop = asyncio.get_running_loop()
+        scheduler, found = LoopScheduler(loop), loop.create_future()
+        scheduler.call_at(scheduler.now_s() + 0.001, lambda: found.set_result("never"))()
+        thread = threading.Thread(
+            target=lambda: scheduler.post(lambda: found.set_result(threading.current_thread().name))
+        )
+        thread.start()
+        thread.join()
+        schedulers.append(scheduler)
+        return str(await asyncio.wait_for(found, LIMIT_S))
+
+    schedulers: list[LoopScheduler] = []
+    assert asyncio.run(posted()) == threading.current_thread().name
+    schedulers[0].post(lambda: pytest.fail("the loop is closed"))
+
+
+class Counting:
+    """A manual scheduler that counts how often it was asked to wake up."""
+
+    def __init__(self) -> None:
+        self.manual = ManualScheduler()
+        self.timers = 0
+        self.now_s = self.manual.now_s
+        self.post = self.manual.post
+
+    def call_at(self, when_s: float, work: object) -> object:
+        self.timers += 1
+        return self.manual.call_at(when_s, work)  # type: ignore[arg-type]
+
+
+def test_many_deadlines_take_one_timer_and_few_wake_ups() -> None:
+    scheduler, passed = Counting(), []
+    deadlines = Deadlines(
+        scheduler,  # type: ignore[arg-type]
+        7.0,
+        lambda name: passed.append((name, scheduler.now_s())),
+    )
+    names = [f"/n{number}" for number in range(1000)]
+    for _ in range(10):
+        for name in names:
+            deadlines.touch(name)
+        scheduler.manual.advance(2.0)
+    assert passed == []
+    assert scheduler.timers <= 5
+    for name in names[1:]:
+        deadlines.drop(name)
+    scheduler.manual.advance(100.0)
+    assert passed == [("/n0", 25.0)]

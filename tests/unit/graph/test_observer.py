@@ -1,0 +1,348 @@
+"""How an observation is put together, with a graph and clients that do what they are told."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import logging
+from collections.abc import Awaitable, Callable, Collection
+from typing import TypeVar
+
+import pytest
+
+from lifecycle.errors import MiddlewareError
+from lifecycle.graph.observer import Observer
+from lifecycle.manifest.diagnostics import Position
+from lifecycle.manifest.model import (
+    DiscoveryRange,
+    EndpointKind,
+    EndpointPolicy,
+    Policy,
+    Run,
+    RunKind,
+    Timeouts,
+)
+from lifecycle.plan.model import Plan, PlannedNode
+from lifecycle.verify.observation import (
+    Identity,
+    NodeConfiguration,
+    Observation,
+    ObservedEndpoint,
+    ObservedNode,
+)
+from tests.unit.supervisor.fakes import run as run_jumping
+
+T = TypeVar("T")
+VIDEO = ObservedEndpoint(
+    kind=EndpointKind.PUBLISHER, node="/a", name="/video", type="std_msgs/msg/String"
+)
+
+
+class FakeGraph:
+    def __init__(self) -> None:
+        self.nodes: tuple[ObservedNode, ...] = ()
+        self.endpoints: tuple[ObservedEndpoint, ...] = ()
+        self.kept: Collection[str] = ()
+        self.callbacks: list[Callable[[], None]] = []
+        self.destroyed = False
+        self.arriving: list[tuple[ObservedNode, ...]] = []
+
+    def snapshot(
+        self, *, keep: Collection[str] = ()
+    ) -> tuple[tuple[ObservedNode, ...], tuple[ObservedEndpoint, ...]]:
+        self.kept = keep
+        if self.arriving:
+            self.nodes = self.arriving.pop(0)
+        return self.nodes, self.endpoints
+
+    def settling_s(self) -> float:
+        return 0.01 if self.arriving else 0.0
+
+    def on_change(self, callback: Callable[[], None]) -> Callable[[], None]:
+        self.callbacks.append(callback)
+        return lambda: self.callbacks.remove(callback)
+
+    def destroy(self) -> None:
+        self.destroyed = True
+
+    def change(self) -> None:
+        for callback in self.callbacks:
+            callback()
+
+
+class FakeClients:
+    def __init__(self) -> None:
+        self.states: dict[str, str] = {}
+        self.configurations: dict[str, NodeConfiguration] = {}
+        self.asked: list[str] = []
+        self.followed: dict[str, Callable[[], None]] = {}
+        self.forgotten: list[str] = []
+        self.destroyed = False
+
+    async def get_state(self, node: str, *, timeout_s: float) -> str:
+        self.asked.append(node)
+        if node not in self.states:
+            raise MiddlewareError(f"cannot call service '{node}/get_state': it is hung")
+        return self.states[node]
+
+    async def get_configuration(self, node: str, *, timeout_s: float) -> NodeConfiguration | None:
+        return self.configurations.get(node)
+
+    def on_transition(self, node: str, callback: Callable[[], None]) -> None:
+        self.followed[node] = callback
+
+    def forget(self, node: str) -> None:
+        self.forgotten.append(node)
+
+    def destroy(self) -> None:
+        self.destroyed = True
+
+
+def plan(*names: str) -> Plan:
+    at = Position(file="m.yaml", line=1, column=1)
+    return Plan(
+        system="test",
+        manifest_path="m.yaml",
+        domain_id=0,
+        discovery_range=DiscoveryRange.LOCALHOST,
+        policy=Policy(),
+        machines=(),
+        processes=(),
+        nodes=tuple(
+            PlannedNode(
+                key=name,
+                name=name,
+                namespace="/",
+                machine="",
+                process=name,
+                managed=True,
+                run=Run(kind=RunKind.ATTACH),
+                endpoints=(),
+                declared_parameters=(),
+                parameters=(),
+                parameter_files=(),
+                remap=(),
+                participants=(),
+                after=(),
+                timeouts=Timeouts(),
+                endpoint_policy=EndpointPolicy.DECLARED,
+                log_level="",
+                at=at,
+            )
+            for name in names
+        ),
+        flows=(),
+        levels=(),
+    )
+
+
+def configuration(name: str, state: str = "inactive") -> NodeConfiguration:
+    return NodeConfiguration(
+        identity=Identity(machine_id="m", process_id=1, node_id=f"{name}@01"),
+        name=name,
+        state=state,
+        connected=True,
+        rmw="rmw_fastrtps_cpp",
+        transports=(),
+        serializations=(),
+        paradigms=(),
+        endpoints=(),
+    )
+
+
+@pytest.fixture
+def graph() -> FakeGraph:
+    return FakeGraph()
+
+
+@pytest.fixture
+def clients() -> FakeClients:
+    return FakeClients()
+
+
+@pytest.fixture
+def observer(graph: FakeGraph, clients: FakeClients) -> Observer:
+    return Observer(graph, clients, quiet_s=0.01, burst_s=0.05)
+
+
+def run(awaitable: Awaitable[T]) -> T:
+    async def bounded() -> T:
+        return await asyncio.wait_for(awaitable, 10)
+
+    return asyncio.run(bounded())
+
+
+def managed(*names: str) -> tuple[ObservedNode, ...]:
+    return tuple(ObservedNode(full_name=name, managed=True) for name in names)
+
+
+def test_planned_nodes_are_asked_and_others_only_seen(
+    observer: Observer, graph: FakeGraph, clients: FakeClients
+) -> None:
+    graph.nodes, graph.endpoints = managed("/a", "/other"), (VIDEO,)
+    clients.states = {"/a": "inactive", "/other": "active"}
+    clients.configurations = {"/a": configuration("/a")}
+    assert run(observer.observe(plan("a", "b"))) == Observation(
+        nodes=(
+            ObservedNode(full_name="/a", managed=True, state="inactive"),
+            ObservedNode(full_name="/other", managed=True),
+        ),
+        endpoints=(VIDEO,),
+        configurations=(configuration("/a"),),
+    )
+    assert clients.asked == ["/a"]
+    assert graph.kept == {"/a", "/b"}
+
+
+def test_a_node_without_lifecycle_services_is_not_asked_for_its_state(
+    observer: Observer, graph: FakeGraph, clients: FakeClients
+) -> None:
+    graph.nodes = (ObservedNode(full_name="/a", managed=False),)
+    clients.configurations = {"/a": configuration("/a", "active")}
+    observation = run(observer.observe(plan("a")))
+    assert clients.asked == []
+    assert observation.nodes == graph.nodes
+    assert observation.configurations == (configuration("/a", "active"),)
+
+
+def test_what_was_put_is_believed_and_not_asked_for(
+    observer: Observer, graph: FakeGraph, clients: FakeClients
+) -> None:
+    graph.nodes = managed("/a")
+    clients.states = {"/a": "unconfigured"}
+    observer.put_configuration(configuration("/a", "active"))
+    observation = run(observer.observe(plan("a")))
+    assert observation.nodes == (ObservedNode(full_name="/a", managed=True, state="active"),)
+    assert observation.configurations == (configuration("/a", "active"),)
+    assert clients.asked == []
+
+
+def test_what_was_put_stands_before_discovery_shows_the_node_and_goes_with_it(
+    observer: Observer, graph: FakeGraph
+) -> None:
+    observer.put_configuration(configuration("/a"))
+    assert run(observer.observe(plan("a"))).configurations == (configuration("/a"),)
+    graph.nodes = managed("/a")
+    assert run(observer.observe(plan("a"))).configurations == (configuration("/a"),)
+    graph.nodes = ()
+    assert run(observer.observe(plan("a"))).configurations == ()
+
+
+def test_a_newer_configuration_replaces_an_older_and_can_be_dropped(observer: Observer) -> None:
+    observer.put_configuration(configuration("/a", "inactive"))
+    observer.put_configuration(configuration("/a", "active"))
+    assert run(observer.observe(plan("a"))).configurations == (configuration("/a", "active"),)
+    observer.drop_configuration("/a")
+    observer.drop_configuration("/a")
+    assert run(observer.observe(plan("a"))).configurations == ()
+
+
+def test_a_node_that_does_not_answer_has_no_state_and_the_log_says_why(
+    observer: Observer, graph: FakeGraph, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    graph.nodes = managed("/a")
+    assert run(observer.observe(plan("a"))).nodes == managed("/a")
+    assert caplog.messages == [
+        "state of /a unknown: cannot call service '/a/get_state': it is hung"
+    ]
+
+
+def test_a_node_that_left_is_forgotten_once(
+    observer: Observer, graph: FakeGraph, clients: FakeClients
+) -> None:
+    graph.nodes, clients.states = managed("/a"), {"/a": "active"}
+    run(observer.observe(plan("a")))
+    graph.nodes = ()
+    run(observer.observe(plan("a")))
+    run(observer.observe(plan("a")))
+    assert clients.forgotten == ["/a"]
+
+
+def test_nothing_was_looked_at_yet_counts_as_a_change(observer: Observer) -> None:
+    run(observer.wait_change())
+
+
+def test_a_look_uses_up_the_changes_before_it(observer: Observer, graph: FakeGraph) -> None:
+    async def look_and_wait() -> None:
+        await observer.observe(plan())
+        graph.change()
+        await asyncio.wait_for(observer.wait_change(), 5)
+        with pytest.raises(asyncio.TimeoutError):
+            await asyncio.wait_for(observer.wait_change(), 0.1)
+        graph.change()
+        await asyncio.sleep(0)
+        await observer.observe(plan())
+        with pytest.raises(asyncio.TimeoutError):
+            await asyncio.wait_for(observer.wait_change(), 0.1)
+
+    run(look_and_wait())
+
+
+def test_a_burst_is_waited_out_but_not_for_ever(observer: Observer, graph: FakeGraph) -> None:
+    async def burst() -> tuple[float, float]:
+        loop = asyncio.get_running_loop()
+        await observer.observe(plan())
+
+        async def keep_changing() -> None:
+            while True:
+                graph.change()
+                await asyncio.sleep(0.002)
+
+        began = loop.time()
+        changing = asyncio.ensure_future(keep_changing())
+        await observer.wait_change()
+        cut_off_s = loop.time() - began
+        changing.cancel()
+        await observer.observe(plan())
+        began = loop.time()
+        graph.change()
+        await observer.wait_change()
+        return cut_off_s, loop.time() - began
+
+    cut_off_s, quiet_s = run_jumping(burst())
+    assert cut_off_s == pytest.approx(0.05, abs=0.003)
+    assert quiet_s == pytest.approx(0.01, abs=0.003)
+
+
+def test_a_transition_of_a_node_that_is_asked_wakes(
+    observer: Observer, graph: FakeGraph, clients: FakeClients
+) -> None:
+    graph.nodes, clients.states = managed("/a"), {"/a": "inactive"}
+
+    async def transition() -> None:
+        await observer.observe(plan("a"))
+        clients.followed["/a"]()
+        await asyncio.wait_for(observer.wait_change(), 5)
+
+    run(transition())
+
+
+def test_a_change_after_the_loop_was_closed_is_nobodys_concern(
+    observer: Observer, graph: FakeGraph
+) -> None:
+    run(observer.observe(plan()))
+    graph.change()
+
+
+def test_leaving_takes_everything_along(graph: FakeGraph, clients: FakeClients) -> None:
+    with Observer(graph, clients):
+        assert len(graph.callbacks) == 1
+    assert (graph.callbacks, graph.destroyed, clients.destroyed) == ([], True, True)
+
+
+def test_an_observation_does_not_share_what_the_graph_keeps(
+    observer: Observer, graph: FakeGraph, clients: FakeClients
+) -> None:
+    graph.nodes, clients.states = managed("/a"), {"/a": "active"}
+    run(observer.observe(plan("a")))
+    assert graph.nodes == managed("/a")
+    assert dataclasses.replace(graph.nodes[0], state="active") != graph.nodes[0]
+
+
+def test_an_observation_waits_for_who_answered_and_is_not_seen_yet() -> None:
+    graph = FakeGraph()
+    graph.arriving = [(), (), (ObservedNode(full_name="/stranger"),)]
+    observer = Observer(graph, FakeClients())
+    observation = asyncio.run(observer.observe(plan()))
+    assert [node.full_name for node in observation.nodes] == ["/stranger"]

@@ -1,0 +1,373 @@
+"""What flow needs come to: marks, classes, datagrams, and who shares a participant."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from lifecycle.manifest import load
+from lifecycle.manifest.flow_needs import FlowNeeds, ParticipantGroup
+from lifecycle.manifest.marking import identifiers, marking_of
+from lifecycle.manifest.model import (
+    EndpointKind,
+    FlowIdentification,
+    FlowNeed,
+    FlowTransport,
+    Machine,
+    Manifest,
+    Network,
+    Run,
+    RunKind,
+)
+from lifecycle.network.dscp import code_points
+from lifecycle.network.five_qi import five_qi_of
+from lifecycle.network.five_qi_dscp import dscp_mapping
+from lifecycle.network.nfe import UniqueRequirement
+from lifecycle.network.transport_priority import TransportPriorityMapping
+from tests.unit.plan.samples import at, link, manifest, need, node, publisher, subscription
+
+PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
+STRICTLY = UniqueRequirement.STRICTLY_REQUIRED
+OPTIONALLY = UniqueRequirement.OPTIONALLY_REQUIRED
+NETWORK = FlowTransport.NETWORK
+CORPUS = Path(__file__).parents[2] / "corpus" / "valid"
+
+
+def groups(*needs: FlowNeed, **rest: object) -> list[ParticipantGroup]:
+    """The participants of one node whose publishers have these needs."""
+    only = node("n", *(publisher(each.name) for each in needs), needs=needs)
+    return list(FlowNeeds(manifest(only, **rest), []).groups(only))
+
+
+def carried(*needs: FlowNeed, **rest: object) -> list[tuple[str, ...]]:
+    return [each.publishers for each in groups(*needs, **rest)]
+
+
+# --- as few participants as meet every need
+
+
+def test_publishers_that_ask_for_nothing_stay_in_the_node_s_own_participant():
+    assert groups(need(PUB, "a"), need(PUB, "b", UniqueRequirement.SYSTEM_DEFAULT)) == []
+
+
+def test_publishers_of_one_class_share_and_of_two_classes_do_not():
+    assert carried(
+        need(PUB, "a", dscp=46),
+        need(PUB, "b", dscp=8),
+        need(PUB, "c", dscp=46),
+        need(PUB, "d", transport=NETWORK),
+        need(PUB, "e", dscp=46, transport=NETWORK),
+        need(PUB, "f", dscp=46, non_blocking_send=True),
+        need(PUB, "g", transport=NETWORK),
+    ) == [("a", "c"), ("b",), ("d", "g"), ("e",), ("f",)]
+
+
+@pytest.mark.parametrize("unique", [STRICTLY, OPTIONALLY])
+def test_a_unique_publisher_shares_with_none_even_of_its_class(unique: UniqueRequirement):
+    assert carried(
+        need(PUB, "a", unique, dscp=46), need(PUB, "b", dscp=46), need(PUB, "c", unique, dscp=46)
+    ) == [("a",), ("b",), ("c",)]
+
+
+def test_the_smaller_datagram_serves_all_of_a_class():
+    (only,) = groups(
+        need(PUB, "small", dscp=46, max_message_size=100),
+        need(PUB, "large", dscp=46, max_message_size=60_000),
+    )
+    assert (only.publishers, only.max_datagram_bytes) == (("small", "large"), 1400)
+
+
+def test_a_priority_and_a_dscp_that_come_to_the_same_share():
+    assert carried(need(PUB, "a", dscp=46), need(PUB, "b", transport_priority=184)) == [("a", "b")]
+
+
+def test_a_node_whose_own_participant_is_on_the_network_needs_no_other_for_it():
+    only = node(
+        "n",
+        publisher("a"),
+        publisher("c"),
+        subscription("b"),
+        needs=[
+            need(PUB, "a", transport=NETWORK),
+            need(PUB, "c", dscp=46),
+            need(SUB, "b", transport=NETWORK),
+        ],
+    )
+    needs = FlowNeeds(manifest(only), [])
+    assert needs.node_transports(only) == ("udpv4",)
+    assert [(each.publishers, each.transports) for each in needs.groups(only)] == [
+        (("c",), ("udpv4",))
+    ]
+
+
+def class_of_the_publisher(*hearers: FlowNeed | None, run: RunKind = RunKind.PYTHON):
+    source = node("source", publisher("a"), needs=[need(PUB, "a", five_qi=82)])
+    others = [
+        node(
+            f"hearer{index}",
+            subscription("a"),
+            needs=[each] if each else [],
+            run=Run(kind=run, python="m:C", command=("x",)),
+        )
+        for index, each in enumerate(hearers)
+    ]
+    return [each.five_qi for each in FlowNeeds(manifest(source, *others), []).groups(source)]
+
+
+def test_a_5qi_needs_sockets_of_its_own_unless_the_subscriptions_tell_the_flow_apart():
+    unique = need(SUB, "a", STRICTLY)
+    assert class_of_the_publisher(unique) == []
+    assert class_of_the_publisher(unique, unique) == []
+    assert class_of_the_publisher(unique, None) == [82]
+    assert class_of_the_publisher(None) == [82]
+    assert class_of_the_publisher() == [82]
+    assert class_of_the_publisher(unique, run=RunKind.COMMAND) == [82]
+
+
+def test_publishers_of_one_5qi_share_and_of_two_do_not():
+    assert carried(
+        need(PUB, "a", five_qi=82), need(PUB, "b", five_qi=85), need(PUB, "c", five_qi=82)
+    ) == [("a", "c"), ("b",)]
+
+
+# --- datagrams
+
+
+@pytest.mark.parametrize(
+    ("size", "address", "declared", "limit"),
+    [
+        (1368, "10.0.0.1", None, None),
+        (1369, "10.0.0.1", None, 1400),
+        (1348, "fd00::1", None, None),
+        (1349, "fd00::1", None, 1400),
+        (1369, "", None, 1400),
+        (1200, "10.0.0.1", 1250, 1250),
+        (1100, "10.0.0.1", 1250, None),
+        (None, "10.0.0.1", None, None),
+        (None, "10.0.0.1", 1250, 1250),  # of unknown size, and the path is narrow
+        (8000, "10.0.0.1", 8972, None),  # jumbo frames
+    ],
+)
+def test_a_prioritised_publisher_gets_datagrams_that_ip_leaves_whole(
+    size: int | None, address: str, declared: int | None, limit: int | None
+):
+    only = node(
+        "n",
+        publisher("a"),
+        needs=[need(PUB, "a", dscp=46, max_message_size=size)],
+        machine="m",
+    )
+    system = manifest(
+        only,
+        machines=(Machine(name="m", address=address, at=at(1)),),
+        network=Network(max_datagram_bytes=declared),
+    )
+    assert [each.max_datagram_bytes for each in FlowNeeds(system, []).groups(only)] == [limit]
+
+
+@pytest.mark.parametrize(
+    "asks", [{"dscp": 46}, {"five_qi": 9}, {"unique": STRICTLY}, {"unique": OPTIONALLY}]
+)
+def test_prioritised_is_what_is_marked_has_a_class_or_is_unique(asks: dict[str, object]):
+    (only,) = groups(need(PUB, "a", max_message_size=9000, **asks))
+    assert only.max_datagram_bytes == 1400
+
+
+def test_a_flow_that_no_network_is_to_prefer_may_be_fragmented():
+    assert groups(need(PUB, "a", max_message_size=9000)) == []
+
+
+def test_network_transport_is_ipv6_where_the_machine_s_address_is():
+    for address, transports in (
+        ("10.0.0.1", ("udpv4",)),
+        ("fd00::1", ("udpv6",)),
+        ("", ("udpv4",)),
+    ):
+        only = node("n", publisher("a"), needs=[need(PUB, "a", transport=NETWORK)], machine="m")
+        system = manifest(only, machines=(Machine(name="m", address=address, at=at(1)),))
+        assert [each.transports for each in FlowNeeds(system, []).groups(only)] == [transports]
+
+
+# --- marks
+
+
+@pytest.mark.parametrize(
+    ("priority", "mapping", "dscp"),
+    [
+        (184, None, 46),  # without a mapping, the priority is the TOS byte
+        (0xB8, TransportPriorityMapping(mask=0xFF), 46),
+        (0, TransportPriorityMapping(mask=0x03, high=0x03), 0),
+        (3, TransportPriorityMapping(mask=0x03, high=0xFC), 63),
+        (184, TransportPriorityMapping(mask=0), None),
+    ],
+)
+def test_a_transport_priority_becomes_a_dscp(
+    priority: int, mapping: TransportPriorityMapping | None, dscp: int | None
+):
+    network = Network(transport_priority_mapping=mapping)
+    marking = marking_of(need(PUB, "a", transport_priority=priority), network, None)
+    assert (marking.dscp, marking.problem) == (dscp, ("", ""))
+
+
+def test_where_a_dscp_comes_from_is_said():
+    marking = marking_of(need(PUB, "a", transport_priority=184), Network(), None)
+    assert marking.reason == "transport_priority 184 (0xb8) with mask 0xff, low 0x0, high 0xff"
+
+
+def test_mask_0_marks_nothing_and_says_so():
+    network = Network(transport_priority_mapping=TransportPriorityMapping(mask=0))
+    marking = marking_of(need(PUB, "a", transport_priority=184), network, None)
+    assert marking.notes == (
+        "cannot mark anything with transport_priority 184 (0xb8): the mask is 0",
+    )
+
+
+def test_a_5qi_marks_only_where_a_mapping_is_asked_for():
+    asked = need(PUB, "a", five_qi=82)
+    mapping = dscp_mapping("azure_private_5g_core")
+    assert marking_of(asked, Network(), 82).dscp is None
+    marking = marking_of(asked, Network(five_qi_dscp=mapping), 82)
+    assert marking.dscp == mapping.dscp_for(82) == 18
+    assert marking.reason == "for 5QI 82 by mapping 'azure_private_5g_core'"
+
+
+def test_a_dscp_that_is_written_wins_over_the_mapping_of_the_5qi():
+    network = Network(five_qi_dscp=dscp_mapping("azure_private_5g_core"))
+    assert marking_of(need(PUB, "a", five_qi=82, dscp=46), network, 82).dscp == 46
+
+
+# --- DSCP values as identifiers
+
+
+def test_identifiers_that_mislead_least_come_first_and_default_forwarding_last():
+    order = identifiers([3, 46])
+    named = {each.dscp for each in code_points()}
+    assert len(order) == 62
+    assert order[:3] == (7, 11, 15)  # pool 2 of RFC 2474, for local use
+    assert not named & set(order[: 64 - len(named | {3})])
+    assert order[-1] == 0
+
+
+def of_dscp(count: int, *needs: FlowNeed) -> tuple[FlowNeeds, Manifest]:
+    nodes = [
+        node(f"n{index}", publisher("a"), needs=[need(PUB, "a", STRICTLY)])
+        for index in range(count)
+    ]
+    nodes.append(node("other", *(publisher(each.name) for each in needs), needs=needs))
+    system = manifest(*nodes, network=Network(flow_identification=FlowIdentification.DSCP))
+    return FlowNeeds(system, []), system
+
+
+def test_each_publisher_that_needs_it_gets_a_dscp_that_no_other_has():
+    needs, system = of_dscp(
+        20, need(PUB, "own", STRICTLY, dscp=3), need(PUB, "class", dscp=46), need(PUB, "none")
+    )
+    values = [needs.of(each.key, PUB, "a").dscp for each in system.nodes[:-1]]
+    assert None not in values
+    assert len({*values, 3, 46}) == 22
+    assert needs.of("other", PUB, "own").dscp == 3
+    assert needs.of("other", PUB, "none").dscp is None
+
+
+def test_a_publisher_that_others_start_cannot_be_marked_and_so_gets_no_identifier():
+    foreign = node(
+        "n",
+        publisher("a"),
+        needs=[need(PUB, "a", OPTIONALLY)],
+        run=Run(kind=RunKind.COMMAND, command=("x",)),
+    )
+    system = manifest(foreign, network=Network(flow_identification=FlowIdentification.DSCP))
+    assert FlowNeeds(system, []).of("n", PUB, "a").dscp is None
+
+
+# --- 5QI
+
+
+def resolved(flow: FlowNeed, *links: object):
+    only = node("n", publisher("a"), needs=[flow])
+    return FlowNeeds(manifest(only, links=links), []).of("n", PUB, "a")
+
+
+def test_auto_proposes_a_class_from_what_is_declared_and_says_why():
+    each = resolved(need(PUB, "a", five_qi_auto=True, max_delay_ms=10.0, loss=1e-4, rate_hz=10.0))
+    assert each.five_qi == 82
+    assert each.flow_class.reason == (
+        "5QI 82 (Delay-critical GBR): delay budget 10 ms <= 10 ms, error rate 0.0001 <= 0.0001; "
+        "the least demanding class of Release 16 that fits"
+    )
+
+
+def test_auto_takes_the_shortest_delay_of_the_links_of_its_topic():
+    links = [link("/a", "n", "x", max_delay_ms=300.0), link("/a", "n", "y", max_delay_ms=100.0)]
+    each = resolved(need(PUB, "a", five_qi_auto=True), *links)
+    assert each.max_delay_ms == 100.0
+    assert "delay budget 100 ms <= 100 ms" in each.flow_class.reason
+
+
+def test_auto_without_a_delay_proposes_nothing():
+    each = resolved(need(PUB, "a", five_qi_auto=True, loss=0.1))
+    assert each.five_qi is None
+    assert each.flow_class.problem == (
+        "cannot propose a 5QI for 'a': no max_delay_ms is declared",
+        "add 'max_delay_ms', or a link of its topic that has one",
+    )
+
+
+def test_a_declared_rate_asks_for_a_class_that_guarantees_one():
+    for rate, guaranteed in ((None, False), (5.0, True)):
+        each = resolved(need(PUB, "a", five_qi_auto=True, max_delay_ms=300.0, rate_hz=rate))
+        assert five_qi_of(each.five_qi).resource_type.guarantees_rate is guaranteed
+
+
+def test_without_a_rate_a_class_that_guarantees_one_is_the_last_resort():
+    each = resolved(need(PUB, "a", five_qi_auto=True, max_delay_ms=5.0))
+    assert five_qi_of(each.five_qi).resource_type.guarantees_rate
+
+
+def test_a_written_5qi_is_kept_with_what_it_does_not_keep():
+    each = resolved(need(PUB, "a", five_qi=3, max_delay_ms=5.0, loss=1e-6))
+    assert each.five_qi == 3
+    assert [issue.field for issue in each.flow_class.issues] == ["max_delay_ms", "loss"]
+
+
+# --- through the loader
+
+
+def test_every_key_of_flow_needs_becomes_its_field(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(CORPUS)
+    system = load("flows_every_key.lifecycle.yaml").manifest
+    network = system.network
+    assert network.flow_identification is FlowIdentification.PARTICIPANT
+    assert network.transport_priority_mapping == TransportPriorityMapping(mask=0xFF)
+    assert network.five_qi_dscp is not None
+    assert network.five_qi_dscp.values == ((82, 34), (85, 46))
+    assert network.max_datagram_bytes == 1300
+    video, pose, alarm, log = system.nodes[0].flows
+    assert (video.unique, video.transport_priority, video.enforce) == (STRICTLY, 184, False)
+    assert (video.max_message_size, video.transport, video.non_blocking_send) == (
+        60000,
+        NETWORK,
+        True,
+    )
+    assert (pose.five_qi, pose.five_qi_auto) == (None, True)
+    assert (pose.max_delay_ms, pose.loss, pose.rate_hz) == (10.0, 1e-4, 50.0)
+    assert (alarm.five_qi, alarm.five_qi_auto, alarm.transport_priority) == (82, False, None)
+    assert (log.dscp, log.transport, log.non_blocking_send) == (8, FlowTransport.ANY, False)
+    assert system.nodes[1].flows[0].transport is NETWORK
+
+
+def test_an_included_manifest_does_not_bring_its_network(findings):
+    part = """\
+    manifest_version: 1
+    system: part
+    network: {flow_identification: dscp}
+    nodes: {n: {run: {python: "demo:N"}}}
+    """
+    found = findings("include: [{manifest: part.yaml}]\n", part_yaml=part)
+    assert [each for each in found if each.startswith("manifest.include-ignored")] == [
+        (
+            "manifest.include-ignored part.yaml:3:1: warning: network: cannot use the "
+            "network of an included manifest; the including one's holds"
+        )
+    ]

@@ -1,0 +1,99 @@
+"""YAML 1.2's core schema, and no other."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lifecycle.manifest.scalars import INT64_MAX, INT64_MIN, resolve
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("", None),
+        ("~", None),
+        ("null", None),
+        ("true", True),
+        ("FALSE", False),
+        ("7", 7),
+        ("-7", -7),
+        ("-0", 0),
+        ("0o17", 15),
+        ("0xff", 255),
+        ("1.5", 1.5),
+        (".5", 0.5),
+        ("1.", 1.0),
+        ("1e3", 1000.0),
+        ("9223372036854775807", INT64_MAX),
+        ("-9223372036854775808", INT64_MIN),
+    ],
+)
+def test_the_core_schema(text: str, value: object) -> None:
+    resolved = resolve(text)
+    assert resolved == value
+    assert type(resolved) is type(value)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "yes",
+        "No",
+        "on",
+        "OFF",
+        "y",
+        "1:30",
+        "017",
+        "08",
+        "-09",
+        "+00",
+        "1_000",
+        "0b1",
+        "0x",
+        "1.2.3",
+        "+",
+        "e3",
+        "tRUE",
+        "<<",
+    ],
+)
+def test_what_only_yaml_1_1_knows_is_a_string(text: str) -> None:
+    assert resolve(text) == text
+
+
+@pytest.mark.parametrize("text", [".nan", ".NaN", ".inf", "-.Inf", "+.INF", "1e999", "-1e999"])
+def test_numbers_are_finite(text: str) -> None:
+    with pytest.raises(ValueError, match=r"^a number must be finite$"):
+        resolve(text)
+
+
+@pytest.mark.parametrize("text", ["9223372036854775808", "-9223372036854775809", "9" * 5000])
+def test_integers_fit_into_64_bits(text: str) -> None:
+    with pytest.raises(ValueError, match=r"^an integer must fit into 64 bits"):
+        resolve(text)
+
+
+@given(st.integers(min_value=INT64_MIN, max_value=INT64_MAX))
+def test_every_int64_reads_back(number: int) -> None:
+    assert resolve(str(number)) == number
+
+
+@given(st.floats(allow_nan=False, allow_infinity=False))
+def test_every_double_reads_back(number: float) -> None:
+    resolved = resolve(repr(number))
+    assert isinstance(resolved, float)
+    assert resolved == number
+    assert math.copysign(1, resolved) == math.copysign(1, number)
+
+
+@given(st.text())
+def test_any_text_is_a_scalar_or_refused(text: str) -> None:
+    try:
+        value = resolve(text)
+    except ValueError:
+        return
+    assert value is None or isinstance(value, (bool, int, float)) or value == text

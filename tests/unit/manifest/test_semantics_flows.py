@@ -1,0 +1,220 @@
+"""Checks of flow needs and links; the limits of *Unique Network Flows*."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import pytest
+
+from lifecycle.manifest.diagnostics import Position
+from lifecycle.manifest.model import (
+    Endpoint,
+    EndpointKind,
+    FlowIdentification,
+    FlowNeed,
+    Interface,
+    Link,
+    Machine,
+    Manifest,
+    Network,
+    Node,
+    Run,
+    RunKind,
+    UniqueHow,
+)
+from lifecycle.manifest.qos import PRESETS
+from lifecycle.manifest.semantics import check
+from lifecycle.network.nfe import UniqueRequirement
+
+Findings = Callable[..., list[str]]
+
+PAIR = """
+nodes:
+  camera:
+    run: {{python: "demo:Camera"}}
+    interface:
+      publishers: [{{name: video, type: sensor_msgs/msg/Image}}]
+    flows: {{publishers: {{video: {publisher}}}}}
+  viewer:
+    run: {{python: "demo:Viewer"}}
+    interface:
+      subscriptions: [{{name: video, type: sensor_msgs/msg/Image}}]
+    flows: {{subscriptions: {{video: {subscription}}}}}
+links:
+  - {{topic: /video, from: camera, to: viewer, unique: {demand}}}
+"""
+YES, SOME, FILE, NO = (
+    f"{{unique: {each}}}"
+    for each in ("strictly_required", "optionally_required", "system_default", "not_required")
+)
+
+
+@pytest.mark.parametrize(
+    ("demand", "publisher", "subscription", "missing"),
+    [
+        ("strongly", YES, YES, []),
+        ("strongly", SOME, FILE, []),
+        ("strongly", YES, NO, ["subscription 'video' of 'viewer'"]),
+        ("strongly", NO, YES, ["publisher 'video' of 'camera'"]),
+        (
+            "strongly",
+            NO,
+            NO,
+            ["publisher 'video' of 'camera'", "subscription 'video' of 'viewer'"],
+        ),
+        ("strongly", "{dscp: EF}", YES, ["publisher 'video' of 'camera'"]),
+        ("weakly", YES, NO, []),
+        ("weakly", NO, SOME, []),
+        ("weakly", "{dscp: EF}", NO, []),
+        (
+            "weakly",
+            NO,
+            NO,
+            ["neither publisher 'video' of 'camera' nor subscription 'video' of 'viewer'"],
+        ),
+        ("not", NO, NO, []),
+    ],
+)
+def test_a_link_demands_what_its_ends_must_ask_for(
+    findings: Findings, demand: str, publisher: str, subscription: str, missing: list[str]
+) -> None:
+    found = findings(PAIR.format(demand=demand, publisher=publisher, subscription=subscription))
+    assert len(found) == len(missing)
+    for text, name in zip(found, missing, strict=True):
+        asks = "asks" if name.startswith("neither") else "does not ask"
+        assert text.startswith(
+            f"check.link-not-unique 15:5: links[0]: cannot make the flow of '/video' {demand} "
+            f"unique: {name} {asks} to be unique; add 'video: {{unique: strictly_required}}' to "
+        )
+
+
+def streams(count: int, *, need: FlowNeed) -> Manifest:
+    """Return `count` marked publishers, in as many nodes, each with a weakly unique link."""
+
+    def at(line: int) -> Position:
+        return Position(file="s", line=line, column=1)
+
+    def node(key: str, kind: EndpointKind, names: list[str], **fields: object) -> Node:
+        endpoints = tuple(
+            Endpoint(
+                kind=kind, name=name, type="std_msgs/msg/Empty", qos=PRESETS["default"], at=at(1)
+            )
+            for name in names
+        )
+        return Node(
+            key=key,
+            name=key,
+            namespace="/",
+            machine=key,
+            run=Run(kind=RunKind.PYTHON, python="demo:N"),
+            interface=Interface(endpoints=endpoints),
+            at=at(1),
+            **fields,  # type: ignore[arg-type]
+        )
+
+    sources = [
+        node(
+            f"n{index}",
+            EndpointKind.PUBLISHER,
+            [f"s{index}"],
+            flows=(dataclasses.replace(need, name=f"s{index}", dscp=index % 64, at=at(index + 1)),),
+        )
+        for index in range(count)
+    ]
+    sink = node("sink", EndpointKind.SUBSCRIPTION, [f"s{index}" for index in range(count)])
+    links = tuple(
+        Link(
+            topic=f"/s{index}",
+            from_node=f"n{index}",
+            to_node="sink",
+            unique=UniqueHow.WEAKLY,
+            at=at(1),
+        )
+        for index in range(count)
+    )
+    return Manifest(
+        path="s",
+        system="s",
+        machines=tuple(
+            Machine(name=each.key, address=f"10.0.0.{index}", at=at(1))
+            for index, each in enumerate((*sources, sink), start=1)
+        ),
+        nodes=(*sources, sink),
+        links=links,
+    )
+
+
+MARKED = FlowNeed(
+    kind=EndpointKind.PUBLISHER, name="", dscp=0, at=Position(file="s", line=1, column=1)
+)
+
+
+def test_sixty_four_publishers_can_be_told_apart_by_dscp_alone() -> None:
+    assert check(streams(64, need=MARKED)) == ()
+
+
+def test_the_sixty_fifth_publisher_with_only_a_dscp_is_refused_by_name() -> None:
+    assert [str(each) for each in check(streams(65, need=MARKED))] == [
+        (
+            "s:65:1: cannot tell publisher '/s64' of 'n64' apart by its DSCP: it is number 65 of "
+            "65 that have nothing else, and a DSCP has 64 values; ask for 'unique: "
+            "strictly_required', or give each a DSCP of its own"
+        )
+    ]
+
+
+def test_publishers_that_ask_to_be_unique_do_not_rely_on_their_dscp() -> None:
+    need = dataclasses.replace(MARKED, unique=UniqueRequirement.OPTIONALLY_REQUIRED)
+    assert check(streams(70, need=need)) == ()
+
+
+def test_a_dscp_that_no_link_needs_as_identifier_may_be_shared() -> None:
+    manifest = streams(70, need=MARKED)
+    links = tuple(dataclasses.replace(link, unique=UniqueHow.NOT) for link in manifest.links)
+    assert check(dataclasses.replace(manifest, links=links)) == ()
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("dscp", 64, "cannot use DSCP 64; allowed: 0 to 63"),
+        ("dscp", -1, "cannot use DSCP -1; allowed: 0 to 63"),
+        ("five_qi", 0, "cannot use five_qi 0; allowed: 1 to 254"),
+        ("five_qi", 256, "cannot use five_qi 256; allowed: 1 to 254"),
+    ],
+)
+def test_numbers_out_of_range_are_refused_even_from_a_program(
+    field: str, value: int, message: str
+) -> None:
+    manifest = streams(1, need=dataclasses.replace(MARKED, dscp=None))
+    source = manifest.nodes[0]
+    flows = (dataclasses.replace(source.flows[0], **{field: value}),)
+    nodes = (dataclasses.replace(source, flows=flows), *manifest.nodes[1:])
+    found = check(dataclasses.replace(manifest, nodes=nodes, links=()))
+    assert [each.message for each in found] == [message]
+
+
+def test_a_subscription_cannot_be_marked() -> None:
+    manifest = streams(1, need=MARKED)
+    need = dataclasses.replace(MARKED, kind=EndpointKind.SUBSCRIPTION, name="s0", dscp=46)
+    sink = dataclasses.replace(manifest.nodes[1], flows=(need,))
+    found = check(dataclasses.replace(manifest, nodes=(manifest.nodes[0], sink)))
+    assert [str(each) for each in found] == [
+        (
+            "s:1:1: cannot mark subscription 's0' with a DSCP: only senders mark; "
+            "give it to the publishers of the topic"
+        )
+    ]
+
+
+def test_a_link_that_relies_on_a_dscp_counts_as_an_identifier_too() -> None:
+    network = Network(flow_identification=FlowIdentification.DSCP)
+    found = check(dataclasses.replace(streams(65, need=MARKED), network=network))
+    assert [str(each) for each in found] == [
+        (
+            "s:65:1: cannot give publisher '/s64' of 'n64' DF = DSCP 0 = TOS 0 (0x00): it "
+            "identifies '/s0' of 'n0' (s:1:1); give it another DSCP, or none: then it gets one "
+            "that nobody has"
+        )
+    ]

@@ -1,0 +1,173 @@
+"""Checks of types, QoS and who talks to whom."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+Findings = Callable[..., list[str]]
+
+PAIR = """
+policy: {{{policy}}}
+nodes:
+  talker:
+    run: {{python: "demo:Talker"}}
+    interface:
+      publishers: [{{name: a, type: std_msgs/msg/String, qos: {offered}}}]
+  listener:
+    run: {{python: "demo:Listener"}}
+    interface:
+      subscriptions: [{{name: a, type: std_msgs/msg/String, qos: {requested}}}]
+"""
+
+
+def pair(offered: str, requested: str) -> str:
+    return PAIR.format(policy="", offered=offered, requested=requested)
+
+
+@pytest.mark.parametrize(
+    "qos",
+    ["default", "sensor_data", "parameters", "services_default", "rosout_default", "clock"],
+)
+def test_one_preset_at_both_ends_always_matches(findings: Findings, qos: str) -> None:
+    assert findings(pair(qos, qos)) == []
+
+
+@pytest.mark.parametrize(
+    ("offered", "requested", "remedy"),
+    [
+        (
+            "{deadline_ns: 5}",
+            "{deadline_ns: 4}",
+            (
+                "deadline is offered 5 ns and requested 4 ns; "
+                "offer at most 4 ns there, or request at least 5 ns here"
+            ),
+        ),
+        (
+            "default",
+            "{deadline_ns: 4}",
+            (
+                "deadline is offered infinite and requested 4 ns; "
+                "offer at most 4 ns there, or request none here"
+            ),
+        ),
+        (
+            "{durability: VOLATILE}",
+            "{durability: TRANSIENT_LOCAL}",
+            (
+                "durability is offered VOLATILE and requested TRANSIENT_LOCAL; "
+                "offer TRANSIENT_LOCAL there, or request VOLATILE here"
+            ),
+        ),
+    ],
+)
+def test_a_mismatch_names_policy_both_ends_and_the_remedy(
+    findings: Findings, offered: str, requested: str, remedy: str
+) -> None:
+    assert findings(pair(offered, requested)) == [
+        (
+            "check.qos-incompatible 12:23: nodes.listener.interface.subscriptions[0]: "
+            f"cannot match publisher 'a' of node 'talker' (8:20) on '/a': {remedy}"
+        )
+    ]
+
+
+def test_an_untold_liveliness_is_no_reason_to_doubt(findings: Findings) -> None:
+    assert findings(pair("sensor_data", "{preset: sensor_data, liveliness: AUTOMATIC}")) == []
+
+
+def test_an_untold_liveliness_is_doubtful_where_a_manual_one_is_requested(
+    findings: Findings,
+) -> None:
+    assert findings(pair("default", "{liveliness: MANUAL_BY_TOPIC}")) == [
+        (
+            "check.qos-doubtful 12:23: warning: nodes.listener.interface.subscriptions[0]: "
+            "cannot tell whether this matches publisher 'a' of node 'talker' (8:20) on '/a': "
+            "liveliness is offered SYSTEM_DEFAULT and requested MANUAL_BY_TOPIC; "
+            "write the values at both ends"
+        )
+    ]
+
+
+def test_ends_of_different_types_are_not_compared_further(findings: Findings) -> None:
+    text = pair("sensor_data", "default").replace("String, qos: default", "Empty, qos: default")
+    assert [each.split()[0] for each in findings(text)] == ["check.type-mismatch"]
+
+
+LONELY = """
+policy: {{{policy}}}
+nodes:
+  node:
+    run: {{python: "demo:Node"}}
+    interface:
+      {kind}: [{{name: a, type: {type}}}]
+"""
+
+
+@pytest.mark.parametrize(
+    ("kind", "type_", "policy", "rule"),
+    [
+        ("publishers", "std_msgs/msg/Empty", "unheard", "check.unheard"),
+        ("subscriptions", "std_msgs/msg/Empty", "unpublished", "check.unpublished"),
+        ("service_clients", "std_srvs/srv/Empty", "unpublished", "check.no-server"),
+    ],
+)
+@pytest.mark.parametrize("severity", ["error", "warning", "ignore"])
+def test_the_policy_decides_how_bad_a_loose_end_is(
+    findings: Findings, kind: str, type_: str, policy: str, rule: str, severity: str
+) -> None:
+    found = findings(LONELY.format(policy=f"{policy}: {severity}", kind=kind, type=type_))
+    expected = [] if severity == "ignore" else [rule]
+    assert [each.split()[0] for each in found] == expected
+    assert all(("warning:" in each) == (severity == "warning") for each in found)
+
+
+@pytest.mark.parametrize(
+    ("name", "managed", "known"),
+    [
+        ("/server/change_state", "true", True),
+        ("/server/change_state", "false", False),
+        ("/server/get_parameters", "false", True),
+        ("/server/get_type_description", "false", True),
+        ("/server/get_configuration", "true", True),
+        ("/nobody/get_parameters", "true", False),
+    ],
+)
+def test_services_that_every_node_has_need_no_declaration(
+    findings: Findings, name: str, managed: str, known: bool
+) -> None:
+    found = findings(f"""
+        nodes:
+          server: {{run: {{python: "demo:Server"}}, managed: {managed}}}
+          client:
+            run: {{python: "demo:Client"}}
+            interface:
+              service_clients: [{{name: {name}, type: std_srvs/srv/Empty}}]
+    """)
+    assert [each.split()[0] for each in found] == ([] if known else ["check.no-server"])
+
+
+def test_a_server_that_nobody_calls_is_an_offer(findings: Findings) -> None:
+    text = LONELY.format(policy="", kind="service_servers", type="std_srvs/srv/Empty")
+    assert findings(text) == []
+
+
+def test_a_package_that_is_not_installed_is_reported_once(findings: Findings) -> None:
+    found = findings("""
+        policy: {unheard: ignore}
+        nodes:
+          node:
+            run: {python: "demo:Node"}
+            interface:
+              publishers:
+                - {name: a, type: acme_msgs/msg/A}
+                - {name: b, type: acme_msgs/msg/B}
+    """)
+    assert found == [
+        (
+            "check.type-not-installed 9:11: warning: nodes.node.interface.publishers[0]: "
+            "cannot tell whether 'acme_msgs/msg/A' exists: 'acme_msgs' is not installed here"
+        )
+    ]

@@ -1,0 +1,102 @@
+"""Checks of `after`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lifecycle.manifest.diagnostics import Position
+from lifecycle.manifest.model import After, Condition, Manifest, Node, Run, RunKind
+from lifecycle.manifest.semantics import check
+
+Findings = Callable[..., list[str]]
+
+
+def system(edges: dict[str, list[str]]) -> Manifest:
+    at = Position(file="s", line=1, column=1)
+    nodes = tuple(
+        Node(
+            key=key,
+            name=key,
+            namespace="/",
+            machine="",
+            run=Run(kind=RunKind.PYTHON, python="demo:Node"),
+            after=tuple(
+                After(
+                    node=other,
+                    condition=Condition.STARTED,
+                    at=Position(file="s", line=line, column=index),
+                )
+                for index, other in enumerate(others)
+            ),
+            at=at,
+        )
+        for line, (key, others) in enumerate(edges.items(), start=1)
+    )
+    return Manifest(path="s", system="s", nodes=nodes)
+
+
+def circles(edges: dict[str, list[str]]) -> list[str]:
+    found = check(system(edges), environment={})
+    return [each.message.rpartition(": ")[2] for each in found if each.rule == "check.after-cycle"]
+
+
+def test_a_circle_is_shown_as_a_path() -> None:
+    assert circles({"a": ["b"], "b": ["c"], "c": ["a"]}) == ["a → b → c → a"]
+
+
+def test_a_circle_is_shown_without_the_way_that_leads_to_it() -> None:
+    assert circles({"in": ["a"], "a": ["b"], "b": ["a"]}) == ["a → b → a"]
+
+
+def test_every_circle_is_shown() -> None:
+    edges = {"a": ["b"], "b": ["a"], "c": ["d"], "d": ["c"]}
+    assert circles(edges) == ["a → b → a", "c → d → c"]
+
+
+def test_a_diamond_is_no_circle() -> None:
+    assert circles({"a": ["b", "c"], "b": ["d"], "c": ["d"], "d": []}) == []
+
+
+def test_a_chain_of_ten_thousand_nodes_is_no_problem() -> None:
+    edges = {f"n{i}": [f"n{i + 1}"] for i in range(10_000)}
+    edges["n10000"] = ["n0"]
+    assert len(circles(edges)) == 1
+
+
+keys = st.sampled_from("abcdef")
+
+
+@given(st.dictionaries(keys, st.lists(keys, max_size=4, unique=True)))
+def test_a_circle_is_found_exactly_when_no_order_exists(edges: dict[str, list[str]]) -> None:
+    known = {key: [o for o in others if o in edges and o != key] for key, others in edges.items()}
+    left = dict(known)
+    while ready := [key for key, others in left.items() if not set(others) & set(left)]:
+        for key in ready:
+            del left[key]
+    assert bool(circles(known)) == bool(left)
+
+
+@pytest.mark.parametrize(
+    ("waiting", "condition", "target", "rule"),
+    [
+        ("true", "active", "true", []),
+        ("false", "started", "false", []),
+        ("false", "connected", "true", []),
+        ("false", "active", "true", ["check.after-unmanaged"]),
+        ("true", "configured", "false", ["check.after-unmanaged"]),
+        ("true", "started", "false", []),
+    ],
+)
+def test_nodes_that_are_not_managed_have_only_a_start(
+    findings: Findings, waiting: str, condition: str, target: str, rule: list[str]
+) -> None:
+    found = findings(f"""
+        nodes:
+          a: {{run: {{command: [a]}}, managed: {waiting}, after: {{b: {condition}}}}}
+          b: {{run: {{command: [b]}}, managed: {target}}}
+    """)
+    assert [each.split()[0] for each in found] == rule

@@ -1,0 +1,105 @@
+"""Checks of machines, processes and ports."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+Findings = Callable[..., list[str]]
+
+
+def many(count: int, *, flows: str = "", kind: str = "publishers") -> str:
+    """Return one node with `count` endpoints that all have the same flow need."""
+    names = [f"e{index}" for index in range(count)]
+    lines = ["machines: {robot: {address: 10.0.0.1}}", "policy: {unheard: ignore,"]
+    lines += ["  unpublished: ignore}", "nodes:", "  n:", '    run: {python: "demo:N"}']
+    lines += ["    machine: robot", "    interface:", f"      {kind}:"]
+    lines += [f"        - {{name: {name}, type: std_msgs/msg/Empty}}" for name in names]
+    lines += ["    flows:", f"      {kind}:"]
+    lines += [f"        {name}: {flows}" for name in names]
+    return "\n".join(lines) + "\n"
+
+
+@pytest.mark.parametrize(
+    ("count", "flows", "domain", "participants"),
+    [
+        # One more for the process, and one for the supervisor that observes.
+        (118, "{unique: strictly_required}", 0, None),
+        (119, "{unique: strictly_required}", 0, 121),
+        (61, "{unique: optionally_required}", 232, None),
+        (62, "{unique: optionally_required}", 232, 64),
+        (200, "{dscp: EF}", 0, None),  # one participant carries them all
+    ],
+)
+def test_participants_that_own_flows_count_against_the_ports(
+    findings: Findings, count: int, flows: str, domain: int, participants: int | None
+) -> None:
+    found = findings(f"discovery: {{domain_id: {domain}}}\n" + many(count, flows=flows))
+    fit, limit = (120, "the ports of domain 1, from 7650") if domain == 0 else (63, "")
+    limit = limit or "the highest port, 65535"
+    expected = [
+        (
+            f"check.ports 3:1: discovery: cannot run {participants} participants in domain "
+            f"{domain} on machine 'robot': {fit} fit before {limit}; use another domain, run "
+            "fewer processes, or give fewer publishers a flow of their own"
+        )
+    ]
+    assert found == (expected if participants else [])
+
+
+def test_unique_subscriptions_share_four_hundred_ports_of_a_host(findings: Findings) -> None:
+    need = "{unique: strictly_required}"
+    assert findings(many(398, flows=need, kind="subscriptions")) == []
+    assert findings(many(399, flows=need, kind="subscriptions")) == [
+        (
+            "check.ports 3:12: machines.robot: cannot give 399 subscriptions a port of their own "
+            "on machine 'robot': 398 fit, because Fast DDS takes them from 7000–7399 in every "
+            "domain and each of 2 participants takes one; ask for fewer unique subscriptions"
+        )
+    ]
+
+
+def test_machines_of_one_address_are_one_host(findings: Findings) -> None:
+    nodes = "".join(
+        f'  n{index}: {{run: {{python: "demo:N"}}, machine: {"ab"[index % 2]}}}\n'
+        for index in range(54)
+    )
+    found = findings(
+        f"discovery: {{domain_id: 101}}\nmachines: {{a: {{}}, b: {{}}}}\nnodes:\n{nodes}"
+    )
+    assert found == [
+        (
+            "check.ports 3:1: warning: discovery: cannot run 55 participants in domain 101 on "
+            "machines 'a', 'b': 54 fit before the ephemeral ports 32768–60999; use another domain, "
+            "run fewer processes, or give fewer publishers a flow of their own (safe domains: "
+            "0–101, 215–232)"
+        )
+    ]
+
+
+@pytest.mark.parametrize(("domain", "sure"), [(101, True), (102, False), (214, False), (215, True)])
+def test_domains_in_the_ephemeral_range_are_doubtful(
+    findings: Findings, domain: int, sure: bool
+) -> None:
+    found = findings(f"""
+        discovery: {{domain_id: {domain}}}
+        nodes: {{n: {{run: {{python: "demo:N"}}}}}}
+    """)
+    warning = (
+        f"check.domain 3:1: warning: discovery: cannot be sure of the ports of domain {domain}: "
+        "Linux gives them to other sockets, by default; use domain 0–101, 215–232"
+    )
+    assert found == ([] if sure else [warning])
+
+
+def test_processes_that_fit_together_are_silent(findings: Findings) -> None:
+    assert (
+        findings("""
+        nodes:
+          a: {run: {python: "demo:A", environment: {X: "1"}}, process: p}
+          b: {run: {python: "demo:B", environment: {X: "1"}}, process: p}
+          p: {run: {python: "demo:P", environment: {X: "1"}}, process: p}
+    """)
+        == []
+    )

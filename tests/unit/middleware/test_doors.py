@@ -1,0 +1,86 @@
+"""Whom an observer asks, from what its connection URLs say, and who answers."""
+
+from __future__ import annotations
+
+import socket
+import struct
+from collections.abc import Iterator
+
+import pytest
+
+from lifecycle.middleware.doors import knock_for
+from lifecycle.network.connection_url import parse
+
+_WAIT_S = 5.0
+_PREFIX = bytes(range(12))
+_ANSWER = b"RTPS\x02\x03\x01\x0f" + _PREFIX + b"more"
+_METATRAFFIC_UNICAST = 0x0032
+
+
+@pytest.fixture(params=["127.0.0.1", "::1"])
+def peer(request: pytest.FixtureRequest) -> Iterator[socket.socket]:
+    """A socket where another participant's discovery would listen."""
+    family = socket.AF_INET6 if ":" in request.param else socket.AF_INET
+    with socket.socket(family, socket.SOCK_DGRAM) as found:
+        found.settimeout(_WAIT_S)
+        found.bind((request.param, 0))
+        yield found
+
+
+def url_for(peer: socket.socket) -> tuple[str, str]:
+    """Return a URL that looks for `peer` alone, and its address."""
+    address, port = peer.getsockname()[:2]
+    host, kind = (f"[{address}]", "udpv6") if ":" in address else (address, "udpv4")
+    return f"{kind}://{host}:7911?metatraffic_port=7910&peer={host}:{port}&multicast=off", address
+
+
+def locators(message: bytes, address: str) -> set[int]:
+    """Return the ports at which an announcement wants to be answered at `address`."""
+    packed = socket.inet_pton(socket.AF_INET6 if ":" in address else socket.AF_INET, address)
+    kind = 2 if ":" in address else 1
+    head = struct.pack("<HHi", _METATRAFFIC_UNICAST, 24, kind)
+    ports, at = set(), message.find(head)
+    while at >= 0:
+        (port,) = struct.unpack_from("<I", message, at + len(head))
+        if message[at + len(head) + 4 :][:16] == packed.rjust(16, b"\0"):
+            ports.add(port)
+        at = message.find(head, at + 1)
+    return ports
+
+
+def test_a_listed_peer_is_asked_to_answer_the_observer_and_is_counted(peer: socket.socket) -> None:
+    url, address = url_for(peer)
+    (knock,) = knock_for(25, (parse(url),), {})
+    try:
+        message, (_, asked_from, *_) = peer.recvfrom(65536)
+        assert locators(message, address) == {7910, asked_from}
+        assert knock.answered() == frozenset()
+        peer.sendto(_ANSWER, (address, asked_from))
+        assert knock.answered() == {_PREFIX.hex()}
+    finally:
+        knock.close()
+
+
+def test_who_is_not_listed_is_not_asked(peer: socket.socket) -> None:
+    url, _ = url_for(peer)
+    without = url.partition("&peer=")[0] + "&multicast=off"
+    for knock in knock_for(25, (parse(without),), {}):
+        knock.close()
+    for knock in knock_for(25, (parse(url),), {}):
+        knock.close()
+    peer.recv(65536)
+    peer.setblocking(False)
+    with pytest.raises(BlockingIOError):
+        peer.recv(65536)
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "shm://",
+        "tcpv4://127.0.0.1:5100?peer=127.0.0.1:5101",
+        "udpv4://127.0.0.1:7911?server=127.0.0.1:11811",
+    ],
+)
+def test_over_shared_memory_and_tcp_and_behind_a_server_nobody_can_be_asked(url: str) -> None:
+    assert knock_for(25, (parse(url),), {}) == ()

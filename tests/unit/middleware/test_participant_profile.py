@@ -1,0 +1,245 @@
+"""The profile of a participant: what it needs, added to what was there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as ET
+
+import pytest
+
+from lifecycle.errors import MiddlewareError
+from lifecycle.middleware.participant_profile import (
+    DefaultProfile,
+    ParticipantSettings,
+    default_profile,
+    profile,
+)
+from lifecycle.middleware.profiles import discovery_profile
+
+UDP = ParticipantSettings(transports=("udpv4",))
+USERS = """<?xml version="1.0"?>
+<dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles"><profiles>
+  <data_reader profile_name="/in"/>
+  <participant profile_name="other"/>
+  <participant profile_name="mine" is_default_profile="true">
+    <rtps>
+      {extra}
+      <propertiesPolicy><properties>
+        <property><name>fastdds.max_message_size</name><value>9000</value></property>
+        <property><name>color</name><value>red</value></property>
+      </properties></propertiesPolicy>
+      <builtin>
+        <initialPeersList><locator><udpv4><address>10.0.0.9</address></udpv4></locator>
+        </initialPeersList>
+        <metatrafficMulticastLocatorList><locator><udpv4/></locator>
+        </metatrafficMulticastLocatorList>
+      </builtin>
+    </rtps>
+  </participant>
+</profiles></dds>"""
+
+
+def users(tmp_path: Path, extra: str = "") -> DefaultProfile:
+    path = tmp_path / "mine.xml"
+    path.write_text(USERS.format(extra=extra))
+    found = default_profile({"FASTRTPS_DEFAULT_PROFILES_FILE": str(path)})
+    assert found is not None
+    return found
+
+
+def made(settings: ParticipantSettings, **options: Any) -> ET.Element:
+    """Return the profile, parsed, without its namespace."""
+    text = profile("p", settings, environment={}, **options)
+    return ET.fromstring(text.replace(' xmlns="http://www.eprosima.com', ' x="'))
+
+
+def texts(root: ET.Element, path: str) -> list[str]:
+    return [(each.text or "").strip() for each in root.findall(path)]
+
+
+def test_transports_are_all_that_the_participant_has() -> None:
+    root = made(ParticipantSettings(transports=("udpv4", "udpv6")))
+    descriptors = root.findall(".//transport_descriptor")
+    assert [each.findtext("type") for each in descriptors] == ["UDPv4", "UDPv6"]
+    ids = [each.findtext("transport_id") for each in descriptors]
+    assert texts(root, ".//userTransports/transport_id") == ids == ["p_udpv4", "p_udpv6"]
+    assert texts(root, ".//useBuiltinTransports") == ["false"]
+    participant = root.find(".//participant")
+    assert participant is not None
+    assert participant.attrib == {"profile_name": "p"}, "it must never become the default"
+
+
+def test_non_blocking_send_is_set_on_udp_and_keeps_shared_memory_where_none_is_chosen() -> None:
+    root = made(ParticipantSettings(non_blocking_send=True))
+    found = [
+        (each.findtext("type"), each.findtext("non_blocking_send"))
+        for each in root.findall(".//transport_descriptor")
+    ]
+    assert found == [("SHM", None), ("UDPv4", "true")]
+
+
+def test_the_datagram_size_limits_what_is_sent_and_not_the_receive_buffer() -> None:
+    root = made(ParticipantSettings(transports=("udpv4",), max_datagram_bytes=1400))
+    assert texts(root, ".//property/name") == ["fastdds.max_message_size"]
+    assert texts(root, ".//property/value") == ["1400"]
+    assert texts(root, ".//maxMessageSize") == []
+
+
+def test_a_datagram_size_alone_leaves_transports_alone() -> None:
+    root = made(ParticipantSettings(max_datagram_bytes=1400))
+    assert root.findall(".//userTransports") == []
+    assert root.findall(".//useBuiltinTransports") == []
+
+
+def test_discovery_is_left_alone_unless_it_is_localhost() -> None:
+    assert made(UDP).findall(".//builtin") == []
+
+
+def test_localhost_is_discovered_as_rmw_fastrtps_does_for_each_transport() -> None:
+    root = made(
+        ParticipantSettings(transports=("udpv4", "udpv6")),
+        localhost_peers=("10.0.0.7", "fd00::7", "robot.local"),
+    )
+    assert texts(root, ".//maxInitialPeersRange") == ["32", "32"]
+    listened = root.findall(".//metatrafficUnicastLocatorList/locator/*")
+    assert [(each.tag, len(each)) for each in listened] == [("udpv4", 0), ("udpv6", 0)]
+    searched = root.findall(".//initialPeersList/locator/*")
+    assert [(each.tag, each.findtext("address")) for each in searched] == [
+        ("udpv4", "10.0.0.7"),
+        ("udpv6", "fd00::7"),
+        ("udpv4", "robot.local"),
+        ("udpv6", "robot.local"),
+        ("udpv4", "127.0.0.1"),
+        ("udpv6", "::1"),
+    ]
+
+
+def test_a_profile_of_the_users_is_kept_but_for_what_is_added(tmp_path: Path) -> None:
+    base = users(tmp_path)
+    before = ET.tostring(base.element)
+    settings = ParticipantSettings(transports=("udpv4",), max_datagram_bytes=1400)
+    root = made(settings, base=base, localhost_peers=())
+    assert texts(root, ".//initialPeersList//address") == ["10.0.0.9", "127.0.0.1"]
+    assert root.findall(".//metatrafficMulticastLocatorList") == []
+    assert texts(root, ".//property/name") == ["color", "fastdds.max_message_size"]
+    assert texts(root, ".//property/value") == ["red", "1400"]
+    assert ET.tostring(base.element) == before
+
+
+def test_quick_discovery_is_kept(tmp_path: Path) -> None:
+    path = tmp_path / "quick.xml"
+    path.write_text(discovery_profile())
+    base = default_profile({"FASTRTPS_DEFAULT_PROFILES_FILE": str(path)})
+    assert texts(made(UDP, base=base), ".//initialAnnouncements/count") == ["40"]
+
+
+@pytest.mark.parametrize(
+    "choice",
+    [
+        "<builtinTransports>UDPv6</builtinTransports>",
+        "<useBuiltinTransports>false</useBuiltinTransports>",
+        "<userTransports><transport_id>t</transport_id></userTransports>",
+    ],
+)
+def test_transports_that_the_user_chose_are_not_replaced(tmp_path: Path, choice: str) -> None:
+    base, tag = users(tmp_path, choice), choice[1 : choice.index(">")]
+    with pytest.raises(MiddlewareError) as refused:
+        made(UDP, base=base)
+    assert str(refused.value) == (
+        "cannot give a participant udpv4: the default participant profile 'mine' of "
+        f"'{tmp_path}/mine.xml' already chooses its transports (<{tag}>); take <{tag}> out of it, "
+        "or what needs udpv4 out of the manifest"
+    )
+    made(ParticipantSettings(max_datagram_bytes=1400), base=base)
+
+
+def test_the_environments_choice_of_transports_is_not_replaced_by_a_default() -> None:
+    settings = ParticipantSettings(non_blocking_send=True)
+    environment = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv6"}
+    with pytest.raises(MiddlewareError) as refused:
+        profile("p", settings, environment=environment)
+    assert str(refused.value) == (
+        "cannot give a participant a non-blocking send: FASTDDS_BUILTIN_TRANSPORTS='UDPv6' already "
+        "chooses its transports; unset it, or say "
+        "FASTDDS_BUILTIN_TRANSPORTS=UDPv6?non_blocking=true"
+    )
+    assert "UDPv4" in profile("p", UDP, environment=environment), "the manifest is more precise"
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (
+            {"transports": ("shm",)},
+            "cannot use transports 'shm': allowed are 'udpv4' and 'udpv6', each once",
+        ),
+        (
+            {"transports": ("udpv4", "udpv4")},
+            "cannot use transports 'udpv4', 'udpv4': allowed are 'udpv4' and 'udpv6', each once",
+        ),
+        (
+            {"max_datagram_bytes": 499},
+            (
+                "cannot send datagrams of at most 499 bytes: allowed are 500–65500; "
+                "1400 fits an Ethernet frame"
+            ),
+        ),
+        (
+            {"max_datagram_bytes": 65501},
+            (
+                "cannot send datagrams of at most 65501 bytes: allowed are 500–65500; "
+                "1400 fits an Ethernet frame"
+            ),
+        ),
+    ],
+)
+def test_settings_out_of_range_are_refused(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(MiddlewareError) as refused:
+        ParticipantSettings(**settings)
+    assert str(refused.value) == message
+
+
+def test_settings_that_need_nothing_are_false() -> None:
+    assert not ParticipantSettings()
+    assert UDP
+    assert ParticipantSettings(max_datagram_bytes=500)
+    assert ParticipantSettings(non_blocking_send=True)
+
+
+def test_without_a_file_there_is_no_default_profile(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert default_profile({}) is None
+
+
+def test_the_file_of_the_working_directory_counts_last_unless_it_is_skipped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    named = tmp_path / "named.xml"
+    named.write_text(USERS.format(extra=""))
+    Path("DEFAULT_FASTRTPS_PROFILES.xml").write_text(USERS.replace("mine", "local"))
+    environment = {"FASTRTPS_DEFAULT_PROFILES_FILE": str(named)}
+    both, one = (
+        default_profile({**environment, **each}) for each in ({}, {"SKIP_DEFAULT_XML": "1"})
+    )
+    assert both is not None
+    assert one is not None
+    assert (both.name, one.name) == ("local", "mine")
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [(None, "No such file or directory"), ("<dds>", "no element found: line 1, column 5")],
+)
+def test_a_profiles_file_that_cannot_be_read_is_named(
+    tmp_path: Path, content: str | None, reason: str
+) -> None:
+    path = tmp_path / "p.xml"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(MiddlewareError) as refused:
+        default_profile({"FASTRTPS_DEFAULT_PROFILES_FILE": str(path)})
+    assert str(refused.value) == f"cannot read profiles {str(path)!r}: {reason}"

@@ -1,0 +1,165 @@
+"""Environment, process control and shared memory rules that need no ROS."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+import xml.etree.ElementTree as ET
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from lifecycle.errors import MiddlewareError
+from lifecycle.middleware import exit_after
+from lifecycle.middleware.profiles import discovery_environment, discovery_profile
+
+VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
+
+
+def test_the_door_opens_without_importing_rclpy() -> None:
+    look = (
+        "import sys; from lifecycle.middleware import sweep, die_with_parent, exit_after, "
+        "discovery_environment, leave_and_exit; print('rclpy' in sys.modules)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", look], check=True, capture_output=True, text=True, timeout=30
+    )
+    assert done.stdout == "False\n"
+
+
+def test_the_profile_only_sets_announcements() -> None:
+    root = ET.fromstring(discovery_profile(announcements=7, period_ms=20))
+    space = "{http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles}"
+    (participant,) = root.iter(f"{space}participant")
+    assert participant.get("is_default_profile") == "true"
+    leaves = {
+        each.tag.removeprefix(space): each.text for each in participant.iter() if not len(each)
+    }
+    assert leaves == {"count": "7", "nanosec": "20000000"}
+
+
+@pytest.mark.parametrize(("announcements", "period_ms"), [(0, 50), (1, 0), (1, 1000)])
+def test_announcements_out_of_range_are_refused(announcements: int, period_ms: int) -> None:
+    with pytest.raises(ValueError, match="cannot announce") as refused:
+        discovery_profile(announcements=announcements, period_ms=period_ms)
+    assert str(refused.value) == (
+        f"cannot announce {announcements} times each {period_ms} ms: allowed are once or more, "
+        "each 1–999 ms"
+    )
+
+
+def test_the_environment_names_a_complete_file(tmp_path: Path) -> None:
+    environment = discovery_environment(tmp_path, {})
+    assert environment == {VARIABLE: str(tmp_path / "quick_discovery.xml")}
+    assert Path(environment[VARIABLE]).read_text(encoding="utf-8") == discovery_profile()
+    assert list(tmp_path.iterdir()) == [tmp_path / "quick_discovery.xml"]
+
+
+@pytest.mark.parametrize("variable", [VARIABLE, "FASTDDS_DEFAULT_PROFILES_FILE"])
+def test_a_users_own_profile_is_left_alone(tmp_path: Path, variable: str) -> None:
+    assert discovery_environment(tmp_path, {variable: "/own.xml"}) == {}
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_users_profile_in_the_working_directory_is_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "DEFAULT_FASTRTPS_PROFILES.xml").touch()
+    assert discovery_environment(tmp_path, {}) == {}
+
+
+def test_a_directory_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    with pytest.raises(MiddlewareError) as refused:
+        discovery_environment(tmp_path / "missing", {})
+    assert str(refused.value) == (
+        f"cannot write the discovery profile '{tmp_path}/missing/quick_discovery.xml': "
+        "No such file or directory"
+    )
+
+
+@pytest.mark.parametrize(("seconds", "code"), [(0, 0), (-1, 0), (1, -1), (1, 256)])
+def test_a_deadman_out_of_range_is_refused(seconds: float, code: int) -> None:
+    with pytest.raises(ValueError, match="cannot exit") as refused:
+        exit_after(seconds, code)
+    assert str(refused.value) == (
+        f"cannot exit with {code} after {seconds} s: 0–255 after more than 0 s"
+    )
+
+
+def test_the_deadman_ends_a_process_that_holds_the_gil() -> None:
+    hang = (
+        "import ctypes\n"
+        "from lifecycle.middleware import exit_after\n"
+        "exit_after(0.1, 42)\n"
+        "ctypes.PyDLL(None).sleep(60)\n"
+    )
+    began = time.monotonic()
+    assert subprocess.run([sys.executable, "-c", hang], check=False, timeout=30).returncode == 42
+    assert time.monotonic() - began < 10
+
+
+def test_a_child_dies_with_its_parent(wait_for: Callable[[Callable[[], object]], None]) -> None:
+    child = (
+        "from lifecycle.middleware import die_with_parent; die_with_parent(); "
+        "print('on', flush=True); input()"
+    )
+    parent = (
+        "import os, subprocess, sys\n"
+        f"child = subprocess.Popen([sys.executable, '-c', {child!r}], stdin=subprocess.PIPE,\n"
+        "                          stdout=subprocess.PIPE)\n"
+        "child.stdout.readline()\n"
+        "print(child.pid, flush=True)\n"
+        "input()\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", parent],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as process:
+        assert process.stdout is not None
+        pid = int(process.stdout.readline())
+        assert Path(f"/proc/{pid}").exists()
+        process.kill()
+    wait_for(lambda: _ended(pid))
+
+
+def test_an_orphan_is_adopted_by_the_subreaper() -> None:
+    reaper = (
+        "import os, subprocess, sys, time\n"
+        "from lifecycle.middleware import adopt_orphans\n"
+        "adopt_orphans()\n"
+        "grandchild = 'import os, sys; print(os.getpid(), flush=True); sys.stdin.read()'\n"
+        "child = ('import subprocess, sys; '\n"
+        "         f'subprocess.Popen([sys.executable, \"-c\", {grandchild!r}])')\n"
+        "r, w = os.pipe()\n"
+        "subprocess.run([sys.executable, '-c', child], check=True, stdin=r)\n"
+        "os.close(w)\n"
+        "print(os.wait()[0])\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", reaper], check=True, capture_output=True, text=True, timeout=30
+    )
+    orphan, adopted = done.stdout.split()
+    assert orphan == adopted
+
+
+@pytest.fixture
+def wait_for() -> Callable[[Callable[[], object]], None]:
+    def wait(holds: Callable[[], object]) -> None:
+        deadline = time.monotonic() + 10
+        while not holds():
+            assert time.monotonic() < deadline
+            time.sleep(0.005)
+
+    return wait
+
+
+def _ended(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] in "ZX"
+    except (FileNotFoundError, ProcessLookupError):
+        return True

@@ -1,0 +1,154 @@
+"""What a host must have for a URL: real sockets of this process, no DDS."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+
+import pytest
+
+from lifecycle.errors import MiddlewareError
+from lifecycle.middleware.url_check import (
+    OpenSocket,
+    check_free,
+    check_host,
+    check_sockets,
+    open_sockets,
+)
+from lifecycle.network.connection_url import parse
+
+_UDP4 = (socket.AF_INET, socket.SOCK_DGRAM, "127.0.0.1")
+_UDP6 = (socket.AF_INET6, socket.SOCK_DGRAM, "::1")
+_TCP4 = (socket.AF_INET, socket.SOCK_STREAM, "127.0.0.1")
+
+
+def bound(family: int, kind: int, address: str) -> socket.socket:
+    each = socket.socket(family, kind)
+    each.bind((address, 0))
+    if kind == socket.SOCK_STREAM:
+        each.listen()
+    return each
+
+
+@pytest.fixture
+def udp() -> Iterator[int]:
+    """A UDP port of 127.0.0.1 that is taken."""
+    with bound(*_UDP4) as taken:
+        yield taken.getsockname()[1]
+
+
+@pytest.mark.parametrize(("kind", "how"), [("udpv4", _UDP4), ("udpv6", _UDP6), ("tcpv4", _TCP4)])
+def test_a_bound_socket_is_listed_with_its_address_until_it_is_closed(
+    kind: str, how: tuple[int, int, str]
+) -> None:
+    with bound(*how) as each:
+        port = each.getsockname()[1]
+        (found,) = (s for s in open_sockets() if (s.kind, s.port) == (kind, port))
+        assert found.address == how[2]
+    assert found.inode not in {s.inode for s in open_sockets()}
+
+
+def test_a_tcp_connection_is_no_listening_socket() -> None:
+    with bound(*_TCP4) as listening, socket.create_connection(listening.getsockname()) as dialled:
+        ports = {s.port for s in open_sockets() if s.kind == "tcpv4"}
+        assert listening.getsockname()[1] in ports
+        assert dialled.getsockname()[1] not in ports
+
+
+@pytest.mark.parametrize(
+    ("option", "what"),
+    [
+        ("metatraffic_port", "UDP metatraffic port 127.0.0.1"),
+        ("output_port", "UDP output port 127.0.0.1"),
+    ],
+)
+def test_each_port_that_somebody_has_is_named(udp: int, option: str, what: str) -> None:
+    url = f"udpv4://127.0.0.1?{option}={udp}"
+    with pytest.raises(MiddlewareError) as refused:
+        check_free([parse(url)])
+    assert str(refused.value) == (
+        f"cannot connect by '{url}': {what}:{udp} is not free on this host; end who has it "
+        "(`ss -lnp`), or choose another port"
+    )
+
+
+@pytest.mark.parametrize(
+    ("scheme", "how", "what"),
+    [("udpv4", _UDP4, "UDP"), ("udpv6", _UDP6, "UDP"), ("tcpv4", _TCP4, "TCP")],
+)
+def test_the_data_port_is_tried_on_the_address_and_protocol_of_the_url(
+    scheme: str, how: tuple[int, int, str], what: str
+) -> None:
+    host = f"[{how[2]}]" if ":" in how[2] else how[2]
+    with bound(*how) as taken:
+        port = taken.getsockname()[1]
+        url = parse(f"{scheme}://{host}:{port}")
+        with pytest.raises(MiddlewareError, match=rf"{what} .*:{port} is not free"):
+            check_free([url])
+    check_free([url])
+
+
+def test_a_port_of_another_protocol_is_not_in_the_way(udp: int) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        tcp = probe.getsockname()[1]
+    with bound(socket.AF_INET, socket.SOCK_DGRAM, "127.0.0.1"):
+        check_free([parse(f"tcpv4://127.0.0.1:{tcp}")])
+
+
+def test_the_port_of_a_group_is_shared(udp: int) -> None:
+    check_free([parse(f"udpm://239.255.1.9:{udp}?interface=127.0.0.1")])
+
+
+@pytest.mark.parametrize(
+    ("url", "missing"),
+    [
+        ("udpv4://192.0.2.77:7911", "192.0.2.77"),
+        ("udpm://239.255.1.9:7911?interface=192.0.2.78", "192.0.2.78"),
+        ("udpv4://?interface=nonesuch0", "nonesuch0"),
+    ],
+)
+def test_an_address_or_interface_this_host_has_not_is_refused(url: str, missing: str) -> None:
+    with pytest.raises(MiddlewareError) as refused:
+        check_host([parse(url)])
+    assert str(refused.value).startswith(
+        f"cannot connect by '{url}': this host has no address '{missing}'; it has "
+    )
+    assert "127.0.0.1" in str(refused.value)
+
+
+def test_what_every_host_has_is_accepted() -> None:
+    check_host(
+        [
+            parse("udpv4://127.0.0.1:7911"),
+            parse("udpv4://0.0.0.0:7911"),
+            parse("udpv4://?interface=lo"),
+            parse("udpm://239.255.1.9:7911"),
+            parse("shm://"),
+        ]
+    )
+
+
+def opened(kind: str, port: int) -> OpenSocket:
+    return OpenSocket(inode=port, kind=kind, address="127.0.0.1", port=port)
+
+
+def test_a_participant_that_did_not_get_its_port_is_refused() -> None:
+    url = parse("udpv4://127.0.0.1:7911?metatraffic_port=7910")
+    check_sockets([url], [opened("udpv4", 7911), opened("udpv4", 7910)])
+    with pytest.raises(MiddlewareError) as refused:
+        check_sockets([url], [opened("udpv4", 7911), opened("udpv4", 7412), opened("tcpv4", 7910)])
+    assert str(refused.value) == (
+        "cannot connect by 'udpv4://127.0.0.1:7911?metatraffic_port=7910': UDP metatraffic port "
+        "127.0.0.1:7910 is not free on this host; end who has it (`ss -lnp`), or choose another "
+        "port"
+    )
+
+
+def test_a_participant_without_any_socket_is_refused() -> None:
+    with pytest.raises(MiddlewareError) as refused:
+        check_sockets([parse("udpv4://127.0.0.1")], [])
+    assert str(refused.value) == (
+        "cannot connect by 'udpv4://127.0.0.1': Fast DDS opened no socket for it"
+    )
+    check_sockets([parse("shm://")], [])

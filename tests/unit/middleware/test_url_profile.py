@@ -1,0 +1,107 @@
+"""Connection URLs in a profile: transports, locators, discovery, and what is refused."""
+
+from __future__ import annotations
+
+import os
+from xml.etree import ElementTree as ET
+
+import pytest
+
+from lifecycle.errors import MiddlewareError
+from lifecycle.middleware.participant_profile import ParticipantSettings, profile
+from lifecycle.plan.model import ParticipantConnections
+
+
+def made(*urls: str, **options: bool) -> ET.Element:
+    settings = ParticipantSettings.of(ParticipantConnections(urls=urls), **options)
+    text = profile("p", settings, domain_id=3, environment={})
+    return ET.fromstring(text.replace(' xmlns="http://www.eprosima.com', ' x="'))
+
+
+def locators(root: ET.Element, path: str) -> list[dict[str, str]]:
+    return [
+        {"kind": each.tag, **{value.tag: value.text or "" for value in each}}
+        for each in root.findall(f".//{path}/locator/*")
+    ]
+
+
+def test_fixed_ports_fix_everything_and_forbid_other_ports() -> None:
+    root = made(
+        "udpv4://10.77.0.1:7911?metatraffic_port=7910&output_port=7999"
+        "&peer=10.77.0.2:7910&multicast=off"
+    )
+    at = {"kind": "udpv4", "address": "10.77.0.1"}
+    assert locators(root, "defaultUnicastLocatorList") == [{**at, "port": "7911"}]
+    assert locators(root, "metatrafficUnicastLocatorList") == [{**at, "port": "7910"}]
+    assert locators(root, "metatrafficMulticastLocatorList") == []
+    peer = {"kind": "udpv4", "address": "10.77.0.2", "port": "7910"}
+    assert locators(root, "initialPeersList") == [peer]
+    said = ("avoid_builtin_multicast", "mutation_tries", "output_port", "maxInitialPeersRange")
+    assert [root.findtext(f".//{tag}") for tag in said] == ["true", "0", "7999", "1"]
+    assert root.findtext(".//interfaceWhiteList/address") == "10.77.0.1"
+
+
+def test_shared_memory_alone_says_nothing_of_locators_and_keeps_its_ports_free_to_move() -> None:
+    root = made("shm://")
+    assert [each.text for each in root.findall(".//transport_descriptor/type")] == ["SHM"]
+    assert root.findall(".//locator") == []
+    assert root.findall(".//mutation_tries") == []
+
+
+def test_a_group_beside_tcp_shares_one_profile() -> None:
+    root = made("udpm://239.255.1.9:7901?ttl=0&interface=127.0.0.1", "tcpv4://10.77.0.1:5100")
+    types = [each.text for each in root.findall(".//transport_descriptor/type")]
+    assert types == ["UDPv4", "TCPv4"]
+    assert locators(root, "defaultMulticastLocatorList") == [
+        {"kind": "udpv4", "address": "239.255.1.9", "port": "7901"}
+    ]
+    assert root.findtext(".//TTL") == "0"
+    assert root.findtext(".//listening_ports/port") == "5100"
+
+
+@pytest.mark.parametrize(("super_client", "protocol"), [(True, "SUPER_CLIENT"), (False, "CLIENT")])
+def test_several_servers_count_their_prefix_up(super_client: bool, protocol: str) -> None:
+    root = made(
+        "tcpv4://10.77.0.1:5101?server=10.77.0.3:42100&server=10.77.0.4:42100",
+        super_client=super_client,
+    )
+    assert root.findtext(".//discoveryProtocol") == protocol
+    prefixes = [each.get("prefix") for each in root.findall(".//RemoteServer")]
+    assert prefixes == [f"44.53.0{n}.5f.45.50.52.4f.53.49.4d.41" for n in (0, 1)]
+
+
+@pytest.mark.parametrize(
+    ("urls", "problem"),
+    [
+        (("shm://", "udpv4://:7911"), "cannot use 'shm://' beside 'udpv4://:7911'"),
+        (("tcpv4://:5100", "tcpv4://:5101"), "one participant has one TCP port"),
+        (("udpm://239.1.1.1:1?ttl=0", "udpv4://?ttl=1"), "one participant has one ttl"),
+        (("tcpv4://?server=10.0.0.1:1", "udpv4://?peer=10.0.0.2"), "finds nobody else"),
+        (("udpv4://", "udpv4://10.0.0.1:1"), "on all interfaces and"),
+    ],
+)
+def test_urls_that_one_participant_cannot_have_together_are_refused(
+    urls: tuple[str, ...], problem: str
+) -> None:
+    with pytest.raises(MiddlewareError) as refused:
+        made(*urls)
+    assert problem in str(refused.value)
+
+
+@pytest.mark.parametrize("url", ["tcpv4://10.77.0.1:5100", "shm://"])
+def test_who_cannot_be_asked_announces_itself_each_half_second(url: str) -> None:
+    assert made(url).findtext(".//leaseAnnouncement/nanosec") == "500000000"
+
+
+def test_who_can_be_asked_announces_itself_as_seldom_as_always() -> None:
+    root = made("udpv4://10.77.0.1:7911?metatraffic_port=7910&multicast=off")
+    assert root.findall(".//leaseAnnouncement") == []
+
+
+def test_over_tcp_the_thread_that_finishes_a_connection_overtakes_nobody() -> None:
+    root = made("tcpv4://10.77.0.1:5100")
+    policies = [
+        root.findtext(f".//transport_descriptor/{tag}/scheduling_policy")
+        for tag in ("accept_thread", "default_reception_threads")
+    ]
+    assert policies == [str(os.SCHED_BATCH), str(os.SCHED_OTHER)]

@@ -1,0 +1,272 @@
+"""The 5QI table, the check of a flow against its class, and proposals."""
+
+from __future__ import annotations
+
+import json
+from importlib import resources
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lifecycle.network.five_qi import (
+    ClassIssue,
+    ResourceType,
+    check_class,
+    five_qi_of,
+    five_qis,
+    propose,
+)
+
+GBR, NON_GBR = ResourceType.GBR, ResourceType.NON_GBR
+DELAY_CRITICAL = ResourceType.DELAY_CRITICAL_GBR
+ALL = five_qis(include_flagged=True)
+
+
+def test_release_16_has_the_26_values_that_the_article_counts() -> None:
+    assert [each.value for each in ALL if each.in_release_16] == [
+        *range(1, 10),
+        *(65, 66, 67, 69, 70, 71, 72, 73, 74, 76, 79, 80),
+        *range(82, 87),
+    ]
+    assert len([each for each in ALL if each.in_release_16]) == 26
+
+
+def test_later_and_withdrawn_values_are_there_too() -> None:
+    assert [each.value for each in ALL if not each.in_release_16] == [10, 75, 87, 88, 89, 90]
+    assert len(ALL) == 32
+
+
+def test_values_with_a_doubtful_cell_are_not_offered_by_default() -> None:
+    offered = {each.value for each in five_qis()}
+    assert {each.value for each in ALL} - offered == {10, 75, 79, 83}
+    assert all(each.note for each in ALL if each.flagged)
+
+
+@pytest.mark.parametrize(
+    ("value", "resource", "priority", "budget_ms", "error_rate"),
+    [
+        (3, GBR, 30, 50, 1e-3),
+        (4, GBR, 50, 300, 1e-6),
+        (7, NON_GBR, 70, 100, 1e-3),
+        (9, NON_GBR, 90, 300, 1e-6),
+        (82, DELAY_CRITICAL, 19, 10, 1e-4),
+        (85, DELAY_CRITICAL, 21, 5, 1e-5),
+    ],
+)
+def test_the_articles_table_of_example_5qis(
+    value: int, resource: ResourceType, priority: int, budget_ms: int, error_rate: float
+) -> None:
+    found = five_qi_of(value)
+    assert found.resource_type is resource
+    assert found.priority_level == priority
+    assert found.packet_delay_budget_ms == budget_ms
+    assert found.packet_error_rate == error_rate
+
+
+def test_only_delay_critical_classes_have_a_data_burst_volume() -> None:
+    for each in ALL:
+        assert (each.max_data_burst_bytes is not None) == (each.resource_type is DELAY_CRITICAL)
+        assert (each.averaging_window_ms is not None) == each.resource_type.guarantees_rate
+
+
+def test_every_row_names_sources_that_the_table_describes() -> None:
+    file = resources.files("lifecycle.network").joinpath("data").joinpath("five_qi.json")
+    described = set(json.loads(file.read_text(encoding="utf-8"))["sources"])
+    assert all(each.sources and set(each.sources) <= described for each in ALL)
+
+
+def test_an_unknown_value_is_refused_with_what_there_is() -> None:
+    with pytest.raises(ValueError) as caught:
+        five_qi_of(81)
+    assert str(caught.value) == (
+        "cannot use 5QI 81; standardized are 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 65, 66, 67, 69, 70, "
+        "71, 72, 73, 74, 75, 76, 79, 80, 82, 83, 84, 85, 86, 87, 88, 89, 90"
+    )
+
+
+def test_the_articles_video_link_of_5_ms_fits_85_and_not_3() -> None:
+    assert check_class(five_qi_of(85), max_delay_ms=5) == ()
+    assert check_class(five_qi_of(3), max_delay_ms=5) == (
+        ClassIssue(
+            field="max_delay_ms",
+            message="cannot keep a delay of 5 ms with 5QI 3 (GBR): "
+            "its packet delay budget is 50 ms",
+        ),
+    )
+
+
+def test_loss_below_the_error_rate_is_an_issue() -> None:
+    assert check_class(five_qi_of(82), loss=1e-4) == ()
+    assert check_class(five_qi_of(82), loss=1e-5) == (
+        ClassIssue(
+            field="loss",
+            message="cannot keep a loss of 1e-05 with 5QI 82 (Delay-critical GBR): "
+            "its packet error rate is 0.0001",
+        ),
+    )
+
+
+def test_a_rate_needs_a_class_that_guarantees_one() -> None:
+    assert check_class(five_qi_of(2), rate_bps=2e6) == ()
+    assert check_class(five_qi_of(9), rate_bps=2e6) == (
+        ClassIssue(
+            field="rate_bps",
+            message="cannot guarantee 2e+06 bit/s with 5QI 9 (Non-GBR): "
+            "only GBR classes guarantee a rate",
+        ),
+    )
+
+
+def test_video_frames_do_not_fit_the_burst_of_255_bytes_of_5qi_85() -> None:
+    assert check_class(five_qi_of(85), rate_bps=408_000, message_bytes=255) == ()
+    assert check_class(five_qi_of(85), rate_bps=1e6, message_bytes=20_000) == (
+        ClassIssue(
+            field="rate_bps",
+            message="cannot keep the delay of 1e+06 bit/s with 5QI 85 (Delay-critical GBR): by "
+            "default it serves 255 bytes in 5 ms, 408000 bit/s",
+        ),
+        ClassIssue(
+            field="message_bytes",
+            message="cannot keep the delay of a message of 20000 bytes with 5QI 85 (Delay-critical "
+            "GBR): by default it serves 255 bytes in 5 ms",
+        ),
+    )
+
+
+@pytest.mark.parametrize(
+    ("max_delay_ms", "loss", "gbr", "value"),
+    [
+        (5, 1e-5, True, 85),
+        (5, 1e-4, True, 86),
+        (300, 1e-6, False, 9),
+        (300, 1e-6, True, 4),
+        (100, 1e-3, False, 7),
+        (50, 1e-3, True, 3),
+        (10, 1e-3, True, 82),
+        (10, 1e-6, None, 80),
+        (1000, 1, None, 76),
+    ],
+)
+def test_the_least_demanding_class_that_fits_is_proposed(
+    max_delay_ms: float, loss: float, *, gbr: bool | None, value: int
+) -> None:
+    found = propose(max_delay_ms, loss, gbr).five_qi
+    assert found is not None
+    assert found.value == value
+
+
+def test_a_proposal_says_why() -> None:
+    assert propose(10, 1e-3, True).why == (
+        "5QI 82 (Delay-critical GBR): delay budget 10 ms <= 10 ms, error rate 0.0001 <= 0.001; "
+        "the least demanding class of Release 16 that fits"
+    )
+
+
+def test_a_later_release_is_proposed_where_release_16_has_nothing() -> None:
+    proposal = propose(20, 1e-3, True, message_bytes=20_000)
+    assert proposal.five_qi is five_qi_of(90)
+    assert "the least demanding class of Release 17 that fits" in proposal.why
+
+
+def test_flagged_classes_are_proposed_only_on_request() -> None:
+    assert propose(50, 1e-2, False).five_qi is five_qi_of(80)
+    assert propose(50, 1e-2, False, include_flagged=True).five_qi is five_qi_of(79)
+
+
+@pytest.mark.parametrize(
+    ("max_delay_ms", "loss", "gbr", "message_bytes", "why"),
+    [
+        (
+            1,
+            1e-3,
+            True,
+            None,
+            (
+                "cannot propose a 5QI for a delay of 1 ms with a loss of 0.001: "
+                "the shortest delay budget is 5 ms, of 5QI 85 (Delay-critical GBR)"
+            ),
+        ),
+        (
+            500,
+            1e-9,
+            None,
+            None,
+            (
+                "cannot propose a 5QI for a loss of 1e-09: "
+                "the lowest error rate is 1e-08, of 5QI 73 (GBR)"
+            ),
+        ),
+        (
+            5,
+            1e-5,
+            True,
+            256,
+            (
+                "cannot propose a 5QI for messages of 256 bytes in 5 ms with a loss of 1e-05: "
+                "the largest burst is 255 bytes, of 5QI 85 (Delay-critical GBR)"
+            ),
+        ),
+    ],
+)
+def test_where_nothing_fits_the_bound_that_rules_all_out_is_named(
+    max_delay_ms: float, loss: float, *, gbr: bool | None, message_bytes: int | None, why: str
+) -> None:
+    proposal = propose(max_delay_ms, loss, gbr, message_bytes=message_bytes)
+    assert proposal.five_qi is None
+    assert proposal.why == why
+
+
+@pytest.mark.parametrize(
+    ("max_delay_ms", "loss", "message"),
+    [
+        (0, 0.1, "cannot use max_delay_ms 0; use more than 0"),
+        (float("nan"), 0.1, "cannot use max_delay_ms nan; use more than 0"),
+        (5, 0, "cannot use loss 0; use more than 0, at most 1"),
+        (5, 1.5, "cannot use loss 1.5; use more than 0, at most 1"),
+    ],
+)
+def test_bounds_out_of_range_are_refused(max_delay_ms: float, loss: float, message: str) -> None:
+    with pytest.raises(ValueError) as caught:
+        propose(max_delay_ms, loss, None)
+    assert str(caught.value) == message
+
+
+@given(
+    max_delay_ms=st.floats(0.1, 2000),
+    exponent=st.floats(-9, 0),
+    gbr=st.sampled_from((True, False, None)),
+    message_bytes=st.none() | st.integers(1, 70_000),
+)
+def test_a_proposed_class_keeps_what_was_asked_and_a_refusal_means_that_none_does(
+    max_delay_ms: float, exponent: float, *, gbr: bool | None, message_bytes: int | None
+) -> None:
+    loss = 10.0**exponent
+    found = propose(max_delay_ms, loss, gbr, message_bytes=message_bytes).five_qi
+    keeping = [
+        each
+        for each in five_qis()
+        if gbr in (None, each.resource_type.guarantees_rate)
+        and each.packet_delay_budget_ms <= max_delay_ms
+        and each.packet_error_rate <= loss
+        and (
+            message_bytes is None
+            or each.max_data_burst_bytes is None
+            or message_bytes <= each.max_data_burst_bytes
+        )
+    ]
+    assert (found is None) == (not keeping)
+    assert found is None or found in keeping
+
+
+def test_a_rate_beyond_the_burst_of_every_fast_class_is_refused_with_the_highest() -> None:
+    assert propose(5, 1, True, rate_bps=1e9).why == (
+        "cannot propose a 5QI for 1e+09 bit/s in 5 ms with a loss of 1: the highest rate is "
+        "2.1664e+06 bit/s, of 5QI 86 (Delay-critical GBR)"
+    )
+
+
+def test_a_rate_alone_rules_out_classes_that_guarantee_none() -> None:
+    found = propose(300, 1, None, rate_bps=1000).five_qi
+    assert found is not None
+    assert found.resource_type.guarantees_rate

@@ -1,0 +1,63 @@
+"""5QI ↔ DSCP mappings are data with provenance, never a constant."""
+
+from __future__ import annotations
+
+import pytest
+
+from lifecycle.network.five_qi import five_qis
+from lifecycle.network.five_qi_dscp import dscp_mapping, dscp_mappings, parse_mapping
+
+
+def test_every_shipped_mapping_says_where_it_comes_from_and_how_complete_it_is() -> None:
+    assert [each.name for each in dscp_mappings()] == ["azure_private_5g_core", "gsma_ir34"]
+    assert all(each.source and each.status for each in dscp_mappings())
+
+
+def test_the_azure_table_covers_the_26_values_of_release_16() -> None:
+    mapping = dscp_mapping("azure_private_5g_core")
+    release_16 = {each.value for each in five_qis(include_flagged=True) if each.in_release_16}
+    assert {value for value, _ in mapping.values} == release_16
+    assert mapping.dscp_for(85) == 18
+    assert mapping.dscp_for(80) == 34
+    assert mapping.dscp_for(90) is None
+
+
+def test_one_dscp_may_stand_for_several_5qis() -> None:
+    assert dscp_mapping("azure_private_5g_core").five_qis_for(46) == (1, 5, 65, 66)
+    assert dscp_mapping("gsma_ir34").five_qis_for(0) == ()
+
+
+def test_an_unknown_mapping_is_refused_with_what_there_is() -> None:
+    with pytest.raises(ValueError) as caught:
+        dscp_mapping("gsma")
+    assert str(caught.value) == (
+        "cannot find 5QI to DSCP mapping 'gsma'; shipped are azure_private_5g_core, gsma_ir34"
+    )
+
+
+def test_a_user_writes_his_own_with_names_or_numbers() -> None:
+    own = parse_mapping('{"name": "lab", "source": "our core", "values": {"85": "EF", "9": 0}}')
+    assert (own.name, own.source, own.values) == ("lab", "our core", ((9, 0), (85, 46)))
+
+
+@pytest.mark.parametrize(
+    ("values", "reason"),
+    [
+        ('{"81": 46}', "cannot use 5QI 81; standardized are 1, 2, "),
+        ('{"85": 184}', "cannot use DSCP 184; use 0 to 63 or a name such as EF; 184 is a TOS byte"),
+        ('{"85": "EFF"}', "cannot use 'EFF' as DSCP; "),
+        ("[]", "Expected `object`, got `array` - at `$.values`"),
+    ],
+)
+def test_a_user_s_mistake_is_named(values: str, reason: str) -> None:
+    with pytest.raises(ValueError) as caught:
+        parse_mapping(f'{{"name": "lab", "source": "our core", "values": {values}}}')
+    assert str(caught.value).startswith(f"cannot read 5QI to DSCP mapping: {reason}")
+
+
+def test_a_mapping_without_provenance_is_refused() -> None:
+    with pytest.raises(ValueError) as caught:
+        parse_mapping('{"name": "lab", "values": {}}')
+    assert str(caught.value) == (
+        "cannot read 5QI to DSCP mapping: Object missing required field `source`"
+    )

@@ -1,0 +1,117 @@
+"""Which flows the NFEs of a publisher and a subscription form."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lifecycle.network.flow import FlowTuple, flow_tuples
+from lifecycle.network.nfe import InternetProtocol, NetworkFlowEndpoint, TransportProtocol
+
+IPV4, IPV6 = InternetProtocol.IPV4, InternetProtocol.IPV6
+UDP, TCP = TransportProtocol.UDP, TransportProtocol.TCP
+SHARED_MEMORY = NetworkFlowEndpoint(
+    transport_protocol=TransportProtocol.UNKNOWN,
+    internet_protocol=InternetProtocol.UNKNOWN,
+    transport_port=0,
+)
+
+
+def nfe(
+    address: str, port: int, transport: TransportProtocol = UDP, **rest: int
+) -> NetworkFlowEndpoint:
+    return NetworkFlowEndpoint(
+        transport_protocol=transport,
+        internet_protocol=IPV6 if ":" in address else IPV4,
+        transport_port=port,
+        internet_address=address,
+        **rest,
+    )
+
+
+def ends(flow: FlowTuple) -> tuple[str, int, str, int]:
+    return (
+        flow.source_address,
+        flow.source_port,
+        flow.destination_address,
+        flow.destination_port,
+    )
+
+
+def test_two_nfes_make_one_flow_that_carries_the_senders_dscp_and_label() -> None:
+    source = [nfe("FD09::1", 17900, dscp=46, flow_label=0x12345)]
+    assert flow_tuples(source, [nfe("fd09::2", 17910)]) == (
+        FlowTuple(
+            transport_protocol=UDP,
+            internet_protocol=IPV6,
+            source_address="fd09::1",
+            source_port=17900,
+            destination_address="fd09::2",
+            destination_port=17910,
+            flow_label=0x12345,
+            dscp=46,
+        ),
+    )
+
+
+def test_fast_dds_sends_unicast_from_its_wildcard_socket() -> None:
+    source = [SHARED_MEMORY, nfe("0.0.0.0", 45000), nfe("10.0.0.1", 45001)]
+    (flow,) = flow_tuples(source, [SHARED_MEMORY, nfe("10.0.0.2", 7000)])
+    assert ends(flow) == ("0.0.0.0", 45000, "10.0.0.2", 7000)
+    assert not flow.source_is_known
+
+
+def test_fast_dds_sends_multicast_from_the_socket_of_each_interface() -> None:
+    source = [nfe("0.0.0.0", 45000), nfe("10.0.0.1", 45001), nfe("192.168.1.1", 45002)]
+    flows = flow_tuples(source, [nfe("239.255.0.1", 7401)])
+    assert [ends(flow)[:2] for flow in flows] == [("10.0.0.1", 45001), ("192.168.1.1", 45002)]
+    assert all(flow.source_is_known for flow in flows)
+
+
+def test_a_sender_of_one_kind_serves_both_destinations() -> None:
+    source = [nfe("10.0.0.1", 45001)]
+    flows = flow_tuples(source, [nfe("10.0.0.2", 7000), nfe("239.255.0.1", 7401)])
+    assert [flow.destination_address for flow in flows] == ["10.0.0.2", "239.255.0.1"]
+
+
+def test_loopback_talks_to_loopback_only() -> None:
+    source = [nfe("127.0.0.1", 45000), nfe("10.0.0.1", 45001)]
+    flows = flow_tuples(source, [nfe("127.0.0.1", 7000), nfe("10.0.0.2", 7000)])
+    assert [ends(flow) for flow in flows] == [
+        ("127.0.0.1", 45000, "127.0.0.1", 7000),
+        ("10.0.0.1", 45001, "10.0.0.2", 7000),
+    ]
+
+
+def test_protocols_do_not_mix_and_shared_memory_forms_no_flow() -> None:
+    assert flow_tuples([nfe("10.0.0.1", 1)], [nfe("10.0.0.2", 2, TCP)]) == ()
+    assert flow_tuples([nfe("10.0.0.1", 1)], [nfe("fd09::2", 2)]) == ()
+    assert flow_tuples([SHARED_MEMORY], [SHARED_MEMORY]) == ()
+
+
+NFES = st.lists(
+    st.just(SHARED_MEMORY)
+    | st.builds(
+        nfe,
+        st.sampled_from(("0.0.0.0", "127.0.0.1", "10.0.0.1", "239.255.0.1", "::", "fd09::1")),
+        st.integers(1, 3),
+        st.sampled_from((UDP, TCP)),
+    ),
+    max_size=5,
+)
+
+
+@given(source=NFES, destination=NFES)
+def test_every_flow_has_its_ends_among_the_nfes_and_is_listed_once(
+    source: list[NetworkFlowEndpoint], destination: list[NetworkFlowEndpoint]
+) -> None:
+    flows = flow_tuples(source, destination)
+    assert len(set(flows)) == len(flows)
+    for flow in flows:
+        assert (flow.transport_protocol, flow.source_address, flow.source_port) in {
+            (each.transport_protocol, each.internet_address, each.transport_port) for each in source
+        }
+        assert (flow.transport_protocol, flow.destination_address, flow.destination_port) in {
+            (each.transport_protocol, each.internet_address, each.transport_port)
+            for each in destination
+        }

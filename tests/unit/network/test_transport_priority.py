@@ -1,0 +1,152 @@
+"""Connext Micro's mapping: its whole examples table, its sentences, and its properties."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lifecycle.network.transport_priority import TransportPriorityMapping, map_priority
+
+MAPPINGS = st.builds(
+    lambda mask, ends: TransportPriorityMapping(mask=mask, low=min(ends), high=max(ends)),
+    st.integers(1, 0xFFFFFFFF),
+    st.tuples(st.integers(0, 255), st.integers(0, 255)),
+)
+
+
+@pytest.mark.parametrize(
+    ("priority", "mask", "low", "high", "tos"),
+    [
+        pytest.param(0xB8, 0xFF, 0, 0xFF, 0xB8, id="no scaling, direct mapping"),
+        pytest.param(0x00, 0x03, 0, 0x03, 0x00, id="lowest priority"),
+        pytest.param(0x01, 0x03, 0, 0x3F, 0x15, id="priority scaled into range"),
+        pytest.param(0x02, 0x03, 0, 0x3F, 0x2A, id="higher priority"),
+        pytest.param(0x03, 0x03, 0, 0x3F, 0x3F, id="highest priority"),
+    ],
+)
+def test_the_examples_table_of_section_3_24_3(
+    priority: int, mask: int, low: int, high: int, tos: int
+) -> None:
+    mapped = map_priority(priority, TransportPriorityMapping(mask=mask, low=low, high=high))
+    assert mapped.tos == tos
+
+
+def test_0xb8_is_101110_00_the_dscp_ef_and_ecn_0() -> None:
+    mapped = map_priority(0xB8, TransportPriorityMapping(mask=0xFF))
+    assert mapped.dscp() == 0b101110 == 46
+    assert mapped.notes() == ()
+
+
+def test_a_mask_above_16_bits_is_shifted_by_4_until_it_fits() -> None:
+    # 0x0ff00000 needs three shifts: 0x0000ff00 -> mask' 0xff00, masked 0xb800.
+    mapped = map_priority(0x0B800000, TransportPriorityMapping(mask=0x0FF00000))
+    assert mapped.tos == 0xB8
+
+
+def test_mask_0_leaves_the_tos_byte_alone() -> None:
+    mapped = map_priority(0xB8, TransportPriorityMapping(mask=0))
+    assert (mapped.tos, mapped.dscp()) == (None, None)
+    assert mapped.notes() == ("transport priority 0xb8 has no effect: the mask is 0",)
+
+
+def test_bits_outside_the_mask_vanish_and_are_reported() -> None:
+    mapped = map_priority(0x1B8, TransportPriorityMapping(mask=0xFF))
+    assert mapped.tos == 0xB8
+    assert mapped.ignored_bits == 0x100
+    assert mapped.notes() == (
+        "bits 0x100 of transport priority 0x1b8 vanish: mask 0xff leaves TOS 0xb8",
+    )
+
+
+def test_bits_inside_the_mask_that_the_shift_drops_are_reported_too() -> None:
+    mapped = map_priority(0xF000F, TransportPriorityMapping(mask=0xF000F))
+    assert mapped.ignored_bits == 0xF
+
+
+@pytest.mark.parametrize(
+    ("priority", "tos", "ecn", "clear"),
+    [
+        (1, "0x15", "0b01", "DSCP 5 = TOS 20 (0x14)"),
+        (2, "0x2a", "0b10", "AF11 = DSCP 10 = TOS 40 (0x28)"),
+        (3, "0x3f", "0b11", "DSCP 15 = TOS 60 (0x3c)"),
+    ],
+)
+def test_0x15_0x2a_and_0x3f_of_the_table_set_ecn_bits_and_are_refused_as_dscp(
+    priority: int, tos: str, ecn: str, clear: str
+) -> None:
+    mapped = map_priority(priority, TransportPriorityMapping(mask=3, high=0x3F))
+    assert mapped.sets_ecn
+    (note,) = mapped.notes()
+    assert note == (
+        f"TOS {tos} sets ECN bits {ecn}, which belong to the transport; without them it is {clear}"
+    )
+    with pytest.raises(ValueError, match="its two lowest bits are ECN and belong to the transport"):
+        mapped.dscp()
+
+
+@pytest.mark.parametrize(
+    ("mask", "low", "high", "message"),
+    [
+        (-1, 0, 255, "cannot use mask -0x1; use 0 to 0xffffffff"),
+        (1 << 32, 0, 255, "cannot use mask 0x100000000; use 0 to 0xffffffff"),
+        (3, 5, 4, "cannot map to 0x5 … 0x4; use 0 to 0xff, low <= high"),
+        (3, 0, 256, "cannot map to 0x0 … 0x100; use 0 to 0xff, low <= high"),
+    ],
+)
+def test_a_mapping_out_of_range_is_refused(mask: int, low: int, high: int, message: str) -> None:
+    with pytest.raises(ValueError) as caught:
+        TransportPriorityMapping(mask=mask, low=low, high=high)
+    assert str(caught.value) == message
+
+
+def test_a_priority_beyond_32_bits_is_refused_and_a_negative_one_is_its_bits() -> None:
+    mapping = TransportPriorityMapping(mask=0xFF)
+    assert map_priority(-1, mapping).tos == 0xFF
+    with pytest.raises(ValueError) as caught:
+        map_priority(1 << 32, mapping)
+    assert str(caught.value) == (
+        "cannot use transport priority 4294967296; it does not fit 32 bits"
+    )
+
+
+@given(priority=st.integers(0, 255))
+def test_mask_0xff_with_the_defaults_maps_directly(priority: int) -> None:
+    assert map_priority(priority, TransportPriorityMapping(mask=0xFF)).tos == priority
+
+
+@given(priority=st.integers(0, 0xFFFFFFFF), mapping=MAPPINGS)
+def test_the_result_stays_between_low_and_high_and_both_ends_are_reached(
+    priority: int, mapping: TransportPriorityMapping
+) -> None:
+    tos = map_priority(priority, mapping).tos
+    assert tos is not None
+    assert mapping.low <= tos <= mapping.high
+    assert map_priority(0, mapping).tos == mapping.low
+    assert map_priority(0xFFFFFFFF, mapping).tos == mapping.high
+
+
+@given(priority=st.integers(0, 0xFFFFFFFF), mapping=MAPPINGS)
+def test_ignored_bits_make_no_difference_and_are_the_priority_s_own(
+    priority: int, mapping: TransportPriorityMapping
+) -> None:
+    mapped = map_priority(priority, mapping)
+    assert map_priority(priority & ~mapped.ignored_bits, mapping).tos == mapped.tos
+    assert mapped.ignored_bits & ~priority == 0
+
+
+@given(
+    priorities=st.tuples(st.integers(0, 0xFFFF), st.integers(0, 0xFFFF)),
+    width=st.integers(1, 16),
+    ends=st.tuples(st.integers(0, 255), st.integers(0, 255)),
+)
+def test_a_higher_priority_inside_a_mask_without_gaps_never_gets_a_lower_byte(
+    priorities: tuple[int, int], width: int, ends: tuple[int, int]
+) -> None:
+    mask = (1 << width) - 1
+    mapping = TransportPriorityMapping(mask=mask, low=min(ends), high=max(ends))
+    lower, higher = sorted(each & mask for each in priorities)
+    one, other = map_priority(lower, mapping).tos, map_priority(higher, mapping).tos
+    assert one is not None
+    assert other is not None
+    assert one <= other

@@ -1,0 +1,179 @@
+"""Callbacks: what they return, what they raise, how long they take."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Generator
+from typing import Any
+
+import pytest
+
+from lifecycle.node.execution import Interruptible, Result, call, judge
+from lifecycle.node.machine import Outcome
+
+WHAT = "/camera: on_configure"
+
+
+class Never:
+    """Awaits for ever, as a service that nobody serves does."""
+
+    def __await__(self) -> Generator[None, None, None]:
+        while True:
+            yield
+
+
+def drive(
+    callback: Callable[..., Any],
+    *,
+    deadline_s: float = 10.0,
+    turns: int = 3,
+    started: Callable[[Interruptible], None] = lambda running: None,
+) -> Result:
+    """Run a callback as an executor does: resume it at each turn."""
+    coroutine = call(callback, ("state",), what=WHAT, deadline_s=deadline_s, started=started)
+    for _ in range(turns):
+        try:
+            coroutine.send(None)
+        except StopIteration as stop:  # noqa: PERF203
+            result: Result = stop.value
+            return result
+    coroutine.close()
+    raise AssertionError(f"still running after {turns} turns")
+
+
+@pytest.mark.parametrize(
+    ("returned", "outcome"),
+    [
+        (None, Outcome.SUCCESS),
+        (Outcome.SUCCESS, Outcome.SUCCESS),
+        (Outcome.FAILURE, Outcome.FAILURE),
+        (Outcome.ERROR, Outcome.ERROR),
+        (True, Outcome.ERROR),
+        ("SUCCESS", Outcome.ERROR),
+        (0, Outcome.ERROR),
+        (Exception, Outcome.ERROR),
+    ],
+)
+def test_what_a_callback_returns_decides(returned: object, outcome: Outcome) -> None:
+    assert drive(lambda: returned).outcome is outcome
+
+
+def test_anything_else_is_an_error_that_quotes_it() -> None:
+    assert judge(True, what=WHAT).error == (
+        "cannot use True, returned by /camera: on_configure; return SUCCESS, FAILURE, ERROR, or "
+        "None for SUCCESS"
+    )
+
+
+def test_a_failure_says_who_returned_it() -> None:
+    assert drive(lambda: Outcome.FAILURE).error == "/camera: on_configure returned FAILURE"
+
+
+def test_a_callback_may_take_the_state_or_not() -> None:
+    seen: list[object] = []
+    assert drive(lambda: None).outcome is Outcome.SUCCESS
+    assert drive(seen.append).outcome is Outcome.SUCCESS
+    assert seen == ["state"]
+
+
+def test_an_exception_is_an_error_with_its_traceback() -> None:
+    def on_configure() -> None:
+        raise OSError("no such camera")
+
+    result = drive(on_configure)
+    assert result.outcome is Outcome.ERROR
+    assert result.error == "/camera: on_configure raised OSError: no such camera"
+    assert 'raise OSError("no such camera")' in result.trace
+
+
+def test_awaiting_asyncio_says_that_there_is_no_loop_and_what_to_await() -> None:
+    async def naps(state: str) -> None:
+        await asyncio.sleep(0.1)
+
+    result = drive(naps)
+    assert result.outcome is Outcome.ERROR
+    assert result.error == (
+        "/camera: on_configure raised RuntimeError: no running event loop; callbacks run in "
+        "rclpy's executor, which has no asyncio loop: await what rclpy gives, as "
+        "client.call_async(request) does, and wait by self.sleep(seconds)"
+    )
+
+
+def test_an_async_callback_is_resumed_until_it_returns() -> None:
+    turns: list[int] = []
+
+    class Twice:
+        def __await__(self) -> Generator[None, None, None]:
+            for turn in range(2):
+                turns.append(turn)
+                yield
+
+    async def on_configure() -> Outcome:
+        await Twice()
+        return Outcome.FAILURE
+
+    assert drive(on_configure).outcome is Outcome.FAILURE
+    assert turns == [0, 1]
+
+
+def test_an_async_callback_beyond_its_deadline_is_interrupted_where_it_awaits() -> None:
+    ended: list[str] = []
+
+    async def on_configure() -> None:
+        try:
+            await Never()  # a calibration service that never answers
+        finally:
+            ended.append("finally")
+
+    result = drive(on_configure, deadline_s=1e-9)
+    assert result.outcome is Outcome.ERROR
+    assert result.error == ("cannot finish /camera: on_configure within its deadline of 1e-09 s")
+    assert "a calibration service that never answers" in result.trace
+    assert ended == ["finally"]
+
+
+def test_a_callback_that_swallows_its_interruption_is_ended_all_the_same() -> None:
+    async def on_configure() -> None:
+        while True:
+            try:
+                await Never()
+            except Exception:  # noqa: BLE001, PERF203
+                continue
+
+    result = drive(on_configure, deadline_s=1e-9)
+    assert result.outcome is Outcome.ERROR
+    assert "within its deadline" in result.error
+
+
+def test_a_running_callback_can_be_cancelled() -> None:
+    async def on_activate() -> None:
+        await Never()
+
+    result = drive(on_activate, started=lambda running: running.cancel("the process ends"))
+    assert result.outcome is Outcome.ERROR
+    assert result.error == "cannot go on with /camera: on_configure: the process ends"
+
+
+def test_a_sync_callback_beyond_its_deadline_is_an_error_that_says_what_to_do() -> None:
+    result = drive(lambda: None, deadline_s=0.0)
+    assert result.outcome is Outcome.ERROR
+    assert result.error == (
+        "cannot accept /camera: on_configure: it blocked for 0.0 s, its deadline is 0 s; "
+        "make it `async def` so that it can be interrupted"
+    )
+
+
+def test_keyboard_interrupt_is_not_swallowed() -> None:
+    def on_configure() -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        drive(on_configure)
+
+
+def test_cancelled_error_of_asyncio_is_not_swallowed() -> None:
+    def on_configure() -> None:
+        raise asyncio.CancelledError
+
+    with pytest.raises(asyncio.CancelledError):
+        drive(on_configure)

@@ -1,0 +1,221 @@
+"""The gate: closed until active, nothing in the way while open."""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Callable, Coroutine
+from typing import Any
+
+import pytest
+
+from lifecycle.errors import LifecycleError
+from lifecycle.node.gate import Gate, GatedPublisher, GatedSubscription, GatedTimer
+from lifecycle.node.publisher import DeclaredPublisher
+
+
+class FakePublisher:
+    topic = "/video"
+
+    def __init__(self) -> None:
+        self.sent: list[object] = []
+
+    def publish(self, msg: object) -> None:
+        self.sent.append(msg)
+
+
+class FakeSubscription:
+    def __init__(
+        self, callback: Callable[..., object], *, durability: str = "VOLATILE", depth: int = 2
+    ) -> None:
+        self.callback = callback
+        self.qos_profile = types.SimpleNamespace(
+            durability=types.SimpleNamespace(name=durability), depth=depth
+        )
+
+
+def at_once(task: Callable[[], Coroutine[Any, Any, None]]) -> None:
+    """Run a task as an executor would, but now."""
+    with pytest.raises(StopIteration):
+        task().send(None)
+
+
+class FakeTimer:
+    def __init__(self) -> None:
+        self.running = True
+
+    def cancel(self) -> None:
+        self.running = False
+
+    def reset(self) -> None:
+        self.running = True
+
+
+def test_a_closed_publisher_drops_and_says_so_once_per_inactive_period() -> None:
+    gate, publisher, warnings = Gate(), FakePublisher(), list[str]()
+    gate.add(publisher, GatedPublisher(publisher, warnings.append))
+    publisher.publish(1)
+    publisher.publish(2)
+    gate.open()
+    publisher.publish(3)
+    gate.close()
+    publisher.publish(4)
+    assert publisher.sent == [3]
+    said = (
+        "cannot publish on '/video': the node is not active, so the message is dropped, and so "
+        "are those that follow until it is active"
+    )
+    assert warnings == [said, said]
+
+
+def test_an_open_publisher_is_the_publisher_itself() -> None:
+    gate, publisher = Gate(), FakePublisher()
+    gate.add(publisher, GatedPublisher(publisher, pytest.fail))
+    gate.open()
+    assert "publish" not in vars(publisher)
+
+
+def test_an_entity_made_while_active_is_open_at_once() -> None:
+    gate, publisher = Gate(), FakePublisher()
+    gate.open()
+    gate.add(publisher, GatedPublisher(publisher, pytest.fail))
+    publisher.publish(1)
+    assert publisher.sent == [1]
+
+
+def test_a_released_entity_is_open_for_good() -> None:
+    gate, publisher = Gate(), FakePublisher()
+    gate.add(publisher, GatedPublisher(publisher, pytest.fail))
+    gate.release(publisher)
+    gate.close()
+    publisher.publish(1)
+    assert publisher.sent == [1]
+
+
+def test_a_removed_entity_is_left_alone() -> None:
+    gate, timer = Gate(), FakeTimer()
+    gate.add(timer, GatedTimer(timer, wanted=True))
+    gate.remove(timer)
+    gate.open()
+    assert not timer.running
+
+
+def test_messages_reach_the_callback_only_while_open() -> None:
+    received: list[object] = []
+    gate, subscription = Gate(), FakeSubscription(received.append)
+    gate.add_subscription(subscription, at_once)
+    subscription.callback("early")
+    gate.open()
+    subscription.callback("now")
+    gate.close()
+    subscription.callback("late")
+    assert received == ["now"]
+
+
+def test_gating_a_subscription_twice_keeps_the_users_callback() -> None:
+    received: list[object] = []
+    gate, subscription = Gate(), FakeSubscription(received.append)
+    gate.add_subscription(subscription, at_once)
+    gate.add_subscription(subscription, at_once)
+    gate.open()
+    subscription.callback("now")
+    assert received == ["now"]
+
+
+def test_a_callback_with_message_info_is_replaced_by_one_that_takes_it_too() -> None:
+    subscription = FakeSubscription(lambda message, info: None)
+    GatedSubscription(subscription, at_once).close()
+    subscription.callback("message", "info")
+    with pytest.raises(TypeError):
+        subscription.callback("message")
+
+
+def test_the_last_transient_local_samples_wait_for_activation() -> None:
+    received: list[object] = []
+    gate = Gate()
+    subscription = FakeSubscription(received.append, durability="TRANSIENT_LOCAL", depth=2)
+    gate.add_subscription(subscription, at_once)
+    for sample in ("map 1", "map 2", "map 3"):
+        subscription.callback(sample)
+    assert received == []
+    gate.open()
+    subscription.callback("map 4")
+    gate.close()
+    subscription.callback("map 5")
+    gate.open()
+    assert received == ["map 2", "map 3", "map 4", "map 5"]
+
+
+def test_kept_samples_wait_on_if_the_gate_closes_before_they_are_delivered() -> None:
+    received: list[object] = []
+    gate = Gate()
+    subscription = FakeSubscription(received.append, durability="TRANSIENT_LOCAL")
+    tasks: list[Callable[[], Coroutine[Any, Any, None]]] = []
+    gate.add_subscription(subscription, tasks.append)
+    subscription.callback("map")
+    gate.open()
+    gate.close()
+    at_once(tasks[0])
+    assert received == []
+    gate.open()
+    at_once(tasks[1])
+    assert received == ["map"]
+
+
+def test_a_timer_runs_only_while_open() -> None:
+    gate, timer = Gate(), FakeTimer()
+    gate.add(timer, GatedTimer(timer, wanted=True))
+    assert not timer.running
+    gate.open()
+    assert timer.running
+    gate.close()
+    assert not timer.running
+
+
+def test_a_timer_that_the_user_cancelled_stays_cancelled() -> None:
+    gate, timer = Gate(), FakeTimer()
+    gate.add(timer, GatedTimer(timer, wanted=True))
+    gate.open()
+    timer.cancel()
+    gate.close()
+    gate.open()
+    assert not timer.running
+
+
+def test_a_timer_that_the_user_starts_while_closed_starts_when_open() -> None:
+    gate, timer = Gate(), FakeTimer()
+    gate.add(timer, GatedTimer(timer, wanted=False))
+    gate.open()
+    gate.close()
+    timer.reset()
+    assert not timer.running
+    gate.open()
+    assert timer.running
+
+
+def test_a_declared_publisher_follows_connect_and_the_gate() -> None:
+    gate, entity, warnings = Gate(), FakePublisher(), list[str]()
+    handle = DeclaredPublisher("video", warnings.append)
+    handle.publish("before connect")
+    handle.attach(entity)
+    gate.add(handle, handle)
+    handle.publish("inactive")
+    gate.open()
+    handle.publish("active")
+    assert handle.publish == entity.publish
+    gate.close()
+    handle.publish("inactive again")
+    gate.remove(handle)
+    handle.detach()
+    gate.open()
+    handle.publish("after disconnect")
+    assert entity.sent == ["active"]
+    assert len(warnings) == 3
+
+
+def test_a_declared_publisher_that_is_not_connected_has_no_entity() -> None:
+    with pytest.raises(LifecycleError) as error:
+        _ = DeclaredPublisher("video", pytest.fail).entity
+    assert str(error.value) == (
+        "cannot reach publisher 'video': the node is not connected; endpoints exist from connect "
+        "until disconnect"
+    )

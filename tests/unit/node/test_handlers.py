@@ -1,0 +1,143 @@
+"""Handlers and endpoints are matched one to one, and every mismatch is told at once."""
+
+from __future__ import annotations
+
+import pytest
+
+from lifecycle.errors import LifecycleError
+from lifecycle.manifest.diagnostics import Position
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.node.handlers import match, on_action, on_message, on_service, on_timer
+from lifecycle.plan.model import PlannedEndpoint
+
+AT = Position(file="robot.lifecycle.yaml", line=3, column=1)
+
+
+def endpoint(kind: EndpointKind, name: str) -> PlannedEndpoint:
+    return PlannedEndpoint(kind=kind, name=name, resolved=f"/{name}", type="", qos=None, at=AT)
+
+
+SCAN = endpoint(EndpointKind.SUBSCRIPTION, "scan")
+RESET = endpoint(EndpointKind.SERVICE_SERVER, "reset")
+DOCK = endpoint(EndpointKind.ACTION_SERVER, "dock")
+VIDEO = endpoint(EndpointKind.PUBLISHER, "video")
+
+
+class Base:
+    @on_message("scan")
+    def see(self, message: object) -> None: ...
+
+    @on_service("reset")
+    def reset(self, request: object, response: object) -> None: ...
+
+    @on_action("dock")
+    def dock(self, goal: object) -> None: ...
+
+    @on_timer(period_s=0.5)
+    def tick(self) -> None: ...
+
+
+def test_each_endpoint_finds_its_method() -> None:
+    handlers = match(Base, [SCAN, RESET, DOCK, VIDEO], node="/base")
+    assert [handlers.method(each) for each in (SCAN, RESET, DOCK)] == ["see", "reset", "dock"]
+    assert [(timer.method, timer.period_s) for timer in handlers.timers] == [("tick", 0.5)]
+
+
+def test_an_override_without_the_decorator_still_handles() -> None:
+    class Special(Base):
+        def see(self, message: object) -> None: ...
+
+    assert match(Special, [SCAN, RESET, DOCK], node="/base").method(SCAN) == "see"
+
+
+def test_one_method_may_handle_two_subscriptions() -> None:
+    class Both:
+        @on_message("front")
+        @on_message("rear")
+        def see(self, message: object) -> None: ...
+
+    front = endpoint(EndpointKind.SUBSCRIPTION, "front")
+    rear = endpoint(EndpointKind.SUBSCRIPTION, "rear")
+    handlers = match(Both, [front, rear], node="/both")
+    assert [handlers.method(front), handlers.method(rear)] == ["see", "see"]
+
+
+def test_a_misspelt_handler_is_told_from_both_sides_with_the_nearest_spelling() -> None:
+    class Typo:
+        @on_message("scam")
+        def see(self, message: object) -> None: ...
+
+    with pytest.raises(LifecycleError) as error:
+        match(Typo, [SCAN], node="/base")
+    assert str(error.value).splitlines() == [
+        (
+            "cannot use handler Typo.see: @on_message('scam') names no subscription that /base "
+            "declares; did you mean 'scan'? declared: 'scan'"
+        ),
+        (
+            "cannot serve subscription 'scan' of /base: no method of Typo is decorated with "
+            "@on_message('scan'); did you mean it where @on_message('scam') stands?"
+        ),
+    ]
+
+
+def test_endpoints_without_handlers_are_all_told_at_once() -> None:
+    class Nothing: ...
+
+    with pytest.raises(LifecycleError) as error:
+        match(Nothing, [SCAN, RESET, DOCK, VIDEO], node="/base")
+    assert str(error.value).splitlines() == [
+        (
+            "cannot serve subscription 'scan' of /base: no method of Nothing is decorated with "
+            "@on_message('scan')"
+        ),
+        (
+            "cannot serve service server 'reset' of /base: no method of Nothing is decorated with "
+            "@on_service('reset')"
+        ),
+        (
+            "cannot serve action server 'dock' of /base: no method of Nothing is decorated with "
+            "@on_action('dock')"
+        ),
+    ]
+
+
+def test_a_handler_of_another_kind_does_not_count() -> None:
+    class Wrong:
+        @on_service("scan")
+        def see(self, request: object, response: object) -> None: ...
+
+    with pytest.raises(LifecycleError) as error:
+        match(Wrong, [SCAN], node="/base")
+    assert str(error.value).splitlines() == [
+        (
+            "cannot use handler Wrong.see: @on_service('scan') names no service server that /base "
+            "declares; declared: none"
+        ),
+        (
+            "cannot serve subscription 'scan' of /base: no method of Wrong is decorated with "
+            "@on_message('scan')"
+        ),
+    ]
+
+
+def test_two_handlers_for_one_subscription_are_an_error() -> None:
+    class Twice:
+        @on_message("scan")
+        def first(self, message: object) -> None: ...
+
+        @on_message("scan")
+        def second(self, message: object) -> None: ...
+
+    with pytest.raises(LifecycleError) as error:
+        match(Twice, [SCAN], node="/base")
+    assert str(error.value) == (
+        "cannot handle subscription 'scan' of /base twice: Twice.first and Twice.second"
+    )
+
+
+@pytest.mark.parametrize("period_s", [0, -1.0, float("nan")])
+def test_a_timer_needs_a_positive_period(period_s: float) -> None:
+    with pytest.raises(LifecycleError) as error:
+        on_timer(period_s=period_s)
+    assert str(error.value) == f"cannot call a method every {period_s!r} s; period_s must be > 0"

@@ -1,0 +1,114 @@
+"""Who is told of connections and of the configuration, when, and how often."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from lifecycle.node.changes import ConfigurationChanges
+from lifecycle.node.connection_events import (
+    ConnectionEvent,
+    ConnectionEventKind,
+    ConnectionEvents,
+)
+
+NET = ConnectionEvent(kind=ConnectionEventKind.CONNECTION_ESTABLISHED, connection="net")
+LOST = ConnectionEvent(kind=ConnectionEventKind.CONNECTION_LOST, connection="net")
+
+
+def unexpected(trace: str) -> None:
+    raise AssertionError(trace)
+
+
+class Executor:
+    """Runs what it is given when it is told to."""
+
+    def __init__(self, *, is_spun: bool = True) -> None:
+        self.is_spun = is_spun
+        self.tasks: list[Callable[[], Any]] = []
+
+    def later(self, task: Callable[[], Any]) -> bool:
+        if self.is_spun:
+            self.tasks.append(task)
+        return self.is_spun
+
+    def turn(self) -> None:
+        while self.tasks:
+            returned = self.tasks.pop(0)()
+            if returned is not None:
+                for _ in returned.__await__():
+                    raise AssertionError("the listeners of these tests do not wait")
+
+
+def test_events_come_in_order_in_one_turn_and_to_sync_and_async_listeners() -> None:
+    executor = Executor()
+    events = ConnectionEvents(executor.later)
+    heard: list[tuple[str, ConnectionEvent]] = []
+
+    async def listen(event: ConnectionEvent) -> None:
+        heard.append(("async", event))
+
+    events.listen(lambda event: heard.append(("sync", event)))
+    remove = events.listen(listen)
+    events.tell(NET)
+    events.tell(LOST)
+    assert heard == []
+    assert len(executor.tasks) == 1
+    executor.turn()
+    assert [event for kind, event in heard if kind == "sync"] == [NET, LOST]
+    assert [event for kind, event in heard if kind == "async"] == [NET, LOST]
+    remove()
+    events.tell(NET)
+    executor.turn()
+    assert [kind for kind, _ in heard[4:]] == ["sync"]
+
+
+def test_an_event_before_the_node_is_spun_is_told_with_the_first_one_after() -> None:
+    executor = Executor(is_spun=False)
+    events = ConnectionEvents(executor.later)
+    heard: list[ConnectionEvent] = []
+    events.listen(heard.append)
+    events.tell(NET)
+    executor.is_spun = True
+    events.tell(LOST)
+    executor.turn()
+    assert heard == [NET, LOST]
+
+
+def test_many_changes_of_one_turn_are_one_notice_and_are_collected_once() -> None:
+    executor = Executor()
+    collected: list[Any] = []
+    heard: list[Any] = []
+
+    def collect() -> Any:
+        collected.append(object())
+        return collected[-1]
+
+    changes = ConfigurationChanges(executor.later, collect, failed=unexpected)
+    changes.touch()
+    assert executor.tasks == []  # nobody listens, so nothing is collected
+    changes.listen(heard.append)
+    changes.touch()
+    changes.touch()
+    executor.turn()
+    assert heard == collected
+    assert len(collected) == 1
+    changes.touch()
+    executor.turn()
+    assert len(heard) == 2
+
+
+def test_a_node_that_cannot_be_described_tells_the_log_and_nobody_else() -> None:
+    executor = Executor()
+    log: list[str] = []
+    heard: list[Any] = []
+
+    def collect() -> Any:
+        raise OSError("no such file")
+
+    changes = ConfigurationChanges(executor.later, collect, failed=log.append)
+    changes.listen(heard.append)
+    changes.touch()
+    executor.turn()
+    assert heard == []
+    assert log[0].endswith("OSError: no such file\n")

@@ -1,0 +1,124 @@
+"""What counts as hanging: callbacks do, transitions do not."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from lifecycle.node.machine import NodeState
+from lifecycle.node.watchdog import Watchdog
+
+
+class Sign:
+    """A busy sign that remembers."""
+
+    def __init__(self) -> None:
+        self.busy = False
+        self.overlong: float | None = None
+
+    def begin(self) -> None:
+        self.busy = True
+
+    def end(self) -> float | None:
+        was, self.busy = self.busy, False
+        return self.overlong if was else None
+
+
+@dataclasses.dataclass
+class Managed:
+    full_name: str
+    state: NodeState = NodeState.UNCONFIGURED
+    listener: Callable[[Any], None] = lambda _: None
+
+    def add_listener(self, listener: Callable[[Any], None]) -> None:
+        self.listener = listener
+
+
+class Node:
+    def __init__(self, name: str) -> None:
+        self.lifecycle = Managed(name)
+
+    def become(self, state: NodeState) -> None:
+        self.lifecycle.state = state
+        self.lifecycle.listener(self)
+
+
+@pytest.fixture
+def sign() -> Sign:
+    return Sign()
+
+
+@pytest.fixture
+def overlong() -> list[float]:
+    return []
+
+
+@pytest.fixture
+def dog(sign: Sign, overlong: list[float]) -> Watchdog:
+    return Watchdog(sign, overlong.append)  # type: ignore[arg-type]
+
+
+def added(dog: Watchdog, name: str) -> Node:
+    node = Node(name)
+    dog.add(node)  # type: ignore[arg-type]
+    return node
+
+
+def test_the_sign_says_busy_exactly_while_a_callback_runs(dog: Watchdog, sign: Sign) -> None:
+    dog.begin()
+    assert sign.busy
+    dog.end()
+    assert not sign.busy
+
+
+def test_a_transition_inside_a_callback_is_not_held_against_it(dog: Watchdog, sign: Sign) -> None:
+    node = added(dog, "/camera")
+    dog.begin()
+    node.become(NodeState.CONFIGURING)
+    assert not sign.busy
+    node.become(NodeState.INACTIVE_DISCONNECTED)
+    assert sign.busy  # what comes after it in the same callback is
+
+
+def test_callbacks_are_not_watched_while_an_async_transition_is_under_way(
+    dog: Watchdog, sign: Sign
+) -> None:
+    node = added(dog, "/camera")
+    dog.begin()
+    node.become(NodeState.CONFIGURING)
+    dog.end()
+    dog.begin()
+    assert not sign.busy
+    node.become(NodeState.INACTIVE_DISCONNECTED)
+    dog.end()
+    dog.begin()
+    assert sign.busy
+
+
+def test_of_two_transitions_both_must_end(dog: Watchdog, sign: Sign) -> None:
+    one, other = added(dog, "/one"), added(dog, "/other")
+    dog.begin()
+    one.become(NodeState.CONFIGURING)
+    other.become(NodeState.CONFIGURING)
+    one.become(NodeState.INACTIVE_DISCONNECTED)
+    assert not sign.busy
+    other.become(NodeState.INACTIVE_DISCONNECTED)
+    assert sign.busy
+
+
+def test_a_callback_that_came_back_late_is_told(
+    dog: Watchdog, sign: Sign, overlong: list[float]
+) -> None:
+    sign.overlong = 1.5
+    dog.begin()
+    dog.end()
+    assert overlong == [1.5]
+
+
+def test_a_callback_in_time_is_not_told(dog: Watchdog, overlong: list[float]) -> None:
+    dog.begin()
+    dog.end()
+    assert overlong == []

@@ -1,0 +1,157 @@
+"""Manifests made by hand, for tests that need no YAML."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+
+from lifecycle.manifest.diagnostics import Position
+from lifecycle.manifest.model import (
+    After,
+    Condition,
+    Discovery,
+    Endpoint,
+    EndpointKind,
+    FlowNeed,
+    Interface,
+    Link,
+    Machine,
+    Manifest,
+    Node,
+    Run,
+    RunKind,
+    UniqueHow,
+)
+from lifecycle.manifest.qos import QosProfile, Reliability
+from lifecycle.network.nfe import UniqueRequirement
+from lifecycle.plan import Plan, build_plan
+
+FILE = "robot.lifecycle.yaml"
+IMAGE = "sensor_msgs/msg/CompressedImage"
+STRING = "std_msgs/msg/String"
+BEST_EFFORT = QosProfile(depth=1, reliability=Reliability.BEST_EFFORT)
+
+
+def at(line: int, column: int = 1) -> Position:
+    """A position in the sample file."""
+    return Position(file=FILE, line=line, column=column)
+
+
+def endpoint(
+    kind: EndpointKind,
+    name: str,
+    type_: str = STRING,
+    qos: QosProfile | None = QosProfile(),  # noqa: B008 - frozen
+    line: int = 10,
+) -> Endpoint:
+    """One declared endpoint."""
+    return Endpoint(kind=kind, name=name, type=type_, qos=qos, at=at(line, 9))
+
+
+def publisher(name: str, type_: str = STRING, **rest: object) -> Endpoint:
+    """One declared publisher."""
+    return endpoint(EndpointKind.PUBLISHER, name, type_, **rest)
+
+
+def subscription(name: str, type_: str = STRING, **rest: object) -> Endpoint:
+    """One declared subscription."""
+    return endpoint(EndpointKind.SUBSCRIPTION, name, type_, **rest)
+
+
+def need(
+    kind: EndpointKind,
+    name: str,
+    unique: UniqueRequirement = UniqueRequirement.NOT_REQUIRED,
+    **rest: object,
+) -> FlowNeed:
+    """One flow need."""
+    return FlowNeed(kind=kind, name=name, unique=unique, at=at(20), **rest)
+
+
+def node(
+    key: str,
+    *endpoints: Endpoint,
+    needs: Iterable[FlowNeed] = (),
+    after: Iterable[tuple[str, Condition]] = (),
+    run: Run = Run(kind=RunKind.PYTHON, python="robot:Node"),  # noqa: B008 - frozen
+    namespace: str = "/",
+    machine: str = "",
+    **rest: object,
+) -> Node:
+    """One node; python by default."""
+    return Node(
+        key=key,
+        name=str(rest.pop("name", key)),
+        namespace=namespace,
+        machine=machine,
+        run=run,
+        interface=Interface(endpoints=endpoints),
+        flows=tuple(needs),
+        after=tuple(After(node=other, condition=when, at=at(30, 5)) for other, when in after),
+        at=at(3, 3),
+        **rest,
+    )
+
+
+def link(topic: str, from_node: str, to_node: str, **rest: object) -> Link:
+    """One link."""
+    return Link(topic=topic, from_node=from_node, to_node=to_node, at=at(40), **rest)
+
+
+def manifest(*nodes: Node, links: Iterable[Link] = (), **rest: object) -> Manifest:
+    """One system."""
+    return Manifest(path=FILE, system="robot", nodes=nodes, links=tuple(links), **rest)
+
+
+def planned(*nodes: Node, links: Iterable[Link] = (), **rest: object) -> Plan:
+    """The plan of these nodes in an empty environment."""
+    return build_plan(manifest(*nodes, links=links, **rest), environment={})
+
+
+def teleop() -> Manifest:
+    """The article's example, a battery beside it, a service and an action."""
+    strictly = UniqueRequirement.STRICTLY_REQUIRED
+    machines = (
+        Machine(name="robot", address="10.77.0.1", at=at(2)),
+        Machine(name="operator", address="10.77.0.2", at=at(2)),
+    )
+    camera = node(
+        "camera",
+        publisher("video", IMAGE, qos=BEST_EFFORT, line=11),
+        publisher("battery", "sensor_msgs/msg/BatteryState", line=12),
+        publisher("status", line=13),
+        endpoint(EndpointKind.SERVICE_SERVER, "~/calibrate", "std_srvs/srv/Trigger", line=14),
+        endpoint(EndpointKind.ACTION_SERVER, "dock", "robot/action/Dock", None, line=15),
+        needs=(
+            need(EndpointKind.PUBLISHER, "video", strictly, dscp=46, five_qi=85),
+            need(EndpointKind.PUBLISHER, "battery", dscp=8),
+        ),
+        namespace="/robot",
+        machine="robot",
+    )
+    viewer = node(
+        "viewer",
+        subscription("/robot/video", IMAGE, qos=BEST_EFFORT, line=16),
+        subscription("/robot/battery", "sensor_msgs/msg/BatteryState", line=17),
+        subscription("/robot/status", line=18),
+        endpoint(
+            EndpointKind.SERVICE_CLIENT, "/robot/camera/calibrate", "std_srvs/srv/Trigger", line=19
+        ),
+        endpoint(EndpointKind.ACTION_CLIENT, "/robot/dock", "robot/action/Dock", None, line=20),
+        needs=(need(EndpointKind.SUBSCRIPTION, "/robot/video", strictly),),
+        after=(("camera", Condition.CONFIGURED),),
+        machine="operator",
+    )
+    return dataclasses.replace(
+        manifest(
+            camera,
+            viewer,
+            links=(
+                link(
+                    "/robot/video", "camera", "viewer", unique=UniqueHow.STRONGLY, max_delay_ms=5.0
+                ),
+            ),
+        ),
+        machines=machines,
+        discovery=Discovery(domain_id=7),
+    )

@@ -1,0 +1,164 @@
+"""Manifest in, plan out."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import jsonschema
+import pytest
+
+from lifecycle import codec
+from lifecycle.errors import ExitCode, UsageError
+from lifecycle.manifest.model import Discovery, DiscoveryRange, EndpointKind, Run, RunKind
+from lifecycle.network.nfe import UniqueRequirement
+from lifecycle.plan import Plan, build_plan, model
+from tests.unit.plan.samples import (
+    endpoint,
+    manifest,
+    node,
+    planned,
+    publisher,
+    subscription,
+    teleop,
+)
+
+SCHEMA = Path(__file__).parents[3] / "schemas" / "plan.v1.schema.json"
+
+
+def test_names_are_resolved_by_namespace_private_mark_and_remap():
+    plan = planned(
+        node(
+            "camera",
+            publisher("video"),
+            publisher("~/raw"),
+            publisher("/absolute"),
+            publisher("chatter"),
+            endpoint(EndpointKind.SERVICE_SERVER, "~/calibrate", "std_srvs/srv/Trigger"),
+            namespace="/robot",
+            remap=(("chatter", "/talk"),),
+        )
+    )
+    assert [each.resolved for each in plan.nodes[0].endpoints] == [
+        "/robot/video",
+        "/robot/camera/raw",
+        "/absolute",
+        "/talk",
+        "/robot/camera/calibrate",
+    ]
+
+
+def test_needs_go_to_the_endpoint_that_they_name():
+    video, battery, status, *_ = build_plan(teleop(), environment={}).nodes[0].endpoints
+    strictly = UniqueRequirement.STRICTLY_REQUIRED
+    assert (video.unique, video.dscp, video.five_qi, video.participant) == (
+        strictly,
+        46,
+        85,
+        "_camera_flow_0",
+    )
+    assert (battery.unique, battery.dscp, battery.participant) == (
+        UniqueRequirement.NOT_REQUIRED,
+        8,
+        "_camera_flow_1",
+    )
+    assert (status.dscp, status.participant) == (None, "")
+
+
+@pytest.mark.parametrize("kind", [RunKind.COMMAND, RunKind.ATTACH])
+def test_a_node_that_others_make_is_given_no_participants(kind: RunKind):
+    sample = teleop()
+    camera = dataclasses.replace(sample.nodes[0], run=Run(kind=kind, command=("camera",)))
+    plan = build_plan(dataclasses.replace(sample, nodes=(camera, sample.nodes[1])), environment={})
+    assert plan.nodes[0].participants == ()
+    assert {each.participant for each in plan.nodes[0].endpoints} == {""}
+
+
+@pytest.mark.parametrize(
+    ("declared", "environment", "expected"),
+    [
+        (7, {"ROS_DOMAIN_ID": "9"}, 7),
+        (0, {"ROS_DOMAIN_ID": "9"}, 0),
+        (None, {"ROS_DOMAIN_ID": "9"}, 9),
+        (None, {"ROS_DOMAIN_ID": ""}, 0),
+        (None, {}, 0),
+    ],
+)
+def test_the_domain_is_the_manifests_else_the_environments_else_zero(
+    declared, environment, expected
+):
+    plan = build_plan(manifest(discovery=Discovery(domain_id=declared)), environment=environment)
+    assert plan.domain_id == expected
+
+
+@pytest.mark.parametrize("text", ["233", "-1", "seven", "1.0", "٣"])
+def test_an_illegal_domain_in_the_environment_is_refused(text: str):
+    with pytest.raises(UsageError) as error:
+        build_plan(manifest(), environment={"ROS_DOMAIN_ID": text})
+    assert str(error.value) == (
+        f"cannot use ROS_DOMAIN_ID={text!r}: a domain is a number from 0 to 232;"
+        " unset it, or set discovery.domain_id in the manifest"
+    )
+
+
+@pytest.mark.parametrize(
+    ("declared", "environment", "expected"),
+    [
+        (DiscoveryRange.SUBNET, {"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF"}, DiscoveryRange.SUBNET),
+        (
+            DiscoveryRange.SYSTEM_DEFAULT,
+            {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"},
+            DiscoveryRange.LOCALHOST,
+        ),
+        (DiscoveryRange.SYSTEM_DEFAULT, {}, DiscoveryRange.SYSTEM_DEFAULT),
+    ],
+)
+def test_the_discovery_range_is_the_manifests_else_the_environments(
+    declared, environment, expected
+):
+    plan = build_plan(manifest(discovery=Discovery(range=declared)), environment=environment)
+    assert plan.discovery_range is expected
+
+
+def test_an_illegal_discovery_range_in_the_environment_is_refused():
+    with pytest.raises(UsageError) as error:
+        build_plan(manifest(), environment={"ROS_AUTOMATIC_DISCOVERY_RANGE": "here"})
+    assert str(error.value) == (
+        "cannot use ROS_AUTOMATIC_DISCOVERY_RANGE='here': it must be one of SUBNET, LOCALHOST, OFF,"
+        " SYSTEM_DEFAULT; unset it, or set discovery.range in the manifest"
+    )
+    assert error.value.exit_code is ExitCode.USAGE
+
+
+def test_this_process_environment_is_read_when_none_is_given(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("ROS_DOMAIN_ID", "17")
+    assert build_plan(manifest()).domain_id == 17
+
+
+def test_the_same_manifest_gives_the_same_plan():
+    assert build_plan(teleop(), environment={}) == build_plan(teleop(), environment={})
+
+
+def test_a_plan_survives_json_and_fits_its_schema():
+    plan = build_plan(teleop(), environment={})
+    text = codec.to_json(plan)
+    assert codec.from_json(text, Plan) == plan
+    document = json.loads(text)
+    validator = jsonschema.Draft202012Validator(json.loads(SCHEMA.read_text(encoding="utf-8")))
+    validator.validate(document)
+    with pytest.raises(jsonschema.ValidationError):
+        validator.validate({**document, "colour": "red"})
+
+
+def test_the_schema_names_exactly_the_fields_of_the_plan():
+    document = json.loads(SCHEMA.read_text(encoding="utf-8"))
+    assert set(document["properties"]) == {each.name for each in dataclasses.fields(Plan)}
+    for name, definition in document["$defs"].items():
+        if name.startswith("Planned"):
+            fields = {each.name for each in dataclasses.fields(getattr(model, name))}
+            assert set(definition["properties"]) == fields
+
+
+def test_a_subscription_alone_makes_no_flow():
+    assert planned(node("one", subscription("a"))).flows == ()

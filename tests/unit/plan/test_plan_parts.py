@@ -1,0 +1,395 @@
+"""Levels, participants, processes, command lines and flows, each alone."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from pathlib import Path
+
+import pytest
+import yaml
+
+from lifecycle.errors import ExitCode
+from lifecycle.manifest.model import (
+    Condition,
+    DiscoveryRange,
+    EndpointKind,
+    Run,
+    RunKind,
+    UniqueHow,
+)
+from lifecycle.network.nfe import UniqueRequirement
+from lifecycle.plan import PlanError, owner_of, participants_cost
+from lifecycle.plan.command import command_line, parameter_text
+from lifecycle.plan.levels import dependency_levels
+from lifecycle.plan.processes import planned_processes
+from tests.unit.plan.samples import link, need, node, planned, publisher, subscription
+
+PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
+STRICTLY = UniqueRequirement.STRICTLY_REQUIRED
+OPTIONALLY = UniqueRequirement.OPTIONALLY_REQUIRED
+
+
+# --- levels
+
+
+def after(*keys: str) -> list[tuple[str, Condition]]:
+    return [(key, Condition.CONFIGURED) for key in keys]
+
+
+LEVELS = {
+    "nobody": ([], ()),
+    "nobody waits": ([node("b"), node("a")], (("b", "a"),)),
+    "a chain written backwards": (
+        [node("c", after=after("b")), node("b", after=after("a")), node("a")],
+        (("a",), ("b",), ("c",)),
+    ),
+    "the longest path counts": (
+        [
+            node("d", after=after("a", "c")),
+            node("a"),
+            node("b", after=after("a")),
+            node("c", after=after("b")),
+            node("e", after=after("a")),
+        ],
+        (("a",), ("b", "e"), ("c",), ("d",)),
+    ),
+}
+
+
+@pytest.mark.parametrize("case", LEVELS)
+def test_a_node_stands_one_level_below_the_last_one_it_waits_for(case: str):
+    nodes, expected = LEVELS[case]
+    assert dependency_levels(nodes) == expected
+
+
+def test_a_thousand_nodes_in_a_row_are_no_problem():
+    nodes = [node(f"n{i}", after=after(f"n{i + 1}")) for i in range(1000)] + [node("n1000")]
+    assert len(dependency_levels(nodes)) == 1001
+
+
+def test_a_cycle_is_shown_as_a_path():
+    nodes = [
+        node("x", after=after("a")),
+        node("a", after=after("b")),
+        node("b", after=after("c")),
+        node("c", after=after("a")),
+    ]
+    with pytest.raises(PlanError) as error:
+        dependency_levels(nodes)
+    assert str(error.value) == (
+        "robot.lifecycle.yaml:30:5: cannot order the nodes: they wait for each other, a → b → c → a"
+    )
+
+
+def test_waiting_for_nobody_known_is_refused():
+    with pytest.raises(PlanError) as error:
+        dependency_levels([node("a", after=after("ghost"))])
+    assert error.value.message == (
+        "cannot wait for node 'ghost': the manifest declares no such node"
+    )
+    assert error.value.exit_code is ExitCode.MANIFEST_INVALID
+
+
+# --- participants
+
+
+def participants(*needs):
+    names = list(dict.fromkeys(each.name for each in needs))
+    endpoints = [publisher(name) for name in (*names, "plain")]
+    (one,) = planned(node("camera", *endpoints, needs=needs)).nodes
+    return (
+        [(each.name, each.dscp, each.reason) for each in one.participants],
+        {each.name: each.participant for each in one.endpoints},
+    )
+
+
+def test_each_unique_publisher_gets_a_participant_of_its_own():
+    made, placed = participants(need(PUB, "a", STRICTLY), need(PUB, "b", OPTIONALLY, dscp=46))
+    assert made == [
+        ("_camera_flow_0", None, "unique publisher a"),
+        ("_camera_flow_1", 46, "unique publisher b marked EF = DSCP 46 = TOS 184 (0xb8)"),
+    ]
+    assert placed == {"a": "_camera_flow_0", "b": "_camera_flow_1", "plain": ""}
+
+
+def test_publishers_that_only_need_a_dscp_share_a_participant_per_value():
+    made, placed = participants(
+        need(PUB, "a", dscp=46), need(PUB, "b", dscp=8), need(PUB, "c", dscp=46)
+    )
+    assert made == [
+        ("_camera_flow_0", 46, "publishers a, c marked EF = DSCP 46 = TOS 184 (0xb8)"),
+        ("_camera_flow_1", 8, "publisher b marked CS1 = DSCP 8 = TOS 32 (0x20)"),
+    ]
+    assert placed == {
+        "a": "_camera_flow_0",
+        "b": "_camera_flow_1",
+        "c": "_camera_flow_0",
+        "plain": "",
+    }
+
+
+def test_a_unique_publisher_does_not_share_even_with_its_own_dscp():
+    made, _ = participants(need(PUB, "a", dscp=46), need(PUB, "b", STRICTLY, dscp=46))
+    assert [name for name, _, _ in made] == ["_camera_flow_0", "_camera_flow_1"]
+
+
+@pytest.mark.parametrize(
+    "unique", [UniqueRequirement.NOT_REQUIRED, UniqueRequirement.SYSTEM_DEFAULT]
+)
+def test_a_publisher_that_asks_for_nothing_gets_nothing(unique: UniqueRequirement):
+    assert participants(need(PUB, "a", unique)) == ([], {"a": "", "plain": ""})
+
+
+def test_a_unique_subscription_needs_no_participant():
+    (one,) = planned(node("v", subscription("a"), needs=[need(SUB, "a", STRICTLY)])).nodes
+    assert one.participants == ()
+
+
+@pytest.mark.parametrize(
+    ("name", "owner"),
+    [
+        ("/robot/_camera_flow_0", "/robot/camera"),
+        ("/_camera_flow_12", "/camera"),
+        ("/__hidden_flow_1", "/_hidden"),
+        ("/_a_flow_b_flow_3", "/a_flow_b"),
+        ("/robot/camera", ""),
+        ("/camera_flow_0", ""),
+        ("/___flow_0", "/_"),
+        ("/__flow_0", ""),
+        ("/_flow_0", ""),
+        ("/_camera_flow_x", ""),
+        ("", ""),
+    ],
+)
+def test_a_hidden_participant_tells_its_owner(name: str, owner: str):
+    assert owner_of(name) == owner
+
+
+def test_cost_grows_with_the_number_of_participants():
+    cost = participants_cost(4)
+    assert (cost.rss_mb, cost.threads, cost.sockets, cost.start_ms) == (10.0, 28, 24, (24, 40))
+
+
+# --- processes
+
+
+def processes(*nodes, environment=None):
+    return planned_processes(
+        nodes,
+        domain_id=7,
+        discovery_range=DiscoveryRange.LOCALHOST,
+        environment=environment or {},
+    )
+
+
+def test_a_process_is_named_by_its_node_or_as_declared():
+    found = processes(node("a"), node("b", process="shared"), node("c", process="shared"))
+    assert [(each.name, each.nodes) for each in found] == [("a", ("a",)), ("shared", ("b", "c"))]
+
+
+def test_a_process_is_told_its_domain_its_range_and_its_nodes_variables():
+    run = Run(kind=RunKind.PYTHON, python="m:C", environment=(("A", "1"), ("ROS_DOMAIN_ID", "9")))
+    (found,) = processes(node("a", run=run))
+    assert found.environment == (
+        ("ROS_DOMAIN_ID", "9"),
+        ("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST"),
+        ("A", "1"),
+    )
+
+
+COMMAND = Run(kind=RunKind.COMMAND, command=("talker",))
+DISAGREE = {
+    "machines": (
+        (node("a", process="p", machine="m"), node("b", process="p", machine="n")),
+        "they stand on machines 'm' and 'n'",
+    ),
+    "kinds": (
+        (node("a", process="p"), node("b", process="p", run=COMMAND)),
+        "one is run by python, the other by command",
+    ),
+    "commands": (
+        (node("a", process="p", run=COMMAND), node("b", process="p", run=COMMAND)),
+        "a command is a process of its own; only python nodes share one",
+    ),
+    "folders": (
+        (
+            node("a", process="p"),
+            node(
+                "b",
+                process="p",
+                run=Run(kind=RunKind.PYTHON, python="m:C", working_directory="/tmp"),
+            ),
+        ),
+        "they want working directories '' and '/tmp'",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", DISAGREE)
+def test_nodes_that_disagree_cannot_share_a_process(case: str):
+    nodes, reason = DISAGREE[case]
+    with pytest.raises(PlanError) as error:
+        processes(*nodes)
+    assert error.value.message == (f"cannot put nodes 'a' and 'b' into one process 'p': {reason}")
+
+
+def test_nodes_of_one_process_must_agree_on_a_variable():
+    def run(value: str) -> Run:
+        return Run(kind=RunKind.PYTHON, python="m:C", environment=(("A", value),))
+
+    with pytest.raises(PlanError) as error:
+        processes(node("a", process="p", run=run("1")), node("b", process="p", run=run("2")))
+    assert error.value.message == (
+        "cannot set A of process 'p' to '2' for node 'b': node 'a' sets it to '1'"
+    )
+
+
+# --- command lines
+
+
+def test_a_command_gets_its_name_remaps_parameters_and_log_level_as_ros_spells_them():
+    one = node(
+        "talker",
+        run=Run(kind=RunKind.COMMAND, command=("/opt/talker", "--fast")),
+        namespace="/robot",
+        remap=(("chatter", "/talk"),),
+        parameters=(("rate", 2.0), ("name", "1")),
+        parameter_files=("/etc/talker.yaml",),
+        log_level="debug",
+    )
+    assert shlex.join(command_line(one, {})) == (
+        "/opt/talker --fast --ros-args -r __node:=talker -r __ns:=/robot -r chatter:=/talk"
+        " --params-file /etc/talker.yaml -p rate:=2.0 -p 'name:=\"1\"' --log-level debug"
+    )
+
+
+def test_python_and_attached_nodes_have_no_argv():
+    found = processes(node("a"), node("b", run=Run(kind=RunKind.ATTACH)))
+    assert [each.argv for each in found] == [(), ()]
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (True, "true"),
+        (7, "7"),
+        (7.0, "7.0"),
+        (1e30, "1e+30"),
+        (math.inf, ".inf"),
+        (-math.inf, "-.inf"),
+        ("true", '"true"'),
+        ('a "b"\nc', '"a \\"b\\"\\nc"'),
+        (("a", "1"), '["a", "1"]'),
+        ((1.5, 2.0), "[1.5, 2.0]"),
+        ((True, False), "[true, false]"),
+    ],
+)
+def test_a_parameter_keeps_its_type(value, text: str):
+    assert parameter_text(value) == text
+    read = yaml.safe_load(text) if value != 1e30 else float(text)  # PyYAML wants 1.0e+30
+    assert read == (list(value) if isinstance(value, tuple) else value)
+    assert type(read) is (list if isinstance(value, tuple) else type(value))
+
+
+def test_not_a_number_is_written_as_yaml_does():
+    assert math.isnan(yaml.safe_load(parameter_text(math.nan)))
+
+
+def executable(prefix: Path, package: str, name: str) -> Path:
+    path = prefix / "lib" / package / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("#!/bin/sh\n")
+    path.chmod(0o755)
+    return path
+
+
+def packaged(name: str = "talker"):
+    return node("t", run=Run(kind=RunKind.COMMAND, package="demo", executable=name))
+
+
+def test_an_executable_is_found_under_the_first_prefix_that_has_it(tmp_path: Path):
+    executable(tmp_path / "three", "demo", "talker")
+    found = executable(tmp_path / "two", "demo", "talker")
+    prefixes = ":".join(str(tmp_path / each) for each in ("one", "two", "three"))
+    assert command_line(packaged(), {"AMENT_PREFIX_PATH": prefixes})[0] == str(found)
+
+
+def test_a_file_that_may_not_be_executed_is_not_found(tmp_path: Path):
+    executable(tmp_path, "demo", "talker").chmod(0o644)
+    executable(tmp_path, "demo", "listener")
+    with pytest.raises(PlanError) as error:
+        command_line(packaged(), {"AMENT_PREFIX_PATH": str(tmp_path)})
+    assert error.value.message == (
+        "cannot find executable 'talker' of package 'demo': the package has listener"
+    )
+
+
+def test_a_missing_package_says_where_it_was_looked_for():
+    with pytest.raises(PlanError) as error:
+        command_line(packaged(), {"AMENT_PREFIX_PATH": "/nowhere:/elsewhere"})
+    assert str(error.value) == (
+        "robot.lifecycle.yaml:3:3: cannot find executable 'talker' of package 'demo':"
+        " no lib/demo with executables under /nowhere, /elsewhere;"
+        " build and source its workspace, or correct the package name"
+    )
+
+
+def test_no_ament_environment_says_so():
+    with pytest.raises(PlanError) as error:
+        command_line(packaged(), {})
+    assert error.value.message == (
+        "cannot find executable 'talker' of package 'demo': AMENT_PREFIX_PATH is empty"
+    )
+
+
+# --- flows
+
+
+def pairs(plan):
+    return [(each.topic, each.publisher, each.subscription) for each in plan.flows]
+
+
+def test_every_publisher_is_paired_with_every_subscription_of_its_topic():
+    plan = planned(
+        node("a", publisher("x"), publisher("y")),
+        node("b", publisher("x"), subscription("x")),
+        node("c", subscription("x"), subscription("y"), subscription("z")),
+    )
+    assert pairs(plan) == [
+        ("/x", "a", "b"),
+        ("/x", "a", "c"),
+        ("/y", "a", "c"),
+        ("/x", "b", "b"),
+        ("/x", "b", "c"),
+    ]
+
+
+def test_two_endpoints_of_one_node_on_a_topic_are_one_flow():
+    plan = planned(node("a", publisher("x"), publisher("/x")), node("b", subscription("x")))
+    assert pairs(plan) == [("/x", "a", "b")]
+
+
+def test_links_add_up_to_the_strongest_demand():
+    plan = planned(
+        node("a", publisher("x")),
+        node("b", subscription("x")),
+        node("c", subscription("x")),
+        links=[
+            link("/x", "*", "*", unique=UniqueHow.WEAKLY, max_delay_ms=50.0),
+            link("/x", "a", "b", unique=UniqueHow.STRONGLY),
+            link("/x", "a", "*", max_delay_ms=5.0),
+            link("/x", "c", "*", max_delay_ms=1.0),
+            link("/y", "*", "*", max_delay_ms=1.0),
+        ],
+    )
+    assert [(each.unique, each.max_delay_ms, each.linked) for each in plan.flows] == [
+        (UniqueHow.STRONGLY, 5.0, True),
+        (UniqueHow.WEAKLY, 5.0, True),
+    ]
+
+
+def test_a_link_of_two_nodes_is_kept_though_they_declare_nothing():
+    plan = planned(node("a"), node("b"), links=[link("/x", "a", "b"), link("/x", "*", "b")])
+    assert pairs(plan) == [("/x", "a", "b")]
+    assert plan.flows[0].linked

@@ -1,0 +1,327 @@
+"""What people see of a plan, and the verb that shows it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from lifecycle.cli.verb_plan import command
+from lifecycle.manifest.model import (
+    Authority,
+    Condition,
+    DataLayer,
+    Discovery,
+    DiscoveryMode,
+    EndpointKind,
+    FlowTransport,
+    Machine,
+    Run,
+    RunKind,
+)
+from lifecycle.manifest.qos import PRESETS, History, Liveliness, QosProfile
+from lifecycle.plan import build_plan
+from lifecycle.plan.demand import demand
+from lifecycle.plan.render import render_text, spell_qos
+from lifecycle.plan.table import table
+from tests.unit.plan.samples import at, need, node, planned, publisher, subscription, teleop
+
+TELEOP = """\
+system robot: 2 nodes, 2 processes, 3 flows; domain 7, discovery range system_default
+
+processes
+  camera  robot     python  robot:Node
+  viewer  operator  python  robot:Node
+
+order
+  1.  camera
+  2.  viewer (after camera configured)
+
+nodes
+  /robot/camera (managed, process camera, machine robot, endpoints declared)
+    publisher       /robot/video             sensor_msgs/msg/CompressedImage
+        BEST_EFFORT VOLATILE KEEP_LAST(1); unique strictly_required; EF = DSCP 46 = TOS 184 (0xb8);
+        5QI 85; at most 5 ms; in _camera_flow_0
+    publisher       /robot/battery           sensor_msgs/msg/BatteryState
+        RELIABLE VOLATILE KEEP_LAST(10); CS1 = DSCP 8 = TOS 32 (0x20); in _camera_flow_1
+    publisher       /robot/status            std_msgs/msg/String
+        RELIABLE VOLATILE KEEP_LAST(10)
+    service server  /robot/camera/calibrate  std_srvs/srv/Trigger
+        RELIABLE VOLATILE KEEP_LAST(10)
+    action server   /robot/dock              robot/action/Dock
+  /viewer (managed, process viewer, machine operator, endpoints declared)
+    subscription    /robot/video             sensor_msgs/msg/CompressedImage
+        BEST_EFFORT VOLATILE KEEP_LAST(1); unique strictly_required
+    subscription    /robot/battery           sensor_msgs/msg/BatteryState
+        RELIABLE VOLATILE KEEP_LAST(10)
+    subscription    /robot/status            std_msgs/msg/String
+        RELIABLE VOLATILE KEEP_LAST(10)
+    service client  /robot/camera/calibrate  std_srvs/srv/Trigger
+        RELIABLE VOLATILE KEEP_LAST(10)
+    action client   /robot/dock              robot/action/Dock
+
+extra participants
+  /robot/_camera_flow_0  unique publisher video marked EF = DSCP 46 = TOS 184 (0xb8)
+  /robot/_camera_flow_1  publisher battery marked CS1 = DSCP 8 = TOS 32 (0x20)
+  cost
+    process camera  about 5 MB, 14 threads, 12 sockets, 12–20 ms to make
+    system          about 5 MB, 14 threads, 12 sockets, 12–20 ms to make; discovery between 6
+                    participants instead of 4, 18 pairs more
+  instead: 2 dedicated nodes in processes of their own, which cost more and break the node up, or
+  'flow_identification: dscp', for at most 64 publishers (docs/flows.md)
+
+middleware
+  rmw_fastrtps_cpp  unique subscription  supported: a UDP port of its own, the first free of
+                                         7000-7399 in every domain
+                    unique publisher     by us: a participant of its own; the RMW itself refuses
+                                         strictly_required on publishers and ignores
+                                         optionally_required
+                    DSCP                 by us: IP_TOS or IPV6_TCLASS on the sender sockets of a
+                                         participant of its own, read back; Fast DDS 2.14 has no
+                                         setting
+                    reading back         supported: publishers report their participant's sender
+                                         sockets; DSCP and flow label are always 0; shared memory
+                                         has no address
+
+flows
+  /robot/video    /robot/camera → /viewer  udpv4 (other host); strongly unique, at most 5 ms
+  /robot/battery  /robot/camera → /viewer  udpv4 (other host)
+  /robot/status   /robot/camera → /viewer  udpv4 (other host)
+
+notes
+  /robot/camera /robot/video
+      how large its messages get is unknown: declare 'max_message_size' to learn whether IP
+      fragments them, of which only the first has ports
+  /robot/camera /robot/battery
+      how large its messages get is unknown: declare 'max_message_size' to learn whether IP
+      fragments them, of which only the first has ports
+  every unique or marked flow
+      changes nothing by itself: each router and switch on the way needs a rule that uses it
+      (docs/flows.md)
+
+ports, if participants start in this order and none is taken
+  machine robot
+    0  supervisor             discovery 9160, user 9161
+    1  camera                 discovery 9162, user 9163
+    2  /robot/_camera_flow_0  discovery 9164, user 9165
+    3  /robot/_camera_flow_1  discovery 9166, user 9167
+  machine operator
+    0  supervisor  discovery 9160, user 9161
+    1  viewer      discovery 9162, user 9163
+    1 unique subscription: the first free of 7000–7399
+"""
+
+
+def test_a_plan_is_shown_whole():
+    assert render_text(build_plan(teleop(), environment={})) == TELEOP
+
+
+def test_a_wide_terminal_shows_each_endpoint_on_one_line():
+    lines = render_text(build_plan(teleop(), environment={}), width=220).splitlines()
+    (line,) = [each for each in lines if "publisher       /robot/battery" in each]
+    assert line.endswith(
+        "RELIABLE VOLATILE KEEP_LAST(10); CS1 = DSCP 8 = TOS 32 (0x20); in _camera_flow_1"
+    )
+
+
+@pytest.mark.parametrize("width", [60, 80, 100, 140])
+def test_lines_fit_where_words_allow_it(width: int):
+    lines = render_text(build_plan(teleop(), environment={}), width=width).splitlines()
+    long = [line for line in lines if len(line) > max(width, 86)]
+    assert long == []
+
+
+def test_a_command_is_shown_as_a_shell_would_take_it():
+    plan = planned(
+        node(
+            "talker",
+            publisher("chatter"),
+            run=Run(kind=RunKind.COMMAND, command=("talker", "a b")),
+            managed=False,
+            after=[("other", Condition.STARTED)],
+        ),
+        node("other", run=Run(kind=RunKind.ATTACH)),
+    )
+    lines = render_text(plan, width=140).splitlines()
+    assert "  talker  command  talker 'a b' --ros-args -r __node:=talker -r __ns:=/" in lines
+    assert "  other   attach   started by others" in lines
+    assert "  /talker (not managed, process talker, endpoints declared)" in lines
+
+
+def test_an_empty_system_is_one_line():
+    assert render_text(planned()) == (
+        "system robot: 0 nodes, 0 processes, 0 flows; domain 0, discovery range system_default\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("qos", "words"),
+    [
+        (PRESETS["sensor_data"], ["BEST_EFFORT VOLATILE KEEP_LAST(5)"]),
+        (QosProfile(history=History.KEEP_ALL, depth=0), ["RELIABLE VOLATILE KEEP_ALL"]),
+        (
+            QosProfile(
+                deadline_ns=100_000_000,
+                lifespan_ns=1_500_000,
+                liveliness=Liveliness.MANUAL_BY_TOPIC,
+                liveliness_lease_duration_ns=10**9,
+            ),
+            [
+                "RELIABLE VOLATILE KEEP_LAST(10)",
+                "deadline 100 ms",
+                "lifespan 1.5 ms",
+                "lease 1000 ms",
+                "liveliness MANUAL_BY_TOPIC",
+            ],
+        ),
+        (
+            PRESETS["best_available"],
+            [
+                "BEST_AVAILABLE BEST_AVAILABLE KEEP_LAST(10)",
+                "deadline BEST_AVAILABLE",
+                "lease BEST_AVAILABLE",
+                "liveliness BEST_AVAILABLE",
+            ],
+        ),
+    ],
+)
+def test_a_profile_is_spelled_in_one_line(qos: QosProfile, words: list[str]):
+    assert spell_qos(qos) == ", ".join(words)
+
+
+def test_a_table_aligns_wraps_its_last_cell_and_drops_empty_columns():
+    rows = [("a", "", "one two three four five six"), ("long", "", "x")]
+    assert table(rows, indent=2, width=34) == [
+        "  a     one two three four five",
+        "        six",
+        "  long  x",
+    ]
+    assert table([]) == []
+
+
+def test_participants_are_counted_machine_by_machine():
+    robot, operator = demand(build_plan(teleop(), environment={}))
+    assert [each.owner for each in robot.participants] == [
+        "supervisor",
+        "camera",
+        "/robot/_camera_flow_0",
+        "/robot/_camera_flow_1",
+    ]
+    assert (robot.unique_subscriptions, operator.unique_subscriptions) == (0, 1)
+    assert robot.participants[1].user_port == 7400 + 250 * 7 + 11 + 2
+
+
+def test_machines_without_an_address_are_this_host_and_share_its_ports():
+    machines = [Machine(name=name, at=at(2)) for name in ("robot", "operator")]
+    plan = planned(
+        node("a", machine="robot"), node("b", machine="operator"), machines=tuple(machines)
+    )
+    (host,) = demand(plan)
+    assert host.machine == "robot, operator"
+    assert [each.owner for each in host.participants] == ["supervisor", "a", "b"]
+
+
+def test_a_participant_beyond_the_last_port_is_shown_without_one():
+    nodes = [node(f"n{index}") for index in range(64)]
+    plan = planned(*nodes, discovery=Discovery(domain_id=232))
+    text = render_text(plan)
+    assert "    63  n62         no port left in this domain" in text.splitlines()
+
+
+# --- the verb
+
+
+MANIFEST = """\
+manifest_version: 1
+system: pair
+discovery: {domain_id: 3}
+nodes:
+  talker:
+    run: {python: "robot:Talker"}
+    interface:
+      publishers:
+        - {name: chatter, type: std_msgs/msg/String, qos: sensor_data}
+  listener:
+    run: {python: "robot:Listener"}
+    interface:
+      subscriptions:
+        - {name: chatter, type: std_msgs/msg/String, qos: sensor_data}
+"""
+
+
+def plan_verb(tmp_path: Path, *arguments: str):
+    path = tmp_path / "pair.lifecycle.yaml"
+    path.write_text(MANIFEST)
+    return CliRunner().invoke(command, [str(path), *arguments], standalone_mode=False)
+
+
+def test_the_verb_shows_text_and_exits_with_zero(tmp_path: Path):
+    result = plan_verb(tmp_path)
+    assert (result.exception, result.return_value) == (None, 0)
+    assert result.stdout.startswith("system pair: 2 nodes, 2 processes, 1 flow; domain 3,")
+
+
+def test_the_verb_shows_json(tmp_path: Path):
+    document = json.loads(plan_verb(tmp_path, "--format", "json").stdout)
+    assert [each["name"] for each in document["nodes"]] == ["talker", "listener"]
+
+
+@pytest.mark.parametrize(
+    ("format_", "start"),
+    [("mermaid", "flowchart"), ("dot", "digraph"), ("svg", "<svg"), ("html", "<!DOCTYPE html>")],
+)
+def test_the_verb_draws(tmp_path: Path, format_: str, start: str):
+    result = plan_verb(tmp_path, "--format", format_)
+    assert result.exception is None
+    assert start in result.stdout
+
+
+def test_connections_are_shown_with_their_urls_and_what_they_carry():
+    multicast = need(EndpointKind.PUBLISHER, "chatter", transport=FlowTransport.MULTICAST)
+    plan = planned(
+        node("talker", publisher("chatter"), needs=[multicast]),
+        node("listener", subscription("chatter")),
+        discovery=Discovery(domain_id=65),
+        data_layer=DataLayer(authority=Authority.SUPERVISOR, events=True),
+    )
+    text = render_text(plan)
+    group = "udpm://239.255.1.1:8910?ttl=0&interface=127.0.0.1"
+    assert (
+        """
+data layer
+  authority  supervisor, from the manifest; what is lost is made again
+"""
+        in text
+    )
+    assert (
+        f"""
+connections
+  /talker
+    own participant  as the RMW chooses
+    udpm_chatter     {group}
+                     carries publisher /chatter
+  /listener
+    own participant  as the RMW chooses
+    udpm_chatter     {group}
+                     carries subscription /chatter
+"""
+        in text
+    )
+    assert "/chatter  /talker → /listener  udpm (the publisher asks for it)\n" in text
+
+
+def test_a_discovery_server_is_shown_with_whoever_it_tells_everything():
+    plan = planned(
+        node("talker", publisher("chatter")),
+        node("listener", subscription("chatter")),
+        discovery=Discovery(domain_id=65, mode=DiscoveryMode.SERVER),
+    )
+    assert """
+data layer
+  discovery         server
+  discovery server  TCP 127.0.0.1:7910
+  observer          tcpv4://127.0.0.1:7914?server=127.0.0.1:7910
+                    is told of everything that the server knows
+""" in render_text(plan)

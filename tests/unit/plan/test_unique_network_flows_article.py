@@ -1,0 +1,359 @@
+"""The design article *Unique Network Flows* as the manifest, the planner and the verifier apply it.
+
+Definitions and identifiers are tested in tests/unit/network/test_nfe.py and test_flow.py, the table
+of 5QIs in test_five_qi.py; docs/flows.md lists every part of the article with its test.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from lifecycle.manifest.model import (
+    EndpointKind,
+    FlowIdentification,
+    Link,
+    Machine,
+    Manifest,
+    Network,
+    UniqueHow,
+)
+from lifecycle.manifest.semantics import check
+from lifecycle.network.nfe import (
+    InternetProtocol,
+    NetworkFlowEndpoint,
+    TransportProtocol,
+    UniqueRequirement,
+)
+from lifecycle.plan import PlanError, build_plan
+from lifecycle.plan.render import render_text
+from lifecycle.verify import Outcome, Stage, verify
+from tests.unit.plan.samples import at, link, manifest, need, node, publisher, subscription
+from tests.unit.verify.edits import change_report
+from tests.unit.verify.perfect import perfect
+
+PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
+NOT, STRICTLY, OPTIONALLY, DEFAULT = (
+    UniqueRequirement.NOT_REQUIRED,
+    UniqueRequirement.STRICTLY_REQUIRED,
+    UniqueRequirement.OPTIONALLY_REQUIRED,
+    UniqueRequirement.SYSTEM_DEFAULT,
+)
+EMPTY = "std_msgs/msg/Empty"
+
+
+def verdict_of(system: Manifest, *edits):
+    plan = build_plan(system, environment={})
+    seen = perfect(plan)
+    for edit in edits:
+        seen = edit(seen)
+    return verify(plan, seen, stage=Stage.CONNECTED)
+
+
+# --- the problem and its example
+
+
+def devices(*, unique: UniqueRequirement, links: list[Link]) -> Manifest:
+    """N1 on D1 publishes video (P1) and battery status (P2); N2 on D2 subscribes to both."""
+    return dataclasses.replace(
+        manifest(
+            node(
+                "n1",
+                publisher("video", EMPTY),
+                publisher("battery", EMPTY),
+                needs=[need(PUB, "video", unique)],
+                machine="d1",
+            ),
+            node(
+                "n2",
+                subscription("video", EMPTY),
+                subscription("battery", EMPTY),
+                needs=[need(SUB, "video", unique)],
+                machine="d2",
+            ),
+            links=links,
+        ),
+        machines=(
+            Machine(name="d1", address="10.0.0.1", at=at(1)),
+            Machine(name="d2", address="10.0.0.2", at=at(1)),
+        ),
+    )
+
+
+def test_the_example_without_a_requirement_has_one_flow_for_both_links():
+    video, battery = verdict_of(devices(unique=NOT, links=[])).flows
+    assert (video.source, video.destination) == (battery.source, battery.destination)
+    assert video.unique is battery.unique is UniqueHow.NOT
+
+
+def test_the_example_with_unique_flows_tells_p1_s1_from_p2_s2():
+    links = [link("/video", "n1", "n2", unique=UniqueHow.STRONGLY, max_delay_ms=5.0)]
+    verdict = verdict_of(devices(unique=STRICTLY, links=links))
+    video, battery = verdict.flows
+    assert (verdict.verdict, video.unique) == (Outcome.OK, UniqueHow.STRONGLY)
+    assert not set(video.source) & set(battery.source)
+    assert not set(video.destination) & set(battery.destination)
+
+
+def test_default_latency_for_both_or_low_latency_for_both_is_refused_as_the_link_is_not_unique():
+    links = [link("/video", "n1", "n2", unique=UniqueHow.WEAKLY, max_delay_ms=5.0)]
+    (found,) = check(devices(unique=NOT, links=links), environment={})
+    assert found.rule == "check.link-not-unique"
+
+
+# --- unique_network_flow_endpoints_requirement_t
+
+
+def one(requirement: UniqueRequirement) -> Manifest:
+    return manifest(
+        node(
+            "n",
+            publisher("a", EMPTY),
+            publisher("b", EMPTY),
+            subscription("c", EMPTY),
+            subscription("d", EMPTY),
+            needs=[need(PUB, "a", requirement), need(SUB, "c", requirement)],
+        )
+    )
+
+
+SHARED = (
+    change_report(PUB, "/a", nfes=()),
+    *(
+        change_report(
+            kind,
+            name,
+            nfes=(
+                NetworkFlowEndpoint(
+                    transport_protocol=TransportProtocol.UDP,
+                    internet_protocol=InternetProtocol.IPV4,
+                    transport_port=7411,
+                    internet_address="127.0.0.1",
+                ),
+            ),
+        )
+        for kind, name in ((PUB, "/a"), (PUB, "/b"), (SUB, "/c"), (SUB, "/d"))
+    ),
+)
+"""What an RMW would show that made nothing unique."""
+
+
+@pytest.mark.parametrize(
+    ("requirement", "participants", "rules"),
+    [
+        (NOT, 0, []),
+        (STRICTLY, 1, ["flow.not-unique", "flow.not-unique"]),
+        (OPTIONALLY, 1, []),
+        (DEFAULT, 0, []),
+    ],
+)
+def test_a_requirement_says_what_is_tried_and_what_may_fail(
+    requirement: UniqueRequirement, participants: int, rules: list[str]
+):
+    system = one(requirement)
+    plan = build_plan(system, environment={})
+    assert len(plan.nodes[0].participants) == participants
+    assert [each.rule for each in verdict_of(system).findings] == []
+    assert [each.rule for each in verdict_of(system, *SHARED).findings] == rules
+
+
+def test_unique_network_flow_endpoints_not_required_is_the_default():
+    (endpoint,) = build_plan(manifest(node("n", publisher("a"))), environment={}).nodes[0].endpoints
+    assert endpoint.unique is NOT
+
+
+def test_unique_network_flow_endpoints_system_default_reports_what_came_of_it():
+    system = manifest(
+        node("one", publisher("c", EMPTY)),
+        node(
+            "two",
+            subscription("c", EMPTY),
+            subscription("d", EMPTY),
+            needs=[need(SUB, "c", DEFAULT)],
+        ),
+    )
+    side_loaded = change_report(
+        SUB,
+        "/c",
+        nfes=(
+            NetworkFlowEndpoint(
+                transport_protocol=TransportProtocol.UDP,
+                internet_protocol=InternetProtocol.IPV4,
+                transport_port=7042,
+                internet_address="127.0.0.1",
+            ),
+        ),
+    )
+    (left_alone,) = verdict_of(system).flows
+    (loaded,) = verdict_of(system, side_loaded).flows
+    # The publisher is alone on its side, so what differs is the subscription.
+    assert (left_alone.unique, loaded.unique) == (UniqueHow.WEAKLY, UniqueHow.STRONGLY)
+    assert loaded.requirement == (NOT, DEFAULT)
+
+
+def test_the_article_s_snippet_of_sub_x_sub_y_and_pub_z():
+    system = manifest(
+        node(
+            "my_node",
+            subscription("topic_x", EMPTY),
+            subscription("topic_y", EMPTY),
+            publisher("topic_z", EMPTY),
+            needs=[need(SUB, "topic_x", STRICTLY), need(PUB, "topic_z", OPTIONALLY)],
+        )
+    )
+    plan = build_plan(system, environment={})
+    assert [(each.name, each.unique) for each in plan.nodes[0].endpoints] == [
+        ("topic_x", STRICTLY),
+        ("topic_y", NOT),
+        ("topic_z", OPTIONALLY),
+    ]
+    assert verdict_of(system).verdict is Outcome.OK
+
+
+# --- what an RMW may do: port, flow label, DSCP
+
+
+def test_candidate_unique_transport_port_is_what_the_planner_takes():
+    plan = build_plan(one(STRICTLY), environment={})
+    assert [each.reason for each in plan.nodes[0].participants] == ["unique publisher a"]
+    assert [each.dscp for each in plan.nodes[0].participants] == [None]
+
+
+def test_candidate_ipv6_flow_label_tells_two_equal_5_tuples_apart():
+    def labelled(label: int) -> tuple[NetworkFlowEndpoint, ...]:
+        return (
+            NetworkFlowEndpoint(
+                transport_protocol=TransportProtocol.UDP,
+                internet_protocol=InternetProtocol.IPV6,
+                transport_port=40000,
+                internet_address="fd00::1",
+                flow_label=label,
+            ),
+        )
+
+    system = one(STRICTLY)
+    same = (change_report(PUB, "/a", nfes=labelled(1)), change_report(PUB, "/b", nfes=labelled(1)))
+    other = (change_report(PUB, "/a", nfes=labelled(1)), change_report(PUB, "/b", nfes=labelled(2)))
+    assert [each.rule for each in verdict_of(system, *same).findings] == ["flow.not-unique"]
+    assert verdict_of(system, *other).findings == ()
+
+
+def identified(count: int, **rest: object) -> Manifest:
+    """So many unique publishers in as many nodes, told apart by their DSCP."""
+    return manifest(
+        *(
+            node(
+                f"n{index}",
+                publisher("p", EMPTY),
+                needs=[need(PUB, "p", STRICTLY)],
+                namespace=f"/m{index}",
+                machine=f"m{index}",
+            )
+            for index in range(count)
+        ),
+        machines=tuple(
+            Machine(name=f"m{index}", address=f"10.0.0.{index + 1}", at=at(1))
+            for index in range(count)
+        ),
+        network=Network(flow_identification=FlowIdentification.DSCP, at=at(2)),
+        **rest,
+    )
+
+
+def test_candidate_dscp_as_a_last_resort_warns_of_misinterpretation_and_erasure():
+    (found,) = [
+        each
+        for each in check(identified(2), environment={})
+        if each.rule == "check.dscp-repurposed"
+    ]
+    assert found.message == (
+        "cannot be sure that the network takes 2 of 64 DSCP values for identifiers: routers read "
+        "them as classes, and may reset or erase them"
+    )
+    assert found.hint == (
+        "tell those who run the network and configure each router on the way, or use "
+        "'flow_identification: participant'"
+    )
+
+
+# --- limitations
+
+
+def errors(system: Manifest) -> list[str]:
+    return [str(each) for each in check(system, environment={}) if each.severity.value == "error"]
+
+
+def test_limitation_64_publishers_have_64_dscp_values():
+    system = identified(64)
+    assert errors(system) == []
+    plan = build_plan(system, environment={})
+    assert sorted(each.dscp for each in (one.endpoints[0] for one in plan.nodes)) == list(range(64))
+    assert [len(each.participants) for each in plan.nodes] == [1] * 64
+
+
+def test_limitation_the_65th_publisher_is_refused_by_name():
+    system = identified(65)
+    message = (
+        "cannot give publisher 'p' of 'n64' a DSCP of its own: it is number 65 of 65 publishers "
+        "that need one, and a DSCP has 64 values"
+    )
+    hint = "use 'flow_identification: participant', or ask for fewer unique publishers"
+    assert errors(system) == [f"robot.lifecycle.yaml:20:1: {message}; {hint}"]
+    with pytest.raises(PlanError) as error:
+        build_plan(system, environment={})
+    assert (error.value.message, error.value.hint) == (message, hint)
+
+
+# --- alternative solutions
+
+
+def test_alternative_1_dedicated_nodes_need_a_process_each_and_no_participants_of_ours():
+    """Each stream in a node and process of its own: unique, at the price of nodes."""
+    together = one(STRICTLY)
+    dedicated = manifest(
+        *(node(f"only_{name}", publisher(name, EMPTY)) for name in ("a", "b")),
+        *(node(f"only_{name}", subscription(name, EMPTY)) for name in ("c", "d")),
+    )
+    plan = build_plan(dedicated, environment={})
+    assert [each.participants for each in plan.nodes] == [()] * 4
+    assert len(plan.processes) == 4
+    assert "instead: a dedicated node in processes of their own, which cost more" in " ".join(
+        render_text(build_plan(together, environment={})).split()
+    )
+
+
+def test_alternative_2_a_6_tuple_by_dscp_gives_each_publisher_a_value_of_its_own():
+    plan = build_plan(identified(3), environment={})
+    values = [each.participants[0].dscp for each in plan.nodes]
+    assert values == [3, 7, 11]
+    assert plan.nodes[0].participants[0].reason == (
+        "unique publisher p marked DSCP 3 = TOS 12 (0x0c)"
+    )
+    assert "3 of 64 DSCP values are identifiers here" in render_text(plan)
+
+
+def test_alternative_3_ds_based_qos_marks_classes_and_needs_no_unique_flow():
+    system = manifest(
+        node(
+            "n",
+            publisher("video", EMPTY),
+            publisher("audio", EMPTY),
+            publisher("battery", EMPTY),
+            needs=[need(PUB, "video", dscp=46), need(PUB, "audio", dscp=46)],
+        )
+    )
+    plan = build_plan(system, environment={})
+    assert [(each.dscp, each.reason) for each in plan.nodes[0].participants] == [
+        (46, "publishers video, audio marked EF = DSCP 46 = TOS 184 (0xb8)")
+    ]
+    assert [each.unique for each in plan.nodes[0].endpoints] == [NOT] * 3
+
+
+def test_what_the_application_must_still_do_is_said_in_the_plan():
+    """The article programs no network: "the application layer is responsible"."""
+    text = " ".join(render_text(build_plan(one(STRICTLY), environment={})).split())
+    assert (
+        "every unique or marked flow changes nothing by itself: each router and switch on the way "
+        "needs a rule that uses it"
+    ) in text

@@ -1,0 +1,425 @@
+"""A supervisor's world without processes, ROS or waiting.
+
+Owns: plans by hand, a spawner whose "processes" are coroutines that speak the control protocol, an
+observer that sees what it is told, and a loop whose clock jumps over every wait.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import dataclasses
+import os
+import selectors
+import signal
+import socket
+from collections.abc import Callable, Coroutine, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+from lifecycle.codec import from_json, to_json
+from lifecycle.manifest.diagnostics import Position
+from lifecycle.manifest.model import (
+    After,
+    Condition,
+    DiscoveryRange,
+    EndpointKind,
+    EndpointPolicy,
+    Policy,
+    Run,
+    RunKind,
+    Timeouts,
+)
+from lifecycle.node.control import Command, Event, HostSpec, Operation
+from lifecycle.plan.model import Plan, PlannedNode, PlannedProcess
+from lifecycle.supervisor.bring_up import BringUp
+from lifecycle.supervisor.events import Emitter
+from lifecycle.supervisor.events import Event as SupervisorEvent
+from lifecycle.supervisor.spawn import SpawnRequest
+from lifecycle.supervisor.states import ProcessExit
+from lifecycle.supervisor.system import System
+from lifecycle.verify.observation import (
+    ConnectionReport,
+    EndpointReport,
+    Identity,
+    NodeConfiguration,
+    Observation,
+)
+from lifecycle.verify.verdict import Finding, Outcome, Verdict
+
+T = TypeVar("T")
+HERE = Position(file="robot.lifecycle.yaml", line=1, column=1)
+
+
+class _JumpingSelector(selectors.DefaultSelector):
+    """Never waits: when nothing is ready, time passes instead."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.now = 0.0
+
+    def select(self, timeout: float | None = None) -> list[Any]:
+        ready = super().select(0)
+        if not ready:
+            assert timeout is not None, "everything waits and nothing will ever happen"
+            self.now += max(timeout, 0.0)
+        return ready
+
+
+class JumpingLoop(asyncio.SelectorEventLoop):
+    """An event loop whose waits take no time; all actors must live in it."""
+
+    def __init__(self) -> None:
+        self._jumping = _JumpingSelector()
+        super().__init__(self._jumping)
+
+    def time(self) -> float:
+        return self._jumping.now
+
+
+def run(main: Coroutine[Any, Any, T]) -> T:
+    """Run a test's coroutine in a loop whose clock jumps."""
+    loop = JumpingLoop()
+    try:
+        return loop.run_until_complete(main)
+    finally:
+        loop.close()
+
+
+def planned_node(
+    key: str,
+    *,
+    after: Mapping[str, Condition] = {},
+    process: str = "",
+    kind: RunKind = RunKind.PYTHON,
+    managed: bool = True,
+    timeouts: Timeouts = Timeouts(),  # noqa: B008 - frozen
+) -> PlannedNode:
+    """One node."""
+    return PlannedNode(
+        key=key,
+        name=key,
+        namespace="/",
+        machine="",
+        process=process or key,
+        managed=managed,
+        run=Run(kind=kind, python="m:C"),
+        endpoints=(),
+        declared_parameters=(),
+        parameters=(),
+        parameter_files=(),
+        remap=(),
+        participants=(),
+        after=tuple(After(node=node, condition=when, at=HERE) for node, when in after.items()),
+        timeouts=timeouts,
+        endpoint_policy=EndpointPolicy.DECLARED,
+        log_level="",
+        at=HERE,
+    )
+
+
+def plan_of(*nodes: PlannedNode) -> Plan:
+    """A plan of these nodes, one process each unless they name one."""
+    processes: dict[str, list[PlannedNode]] = {}
+    for node in nodes:
+        processes.setdefault(node.process, []).append(node)
+    return Plan(
+        system="robot",
+        manifest_path="robot.lifecycle.yaml",
+        domain_id=30,
+        discovery_range=DiscoveryRange.LOCALHOST,
+        policy=Policy(),
+        machines=(),
+        processes=tuple(
+            PlannedProcess(
+                name=name, machine="", run=group[0].run, nodes=tuple(node.key for node in group)
+            )
+            for name, group in processes.items()
+        ),
+        nodes=nodes,
+        flows=(),
+        levels=(),
+    )
+
+
+_STATES = {
+    Operation.CONFIGURE: ("inactive", False),
+    Operation.CONNECT: ("inactive", True),
+    Operation.ACTIVATE: ("active", True),
+    Operation.DEACTIVATE: ("inactive", True),
+    Operation.DISCONNECT: ("inactive", False),
+    Operation.CLEANUP: ("unconfigured", False),
+    Operation.SHUTDOWN: ("finalized", False),
+}
+
+
+def interface_of(node: str, *endpoints: str) -> NodeConfiguration:
+    """What a configured node reports: endpoints as `publishers/video`, mapped nowhere."""
+    return NodeConfiguration(
+        identity=Identity(machine_id="here", process_id=1, node_id=f"{node}@01"),
+        name=node,
+        state="inactive",
+        connected=False,
+        rmw="rmw_fastrtps_cpp",
+        transports=("udpv4", "shm"),
+        serializations=("cdr",),
+        paradigms=("publish-subscribe",),
+        endpoints=tuple(
+            EndpointReport(
+                kind=EndpointKind(endpoint.partition("/")[0]),
+                name=endpoint.partition("/")[2],
+                resolved=f"/{endpoint.partition('/')[2]}",
+                type="std_msgs/msg/String",
+            )
+            for endpoint in endpoints
+        ),
+        checksum="0",
+    )
+
+
+def rewired(
+    interface: NodeConfiguration,
+    operation: Operation,
+    *,
+    connection: str,
+    urls: tuple[str, ...] = (),
+    endpoint: str = "",
+) -> NodeConfiguration:
+    """What the node reports once it made a connection or mapping, or unmade one."""
+    connections = [each for each in interface.connections if each.name != connection]
+    endpoints = interface.endpoints
+    if operation is Operation.CONNECT_TO:
+        connections.append(ConnectionReport(name=connection, urls=urls))
+    elif operation is Operation.MAP_TO:
+        connections = list(interface.connections)
+        endpoints = tuple(
+            dataclasses.replace(each, mapped=True, connection=connection)
+            if f"{each.kind.value}/{each.name}" == endpoint
+            else each
+            for each in endpoints
+        )
+    elif operation is Operation.DISCONNECT_FROM:
+        endpoints = tuple(
+            dataclasses.replace(each, mapped=False, connection="")
+            if each.mapped and each.connection == connection
+            else each
+            for each in endpoints
+        )
+    else:
+        return interface
+    return dataclasses.replace(
+        interface,
+        connections=tuple(connections),
+        endpoints=endpoints,
+        checksum=str(int(interface.checksum) + 1),
+    )
+
+
+def _what(command: Command) -> str:
+    return " ".join(filter(None, (command.endpoint, command.connection)))
+
+
+class FakeProcess:
+    """A host that lives in the loop; see FakeSpawner for what it can be told to do."""
+
+    _next_pid = 1000
+
+    def __init__(self, spawner: FakeSpawner, request: SpawnRequest) -> None:
+        FakeProcess._next_pid += 1
+        self.pid = FakeProcess._next_pid
+        self.exited: asyncio.Future[ProcessExit] = asyncio.get_running_loop().create_future()
+        self.signals: list[int] = []
+        self._spawner = spawner
+        self._name = request.name
+        self._stdout = os.dup(request.stdout)
+        self._task: asyncio.Task[None] | None = None
+        if request.control is not None:
+            control = socket.socket(fileno=os.dup(request.control))
+            self._task = asyncio.ensure_future(self._serve(control))
+
+    def signal(self, number: int) -> None:
+        self.signals.append(number)
+        self._spawner.log.append(f"{self._name} {signal.Signals(number).name}")
+        if number >= self._spawner.ends_at.get(self._name, 0) or number == signal.SIGKILL:
+            self.end(ProcessExit(signal=number))
+
+    def end(self, how: ProcessExit) -> None:
+        if not self.exited.done():
+            if self._task is not None:
+                self._task.cancel()
+            os.close(self._stdout)
+            self.exited.set_result(how)
+
+    def say(self, line: str) -> None:
+        os.write(self._stdout, line.encode() + b"\n")
+
+    async def _serve(self, control: socket.socket) -> None:
+        control.setblocking(False)
+        reader, writer = await asyncio.open_connection(sock=control)
+        with contextlib.closing(writer):
+            spec = from_json(await reader.readline(), HostSpec)
+            if not await self._act(f"{self._name} start", writer, Event(kind="ready")):
+                return
+            del spec
+            while line := await reader.readline():
+                command = from_json(line, Command)
+                state, connected = _STATES.get(command.operation, ("active", True))
+                await self._act(
+                    " ".join(filter(None, (command.node, command.operation.value, _what(command)))),
+                    writer,
+                    Event(
+                        kind="reply",
+                        node=command.node,
+                        id=command.id,
+                        state=state,
+                        connected=connected,
+                        configuration=self._spawner.carry_out(command, state, connected=connected),
+                    ),
+                )
+        if self._name not in self._spawner.ends_at:
+            self.end(ProcessExit(status=0))
+
+    async def _act(self, what: str, writer: asyncio.StreamWriter, answer: Event) -> bool:
+        self._spawner.log.append(what)
+        way = self._spawner.ways.get(what, "")
+        await asyncio.sleep(self._spawner.takes_s.get(what, 0.0))
+        if way == "hang":
+            return True
+        if way == "die":
+            self.say("segmentation fault")
+            self.end(ProcessExit(signal=signal.SIGSEGV))
+            return False
+        if way:
+            kind = "failed" if answer.kind == "ready" else answer.kind
+            state = "unconfigured" if what.endswith("configure") else "inactive"
+            answer = Event(
+                kind=kind, node=answer.node, id=answer.id, ok=False, error=way, state=state
+            )
+        writer.write(to_json(answer) + b"\n")
+        return True
+
+
+class FakeSpawner:
+    """Starts fake hosts.
+
+    Attributes:
+        log: everything that happened, in order: `talker start`, `/talker configure`, signals.
+        ways: what goes wrong: such a line → "hang", "die", or the error to answer with.
+        takes_s: how long such a line takes.
+        ends_at: processes that do not end by themselves, and the signal that ends them.
+        processes: by name.
+        interfaces: what a node reports, by full name; steps of wiring change it.
+    """
+
+    def __init__(self) -> None:
+        self.log: list[str] = []
+        self.ways: dict[str, str] = {}
+        self.takes_s: dict[str, float] = {}
+        self.ends_at: dict[str, int] = {}
+        self.processes: dict[str, FakeProcess] = {}
+        self.interfaces: dict[str, NodeConfiguration] = {}
+
+    def carry_out(
+        self, command: Command, state: str, *, connected: bool
+    ) -> NodeConfiguration | None:
+        """What a node reports after a command; None for a node that reports nothing."""
+        interface = self.interfaces.get(command.node)
+        if interface is None:
+            return None
+        if command.operation in _STATES:
+            interface = dataclasses.replace(interface, state=state, connected=connected)
+        elif f"{command.node} {command.operation.value} {_what(command)}" not in self.ways:
+            interface = rewired(
+                interface,
+                command.operation,
+                connection=command.connection,
+                urls=command.connections.urls,
+                endpoint=command.endpoint,
+            )
+        self.interfaces[command.node] = interface
+        return interface
+
+    async def spawn(self, request: SpawnRequest) -> FakeProcess:
+        process = self.processes[request.name] = FakeProcess(self, request)
+        return process
+
+    async def close(self) -> None:
+        """Nothing to close."""
+
+
+class FakeGraph:
+    """An observer that sees a list of node names, and tells of changes when told to."""
+
+    def __init__(self) -> None:
+        self.observation = Observation()
+        self.changed = asyncio.Event()
+        self.put: list[NodeConfiguration] = []
+
+    async def observe(self, plan: Plan) -> Observation:
+        del plan
+        return self.observation
+
+    async def wait_change(self) -> None:
+        await self.changed.wait()
+        self.changed.clear()
+
+    def put_configuration(self, configuration: NodeConfiguration) -> None:
+        self.put.append(configuration)
+
+
+def verdict_of(outcome: Outcome, *rules: str, blocking: bool | None = None) -> Verdict:
+    """A verdict with one finding for each rule."""
+    return Verdict(
+        verdict=outcome,
+        blocking=outcome is Outcome.VIOLATED if blocking is None else blocking,
+        findings=tuple(
+            Finding(
+                rule=rule,
+                outcome=outcome,
+                subject="/camera",
+                expected="",
+                observed="",
+                message=f"{rule} on /camera",
+            )
+            for rule in rules
+        ),
+        flows=(),
+    )
+
+
+class World:
+    """A system of fakes with everything recorded."""
+
+    def __init__(self, plan: Plan, directory: Path) -> None:
+        self.spawner = FakeSpawner()
+        self.events: list[SupervisorEvent] = []
+        self.emit = Emitter()
+        self.emit.listen(self.events.append)
+        self.system = System(plan, emit=self.emit, logs=directory, processes=plan.processes)
+        self.appeared: dict[str, asyncio.Event] = {}
+        self.bring_up = BringUp(
+            self.system,
+            spawner_of=lambda _: self.spawner,
+            services=self._no_services,
+            appears=self._appears,
+            recorded=lambda: None,
+        )
+
+    @property
+    def log(self) -> list[str]:
+        """What the hosts were asked, in order."""
+        return self.spawner.log
+
+    def heard(self, kind: type[T]) -> list[T]:
+        """Events of one kind."""
+        return [event for event in self.events if isinstance(event, kind)]
+
+    async def _appears(self, name: str) -> None:
+        await self.appeared.setdefault(name, asyncio.Event()).wait()
+
+    @staticmethod
+    def _no_services(node: PlannedNode) -> Any:
+        raise AssertionError(f"nobody may drive {node.key} through services")
+
+
+Check = Callable[[Path], Coroutine[Any, Any, None]]

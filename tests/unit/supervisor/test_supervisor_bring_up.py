@@ -1,0 +1,294 @@
+"""Bring-up and take-down: order, parallelism, deadlines, and what a failure says."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+from pathlib import Path
+
+import pytest
+
+from lifecycle.errors import BringUpError
+from lifecycle.manifest.model import Condition, RunKind, Timeouts
+from lifecycle.node.control import Operation
+from lifecycle.supervisor.events import Notice, ProcessChanged, RequestSent
+from lifecycle.supervisor.failure import StepFailedError
+from lifecycle.supervisor.gate import Gate
+from lifecycle.supervisor.shutdown import TakeDown
+from lifecycle.supervisor.states import ProcessState
+from lifecycle.verify.verdict import Outcome
+from tests.unit.supervisor.fakes import World, plan_of, planned_node, run, verdict_of
+
+LIMIT_S = 30.0
+
+
+def _world(tmp_path: Path, *nodes: object) -> World:
+    return World(plan_of(*nodes), tmp_path)  # type: ignore[arg-type]
+
+
+async def _down(world: World, hurry: asyncio.Event | None = None) -> None:
+    await world.bring_up.close()
+    await TakeDown(world.system, world.emit, hurry or asyncio.Event()).run()
+
+
+def test_nodes_without_an_order_come_up_side_by_side(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = _world(tmp_path, planned_node("a"), planned_node("b"))
+        for what in ("a start", "b start", "/a configure", "/b configure"):
+            world.spawner.takes_s[what] = 3.0
+        began = asyncio.get_running_loop().time()
+        await world.bring_up.connect(LIMIT_S)
+        assert asyncio.get_running_loop().time() - began == pytest.approx(6.0, abs=0.1)
+        await _down(world)
+
+    run(main())
+
+
+@pytest.mark.parametrize(
+    ("condition", "reached", "held"),
+    [
+        (Condition.STARTED, "a start", "b start"),
+        (Condition.CONFIGURED, "/a configure", "/b configure"),
+        (Condition.CONNECTED, "/a connect", "/b connect"),
+        (Condition.ACTIVE, "/a activate", "/b activate"),
+    ],
+)
+def test_a_condition_holds_the_step_that_it_names(
+    tmp_path: Path, condition: Condition, reached: str, held: str
+) -> None:
+    async def main() -> list[str]:
+        world = _world(tmp_path, planned_node("b", after={"a": condition}), planned_node("a"))
+        world.spawner.takes_s[reached] = 5.0
+        await world.bring_up.connect(LIMIT_S)
+        permit = Gate(strict=False).judge(verdict_of(Outcome.OK))
+        await world.bring_up.activate(permit, LIMIT_S)
+        log = list(world.log)
+        await _down(world)
+        return log
+
+    log = run(main())
+    assert log.index(reached) < log.index(held)
+    # The step before it was not held: b went as far as it may while a was busy.
+    steps = ["b start", "/b configure", "/b connect", "/b activate"]
+    before = steps[: steps.index(held)]
+    if condition is not Condition.ACTIVE:
+        assert all(log.index(step) < log.index(held) for step in before)
+
+
+def test_no_activate_request_is_sent_without_a_permit(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = _world(tmp_path, planned_node("a"))
+        await world.bring_up.connect(LIMIT_S)
+        with pytest.raises(BringUpError, match="cannot activate '/a' without a permit"):
+            await world.system.nodes["a"].perform(Operation.ACTIVATE)
+        gate = Gate(strict=False)
+        permit = gate.judge(verdict_of(Outcome.OK))
+        gate.close()
+        with pytest.raises(StepFailedError, match="the gate was closed again"):
+            await world.bring_up.activate(permit, LIMIT_S)
+        assert "/a activate" not in world.log
+        await _down(world)
+
+    run(main())
+
+
+def test_a_failed_transition_ends_the_bring_up_with_the_nodes_own_reason(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = _world(tmp_path, planned_node("a"), planned_node("b"))
+        world.spawner.ways["/a configure"] = "on_configure raised ValueError: no camera"
+        with pytest.raises(StepFailedError) as caught:
+            await world.bring_up.connect(LIMIT_S)
+        assert caught.value.rule == "run.transition-failed"
+        assert caught.value.subject == "/a"
+        assert caught.value.message == (
+            "cannot configure '/a': on_configure raised ValueError: no camera"
+        )
+        await _down(world)
+
+    run(main())
+
+
+def test_a_process_that_dies_says_what_its_node_was_doing_and_its_last_words(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        world = _world(tmp_path, planned_node("a"))
+        world.spawner.ways["/a connect"] = "die"
+        with pytest.raises(StepFailedError) as caught:
+            await world.bring_up.connect(LIMIT_S)
+        pid = world.spawner.processes["a"].pid
+        assert caught.value.rule == "run.process-died"
+        assert caught.value.message == (
+            f"cannot keep '/a' running: pid {pid} died while connecting: killed by SIGSEGV"
+        )
+        assert caught.value.log_tail == ("segmentation fault",)
+        await _down(world)
+
+    run(main())
+
+
+def test_a_node_that_hangs_is_given_up_at_its_own_deadline(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = _world(tmp_path, planned_node("a", timeouts=Timeouts(configure_s=2.0)))
+        world.spawner.ways["/a configure"] = "hang"
+        with pytest.raises(StepFailedError) as caught:
+            await world.bring_up.connect(LIMIT_S)
+        assert caught.value.message == ("cannot bring up '/a': it was still configuring after 2 s")
+        await _down(world)
+        # Nothing polite waits behind a callback that hangs.
+        assert world.log == ["a start", "/a configure"]
+
+    run(main())
+
+
+def test_the_whole_bring_up_has_a_deadline_that_names_what_everybody_was_doing(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        world = _world(
+            tmp_path,
+            planned_node("a", timeouts=Timeouts(configure_s=60.0)),
+            planned_node("b", after={"a": Condition.CONFIGURED}),
+        )
+        world.spawner.ways["/a configure"] = "hang"
+        with pytest.raises(StepFailedError) as caught:
+            await world.bring_up.connect(1.5)
+        assert caught.value.rule == "run.deadline"
+        assert caught.value.subject == "/a"
+        assert caught.value.message == (
+            "cannot bring up 'robot' within 1.5 s: /a is still configuring; "
+            "/b waits to configure until /a is configured"
+        )
+        await _down(world)
+
+    run(main())
+
+
+def test_nodes_of_one_process_share_it_and_its_start_waits_for_both(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = _world(
+            tmp_path,
+            planned_node("a", process="both"),
+            planned_node("b", process="both", after={"c": Condition.STARTED}),
+            planned_node("c"),
+        )
+        world.spawner.takes_s["c start"] = 4.0
+        await world.bring_up.connect(LIMIT_S)
+        assert sorted(world.spawner.processes) == ["both", "c"]
+        assert world.log.index("c start") < world.log.index("both start")
+        await _down(world)
+
+    run(main())
+
+
+def test_a_plain_command_is_only_started_and_whoever_stands_on_it_waits_for_its_name(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        world = _world(
+            tmp_path,
+            planned_node("plain", kind=RunKind.COMMAND, managed=False),
+            planned_node("a", after={"plain": Condition.CONFIGURED}),
+        )
+        connecting = asyncio.ensure_future(world.bring_up.connect(LIMIT_S))
+        await asyncio.sleep(1.0)
+        assert "/a configure" not in world.log
+        world.appeared["/plain"].set()
+        await connecting
+        assert world.log == ["a start", "/a configure", "/a connect"]
+        world.spawner.ends_at["plain"] = signal.SIGINT
+        await _down(world)
+        assert "plain SIGINT" in world.log
+
+    run(main())
+
+
+def test_take_down_goes_in_reverse_order_and_undoes_only_what_was_done(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = _world(
+            tmp_path, planned_node("base"), planned_node("arm", after={"base": Condition.ACTIVE})
+        )
+        await world.bring_up.connect(LIMIT_S)
+        await world.bring_up.activate(Gate(strict=False).judge(verdict_of(Outcome.OK)), LIMIT_S)
+        before = len(world.log)
+        await _down(world)
+        steps = ["deactivate", "disconnect", "cleanup", "shutdown"]
+        assert world.log[before:] == [
+            *(f"/arm {step}" for step in steps),
+            *(f"/base {step}" for step in steps),
+        ]
+        states = {name: process.state for name, process in world.system.processes.items()}
+        assert states == {"base": ProcessState.EXITED, "arm": ProcessState.EXITED}
+
+    run(main())
+
+
+def test_a_node_is_undone_as_far_as_it_came(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = _world(tmp_path, planned_node("a"), planned_node("b"))
+        world.spawner.ways["/b configure"] = "it refused"
+        world.spawner.takes_s["/b configure"] = 1.0
+        with pytest.raises(StepFailedError):
+            await world.bring_up.connect(LIMIT_S)
+        before = len(world.log)
+        await _down(world)
+        undone = [line for line in world.log[before:] if line.startswith("/a")]
+        assert undone == ["/a disconnect", "/a cleanup", "/a shutdown"]
+
+    run(main())
+
+
+def test_a_node_in_the_middle_of_a_step_is_not_asked_but_ended(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = _world(tmp_path, planned_node("a"), planned_node("b"))
+        world.spawner.ways["/b configure"] = "it refused"
+        world.spawner.takes_s["/b configure"] = 1.0
+        world.spawner.takes_s["/a connect"] = 60.0
+        with pytest.raises(StepFailedError):
+            await world.bring_up.connect(LIMIT_S)
+        before = len(world.log)
+        await _down(world)
+        assert [line for line in world.log[before:] if "a" in line] == ["a SIGTERM"]
+
+    run(main())
+
+
+def test_a_process_that_does_not_end_is_ended_step_by_step_and_told_of(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = _world(tmp_path, planned_node("a"))
+        await world.bring_up.connect(LIMIT_S)
+        world.spawner.ends_at["a"] = signal.SIGTERM
+        began = asyncio.get_running_loop().time()
+        await _down(world)
+        assert asyncio.get_running_loop().time() - began == pytest.approx(4.0, abs=0.2)
+        assert world.log[-2:] == ["a SIGINT", "a SIGTERM"]
+        assert world.heard(Notice)[-1].message == "process 'a' had to be ended with SIGTERM"
+
+    run(main())
+
+
+def test_in_a_hurry_nothing_is_asked_and_everything_is_killed(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = _world(tmp_path, planned_node("a"))
+        await world.bring_up.connect(LIMIT_S)
+        world.spawner.ends_at["a"] = signal.SIGKILL
+        hurry = asyncio.Event()
+        hurry.set()
+        before = len(world.log)
+        await _down(world, hurry)
+        assert world.log[before:] == ["a SIGKILL"]
+
+    run(main())
+
+
+def test_every_request_is_told_before_it_is_sent(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = _world(tmp_path, planned_node("a"))
+        await world.bring_up.connect(LIMIT_S)
+        sent = [(event.node, event.operation) for event in world.heard(RequestSent)]
+        assert sent == [("/a", Operation.CONFIGURE), ("/a", Operation.CONNECT)]
+        changes = [event.state for event in world.heard(ProcessChanged)]
+        assert changes == [ProcessState.STARTING, ProcessState.RUNNING]
+        await _down(world)
+
+    run(main())

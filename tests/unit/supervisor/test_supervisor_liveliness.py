@@ -1,0 +1,456 @@
+"""Silent nodes: what becomes of what is noticed, without processes, ROS or waiting."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import os
+import signal
+import socket
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import pytest
+
+from lifecycle.codec import from_json, to_json
+from lifecycle.manifest.model import DiscoveryRange, Machine, Run, RunKind, Timeouts
+from lifecycle.middleware.busy_sign import BusySign
+from lifecycle.node.control import SIGN_DESCRIPTORS, HostSpec, Operation
+from lifecycle.node.control import Event as HostEvent
+from lifecycle.plan.model import Plan, PlannedProcess
+from lifecycle.supervisor.channel import ControlChannel
+from lifecycle.supervisor.events import (
+    Emitter,
+    Event,
+    MachineConnection,
+    NodeAlive,
+    NodeJoined,
+    NodeLeft,
+    NodeSilent,
+)
+from lifecycle.supervisor.judge import without_nodes
+from lifecycle.supervisor.liveliness import Cause, Liveliness, Presence
+from lifecycle.supervisor.neighbours import CALL_EACH_S, Listener, Neighbours
+from lifecycle.supervisor.process import ManagedProcess
+from lifecycle.supervisor.system import System
+from lifecycle.supervisor.zygote import Zygote, ZygoteProcess
+from lifecycle.verify.observation import Observation, ObservedNode
+from lifecycle.verify.verdict import Outcome
+from tests.unit.supervisor.fakes import HERE, World, plan_of, planned_node, run
+
+
+class Ears:
+    """A liveliness with everything it told."""
+
+    def __init__(self) -> None:
+        self.events: list[Event] = []
+        self.changes = 0
+        emit = Emitter()
+        emit.listen(self.events.append)
+        self.liveliness = Liveliness(emit, self._changed)
+
+    def _changed(self) -> None:
+        self.changes += 1
+
+    @property
+    def kinds(self) -> list[str]:
+        return [event.kind for event in self.events]
+
+
+def test_a_silent_node_is_told_once_and_alive_when_its_last_cause_is_gone() -> None:
+    ears = Ears()
+    ears.liveliness.fell_silent(["/camera"], Cause.STOPPED, "it was stopped")
+    ears.liveliness.fell_silent(["/camera"], Cause.HUNG, "it hangs")
+    ears.liveliness.came_back(["/camera"], Cause.STOPPED)
+    assert ears.kinds == ["silent"]
+    ears.liveliness.came_back(["/camera"], Cause.HUNG)
+    assert ears.kinds == ["silent", "alive"]
+    assert ears.liveliness.silent == {}
+    assert ears.changes == 4
+
+
+def test_the_same_cause_twice_is_no_news() -> None:
+    ears = Ears()
+    ears.liveliness.fell_silent(["/camera"], Cause.HUNG, "it hangs")
+    ears.liveliness.fell_silent(["/camera"], Cause.HUNG, "it hangs")
+    assert (ears.kinds, ears.changes) == (["silent"], 1)
+
+
+def test_coming_back_from_what_was_not_noticed_is_no_news() -> None:
+    ears = Ears()
+    ears.liveliness.came_back(["/camera"], Cause.HUNG)
+    assert (ears.kinds, ears.changes) == ([], 0)
+
+
+def test_a_silent_node_violates_and_the_finding_says_why() -> None:
+    ears = Ears()
+    ears.liveliness.fell_silent(["/camera"], Cause.STOPPED, "it was stopped")
+    ears.liveliness.fell_silent(["/camera"], Cause.HUNG, "it hangs")
+    (finding,) = ears.liveliness.findings()
+    assert (finding.rule, finding.outcome, finding.node) == (
+        "run.silent-node",
+        Outcome.VIOLATED,
+        "/camera",
+    )
+    assert finding.message == "cannot rely on '/camera': it was stopped, and it hangs"
+    assert finding.observed == "stopped, hung"
+
+
+def test_a_dead_process_is_not_silent() -> None:
+    ears = Ears()
+    ears.liveliness.fell_silent(["/camera"], Cause.HUNG, "it hangs")
+    ears.liveliness.forget(["/camera"])
+    ears.liveliness.came_back(["/camera"], Cause.HUNG)
+    assert (ears.kinds, ears.liveliness.findings()) == (["silent"], ())
+
+
+def test_who_hangs_may_come_back_and_who_is_stopped_or_lost_is_out_of_reach() -> None:
+    ears = Ears()
+    for node, cause in (("/a", Cause.HUNG), ("/b", Cause.STOPPED), ("/c", Cause.LOST)):
+        ears.liveliness.fell_silent([node], cause, "it is")
+    reached = {node: not ears.liveliness.is_out_of_reach(node) for node in ("/a", "/b", "/c", "/d")}
+    assert reached == {"/a": True, "/b": False, "/c": False, "/d": True}
+
+
+def test_nodes_join_and_leave_between_two_looks() -> None:
+    ears = Ears()
+    emit = Emitter()
+    emit.listen(ears.events.append)
+    presence = Presence(emit)
+    for names in (("/a", "/b"), ("/a", "/b", "/_a_data"), ("/b", "/c", "/ns/_c_flow_0")):
+        presence.see(Observation(nodes=tuple(ObservedNode(full_name=each) for each in names)))
+    assert ears.events == [
+        NodeJoined(node="/a"),
+        NodeJoined(node="/b"),
+        NodeJoined(node="/c"),
+        NodeLeft(node="/a"),
+    ]
+
+
+def test_a_silent_node_is_not_asked_for_anything() -> None:
+    plan = plan_of(planned_node("camera"), planned_node("viewer"))
+    left = without_nodes(plan, {"/camera": "it hangs"})
+    assert [each.full_name for each in left.nodes] == ["/viewer"]
+    assert without_nodes(plan, {}) is plan
+
+
+class FakeEar:
+    def __init__(self, listener: Listener) -> None:
+        self.listener = listener
+
+    def destroy(self) -> None:
+        """Nothing to destroy."""
+
+
+class FakeVoice:
+    def __init__(self) -> None:
+        self.told: list[Mapping[str, str]] = []
+
+    def tell(self, silent: Mapping[str, str]) -> None:
+        self.told.append(dict(silent))
+
+    def destroy(self) -> None:
+        """Nothing to destroy."""
+
+
+class FakeAir:
+    """Carries nothing, and remembers who wanted to hear and be heard."""
+
+    def __init__(self) -> None:
+        self.ears: dict[str, FakeEar] = {}
+        self.voices: dict[str, FakeVoice] = {}
+        self.calls: list[list[str]] = []
+
+    def machine_voice(self, system: str, machine: str) -> FakeVoice:
+        return self.voices.setdefault(f"{system}/{machine}", FakeVoice())
+
+    def machine_ear(self, system: str, machine: str, to: Listener) -> FakeEar:
+        return self.ears.setdefault(f"{system}/{machine}", FakeEar(to))
+
+    def node_ear(self, node: str, to: Listener) -> FakeEar:
+        return self.ears.setdefault(node, FakeEar(to))
+
+    def call_out(self, addresses: Iterable[str]) -> None:
+        self.calls.append(list(addresses))
+
+
+def two_machines() -> Plan:
+    nodes = [
+        dataclasses.replace(planned_node(key), machine=machine)
+        for key, machine in (("camera", "robot"), ("viewer", "desk"), ("lamp", "desk"))
+    ]
+    plan = plan_of(*nodes)
+    machines = (
+        Machine(name="robot", address="10.0.0.1", at=HERE),
+        Machine(name="desk", address="10.0.0.2", at=HERE),
+    )
+    return dataclasses.replace(plan, machines=machines)
+
+
+class Desk:
+    """The supervisor of machine `robot`, which hears `desk`."""
+
+    def __init__(self, directory: Path) -> None:
+        plan = two_machines()
+        self.events: list[Event] = []
+        emit = Emitter()
+        emit.listen(self.events.append)
+        own = [each for each in plan.processes if each.name == "camera"]
+        self.system = System(plan, emit=emit, logs=directory, processes=own)
+        self.air = FakeAir()
+        self.neighbours = Neighbours(self.system, self.air)
+        self.neighbours.open()
+
+    @property
+    def desk(self) -> Listener:
+        return self.air.ears["robot/desk"].listener
+
+    def told(self) -> list[tuple[str, str]]:
+        return [
+            (each.kind, each.machine if isinstance(each, MachineConnection) else each.node)
+            for each in self.events
+            if isinstance(each, (MachineConnection, NodeSilent, NodeAlive))
+        ]
+
+
+async def settle() -> None:
+    """Let what was called from another thread arrive."""
+    for _ in range(5):
+        await asyncio.sleep(0)
+
+
+def test_with_a_machine_its_nodes_are_lost_and_found(tmp_path: Path) -> None:
+    async def test() -> None:
+        desk = Desk(tmp_path)
+        desk.desk.heard(True)
+        await settle()
+        desk.desk.heard(False)
+        await settle()
+        desk.desk.heard(True)
+        await settle()
+        assert desk.told() == [
+            ("connection", "desk"),
+            ("connection", "desk"),
+            ("silent", "/viewer"),
+            ("silent", "/lamp"),
+            ("connection", "desk"),
+            ("alive", "/viewer"),
+            ("alive", "/lamp"),
+        ]
+        states = [each.established for each in desk.events if isinstance(each, MachineConnection)]
+        assert states == [True, False, True]
+        await desk.neighbours.close()
+
+    run(test())
+
+
+def test_a_machine_that_was_never_heard_is_not_lost(tmp_path: Path) -> None:
+    async def test() -> None:
+        desk = Desk(tmp_path)
+        desk.desk.heard(False)
+        await settle()
+        assert desk.told() == []
+        await desk.neighbours.close()
+
+    run(test())
+
+
+def test_a_supervisor_that_leaves_properly_loses_no_node(tmp_path: Path) -> None:
+    async def test() -> None:
+        desk = Desk(tmp_path)
+        desk.desk.heard(True)
+        desk.desk.left()
+        await settle()
+        assert desk.told() == [("connection", "desk"), ("connection", "desk")]
+        await desk.neighbours.close()
+
+    run(test())
+
+
+def test_that_dds_forgets_a_lost_machine_changes_nothing(tmp_path: Path) -> None:
+    async def test() -> None:
+        desk = Desk(tmp_path)
+        desk.desk.heard(True)
+        desk.desk.heard(False)
+        desk.desk.left()
+        await settle()
+        assert set(desk.system.liveliness.silent) == {"/viewer", "/lamp"}
+        await desk.neighbours.close()
+
+    run(test())
+
+
+def test_calls_go_out_while_somebody_is_missing_and_only_then(tmp_path: Path) -> None:
+    async def test() -> None:
+        desk = Desk(tmp_path)
+        desk.desk.heard(True)
+        await settle()
+        assert desk.air.calls == []
+        desk.desk.heard(False)
+        await asyncio.sleep(3.5 * CALL_EACH_S)
+        assert desk.air.calls == [["10.0.0.2"]] * 4
+        desk.desk.heard(True)
+        await asyncio.sleep(10 * CALL_EACH_S)
+        assert len(desk.air.calls) == 4
+        await desk.neighbours.close()
+
+    run(test())
+
+
+def test_what_another_supervisor_says_of_its_nodes_is_taken_over(tmp_path: Path) -> None:
+    async def test() -> None:
+        desk = Desk(tmp_path)
+        desk.desk.told({"/viewer": "a callback hangs", "/camera": "not theirs to say"})
+        await settle()
+        assert dict(desk.system.liveliness.silent) == {"/viewer": "a callback hangs"}
+        desk.desk.told({})
+        await settle()
+        assert desk.told() == [("silent", "/viewer"), ("alive", "/viewer")]
+        await desk.neighbours.close()
+
+    run(test())
+
+
+def test_our_own_silent_nodes_are_told_again_and_again_until_it_is_over(tmp_path: Path) -> None:
+    async def test() -> None:
+        desk = Desk(tmp_path)
+        desk.system.liveliness.fell_silent(["/camera"], Cause.HUNG, "it hangs")
+        await asyncio.sleep(1)
+        desk.system.liveliness.came_back(["/camera"], Cause.HUNG)
+        await asyncio.sleep(1)
+        assert desk.air.voices["robot/robot"].told == [{"/camera": "it hangs"}] * 3 + [{}] * 3
+        await desk.neighbours.close()
+
+    run(test())
+
+
+def test_who_is_lost_to_us_is_not_told_to_others(tmp_path: Path) -> None:
+    async def test() -> None:
+        desk = Desk(tmp_path)
+        desk.desk.heard(True)
+        desk.desk.heard(False)
+        await asyncio.sleep(1)
+        assert desk.air.voices["robot/robot"].told == []
+        await desk.neighbours.close()
+
+    run(test())
+
+
+def test_a_system_of_one_machine_neither_speaks_nor_listens(tmp_path: Path) -> None:
+    async def test() -> None:
+        plan = plan_of(planned_node("camera"))
+        system = System(plan, emit=Emitter(), logs=tmp_path, processes=plan.processes)
+        air = FakeAir()
+        neighbours = Neighbours(system, air)
+        neighbours.open()
+        assert (air.ears, air.voices) == ({}, {})
+        await neighbours.close()
+
+    run(test())
+
+
+@pytest.mark.parametrize("came_back", [True, False])
+def test_after_a_loss_hosts_tell_their_names_anew(tmp_path: Path, came_back: bool) -> None:
+    async def test() -> None:
+        plan = two_machines()
+        world = World(plan, tmp_path)
+        world.system.remote = dict(Desk(tmp_path).system.remote)
+        air = FakeAir()
+        neighbours = Neighbours(world.system, air)
+        neighbours.open()
+        await world.bring_up.connect(30)
+        listener = air.ears["robot/desk"].listener
+        listener.heard(True)
+        if came_back:
+            listener.heard(False)
+            listener.heard(True)
+        await asyncio.sleep(1)
+        asked = f"/camera {Operation.TELL_NAMES.value}" in world.log
+        assert asked is came_back
+        await neighbours.close()
+        for process in world.system.processes.values():
+            await process.end(((9, 5.0),), asyncio.Event())
+
+    run(test())
+
+
+def test_a_channel_tells_that_its_host_hangs_and_when_it_came_back() -> None:
+    async def test() -> None:
+        told: asyncio.Queue[bool] = asyncio.Queue()
+        spec = HostSpec(
+            system="robot",
+            process="p",
+            domain_id=0,
+            discovery_range=DiscoveryRange.LOCALHOST,
+            nodes=(
+                planned_node("quick", timeouts=Timeouts(silent_s=0.01)),
+                planned_node("slow", timeouts=Timeouts(silent_s=0.05)),
+            ),
+        )
+        channel = ControlChannel(spec, lambda _: None, told.put_nowait)
+        theirs = await channel.open()
+        first, descriptors, _, _ = socket.recv_fds(theirs, 1, SIGN_DESCRIPTORS)
+        assert from_json(first + theirs.makefile("rb").readline(), HostSpec) == spec
+        sign = BusySign(*descriptors)
+        assert sign.limit_s == 0.05
+        sign.begin()
+        assert await asyncio.wait_for(told.get(), 10) is True
+        assert sign.end() is not None
+        theirs.sendall(to_json(HostEvent(kind="beat")) + b"\n")
+        assert await asyncio.wait_for(told.get(), 10) is False
+        sign.close()
+        theirs.close()
+        await channel.close()
+
+    asyncio.run(test())
+
+
+def open_descriptors() -> int:
+    return len(list(Path("/proc/self/fd").iterdir()))
+
+
+def test_closing_a_channel_closes_its_busy_sign(tmp_path: Path) -> None:
+    async def test() -> None:
+        world = World(plan_of(planned_node("camera")), tmp_path)
+        before = open_descriptors()
+        for _ in range(3):
+            spec = HostSpec(
+                system="robot",
+                process="camera",
+                domain_id=0,
+                discovery_range=world.system.plan.discovery_range,
+                nodes=world.system.plan.nodes,
+            )
+            channel = ControlChannel(spec, lambda _: None)
+            theirs = await channel.open()
+            theirs.close()
+            await channel.close()
+        assert open_descriptors() <= before
+
+    asyncio.run(test())
+
+
+def test_a_fork_server_tells_that_a_process_was_stopped_and_continues(tmp_path: Path) -> None:
+    async def test() -> None:
+        told: asyncio.Queue[bool] = asyncio.Queue()
+        zygote = Zygote(ZygoteProcess(preload=False, environment=os.environ))
+        argv = ("sleep", "60")
+        planned = PlannedProcess(
+            name="it",
+            machine="",
+            run=Run(kind=RunKind.COMMAND, command=argv),
+            nodes=("it",),
+            argv=argv,
+        )
+        process = ManagedProcess(planned, logs=tmp_path, emit=Emitter())
+        process.on_stop = told.put_nowait
+        await process.spawn(zygote, None)
+        for number, expected in ((signal.SIGSTOP, True), (signal.SIGCONT, False)) * 2:
+            os.kill(process.pid, number)
+            assert await asyncio.wait_for(told.get(), 10) is expected
+        assert not process.ended.done()
+        await process.end(((signal.SIGKILL, 10.0),), asyncio.Event())
+        await zygote.close()
+        assert told.empty()
+
+    asyncio.run(test())

@@ -1,0 +1,180 @@
+"""From node configurations to instructions, and to the plan that must then be seen."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from lifecycle.manifest.model import (
+    Authority,
+    DataLayer,
+    DataLayerSource,
+    EndpointKind,
+    EndpointPolicy,
+    FlowTransport,
+    Policy,
+)
+from lifecycle.plan import Plan
+from lifecycle.supervisor.instructions import steps, wired
+from lifecycle.supervisor.negotiation import NegotiatedSource
+from lifecycle.verify.observation import EndpointReport, Identity, NodeConfiguration
+from tests.unit.plan.samples import at, need, node, planned, publisher, subscription
+from tests.unit.supervisor.fakes import rewired
+
+PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
+
+
+def plan_of(*, transport: FlowTransport = FlowTransport.ANY, is_open: bool = True) -> Plan:
+    policy = EndpointPolicy.OPEN if is_open else EndpointPolicy.DECLARED
+    return planned(
+        node(
+            "talker",
+            publisher("chatter"),
+            needs=[need(PUB, "chatter", transport=transport)],
+            endpoints=EndpointPolicy.OPEN,
+        ),
+        node("listener", subscription("chatter"), endpoints=EndpointPolicy.OPEN),
+        data_layer=DataLayer(
+            authority=Authority.SUPERVISOR, source=DataLayerSource.DYNAMIC, events=True, at=at(4)
+        ),
+        policy=Policy(undeclared_nodes=policy),
+    )
+
+
+def configured(
+    name: str, *endpoints: tuple[EndpointKind, str], transports: tuple[str, ...] = ()
+) -> NodeConfiguration:
+    return NodeConfiguration(
+        identity=Identity(machine_id="here", process_id=hash(name) % 1000, node_id=f"{name}@1"),
+        name=name,
+        state="inactive",
+        connected=False,
+        rmw="rmw_fastrtps_cpp",
+        transports=transports or ("shm", "udpv4", "udpv6", "udpm", "tcpv4"),
+        serializations=("cdr",),
+        paradigms=("publish-subscribe", "request-response"),
+        endpoints=tuple(
+            EndpointReport(kind=kind, name=each, resolved=f"/{each}", type="std_msgs/msg/String")
+            for kind, each in endpoints
+        ),
+        checksum="0",
+    )
+
+
+TALKER = configured("/talker", (PUB, "chatter"))
+LISTENER = configured("/listener", (SUB, "chatter"))
+
+
+def known(*configurations: NodeConfiguration) -> dict[str, NodeConfiguration]:
+    return {each.name: each for each in configurations}
+
+
+def media(plan: Plan) -> dict[tuple[str, str, str], str]:
+    return {(each.topic, each.publisher, each.subscription): each.medium for each in plan.flows}
+
+
+def test_what_the_own_participants_do_anyway_needs_no_connection() -> None:
+    source = NegotiatedSource(plan_of())
+    told = source.instructions(known(TALKER, LISTENER))
+    assert {name: each.connections for name, each in told.items()} == {
+        "/talker": (),
+        "/listener": (),
+    }
+    assert told["/talker"].mappings == (("publishers/chatter", ""),)
+    assert media(source.expected) == {("/chatter", "talker", "listener"): "shm"}
+
+
+def test_a_wish_for_another_medium_becomes_a_connection_of_the_plan_and_of_the_node() -> None:
+    source = NegotiatedSource(plan_of(transport=FlowTransport.UDPV4))
+    told = source.instructions(known(TALKER, LISTENER))
+    ((name, how),) = told["/talker"].connections
+    assert how.urls[0].startswith("udpv4://")
+    assert told["/talker"].mappings == (("publishers/chatter", name),)
+    expected = source.expected.node("talker")
+    assert [each.connection for each in expected.participants] == [name]
+    assert expected.endpoints[0].participant == expected.participants[0].name
+    assert media(source.expected) == {("/chatter", "talker", "listener"): "udpv4"}
+
+
+def test_the_same_reports_are_not_negotiated_again() -> None:
+    source = NegotiatedSource(plan_of())
+    first = source.instructions(known(TALKER, LISTENER))
+    matched = dataclasses.replace(TALKER, state="active")
+    assert source.instructions(known(matched, LISTENER)) is first
+
+
+def test_an_endpoint_made_in_code_is_expected_told_and_flows() -> None:
+    source = NegotiatedSource(plan_of(transport=FlowTransport.UDPV4))
+    before = source.instructions(known(TALKER, LISTENER))
+    grown = dataclasses.replace(
+        TALKER, checksum="1", endpoints=(*TALKER.endpoints, _made(PUB, "/news"))
+    )
+    heard = dataclasses.replace(
+        LISTENER, checksum="1", endpoints=(*LISTENER.endpoints, _made(SUB, "/news"))
+    )
+    after = source.instructions(known(grown, heard))
+    assert after["/talker"].connections == before["/talker"].connections
+    assert after["/talker"].mappings == (
+        *before["/talker"].mappings,
+        ("publishers//news", ""),
+    )
+    assert [each.resolved for each in source.expected.node("listener").endpoints] == [
+        "/chatter",
+        "/news",
+    ]
+    assert media(source.expected)[("/news", "talker", "listener")] == "shm"
+
+
+def _made(kind: EndpointKind, resolved: str) -> EndpointReport:
+    return EndpointReport(kind=kind, name="", resolved=resolved, type="std_msgs/msg/String")
+
+
+def test_a_guest_takes_part_in_an_open_system_only() -> None:
+    guest = configured("/guest", (SUB, "chatter"), transports=("udpv4",))
+    source = NegotiatedSource(plan_of(is_open=False))
+    assert "/guest" not in source.instructions(known(TALKER, LISTENER, guest))
+    source = NegotiatedSource(plan_of())
+    assert "/guest" in source.instructions(known(TALKER, LISTENER, guest))
+
+
+def test_a_guest_that_leaves_leaves_nothing_behind() -> None:
+    source = NegotiatedSource(plan_of(transport=FlowTransport.TCPV4))
+    guest = configured("/guest", (SUB, "chatter"))
+    alone = source.instructions(known(TALKER, LISTENER))
+    with_guest = source.instructions(known(TALKER, LISTENER, guest))
+    assert with_guest["/guest"].connections != ()
+    assert source.instructions(known(TALKER, LISTENER)).keys() == alone.keys()
+
+
+def test_what_cannot_be_connected_is_told_with_what_both_have() -> None:
+    source = NegotiatedSource(plan_of(transport=FlowTransport.TCPV4))
+    poor = dataclasses.replace(LISTENER, transports=("udpv4", "shm"))
+    source.instructions(known(TALKER, poor))
+    (problem,) = source.problems
+    assert problem.startswith("cannot carry '/chatter' from 'talker' to 'listener' by tcpv4")
+    assert "'talker' can be connected by shm, udpv4, udpv6, udpm, tcpv4" in problem
+    assert "'listener' by udpv4, shm" in problem
+
+
+def test_a_guest_that_cannot_be_connected_is_no_problem_of_the_system() -> None:
+    source = NegotiatedSource(plan_of(transport=FlowTransport.TCPV4))
+    guest = configured("/guest", (SUB, "chatter"), transports=("udpv4",))
+    source.instructions(known(TALKER, LISTENER, guest))
+    assert source.problems == ()
+
+
+def test_a_node_that_has_made_all_of_it_is_told_nothing_more() -> None:
+    source = NegotiatedSource(plan_of(transport=FlowTransport.UDPV4))
+    now = known(TALKER, LISTENER)
+    for _ in range(2):
+        for name, wanted in source.instructions(now).items():
+            for step in steps(wanted, wired(now[name])):
+                now[name] = rewired(
+                    now[name],
+                    step.operation,
+                    connection=step.connection,
+                    urls=step.connections.urls,
+                    endpoint=step.endpoint,
+                )
+    told = source.instructions(now)
+    assert all(steps(told[name], wired(each)) == () for name, each in now.items())
+    assert media(source.expected) == {("/chatter", "talker", "listener"): "udpv4"}

@@ -1,0 +1,273 @@
+"""When a run programs networks, with a programmer that only notes what it is asked."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from lifecycle.errors import ExitCode
+from lifecycle.supervisor.events import Emitter, Notice, VerdictChanged
+from lifecycle.supervisor.failure import StepFailedError
+from lifecycle.supervisor.networks import Networks, open_networks, remove_programmed
+from lifecycle.supervisor.options import UpOptions
+from lifecycle.supervisor.orphans import OWN_CHILD, reap_adopted
+from lifecycle.supervisor.programming import (
+    Change,
+    ChangeKind,
+    Changes,
+    PrivilegeError,
+    TargetOptions,
+)
+from lifecycle.supervisor.remote import down
+from lifecycle.supervisor.rundir import RunDirectory, new_run_id
+from lifecycle.verify.verdict import FlowReport, Outcome, Stage, Verdict
+from tests.unit.export.samples import plan, report
+from tests.unit.supervisor.programming.samples import nef_settings, settings_file
+from tests.unit.supervisor.programming.servers import TOKEN, NefServer
+
+_BOUND_S = 5.0
+
+
+class FakePrograms:
+    """A Programmer that notes what it is asked, and fails as often as told."""
+
+    def __init__(self) -> None:
+        self.seen: list[tuple[str, ...]] = []
+        self.fail = 0
+        self.asked = asyncio.Event()
+        self._loop = asyncio.get_running_loop()
+
+    def update(self, flows: Sequence[FlowReport], *, hold: bool) -> tuple[Changes, ...]:
+        assert hold
+        topics = tuple(each.topic for each in flows)
+        if topics in self.seen:
+            return ()
+        self._loop.call_soon_threadsafe(self.asked.set)
+        if self.fail:
+            self.fail -= 1
+            raise PrivilegeError(
+                "cannot write nft table inet flowqos_s: 'nft -f -' needs CAP_NET_ADMIN in this "
+                "network namespace",
+                hint="run this command as root",
+            )
+        self.seen.append(topics)
+        change = Change(kind=ChangeKind.CREATE, key="k", what="w")
+        return (Changes(target="fake", changes=(change,)),)
+
+    def renew(self) -> float | None:
+        return None
+
+    def close(self) -> tuple[Changes, ...]:
+        self.seen.append(("closed",))
+        return ()
+
+
+def verdict(*topics: str) -> Verdict:
+    flows = tuple(report(each) for each in topics)
+    return Verdict(verdict=Outcome.OK, blocking=False, findings=(), flows=flows)
+
+
+def heard(*topics: str) -> VerdictChanged:
+    return VerdictChanged(stage=Stage.ACTIVE, verdict=verdict(*topics))
+
+
+class Told:
+    """An emitter, and the notices that went through it."""
+
+    def __init__(self) -> None:
+        self.emit = Emitter()
+        self.notices: list[str] = []
+        self.emit.listen(self._hear)
+
+    def _hear(self, event: object) -> None:
+        if isinstance(event, Notice):
+            self.notices.append(event.message)
+
+
+def test_flows_are_programmed_at_the_gate_followed_afterwards_and_removed_in_the_end(
+    tmp_path: Path,
+) -> None:
+    told = Told()
+
+    async def run() -> FakePrograms:
+        programs = FakePrograms()
+        networks = Networks("s", tmp_path, told.emit, programs)
+        told.emit(heard("/before"))
+        await networks.begin(verdict("/gate"))
+        assert programs.seen == [("/gate",)]
+        programs.asked.clear()
+        told.emit(heard("/later"))
+        await asyncio.wait_for(programs.asked.wait(), _BOUND_S)
+        await networks.close()
+        told.emit(heard("/after"))
+        await asyncio.sleep(0)
+        return programs
+
+    programs = asyncio.run(run())
+
+    assert programs.seen == [("/gate",), ("/later",), ("closed",)]
+    assert told.notices[0] == "fake: 1 created, 0 unchanged\n  + k: w"
+
+
+def test_a_first_failure_ends_the_run_and_names_the_privilege(tmp_path: Path) -> None:
+    async def run() -> tuple[StepFailedError, FakePrograms]:
+        programs = FakePrograms()
+        programs.fail = 1
+        networks = Networks("s", tmp_path, Emitter(), programs)
+        with pytest.raises(StepFailedError) as caught:
+            await networks.begin(verdict("/gate"))
+        await networks.close()
+        return caught.value, programs
+
+    error, programs = asyncio.run(run())
+
+    assert error.exit_code is ExitCode.BRING_UP_FAILED
+    assert (error.rule, error.subject) == ("run.not-programmed", "s")
+    assert str(error) == (
+        "cannot program networks for 's': cannot write nft table inet flowqos_s: 'nft -f -' needs "
+        "CAP_NET_ADMIN in this network namespace; run this command as root"
+    )
+    assert programs.seen == [("closed",)]
+
+
+def test_a_later_failure_is_a_notice(tmp_path: Path) -> None:
+    told = Told()
+
+    async def run() -> None:
+        programs = FakePrograms()
+        networks = Networks("s", tmp_path, told.emit, programs)
+        await networks.begin(verdict("/gate"))
+        programs.asked.clear()
+        programs.fail = 1
+        told.emit(heard("/later"))
+        await asyncio.wait_for(programs.asked.wait(), _BOUND_S)
+        await networks.close()
+
+    asyncio.run(run())
+
+    # Closing may come before the loop has heard of the failure, but never before the first notice.
+    assert told.notices[0].startswith("fake: 1 created")
+    assert [each.partition(":")[0] for each in told.notices[1:]] in (
+        [],
+        ["cannot write nft table inet flowqos_s"],
+    )
+
+
+def test_without_program_nothing_is_programmed(tmp_path: Path) -> None:
+    told = Told()
+
+    async def run() -> None:
+        networks = Networks("s", tmp_path, told.emit)
+        await networks.begin(verdict("/gate"))
+        told.emit(heard("/later"))
+        await networks.close()
+
+    asyncio.run(run())
+
+    assert told.notices == []
+    assert list(tmp_path.iterdir()) == []
+
+
+class Applied:
+    """A NEF subscription that somebody, or a supervisor, made for a run."""
+
+    def __init__(self, directory: Path, server: NefServer) -> None:
+        settings = nef_settings(server.url, devices=["10.77.0.1"])
+        self.options = TargetOptions(kind="nef", settings=settings_file(directory, nef=settings))
+        self.root = directory / "lifecycle"
+        self.environment = {"XDG_RUNTIME_DIR": str(directory)}
+
+    def apply(self, *, owned: bool = False) -> Path:
+        from lifecycle.supervisor.programming import open_programmer
+        from lifecycle.supervisor.rundir import run_name
+
+        programmer = open_programmer(
+            plan(), [self.options], environment=self.environment, owned=owned
+        )
+        programmer.update([report()])
+        programmer.release()
+        return self.root / run_name(plan())
+
+
+@pytest.fixture
+def token(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TEST_TOKEN", TOKEN)
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+
+
+@pytest.mark.usefixtures("token")
+def test_what_somebody_applied_by_hand_goes_with_the_system(tmp_path: Path) -> None:
+    told = Told()
+    with NefServer() as server:
+        directory = Applied(tmp_path, server).apply()
+        assert len(server.subscriptions) == 1
+
+        asyncio.run(Networks("s", directory, told.emit).close())
+
+        assert server.subscriptions == {}
+    assert ": 1 deleted, 0 unchanged" in told.notices[0]
+
+
+@pytest.mark.usefixtures("token")
+def test_what_cannot_be_removed_in_the_end_is_a_notice_and_stays_listed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = Told()
+    with NefServer() as server:
+        directory = Applied(tmp_path, server).apply()
+        monkeypatch.delenv("TEST_TOKEN")
+
+        asyncio.run(Networks("s", directory, told.emit).close())
+
+    assert "environment variable TEST_TOKEN: it is empty or not set" in told.notices[0]
+    assert (directory / "programmed.json").exists()
+
+
+@pytest.mark.usefixtures("token")
+def test_down_of_a_dead_supervisors_run_removes_what_it_programmed(tmp_path: Path) -> None:
+    with NefServer() as server:
+        directory = Applied(tmp_path, server).apply(owned=True)
+
+        assert down(directory, _BOUND_S) is ExitCode.OK
+
+        assert server.subscriptions == {}
+    assert remove_programmed(directory) == ()
+
+
+@pytest.mark.usefixtures("token")
+def test_before_it_programs_a_run_removes_what_dead_runs_left_even_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = Told()
+    with NefServer() as server:
+        applied = Applied(tmp_path, server)
+        path = applied.apply(owned=True)
+        ledger = path / "programmed.json"
+        ledger.write_text(ledger.read_text().replace(f'"pid":{os.getpid()}', '"pid":1'))
+        directory = RunDirectory.acquire(path.parent, path.name, new_run_id())
+        try:
+            without = UpOptions()
+            open_networks(plan(), without, directory, told.emit, environment=applied.environment)
+            assert len(server.subscriptions) == 1
+
+            options = UpOptions(program=(applied.options,))
+            open_networks(plan(), options, directory, told.emit, environment=applied.environment)
+        finally:
+            directory.release()
+
+        assert server.subscriptions == {}
+    assert told.notices[0].startswith("left by a killed supervisor: nef at ")
+
+
+def test_a_program_that_somebody_waits_for_is_not_buried_as_an_orphan() -> None:
+    with OWN_CHILD:
+        child = subprocess.Popen([sys.executable, "-c", "raise SystemExit(3)"])
+        os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)
+        reap_adopted(())
+        assert child.wait(_BOUND_S) == 3

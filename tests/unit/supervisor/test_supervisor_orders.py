@@ -1,0 +1,192 @@
+"""Orders to a supervisor: which fit, in which order nodes are taken down, and who is told."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from pathlib import Path
+
+import pytest
+
+from lifecycle.errors import BringUpError, ExitCode, UsageError
+from lifecycle.manifest.model import Condition, RunKind
+from lifecycle.supervisor.events import Reach
+from lifecycle.supervisor.gate import Gate
+from lifecycle.supervisor.orders import (
+    ACTIVE,
+    HELD,
+    PAUSED,
+    Done,
+    Mailbox,
+    Order,
+    OrderKind,
+    check_order,
+)
+from lifecycle.supervisor.remote import look, order
+from lifecycle.supervisor.server import Ask, ControlServer, Look, follow
+from lifecycle.supervisor.shutdown import TakeDown
+from lifecycle.verify.observation import Observation
+from lifecycle.verify.verdict import Outcome
+from tests.unit.supervisor.fakes import World, plan_of, planned_node, run, verdict_of
+from tests.unit.supervisor.test_supervisor_rundir import STATUS
+
+PLAN = plan_of(
+    planned_node("camera"),
+    planned_node("viewer", after={"camera": Condition.ACTIVE}),
+    planned_node("base", kind=RunKind.ATTACH),
+)
+
+
+@pytest.mark.parametrize(
+    ("kind", "fits"),
+    [
+        (OrderKind.PAUSE, {ACTIVE, HELD}),
+        (OrderKind.RESUME, {PAUSED, HELD}),
+        (OrderKind.RESTART, {ACTIVE, PAUSED, HELD}),
+    ],
+)
+@pytest.mark.parametrize(
+    "phase", [ACTIVE, PAUSED, HELD, "connecting", "verifying", "restarting", "stopping"]
+)
+def test_an_order_fits_some_phases_and_no_others(
+    tmp_path: Path, kind: OrderKind, fits: set[str], phase: str
+) -> None:
+    async def test() -> None:
+        system = World(PLAN, tmp_path).system
+        if phase in fits:
+            check_order(Order(kind=kind), system, phase)
+        else:
+            with pytest.raises(UsageError, match=rf"^cannot {kind.value} 'robot': it is {phase};"):
+                check_order(Order(kind=kind), system, phase)
+
+    run(test())
+
+
+@pytest.mark.parametrize(
+    ("node", "message"),
+    [
+        (
+            "camrea",
+            "cannot restart 'camrea': this supervisor runs no such node; it runs: /camera, /viewer",
+        ),
+        ("/base", "cannot restart '/base': somebody else runs it"),
+    ],
+)
+def test_a_node_that_is_not_ours_is_not_restarted(tmp_path: Path, node: str, message: str) -> None:
+    async def test() -> None:
+        system = World(PLAN, tmp_path).system
+        for known in ("camera", "/camera"):
+            check_order(Order(kind=OrderKind.RESTART, node=known), system, ACTIVE)
+        with pytest.raises(UsageError) as caught:
+            check_order(Order(kind=OrderKind.RESTART, node=node), system, ACTIVE)
+        assert str(caught.value) == message
+
+    run(test())
+
+
+def test_orders_are_carried_out_one_by_one_and_refused_once_all_is_over() -> None:
+    async def test() -> None:
+        mailbox = Mailbox()
+        first = asyncio.ensure_future(mailbox.place(Order(kind=OrderKind.PAUSE)))
+        second = asyncio.ensure_future(mailbox.place(Order(kind=OrderKind.RESUME)))
+        pending = await mailbox.next()
+        assert pending.order.kind is OrderKind.PAUSE
+        pending.finish(Done())
+        assert await first == Done()
+        mailbox.close("cannot go on: over")
+        assert await second == Done(exit_code=ExitCode.BRING_UP_FAILED, error="cannot go on: over")
+
+    run(test())
+
+
+def test_the_control_socket_looks_follows_and_orders(tmp_path: Path) -> None:
+    seen = Look(plan=PLAN, status=STATUS, observation=Observation(), verdict=None)
+    asked: list[Order] = []
+
+    async def carry_out(given: Order) -> Done:
+        asked.append(given)
+        return Done(exit_code=ExitCode.VIOLATED, error="cannot activate: no")
+
+    async def test() -> None:
+        server = ControlServer(
+            tmp_path / "control", lambda: STATUS, lambda: None, look=lambda: seen, order=carry_out
+        )
+        await server.open()
+        loop = asyncio.get_running_loop()
+        assert await loop.run_in_executor(None, look, tmp_path) == seen
+        answer = await loop.run_in_executor(
+            None, lambda: order(tmp_path, Ask.RESTART, 5.0, node="camera")
+        )
+        assert (answer.exit_code, answer.error) == (ExitCode.VIOLATED, "cannot activate: no")
+        assert asked == [Order(kind=OrderKind.RESTART, node="camera")]
+
+        heard: list[Look] = []
+        came = [threading.Event(), threading.Event()]
+
+        def listen() -> None:
+            for each in follow(tmp_path / "control"):
+                came[len(heard)].set()
+                heard.append(each)
+
+        listening = loop.run_in_executor(None, listen)
+        assert await loop.run_in_executor(None, came[0].wait, 5.0)
+        server.changed()
+        assert await loop.run_in_executor(None, came[1].wait, 5.0)
+        await server.close(0)
+        await asyncio.wait_for(listening, 5.0)
+        assert heard == [seen, seen]
+
+    asyncio.run(test())
+
+
+def test_nodes_are_deactivated_in_reverse_order_and_come_up_anew_in_new_processes(
+    tmp_path: Path,
+) -> None:
+    async def test() -> None:
+        plan = plan_of(
+            planned_node("camera"), planned_node("viewer", after={"camera": Condition.ACTIVE})
+        )
+        world = World(plan, tmp_path)
+        gate = Gate(strict=False)
+        await world.bring_up.connect(30.0)
+        await world.bring_up.activate(gate.judge(verdict_of(Outcome.OK)), 30.0)
+        world.spawner.takes_s["/viewer deactivate"] = 3.0
+        before = len(world.log)
+        await world.bring_up.deactivate()
+        assert world.log[before:] == ["/viewer deactivate", "/camera deactivate"]
+        assert {node.reach for node in world.system.nodes.values()} == {Reach.CONNECTED}
+
+        camera, viewer = world.system.nodes["camera"], world.system.nodes["viewer"]
+        old = camera.process
+        before = len(world.log)
+        await TakeDown(world.system, world.emit, asyncio.Event(), nodes=(camera,)).run()
+        assert [each for each in world.log[before:] if "viewer" in each] == []
+        world.system.renew((camera,))
+        assert camera.process is not old
+        assert world.system.processes["camera"] is camera.process
+        assert (camera.reach, viewer.reach) == (Reach.WAITING, Reach.CONNECTED)
+        await world.bring_up.connect(30.0, (camera,))
+        assert camera.reach is Reach.CONNECTED
+        await world.bring_up.close()
+        await TakeDown(world.system, world.emit, asyncio.Event()).run()
+
+    run(test())
+
+
+def test_a_permit_of_an_earlier_gate_activates_nothing_after_a_pause(tmp_path: Path) -> None:
+    async def test() -> None:
+        world = World(plan_of(planned_node("camera")), tmp_path)
+        gate = Gate(strict=False)
+        await world.bring_up.connect(30.0)
+        permit = gate.judge(verdict_of(Outcome.OK))
+        await world.bring_up.activate(permit, 30.0)
+        gate.close()
+        await world.bring_up.deactivate()
+        before = len(world.log)
+        with pytest.raises(BringUpError, match="the gate was closed again before this request"):
+            await world.bring_up.activate(permit, 30.0)
+        assert world.log[before:] == []
+        await world.bring_up.close()
+        await TakeDown(world.system, world.emit, asyncio.Event()).run()
+
+    run(test())

@@ -1,0 +1,322 @@
+"""What a run looks like: plain lines, JSON lines, the live table, status and flows."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+
+import pytest
+from rich.console import Console
+
+from lifecycle.cli.flow_table import render_flows
+from lifecycle.cli.live import Live
+from lifecycle.cli.status_text import status_text
+from lifecycle.cli.up_output import JsonLines, PlainLines
+from lifecycle.errors import ExitCode
+from lifecycle.manifest.model import UniqueHow
+from lifecycle.network.nfe import (
+    InternetProtocol,
+    NetworkFlowEndpoint,
+    TransportProtocol,
+    UniqueRequirement,
+)
+from lifecycle.node.control import Operation
+from lifecycle.supervisor.events import (
+    Event,
+    Failure,
+    GateOpened,
+    LogLine,
+    NodeChanged,
+    ProcessChanged,
+    Reach,
+    RequestSent,
+    SystemReached,
+    VerdictChanged,
+    WiringChanged,
+    WiringLost,
+)
+from lifecycle.supervisor.options import UpResult
+from lifecycle.supervisor.states import ProcessState
+from lifecycle.supervisor.status import NodeStatus, SystemStatus
+from lifecycle.verify import FlowReport, Outcome, Stage
+from lifecycle.verify.observation import ConnectionReport
+from tests.unit.supervisor.fakes import verdict_of
+
+EVENTS: tuple[Event, ...] = (
+    ProcessChanged(process="camera", state=ProcessState.RUNNING, pid=7),
+    RequestSent(node="/camera", operation=Operation.CONFIGURE),
+    NodeChanged(node="/camera", reach=Reach.CONNECTED, state="inactive", connected=True),
+    LogLine(process="camera", stream="stdout", line="shutter is open"),
+    VerdictChanged(stage=Stage.CONNECTED, verdict=verdict_of(Outcome.OK)),
+    GateOpened(outcome="ok", nodes=("/camera",)),
+    SystemReached(reached="active", elapsed_s=1.25),
+    Failure(
+        rule="run.process-died",
+        subject="/camera",
+        message="cannot keep '/camera' running: pid 7 died: killed by SIGSEGV",
+        log_tail=("shutter is stuck",),
+    ),
+)
+RESULT = UpResult(exit_code=ExitCode.OK, verdict=verdict_of(Outcome.OK))
+STATUS = SystemStatus(
+    system="robot",
+    domain_id=30,
+    phase="active",
+    verdict=Outcome.OK,
+    supervisor=1,
+    elapsed_s=1.5,
+    nodes=(
+        NodeStatus(
+            node="/camera",
+            process="camera",
+            process_state=ProcessState.RUNNING,
+            pid=7,
+            managed=True,
+            reach=Reach.ACTIVE,
+            state="active",
+            doing="",
+            matched=1,
+            endpoints=2,
+            unique_flows=1,
+            flows=3,
+            findings=0,
+        ),
+    ),
+)
+
+
+def test_plain_lines_tell_a_person_what_happens() -> None:
+    stream = io.StringIO()
+    output = PlainLines(stream)
+    for event in EVENTS:
+        output(event)
+    output.finish(RESULT)
+    assert stream.getvalue() == (
+        "process camera: running (pid 7)\n"
+        "/camera: connected\n"
+        "[camera] shutter is open\n"
+        "connected: verdict ok\n"
+        "gate open on verdict ok: activating 1 node\n"
+        "system active after 1.25 s\n"
+        "run.process-died: cannot keep '/camera' running: pid 7 died: killed by SIGSEGV\n"
+        "    | shutter is stuck\n"
+        "verdict: ok\n"
+    )
+
+
+def test_a_verdict_that_reads_as_the_last_one_did_is_not_told_again() -> None:
+    stream = io.StringIO()
+    output = PlainLines(stream)
+    ok = VerdictChanged(stage=Stage.ACTIVE, verdict=RESULT.verdict)
+    wrong = VerdictChanged(
+        stage=Stage.ACTIVE,
+        verdict=dataclasses.replace(RESULT.verdict, verdict=Outcome.VIOLATED),
+    )
+    for event in (ok, ok, EVENTS[0], ok, wrong, wrong, ok):
+        output(event)
+    assert stream.getvalue() == (
+        "active: verdict ok\n"
+        "process camera: running (pid 7)\n"
+        "active: verdict violated\n"
+        "active: verdict ok\n"
+    )
+
+
+def test_a_verdict_that_is_unverifiable_names_what_is_unknown() -> None:
+    stream = io.StringIO()
+    verdict = verdict_of(Outcome.UNVERIFIABLE, "graph.unattributed-endpoint")
+    PlainLines(stream)(VerdictChanged(stage=Stage.ACTIVE, verdict=verdict))
+    assert stream.getvalue() == (
+        "active: verdict unverifiable; unknown: /camera (graph.unattributed-endpoint)\n"
+    )
+
+
+def test_a_node_on_its_way_to_active_is_waited_for_and_one_that_leaves_it_violates() -> None:
+    stream = io.StringIO()
+    lines = PlainLines(stream)
+    wrong = VerdictChanged(
+        stage=Stage.ACTIVE, verdict=verdict_of(Outcome.VIOLATED, "state.wrong-state")
+    )
+    for event in (wrong, SystemReached(reached="active", elapsed_s=1.0), wrong):
+        lines(event)
+    assert stream.getvalue() == (
+        "not active yet; wrong: /camera (state.wrong-state)\n"
+        "system active after 1.00 s\n"
+        "active: verdict violated; wrong: /camera (state.wrong-state)\n"
+    )
+
+
+def test_json_lines_are_one_object_each_and_the_last_is_the_verdict() -> None:
+    stream = io.StringIO()
+    output = JsonLines(stream)
+    for event in EVENTS:
+        output(event)
+    output.finish(RESULT)
+    lines = [json.loads(line) for line in stream.getvalue().splitlines()]
+    kinds = ["process", "request", "node", "log", "verdict", "gate", "system", "failure"]
+    assert [line.get("event") for line in lines] == [*kinds, None]
+    assert lines[1] == {"event": "request", "node": "/camera", "operation": "configure"}
+    assert lines[-1]["verdict"] == "ok"
+
+
+def test_the_live_table_shows_each_node_and_scrolls_what_it_prints() -> None:
+    stream = io.StringIO()
+    console = Console(file=stream, force_terminal=True, width=100, color_system=None)
+    with Live(console) as live:
+        live.watch(lambda: STATUS)
+        for event in EVENTS:
+            live(event)
+        live.finish(RESULT)
+    shown = stream.getvalue()
+    assert "[camera] shutter is open" in shown
+    assert "connecting ▸ verifying ▸ activating ▸ active" in shown
+    row = next(line for line in shown.splitlines() if line.strip().startswith("/camera "))
+    assert row.split() == ["/camera", "running", "7", "active", "1/2", "1/3"]
+    assert "verdict: ok" in shown
+
+
+def test_a_status_is_a_head_and_a_line_for_each_node() -> None:
+    assert status_text(STATUS) == (
+        "robot: active, verdict ok, domain 30, supervisor 1, up for 1.5 s\n"
+        "node     process  pid  state   matched  unique flows\n"
+        "/camera  running  7    active  1/2      1/3"
+    )
+
+
+def test_a_status_says_what_keeps_the_verdict_from_being_ok() -> None:
+    wrong = dataclasses.replace(STATUS, verdict=Outcome.VIOLATED, not_ok="missing: /camera (node)")
+    assert status_text(wrong).splitlines()[0] == (
+        "robot: active, verdict violated (missing: /camera (node)), domain 30, supervisor 1, "
+        "up for 1.5 s"
+    )
+
+
+def _nfe(port: int, protocol: TransportProtocol = TransportProtocol.UDP) -> NetworkFlowEndpoint:
+    return NetworkFlowEndpoint(
+        transport_protocol=protocol,
+        internet_protocol=InternetProtocol.IPV4,
+        transport_port=port,
+        internet_address="10.0.0.1",
+    )
+
+
+FLOW = FlowReport(
+    topic="/video",
+    publisher="/camera",
+    subscription="/viewer",
+    source=(_nfe(40000),),
+    destination=(_nfe(7000), _nfe(7000, TransportProtocol.UNKNOWN)),
+    unique=UniqueHow.STRONGLY,
+    dscp=46,
+    requirement=(UniqueRequirement.STRICTLY_REQUIRED, UniqueRequirement.NOT_REQUIRED),
+    demanded=UniqueHow.WEAKLY,
+    transport="shm or udp",
+    outcome=Outcome.OK,
+    five_qi=85,
+    five_qi_reason="the least demanding class",
+    effective_transport="shm",
+)
+
+
+def test_a_flow_shows_its_tuple_dscp_and_tos_requirement_and_verdict() -> None:
+    head, row = render_flows([FLOW], "text").splitlines()
+    assert " ".join(head.split()) == (
+        "topic publisher subscription source destination protocol dscp 5qi unique required "
+        "demanded transport verdict"
+    )
+    assert row.split()[-2:] == ["shm", "ok"]  # what carries it, not what could
+    for cell in (
+        "85 (auto)",
+        "10.0.0.1:40000",
+        "10.0.0.1:7000 shm",
+        "udp",
+        "46",
+        "184",
+        "strongly",
+        "weakly",
+    ):
+        assert cell in row
+    assert render_flows([], "text") == "no flow"
+    csv_head, csv_row = render_flows([FLOW], "csv").splitlines()
+    cells = dict(zip(csv_head.split(","), csv_row.split(","), strict=True))
+    assert (cells["dscp"], cells["dscp_name"], cells["tos"]) == ("46", "EF", "184")
+    assert (cells["five_qi"], cells["effective_transport"]) == ("85", "shm")
+    assert json.loads(render_flows([FLOW], "json"))[0]["topic"] == "/video"
+
+
+@pytest.mark.parametrize(
+    ("event", "line"),
+    [
+        (
+            WiringChanged(
+                node="/camera",
+                operation=Operation.CONNECT_TO,
+                connection="net",
+                urls=("udpv4://10.77.0.1:7911", "shm://"),
+            ),
+            "/camera: connected to net, udpv4://10.77.0.1:7911, shm://",
+        ),
+        (
+            WiringChanged(
+                node="/camera",
+                operation=Operation.MAP_TO,
+                connection="net",
+                endpoint="publishers/video",
+                attempt=3,
+            ),
+            "/camera: publishers/video mapped onto connection net (try 3)",
+        ),
+        (
+            WiringChanged(
+                node="/camera", operation=Operation.MAP_TO, endpoint="subscriptions/command"
+            ),
+            "/camera: subscriptions/command mapped onto its own participant",
+        ),
+        (
+            WiringChanged(
+                node="/camera",
+                operation=Operation.CONNECT_TO,
+                connection="net",
+                attempt=2,
+                error="cannot connect '/camera' to 'net' (shm://): no shared memory",
+            ),
+            "cannot connect '/camera' to 'net' (shm://): no shared memory (try 2)",
+        ),
+        (
+            WiringChanged(node="/camera", operation=Operation.DISCONNECT_FROM, connection="net"),
+            "/camera: disconnected from net",
+        ),
+        (WiringLost(node="/camera", connection="net"), "/camera: lost net"),
+        (
+            WiringLost(node="/camera", connection="net", endpoint="publishers/video"),
+            "/camera: lost publishers/video on net",
+        ),
+    ],
+)
+def test_a_step_of_wiring_is_one_line(event: Event, line: str) -> None:
+    stream = io.StringIO()
+    PlainLines(stream)(event)
+    assert stream.getvalue() == f"{line}\n"
+
+
+def test_a_status_lists_connections_below_their_node() -> None:
+    node = dataclasses.replace(
+        STATUS.nodes[0],
+        connections=(
+            ConnectionReport(
+                name="net",
+                urls=("udpv4://10.77.0.1:7911",),
+                established=True,
+                mappings=("publishers/video",),
+            ),
+            ConnectionReport(name="far", urls=("tcpv4://10.77.0.1:5100",), error="no route"),
+            ConnectionReport(name="idle", urls=("shm://",)),
+        ),
+    )
+    lines = status_text(dataclasses.replace(STATUS, nodes=(node,))).splitlines()
+    assert lines[3:] == [
+        "  connection net established; udpv4://10.77.0.1:7911; carries publishers/video",
+        "  connection far failed: no route; tcpv4://10.77.0.1:5100; carries nothing",
+        "  connection idle waits for peers; shm://; carries nothing",
+    ]

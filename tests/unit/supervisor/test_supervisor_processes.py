@@ -1,0 +1,270 @@
+"""Real processes without ROS: the zygote, process states, output, and orphans."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Coroutine, Iterator
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from lifecycle.errors import BringUpError
+from lifecycle.manifest.model import Run, RunKind
+from lifecycle.plan.model import PlannedProcess
+from lifecycle.supervisor.events import Emitter, LogLine
+from lifecycle.supervisor.logs import LONGEST_LINE, LineReader, ros_log_root
+from lifecycle.supervisor.orphans import end_run
+from lifecycle.supervisor.process import COMMAND_ESCALATION, ManagedProcess
+from lifecycle.supervisor.rundir import RUN_VARIABLE, ChildRecord, RunRecord, boot_id, start_ticks
+from lifecycle.supervisor.states import ProcessExit, ProcessState, change
+from lifecycle.supervisor.zygote import Zygote, ZygoteProcess
+
+PYTHON = sys.executable
+BOUND_S = 20.0
+
+
+def _run(test: Coroutine[Any, Any, None]) -> None:
+    asyncio.run(asyncio.wait_for(test, BOUND_S))
+
+
+class _Bench:
+    """A zygote and processes of it."""
+
+    def __init__(self, tmp_path: Path, zygote: Zygote) -> None:
+        self.zygote = zygote
+        self.lines: list[str] = []
+        self.spoke = asyncio.Event()
+        self.emit = Emitter()
+        self.emit.listen(self._hear)
+        self._logs = tmp_path
+        self._processes: list[ManagedProcess] = []
+
+    def _hear(self, event: object) -> None:
+        if isinstance(event, LogLine):
+            self.lines.append(event.line)
+            self.spoke.set()
+
+    async def close(self) -> None:
+        for process in self._processes:
+            await process.end(COMMAND_ESCALATION, asyncio.Event())
+        await self.zygote.close()
+
+    async def start(self, *argv: str, environment: tuple[tuple[str, str], ...] = ()) -> Any:
+        process = ManagedProcess(
+            PlannedProcess(
+                name="it",
+                machine="",
+                run=Run(kind=RunKind.COMMAND, command=argv),
+                nodes=("it",),
+                argv=argv,
+                environment=environment,
+            ),
+            logs=self._logs,
+            emit=self.emit,
+        )
+        self._processes.append(process)
+        await process.spawn(self.zygote, None)
+        return process
+
+
+@contextlib.asynccontextmanager
+async def _bench(tmp_path: Path) -> Any:
+    zygote = Zygote(ZygoteProcess(preload=False, environment=os.environ))
+    bench = _Bench(tmp_path, zygote)
+    try:
+        yield bench
+    finally:
+        await bench.close()
+
+
+def test_a_command_gets_its_arguments_environment_and_session_and_its_end_is_noticed(
+    tmp_path: Path,
+) -> None:
+    async def test() -> None:
+        code = "import os; print(os.environ['COLOUR'], os.getsid(0) == os.getpid()); exit(3)"
+        async with _bench(tmp_path) as bench:
+            process = await bench.start(PYTHON, "-c", code, environment=(("COLOUR", "red"),))
+            assert await process.ended == ProcessExit(status=3)
+            await process.end(COMMAND_ESCALATION, asyncio.Event())
+            assert bench.lines == ["red True"]
+            assert process.log.path.read_text() == "red True\n"
+
+    _run(test())
+
+
+def test_a_killed_process_is_noticed_within_a_tenth_of_a_second(tmp_path: Path) -> None:
+    async def test() -> None:
+        took_s = []
+        async with _bench(tmp_path) as bench:
+            for _ in range(5):
+                process = await bench.start("sleep", "60")
+                began = time.monotonic()
+                os.kill(process.pid, signal.SIGKILL)
+                assert await process.ended == ProcessExit(signal=signal.SIGKILL)
+                took_s.append(time.monotonic() - began)
+        assert min(took_s) < 0.1  # the others may have had to wait for a processor
+
+    _run(test())
+
+
+def test_a_program_that_does_not_exist_says_so_in_its_output(tmp_path: Path) -> None:
+    async def test() -> None:
+        async with _bench(tmp_path) as bench:
+            process = await bench.start("/no/such/program")
+            assert await process.ended == ProcessExit(status=127)
+            await process.end(COMMAND_ESCALATION, asyncio.Event())
+            assert process.log.tail == ("cannot run '/no/such/program': No such file or directory",)
+
+    _run(test())
+
+
+def test_a_process_that_ignores_sigint_and_sigterm_is_killed_with_its_group(
+    tmp_path: Path,
+) -> None:
+    async def test() -> None:
+        code = (
+            "import signal, subprocess, time\n"
+            "for number in (signal.SIGINT, signal.SIGTERM): signal.signal(number, signal.SIG_IGN)\n"
+            "print(subprocess.Popen(['sleep', '60']).pid, flush=True)\n"
+            "time.sleep(60)"
+        )
+        steps = ((signal.SIGINT, 0.1), (signal.SIGTERM, 0.1), (signal.SIGKILL, 5.0))
+        async with _bench(tmp_path) as bench:
+            process = await bench.start(PYTHON, "-c", code)
+            await bench.spoke.wait()
+            grandchild = psutil.Process(int(bench.lines[0]))
+            assert await process.end(steps, asyncio.Event()) == "SIGKILL"
+            assert process.ended.result() == ProcessExit(signal=signal.SIGKILL)
+            grandchild.wait(BOUND_S)
+
+    _run(test())
+
+
+def test_a_zygote_that_was_killed_says_that_nothing_can_be_started(tmp_path: Path) -> None:
+    async def test() -> None:
+        process = ZygoteProcess(preload=False, environment=os.environ)
+        zygote = Zygote(process)
+        process.popen.kill()
+        process.popen.wait()
+        bench = _Bench(tmp_path, zygote)
+        with pytest.raises(BringUpError, match="cannot start process 'it': "):
+            await bench.start("true")
+        await bench.close()
+
+    _run(test())
+
+
+def test_when_the_supervisor_vanishes_the_zygote_ends_what_it_forked(tmp_path: Path) -> None:
+    async def test() -> None:
+        process = ZygoteProcess(preload=False, environment=os.environ)
+        zygote = Zygote(process)
+        bench = _Bench(tmp_path, zygote)
+        child = await bench.start("sleep", "60")
+        process.socket.shutdown(2)
+        assert await asyncio.get_running_loop().run_in_executor(None, process.popen.wait) == 0
+        assert not psutil.pid_exists(child.pid)
+        await child.ended
+        await bench.close()
+
+    _run(test())
+
+
+def test_lines_are_split_and_a_line_without_end_cannot_fill_the_memory() -> None:
+    async def test() -> None:
+        read, write = os.pipe()
+        lines: list[str] = []
+        reader = LineReader(read, lines.append)
+        loop = asyncio.get_running_loop()
+        data = b"one\r\ntwo\nth\xffree\n" + b"x" * (3 * LONGEST_LINE) + b"\nlast"
+
+        def fill() -> None:
+            with os.fdopen(write, "wb") as pipe:
+                pipe.write(data)
+
+        await loop.run_in_executor(None, fill)
+        await reader.ended
+        assert lines[:3] == ["one", "two", "th\ufffdree"]
+        assert max(len(line) for line in lines) == LONGEST_LINE
+        assert sum(len(line) for line in lines[3:-1]) == 3 * LONGEST_LINE
+        assert lines[-1] == "last"
+
+    _run(test())
+
+
+def test_every_state_change_is_legal_or_refused_with_the_legal_ones() -> None:
+    assert change(ProcessState.STARTING, ProcessState.RUNNING) is ProcessState.RUNNING
+    with pytest.raises(
+        ValueError,
+        match="cannot change a process from 'stopping' to 'running'; allowed: exited",
+    ):
+        change(ProcessState.STOPPING, ProcessState.RUNNING)
+
+
+@pytest.mark.parametrize(
+    ("environment", "expected"),
+    [
+        ({"ROS_LOG_DIR": "/logs", "ROS_HOME": "/home"}, Path("/logs")),
+        ({"ROS_HOME": "/home"}, Path("/home/log")),
+        ({}, Path("~/.ros/log").expanduser()),
+    ],
+)
+def test_logs_go_where_ros_puts_them(environment: dict[str, str], expected: Path) -> None:
+    assert ros_log_root(environment) == expected
+
+
+@pytest.fixture
+def stray() -> Iterator[psutil.Popen]:
+    """A process with the mark of run `abc` in its environment."""
+    process = psutil.Popen(
+        ["cat"],
+        env={**os.environ, RUN_VARIABLE: "abc"},
+        start_new_session=True,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+    )
+    # Its environment can be read only once its exec is over: an echo proves that.
+    process.stdin.write(b"here\n")
+    process.stdin.flush()
+    assert process.stdout.readline() == b"here\n"
+    yield process
+    process.stdin.close()
+    process.stdout.close()
+    if process.poll() is None:
+        process.kill()
+        process.wait()
+
+
+def _record(run_id: str, *children: ChildRecord, boot: str = "") -> RunRecord:
+    return RunRecord(
+        run_id=run_id,
+        boot_id=boot or boot_id(),
+        began_s=0.0,
+        supervisor=ChildRecord(name="supervisor", pid=1, start_ticks=1),
+        children=children,
+    )
+
+
+def test_an_orphan_is_found_by_the_mark_of_its_run_even_if_nobody_recorded_it(
+    stray: psutil.Popen,
+) -> None:
+    assert end_run(_record("abc")) == (stray.pid,)
+    assert stray.wait(BOUND_S) == -signal.SIGTERM
+
+
+def test_a_process_of_another_run_boot_or_start_time_is_left_alone(stray: psutil.Popen) -> None:
+    ticks = start_ticks(stray.pid)
+    assert ticks is not None
+    reused = ChildRecord(name="it", pid=stray.pid, start_ticks=ticks - 1)
+    same = ChildRecord(name="it", pid=stray.pid, start_ticks=ticks)
+    assert end_run(_record("other", reused)) == ()
+    assert end_run(_record("abc", same, boot="another boot")) == ()
+    assert stray.poll() is None
+    assert end_run(_record("other", same)) == (stray.pid,)

@@ -1,0 +1,142 @@
+"""What may pass by itself while a system is watched, and for how long."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from lifecycle.manifest.model import EndpointKind, FlowTransport
+from lifecycle.plan import Plan
+from lifecycle.supervisor.negotiation import NegotiatedSource
+from lifecycle.supervisor.settling import PASSING_S, Settling
+from lifecycle.verify import Finding, Outcome, Verdict
+from tests.unit.supervisor.fakes import verdict_of
+from tests.unit.supervisor.test_supervisor_negotiation import LISTENER, TALKER, known, plan_of
+
+PUB = EndpointKind.PUBLISHER
+OK = verdict_of(Outcome.OK)
+UNATTRIBUTED = "graph.unattributed-endpoint"
+
+
+def grown() -> tuple[Plan, Plan]:
+    """A plan, and what is expected once both nodes made an endpoint of /news in code."""
+    source = NegotiatedSource(plan_of())
+    source.instructions(known(TALKER, LISTENER))
+    before = source.expected
+    more = [
+        dataclasses.replace(
+            each,
+            checksum="1",
+            endpoints=(
+                *each.endpoints,
+                dataclasses.replace(each.endpoints[0], name="news", resolved="/news"),
+            ),
+        )
+        for each in (TALKER, LISTENER)
+    ]
+    source.instructions(known(*more))
+    return before, source.expected
+
+
+BEFORE, AFTER = grown()
+
+
+def found(*findings: tuple[str, str, str]) -> Verdict:
+    """A violated verdict of (rule, subject, node)."""
+    return Verdict(
+        verdict=Outcome.VIOLATED,
+        blocking=True,
+        findings=tuple(
+            Finding(
+                rule=rule,
+                outcome=Outcome.VIOLATED,
+                subject=subject,
+                expected="",
+                observed="",
+                message="",
+                node=node,
+                endpoint=PUB if rule == "graph.missing-endpoint" else None,
+            )
+            for rule, subject, node in findings
+        ),
+        flows=(),
+    )
+
+
+YOUNG = [
+    ("graph.missing-endpoint", "/news", "/talker"),
+    ("flow.wrong-medium", "/news: /talker → /listener", ""),
+    ("graph.unmatched-flow", "/news: /talker → /listener", ""),
+]
+
+
+@pytest.mark.parametrize("finding", YOUNG, ids=lambda each: each[0])
+def test_what_has_only_just_become_expected_may_be_missing_for_a_moment(
+    finding: tuple[str, str, str],
+) -> None:
+    settling = Settling()
+    assert settling.standing(None, OK, BEFORE, 10.0) == (OK, None)
+    bad = found(finding)
+    assert settling.standing(OK, bad, AFTER, 20.0) == (OK, PASSING_S)
+    assert settling.standing(OK, bad, AFTER, 20.25) == (OK, PASSING_S - 0.25)
+    assert settling.standing(OK, bad, AFTER, 20.0 + PASSING_S) == (bad, None)
+
+
+@pytest.mark.parametrize(
+    "finding",
+    [
+        ("graph.missing-endpoint", "/chatter", "/talker"),
+        ("flow.wrong-medium", "/chatter: /talker → /listener", ""),
+        ("graph.missing-node", "/talker", "/talker"),
+        ("connection.missing", "/talker", "/talker"),
+    ],
+    ids=lambda each: each[0],
+)
+def test_what_was_expected_before_may_not(finding: tuple[str, str, str]) -> None:
+    settling = Settling()
+    settling.standing(None, OK, BEFORE, 10.0)
+    bad = found(finding)
+    assert settling.standing(OK, bad, AFTER, 20.0) == (bad, None)
+
+
+def test_a_connection_that_was_only_just_negotiated_may_be_missing_for_a_moment() -> None:
+    plan = plan_of(transport=FlowTransport.UDPV4)
+    source = NegotiatedSource(plan)
+    source.instructions(known(TALKER, LISTENER))
+    settling = Settling()
+    settling.standing(None, OK, plan, 10.0)
+    bad = found(("connection.missing", "/talker", "/talker"))
+    assert settling.standing(OK, bad, source.expected, 20.0) == (OK, PASSING_S)
+
+
+def test_whatever_else_is_wrong_is_told_at_once_with_all_of_it() -> None:
+    settling = Settling()
+    settling.standing(None, OK, BEFORE, 10.0)
+    bad = found(YOUNG[0], ("graph.missing-node", "/talker", "/talker"))
+    assert settling.standing(OK, bad, AFTER, 20.0) == (bad, None)
+
+
+def test_what_healed_is_told_at_once_too() -> None:
+    settling = Settling()
+    bad = found(("graph.missing-node", "/talker", "/talker"))
+    settling.standing(None, bad, BEFORE, 10.0)
+    other = found(YOUNG[0])
+    assert settling.standing(bad, other, AFTER, 20.0) == (other, None)
+
+
+def test_each_newcomer_has_a_moment_of_its_own() -> None:
+    settling = Settling()
+    settling.standing(None, OK, BEFORE, 0.0)
+    one = found((UNATTRIBUTED, "/rosout", ""))
+    two = found((UNATTRIBUTED, "/rosout", ""), (UNATTRIBUTED, "/parameter_events", ""))
+    assert settling.standing(OK, one, BEFORE, 1.0) == (OK, PASSING_S)
+    assert settling.standing(OK, two, BEFORE, 1.5) == (OK, PASSING_S - 0.5)
+    assert settling.standing(OK, OK, BEFORE, 1.75) == (OK, None)
+    # Gone, and there again: that is another newcomer.
+    assert settling.standing(OK, one, BEFORE, 2.0) == (OK, PASSING_S)
+
+
+def test_the_first_verdict_of_all_is_told_whatever_it_is() -> None:
+    bad = found((UNATTRIBUTED, "/rosout", ""))
+    assert Settling().standing(None, bad, BEFORE, 0.0) == (bad, None)

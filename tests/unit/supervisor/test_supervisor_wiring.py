@@ -1,0 +1,506 @@
+"""The authority: what it tells each node, in which order, and that what is lost is made again."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+
+from lifecycle.errors import BringUpError
+from lifecycle.manifest.model import (
+    Authority as AuthorityKind,
+)
+from lifecycle.manifest.model import (
+    Condition,
+    DataLayer,
+    DataLayerSource,
+    EndpointKind,
+    RunKind,
+)
+from lifecycle.node.control import Event as HostEvent
+from lifecycle.node.control import Operation
+from lifecycle.plan.model import (
+    ParticipantConnections,
+    Plan,
+    PlannedEndpoint,
+    PlannedNode,
+    PlannedParticipant,
+)
+from lifecycle.supervisor.bring_up import BringUp
+from lifecycle.supervisor.events import Notice, WiringChanged, WiringLost
+from lifecycle.supervisor.failure import StepFailedError
+from lifecycle.supervisor.instructions import (
+    Instructions,
+    Step,
+    Wired,
+    planned_instructions,
+    steps,
+    wired,
+)
+from lifecycle.supervisor.shutdown import TakeDown
+from lifecycle.supervisor.wiring import TRIES, Authority, Hand, PlannedSource
+from lifecycle.verify.observation import NodeConfiguration, Observation
+from tests.unit.supervisor.fakes import (
+    HERE,
+    World,
+    interface_of,
+    plan_of,
+    planned_node,
+    rewired,
+    run,
+)
+
+LIMIT_S = 30.0
+URL = "udpv4://127.0.0.1:7911"
+NET = ParticipantConnections(urls=(URL,))
+CONNECT, MAP, DISCONNECT = Operation.CONNECT_TO, Operation.MAP_TO, Operation.DISCONNECT_FROM
+
+
+def wired_node(key: str, *, after: Mapping[str, Condition] = {}) -> PlannedNode:
+    """A node whose publisher goes by `net` and whose subscription by its own participant."""
+    endpoints = tuple(
+        PlannedEndpoint(
+            kind=kind,
+            name=name,
+            resolved=f"/{name}",
+            type="std_msgs/msg/String",
+            qos=None,
+            participant=participant,
+            at=HERE,
+        )
+        for kind, name, participant in (
+            (EndpointKind.PUBLISHER, "out", f"_{key}_net"),
+            (EndpointKind.SUBSCRIPTION, "in", ""),
+        )
+    )
+    return dataclasses.replace(
+        planned_node(key, after=after),
+        authority=AuthorityKind.SUPERVISOR,
+        endpoints=endpoints,
+        participants=(
+            PlannedParticipant(
+                name=f"_{key}_net", dscp=None, reason="", connection="net", connections=NET
+            ),
+        ),
+    )
+
+
+def wired_plan(*nodes: PlannedNode, **layer: object) -> Plan:
+    return dataclasses.replace(
+        plan_of(*nodes),
+        data_layer=DataLayer(authority=AuthorityKind.SUPERVISOR, **layer),  # type: ignore[arg-type]
+    )
+
+
+class ChangingSource(PlannedSource):
+    """Instructions that a test changes, as a negotiation would."""
+
+    def __init__(self, plan: Plan) -> None:
+        super().__init__(plan)
+        self.now = dict(super().instructions({}))
+        self.known: list[frozenset[str]] = []
+        self.next: tuple[str, ...] = ()
+
+    def instructions(self, known: Mapping[str, NodeConfiguration]) -> Mapping[str, Instructions]:
+        self.known.append(frozenset(known))
+        self.problems = self.next
+        return self.now
+
+
+class FakeHand:
+    """A node interface that somebody else's node offers."""
+
+    def __init__(self, interface: NodeConfiguration) -> None:
+        self.now = interface
+        self.made: list[str] = []
+
+    async def interface(self) -> NodeConfiguration:
+        return self.now
+
+    async def wire(self, step: Step) -> NodeConfiguration:
+        self.made.append(str(step))
+        self.now = rewired(
+            self.now,
+            step.operation,
+            connection=step.connection,
+            urls=step.connections.urls,
+            endpoint=step.endpoint,
+        )
+        return self.now
+
+
+class Wiring:
+    """A world whose bring-up has an authority."""
+
+    def __init__(self, plan: Plan, directory: Path) -> None:
+        self.world = World(plan, directory)
+        self.source = ChangingSource(plan)
+        self.hands: dict[str, FakeHand] = {}
+        self.authority = Authority(
+            self.world.system, self.source, self.world.emit, hand_of=self._hand
+        )
+        self.world.bring_up = BringUp(
+            self.world.system,
+            spawner_of=lambda _: self.world.spawner,
+            services=lambda _: pytest.fail("nobody is driven through services"),
+            appears=lambda _: asyncio.sleep(0),
+            recorded=lambda: None,
+            wirer=self.authority,
+        )
+        for node in plan.nodes:
+            self.world.spawner.interfaces[node.full_name] = interface_of(
+                node.full_name, "publishers/out", "subscriptions/in"
+            )
+
+    def _hand(self, name: str) -> Hand:
+        return self.hands[name]
+
+    def told(self, node: str) -> list[str]:
+        """What a hosted node was asked, in order."""
+        return [each.partition(" ")[2] for each in self.world.log if each.startswith(node)]
+
+    def report(self, node: str) -> None:
+        """Let the host tell that the node's configuration changed."""
+        configuration = self.world.spawner.interfaces[node]
+        self.world.system.on_host_event(
+            HostEvent(kind="configuration", node=node, configuration=configuration)
+        )
+
+    def lose(self, node: str, connection: str) -> None:
+        """Take a connection away from a hosted node, and let the host tell."""
+        interfaces = self.world.spawner.interfaces
+        interfaces[node] = rewired(interfaces[node], DISCONNECT, connection=connection)
+        self.report(node)
+
+    def look(self, *others: NodeConfiguration) -> None:
+        """Let the authority see what is there."""
+        self.authority.look(Observation(configurations=others))
+
+    async def down(self) -> None:
+        await self.authority.close()
+        await self.world.bring_up.close()
+        await TakeDown(self.world.system, self.world.emit, asyncio.Event()).run()
+
+
+async def settle(seconds: float = 0.0) -> None:
+    """Let everything happen that happens within so long; the clock jumps."""
+    await asyncio.sleep(seconds)
+    for _ in range(50):
+        await asyncio.sleep(0.0001)
+
+
+def test_a_node_is_connected_and_mapped_between_configure_and_connect(tmp_path: Path) -> None:
+    async def main() -> None:
+        wiring = Wiring(wired_plan(wired_node("a")), tmp_path)
+        await wiring.world.bring_up.connect(LIMIT_S)
+        assert wiring.told("/a") == [
+            "configure",
+            "get_configuration",
+            "connect_to net",
+            "map_to publishers/out net",
+            "map_to subscriptions/in",
+            "connect",
+        ]
+        assert [
+            (each.operation, each.connection, each.endpoint, each.urls, each.error)
+            for each in wiring.world.heard(WiringChanged)
+        ] == [
+            (CONNECT, "net", "", (URL,), ""),
+            (MAP, "net", "publishers/out", (), ""),
+            (MAP, "", "subscriptions/in", (), ""),
+        ]
+        await wiring.down()
+
+    run(main())
+
+
+def test_take_down_disconnects_before_the_node_is_disconnected(tmp_path: Path) -> None:
+    async def main() -> None:
+        wiring = Wiring(wired_plan(wired_node("a")), tmp_path)
+        await wiring.world.bring_up.connect(LIMIT_S)
+        await wiring.down()
+        assert wiring.told("/a")[-4:] == [
+            "disconnect_from net",
+            "disconnect",
+            "cleanup",
+            "shutdown",
+        ]
+
+    run(main())
+
+
+@pytest.mark.parametrize(
+    ("what", "message"),
+    [
+        (
+            "/a connect_to net",
+            f"cannot connect '/a' to 'net' ({URL}): the address is not of this host",
+        ),
+        (
+            "/a map_to publishers/out net",
+            (
+                "cannot map 'publishers/out' of '/a' to connection 'net': "
+                "the address is not of this host"
+            ),
+        ),
+    ],
+)
+def test_a_failed_step_ends_bring_up_and_names_node_connection_endpoint_and_reason(
+    tmp_path: Path, what: str, message: str
+) -> None:
+    async def main() -> None:
+        wiring = Wiring(wired_plan(wired_node("a")), tmp_path)
+        wiring.world.spawner.ways[what] = "the address is not of this host"
+        with pytest.raises(StepFailedError) as caught:
+            await wiring.world.bring_up.connect(LIMIT_S)
+        assert (caught.value.rule, caught.value.subject) == ("run.not-wired", "/a")
+        assert caught.value.message == message
+        assert wiring.world.heard(WiringChanged)[-1].error == message
+        assert "connect" not in wiring.told("/a")
+        await wiring.down()
+
+    run(main())
+
+
+def test_a_negotiation_waits_until_everybody_is_configured(tmp_path: Path) -> None:
+    async def main() -> None:
+        plan = wired_plan(wired_node("a"), wired_node("b"), source=DataLayerSource.DYNAMIC)
+        wiring = Wiring(plan, tmp_path)
+        wiring.world.spawner.takes_s["/b configure"] = 3.0
+        await wiring.world.bring_up.connect(LIMIT_S)
+        log = wiring.world.log
+        assert log.index("/b configure") < log.index("/a connect_to net")
+        await wiring.down()
+
+    run(main())
+
+
+def test_a_negotiation_does_not_wait_for_what_waits_for_a_connection(tmp_path: Path) -> None:
+    async def main() -> None:
+        late = wired_node("late", after={"plain": Condition.STARTED})
+        plain = dataclasses.replace(
+            planned_node("plain", after={"a": Condition.CONNECTED}), managed=False
+        )
+        plan = wired_plan(wired_node("a"), plain, late, source=DataLayerSource.DYNAMIC)
+        wiring = Wiring(plan, tmp_path)
+        await wiring.world.bring_up.connect(LIMIT_S)
+        log = wiring.world.log
+        assert log.index("/a connect") < log.index("plain start") < log.index("/late configure")
+        assert "/late connect" in log
+        await wiring.down()
+
+    run(main())
+
+
+def test_capabilities_that_do_not_fit_end_bring_up(tmp_path: Path) -> None:
+    async def main() -> None:
+        wiring = Wiring(wired_plan(wired_node("a")), tmp_path)
+        wiring.source.next = ("cannot link /a → /b on /out: /a has shm; /b has udpv4",)
+        with pytest.raises(StepFailedError) as caught:
+            await wiring.world.bring_up.connect(LIMIT_S)
+        assert caught.value.message == wiring.source.next[0]
+        await wiring.down()
+
+    run(main())
+
+
+def test_a_lost_connection_is_told_and_made_again_with_its_mappings(tmp_path: Path) -> None:
+    async def main() -> None:
+        wiring = Wiring(wired_plan(wired_node("a"), events=True), tmp_path)
+        await wiring.world.bring_up.connect(LIMIT_S)
+        wiring.report("/a")
+        wiring.look()
+        await settle()
+        before = len(wiring.told("/a"))
+        wiring.lose("/a", "net")
+        wiring.look()
+        await settle()
+        assert wiring.told("/a")[before:] == ["connect_to net", "map_to publishers/out net"]
+        assert wiring.world.heard(WiringLost) == [WiringLost(node="/a", connection="net")]
+        assert wiring.authority.findings() == ()
+        await wiring.down()
+
+    run(main())
+
+
+def test_without_events_nobody_is_watched(tmp_path: Path) -> None:
+    async def main() -> None:
+        wiring = Wiring(wired_plan(wired_node("a"), events=False), tmp_path)
+        await wiring.world.bring_up.connect(LIMIT_S)
+        before = len(wiring.told("/a"))
+        wiring.lose("/a", "net")
+        wiring.look()
+        await settle()
+        assert len(wiring.told("/a")) == before
+        await wiring.down()
+
+    run(main())
+
+
+def test_what_cannot_be_made_again_is_tried_ever_later_and_then_a_finding(tmp_path: Path) -> None:
+    async def main() -> None:
+        wiring = Wiring(wired_plan(wired_node("a"), events=True), tmp_path)
+        await wiring.world.bring_up.connect(LIMIT_S)
+        wiring.report("/a")
+        wiring.look()
+        await settle()
+        wiring.world.spawner.ways["/a connect_to net"] = "port 7911 is taken"
+        wiring.lose("/a", "net")
+        wiring.look()
+        loop = asyncio.get_running_loop()
+        began = loop.time()
+        await settle(60.0)
+        failed = [each for each in wiring.world.heard(WiringChanged) if each.error]
+        assert [each.attempt for each in failed] == list(range(1, TRIES + 1))
+        assert loop.time() - began < 61.0
+        (finding,) = wiring.authority.findings()
+        assert (finding.rule, finding.subject) == ("run.not-wired", "/a")
+        assert finding.message == f"cannot connect '/a' to 'net' ({URL}): port 7911 is taken"
+        # The port comes free; the node tells of something: it is tried anew.
+        del wiring.world.spawner.ways["/a connect_to net"]
+        wiring.lose("/a", "other")
+        wiring.look()
+        await settle()
+        assert wiring.authority.findings() == ()
+        assert dict(wired(wiring.world.spawner.interfaces["/a"]).connections) == {"net": (URL,)}
+        await wiring.down()
+
+    run(main())
+
+
+def test_only_the_difference_is_wired_when_the_negotiation_changes(tmp_path: Path) -> None:
+    async def main() -> None:
+        plan = wired_plan(wired_node("a"), wired_node("b"), source=DataLayerSource.DYNAMIC)
+        wiring = Wiring(plan, tmp_path)
+        await wiring.world.bring_up.connect(LIMIT_S)
+        for node in ("/a", "/b"):
+            wiring.report(node)
+        wiring.look()
+        await settle()
+        before = {node: len(wiring.told(node)) for node in ("/a", "/b")}
+        wiring.source.now["/b"] = dataclasses.replace(
+            wiring.source.now["/b"],
+            connections=(("group", ParticipantConnections(urls=("udpm://239.255.1.1:7900",))),),
+            mappings=(("publishers/out", "group"), ("subscriptions/in", "")),
+        )
+        wiring.look()
+        await settle()
+        assert wiring.told("/a")[before["/a"] :] == []
+        assert wiring.told("/b")[before["/b"] :] == [
+            "connect_to group",
+            "map_to publishers/out group",
+            "disconnect_from net",
+        ]
+        await wiring.down()
+
+    run(main())
+
+
+def test_a_negotiation_that_fails_while_running_is_a_finding_until_it_succeeds(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        wiring = Wiring(wired_plan(wired_node("a"), source=DataLayerSource.DYNAMIC), tmp_path)
+        await wiring.world.bring_up.connect(LIMIT_S)
+        wiring.source.next = ("cannot link /a → /b on /out: /a has shm; /b has udpv4",)
+        wiring.look()
+        wiring.look()
+        (finding,) = wiring.authority.findings()
+        assert finding.message == wiring.source.next[0]
+        assert wiring.world.heard(Notice) == [Notice(message=wiring.source.next[0])]
+        wiring.source.next = ()
+        wiring.look()
+        assert wiring.authority.findings() == ()
+        await wiring.down()
+
+    run(main())
+
+
+def test_an_undeclared_node_that_joins_is_wired_never_activated_and_released_in_the_end(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        wiring = Wiring(wired_plan(wired_node("a"), source=DataLayerSource.DYNAMIC), tmp_path)
+        await wiring.world.bring_up.connect(LIMIT_S)
+        guest = interface_of("/guest", "subscriptions/out")
+        wiring.hands["/guest"] = FakeHand(guest)
+        wiring.source.now["/guest"] = Instructions(
+            node="/guest", connections=(("net", NET),), mappings=(("subscriptions/out", "net"),)
+        )
+        wiring.look(guest)
+        await settle()
+        assert wiring.source.known[-1] == {"/a", "/guest"}
+        assert wiring.hands["/guest"].made == [
+            f"connect '/guest' to 'net' ({URL})",
+            "map 'subscriptions/out' of '/guest' to connection 'net'",
+        ]
+        await wiring.down()
+        assert wiring.hands["/guest"].made[2:] == ["disconnect '/guest' from 'net'"]
+
+    run(main())
+
+
+def test_a_foreign_node_without_a_node_interface_cannot_be_connected(tmp_path: Path) -> None:
+    class Foreign:
+        async def interface(self) -> None:
+            return None
+
+        async def wire(self, step: Step) -> None:
+            raise AssertionError(step)
+
+    async def main() -> None:
+        attached = dataclasses.replace(
+            wired_node("a"), run=dataclasses.replace(wired_node("a").run, kind=RunKind.ATTACH)
+        )
+        wiring = Wiring(wired_plan(attached), tmp_path)
+        node = wiring.world.system.nodes["a"]
+        node.driver = Foreign()  # type: ignore[assignment]
+        with pytest.raises(BringUpError) as caught:
+            await wiring.authority.wire(node)
+        assert caught.value.message == (
+            f"cannot connect '/a' to 'net' ({URL}): it offers no ~/connect_to"
+        )
+
+    run(main())
+
+
+def test_steps_make_before_they_break_and_spare_what_is_not_ours() -> None:
+    wanted = Instructions(
+        node="/a",
+        connections=(("new", NET),),
+        mappings=(("publishers/out", "new"), ("subscriptions/in", "")),
+    )
+    has = Wired(
+        connections=(("old", (URL,)), ("own", (URL,))),
+        mappings=(("publishers/out", "old"), ("subscriptions/in", "")),
+    )
+    made = steps(wanted, has, ours=("old",))
+    assert [(each.operation, each.connection, each.endpoint) for each in made] == [
+        (CONNECT, "new", ""),
+        (MAP, "new", "publishers/out"),
+        (DISCONNECT, "old", ""),
+    ]
+    for step in made:
+        has = has.after(step)
+    assert steps(wanted, has, ours=("new",)) == ()
+
+
+def test_a_connection_whose_urls_changed_is_made_anew_with_all_that_is_on_it() -> None:
+    wanted = Instructions(
+        node="/a", connections=(("net", NET),), mappings=(("publishers/out", "net"),)
+    )
+    has = Wired(
+        connections=(("net", ("udpv4://127.0.0.1:9",)),), mappings=(("publishers/out", "net"),)
+    )
+    assert [each.operation for each in steps(wanted, has)] == [DISCONNECT, CONNECT, MAP]
+
+
+def test_a_participant_that_only_tells_a_flow_apart_is_no_connection() -> None:
+    node = wired_node("a")
+    flow = dataclasses.replace(node.participants[0], connection="")
+    told = planned_instructions(dataclasses.replace(node, participants=(flow,)))
+    assert told.connections == ()
+    assert told.mappings == (("publishers/out", ""), ("subscriptions/in", ""))

@@ -1,0 +1,199 @@
+"""What belongs to tools and client libraries, and what makes an action."""
+
+from __future__ import annotations
+
+import pytest
+
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.verify import (
+    ObservedEndpoint,
+    action_part,
+    fold_actions,
+    is_noise_endpoint,
+    is_noise_node,
+    our_nodes,
+    without_noise,
+)
+
+PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
+SERVER, CLIENT = EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT
+ACTION_SERVER, ACTION_CLIENT = EndpointKind.ACTION_SERVER, EndpointKind.ACTION_CLIENT
+
+SERVER_PARTS = (
+    (SERVER, "send_goal", "robot/action/Dock_SendGoal"),
+    (SERVER, "cancel_goal", "action_msgs/srv/CancelGoal"),
+    (SERVER, "get_result", "robot/action/Dock_GetResult"),
+    (PUB, "feedback", "robot/action/Dock_FeedbackMessage"),
+    (PUB, "status", "action_msgs/msg/GoalStatusArray"),
+)
+
+
+def parts(node: str = "/base", action: str = "/dock") -> list[ObservedEndpoint]:
+    return [
+        ObservedEndpoint(kind=kind, node=node, name=f"{action}/_action/{part}", type=type_)
+        for kind, part, type_ in SERVER_PARTS
+    ]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "/_ros2cli_12",
+        "/_ros2cli_daemon_0_abc",
+        "/launch_ros_77",
+        "/rqt_gui_py_node_1",
+        "/rviz",
+        "/rviz2",
+        "/rviz_17",
+        "/robot/transform_listener_impl_55aa",
+        "/rosbag2_recorder",
+        "/_lifecycle_observer_1",
+    ],
+)
+def test_a_tool_is_noise(name: str):
+    assert is_noise_node(name)
+
+
+@pytest.mark.parametrize(
+    "name", ["/camera", "/rviz_less/camera", "/robot/rqtish", "/launch", "/_camera_flow_0"]
+)
+def test_a_node_of_a_system_is_not_noise(name: str):
+    assert not is_noise_node(name)
+
+
+STRING = "std_msgs/msg/String"
+SET_PARAMETERS = "rcl_interfaces/srv/SetParameters"
+TRIGGER = "std_srvs/srv/Trigger"
+GET_PARAMETERS = "rcl_interfaces/srv/GetParameters"
+
+
+@pytest.mark.parametrize(
+    ("kind", "node", "name", "type_"),
+    [
+        (PUB, "/a", "/rosout", STRING),
+        (PUB, "/a", "/parameter_events", STRING),
+        (SUB, "/a", "/parameter_events", STRING),
+        (SUB, "/a", "/clock", STRING),
+        (PUB, "/ns/a", "/ns/a/transition_event", STRING),
+        (SUB, "/b", "/ns/a/transition_event", STRING),
+        (SERVER, "/ns/a", "/ns/a/get_parameters", GET_PARAMETERS),
+        (SERVER, "/ns/a", "/ns/a/get_configuration", TRIGGER),
+        (SERVER, "/ns/a", "/ns/a/map_to", SET_PARAMETERS),
+        (PUB, "/ns/a", "/lifecycle/graph", STRING),
+        (SUB, "/b", "/lifecycle/graph", STRING),
+        (CLIENT, "/b", "/ns/a/change_state", "lifecycle_msgs/srv/ChangeState"),
+    ],
+)
+def test_an_endpoint_of_a_client_library_is_noise(
+    kind: EndpointKind, node: str, name: str, type_: str
+):
+    assert is_noise_endpoint(kind, node, name, type_, ours=True)
+
+
+@pytest.mark.parametrize(
+    ("kind", "node", "name", "type_"),
+    [
+        (SUB, "/a", "/rosout", STRING),  # a log viewer: somebody wrote that on purpose
+        (PUB, "/a", "/clock", STRING),  # a simulator's main output
+        (SERVER, "/a", "/b/get_parameters", GET_PARAMETERS),  # offered under another node's name
+        (PUB, "/a", "/b/transition_event", STRING),
+        (PUB, "", "/lifecycle/graph", STRING),  # the first sign of a node that nobody knows
+        (SERVER, "/a", "/a/get_map", STRING),
+        (PUB, "/a", "/a/get_parameters", GET_PARAMETERS),
+        (SERVER, "/a", "/a/get_parameters", TRIGGER),  # only the name is the library's
+        (SERVER, "/a", "/a/disconnect", TRIGGER),
+        (CLIENT, "/b", "/a/disconnect", TRIGGER),
+    ],
+)
+def test_an_endpoint_that_somebody_made_is_not_noise(
+    kind: EndpointKind, node: str, name: str, type_: str
+):
+    assert not is_noise_endpoint(kind, node, name, type_, ours=True)
+
+
+@pytest.mark.parametrize("base", ["connect_to", "map_to", "disconnect", "remap", "alias"])
+def test_a_service_of_the_node_interface_is_noise_on_a_node_of_ours_alone(base: str):
+    service = (SERVER, "/a", f"/a/{base}", SET_PARAMETERS)
+    assert is_noise_endpoint(*service, ours=True)
+    assert not is_noise_endpoint(*service, ours=False)
+
+
+def test_whoever_uses_the_node_interface_of_another_declares_nothing():
+    assert is_noise_endpoint(CLIENT, "/b", "/a/map_to", SET_PARAMETERS, ours=False)
+
+
+def server(name: str, type_: str, node: str = "/a") -> ObservedEndpoint:
+    return ObservedEndpoint(kind=SERVER, node=node, name=name, type=type_)
+
+
+def test_a_node_is_ours_by_two_services_that_nobody_else_has_together():
+    ours = [server("/a/get_configuration", TRIGGER), server("/a/map_to", SET_PARAMETERS)]
+    assert our_nodes(ours) == {"/a"}
+    assert our_nodes(ours[:1]) == our_nodes(ours[1:]) == frozenset()
+    assert our_nodes([ours[0], server("/a/map_to", TRIGGER)]) == frozenset()
+    assert our_nodes([ours[0], server("/b/map_to", SET_PARAMETERS, "/a")]) == frozenset()
+
+
+def test_what_users_call_like_the_node_interface_is_left_in():
+    libraries = [server("/a/get_parameters", GET_PARAMETERS)]
+    own = [server("/a/disconnect", SET_PARAMETERS), server("/a/get_configuration", TRIGGER)]
+    assert without_noise([*libraries, *own]) == tuple(own)
+    ours = [*own, server("/a/map_to", SET_PARAMETERS)]
+    assert without_noise([*libraries, *ours]) == ()
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "expected"),
+    [
+        (SERVER, "/dock/_action/send_goal", (ACTION_SERVER, "/dock")),
+        (PUB, "/ns/dock/_action/feedback", (ACTION_SERVER, "/ns/dock")),
+        (CLIENT, "/dock/_action/get_result", (ACTION_CLIENT, "/dock")),
+        (SUB, "/dock/_action/status", (ACTION_CLIENT, "/dock")),
+        (SUB, "/dock/_action/send_goal", None),
+        (SERVER, "/dock/_action/else", None),
+        (SERVER, "/_action/send_goal", None),
+        (SERVER, "/dock/send_goal", None),
+    ],
+)
+def test_a_hidden_name_tells_which_action_it_is_part_of(kind, name, expected):
+    assert action_part(kind, name) == expected
+
+
+def test_the_five_parts_of_an_action_server_fold_into_one_endpoint():
+    other = ObservedEndpoint(kind=PUB, node="/base", name="/odom", type="nav_msgs/msg/Odometry")
+    assert fold_actions([*parts(), other]) == (
+        other,
+        ObservedEndpoint(kind=ACTION_SERVER, node="/base", name="/dock", type="robot/action/Dock"),
+    )
+
+
+@pytest.mark.parametrize("missing", range(5))
+def test_an_incomplete_action_stays_in_parts(missing: int):
+    some = [part for index, part in enumerate(parts()) if index != missing]
+    assert fold_actions(some) == tuple(some)
+
+
+def test_parts_of_two_nodes_do_not_make_one_action():
+    mixed = [*parts("/one")[:3], *parts("/two")[3:]]
+    assert sorted(fold_actions(mixed), key=str) == sorted(mixed, key=str)
+
+
+def test_an_action_that_the_observer_already_folded_swallows_its_parts():
+    folded = ObservedEndpoint(
+        kind=ACTION_SERVER, node="/base", name="/dock", type="robot/action/Dock"
+    )
+    assert fold_actions([folded, *parts()]) == (folded,)
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "type_"),
+    [
+        (PUB, "/rosout", "rcl_interfaces/msg/Log"),
+        (PUB, "/ns/a/transition_event", "lifecycle_msgs/msg/TransitionEvent"),
+        (SERVER, "/ns/a/get_state", "lifecycle_msgs/srv/GetState"),
+    ],
+)
+def test_an_endpoint_of_nobody_known_is_never_noise(
+    kind: EndpointKind, name: str, type_: str
+) -> None:
+    assert not is_noise_endpoint(kind, "", name, type_, ours=True)

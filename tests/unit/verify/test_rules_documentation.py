@@ -1,0 +1,52 @@
+"""docs/rules.md and the registry of rules say the same."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from lifecycle.verify import RULES, Outcome, Rule
+
+PAGE = Path(__file__).parents[3] / "docs" / "rules.md"
+
+
+def sections() -> dict[str, str]:
+    found = re.split(r"^### (.+)$", PAGE.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    return dict(zip(found[1::2], found[2::2], strict=True))
+
+
+def test_the_page_documents_exactly_the_registered_rules():
+    assert sorted(sections()) == sorted(rule.id for rule in RULES)
+
+
+def test_no_rule_is_registered_twice():
+    ids = [rule.id for rule in RULES]
+    assert len(ids) == len(set(ids))
+
+
+@pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.id)
+def test_a_section_gives_meaning_outcomes_reason_and_remedy(rule: Rule):
+    body = sections()[rule.id]
+    meaning = body.strip().splitlines()[0]
+    assert meaning == rule.meaning[0].upper() + rule.meaning[1:] + "."
+    assert f"- Outcomes: {', '.join(each.value for each in rule.outcomes)}\n" in body
+    assert re.search(r"^- Why: \S", body, re.MULTILINE)
+    assert re.search(r"^- What to do: \S", body, re.MULTILINE)
+
+
+@pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.id)
+def test_a_rule_has_a_one_line_meaning_and_remedy_and_a_bad_outcome(rule: Rule):
+    assert rule.meaning
+    assert "\n" not in rule.meaning + rule.fix
+    assert rule.fix
+    assert rule.outcomes
+    assert Outcome.OK not in rule.outcomes
+
+
+def test_a_rule_cannot_be_given_an_outcome_that_it_does_not_document():
+    rule = next(each for each in RULES if each.id == "graph.undeclared-node")
+    with pytest.raises(ValueError) as error:
+        rule.finding(Outcome.UNVERIFIABLE, subject="/a", expected="", observed="", message="")
+    assert str(error.value) == "cannot give rule graph.undeclared-node the outcome unverifiable"

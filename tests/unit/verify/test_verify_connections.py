@@ -1,0 +1,405 @@
+"""Connections, mappings, media and what discovery cannot show: one changed fact, one finding."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import pytest
+
+from lifecycle.manifest.model import (
+    DataLayer,
+    DiscoveryMode,
+    EndpointKind,
+    EndpointPolicy,
+    Machine,
+    Policy,
+    Run,
+    RunKind,
+)
+from lifecycle.network.nfe import InternetProtocol, NetworkFlowEndpoint, TransportProtocol
+from lifecycle.plan import Plan, PlannedNode
+from lifecycle.plan.model import ParticipantConnections, PlannedParticipant
+from lifecycle.verify import Outcome, Stage, render_text, to_json, verify
+from lifecycle.verify.observation import ConnectionReport
+from lifecycle.verify.verdict import OpenEndpoint
+from tests.unit.plan.samples import at, link, node, planned, publisher, subscription
+from tests.unit.verify.edits import (
+    Edit,
+    add_endpoint,
+    both,
+    change_configuration,
+    change_report,
+    drop_endpoint,
+    drop_node,
+    drop_report,
+)
+from tests.unit.verify.perfect import perfect
+
+PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
+URL = "udpv4://10.77.0.1:7911?multicast=off&peer=10.77.0.2:7910"
+FLOW = "/video: /camera → /viewer"
+
+
+def udp(address: str, port: int = 7911) -> NetworkFlowEndpoint:
+    return NetworkFlowEndpoint(
+        transport_protocol=TransportProtocol.UDP,
+        internet_protocol=InternetProtocol.IPV4,
+        transport_port=port,
+        internet_address=address,
+    )
+
+
+def connected(each: PlannedNode, *urls: str) -> PlannedNode:
+    """The node with its first endpoint on a connection `net`."""
+    name = f"_{each.name}_net"
+    return dataclasses.replace(
+        each,
+        endpoints=(
+            dataclasses.replace(each.endpoints[0], participant=name),
+            *each.endpoints[1:],
+        ),
+        participants=(
+            PlannedParticipant(
+                name=name,
+                dscp=None,
+                reason="",
+                connection="net",
+                connections=ParticipantConnections(urls=urls or (URL,)),
+            ),
+        ),
+    )
+
+
+def plan_of(*, medium: str = "", linked: bool = False, run: Run | None = None) -> Plan:
+    links = [link("/video", "camera", "viewer")] if linked else []
+    options = {} if run is None else {"run": run}
+    plan = planned(
+        node("camera", publisher("video"), machine="robot", **options),
+        node("viewer", subscription("video"), machine="operator"),
+        links=links,
+        machines=(
+            Machine(name="robot", address="10.77.0.1", at=at(2)),
+            Machine(name="operator", address="10.77.0.2", at=at(2)),
+        ),
+    )
+    return dataclasses.replace(
+        plan,
+        nodes=(connected(plan.nodes[0]), plan.nodes[1]),
+        flows=tuple(dataclasses.replace(each, medium=medium) for each in plan.flows),
+    )
+
+
+PLAN = plan_of()
+
+
+def unchanged(seen):
+    return seen
+
+
+def findings(edit: Edit, plan: Plan = PLAN, **how: object) -> list[tuple[str, str, str]]:
+    verdict = verify(plan, edit(perfect(plan)), stage=Stage.CONNECTED, **how)
+    return [(each.rule, each.outcome.value, each.subject) for each in verdict.findings]
+
+
+def message(edit: Edit, plan: Plan = PLAN) -> str:
+    (finding,) = verify(plan, edit(perfect(plan)), stage=Stage.CONNECTED).findings
+    return finding.message
+
+
+def reported(*urls: str, name: str = "net", error: str = "") -> Edit:
+    report = ConnectionReport(name=name, urls=urls, node_name="_camera_net", error=error)
+    return change_configuration("/camera", connections=(report,))
+
+
+def test_a_system_wired_as_planned_is_ok() -> None:
+    assert findings(unchanged) == []
+
+
+def test_a_url_may_be_spelled_in_another_order() -> None:
+    other = "udpv4://10.77.0.1:7911?peer=10.77.0.2:7910&multicast=off"
+    assert findings(reported(other)) == []
+
+
+@pytest.mark.parametrize(
+    ("edit", "expected", "words"),
+    [
+        (
+            change_configuration("/camera", connections=()),
+            ("connection.missing", "violated", "/camera"),
+            "cannot find connection 'net' of /camera; it has no connection",
+        ),
+        (
+            reported(name="other"),
+            ("connection.missing", "violated", "/camera"),
+            "cannot find connection 'net' of /camera; it has 'other'",
+        ),
+        (
+            reported(error="port 7911 is taken"),
+            ("connection.failed", "violated", "/camera"),
+            f"cannot connect /camera to 'net' ({URL}): port 7911 is taken",
+        ),
+        (
+            reported("shm://"),
+            ("connection.differs", "violated", "/camera"),
+            "cannot accept connection 'net' of /camera: it was connected to shm:// and must be to "
+            + URL,
+        ),
+        (
+            change_report(PUB, "/video", connection=""),
+            ("connection.wrong-mapping", "violated", "/video"),
+            (
+                "cannot accept the publisher of /video in /camera: it is mapped onto the node's own"
+                " participant and must be onto connection 'net'"
+            ),
+        ),
+        (
+            change_report(SUB, "/video", connection="late"),
+            ("connection.wrong-mapping", "violated", "/video"),
+            (
+                "cannot accept the subscription of /video in /viewer: it is mapped onto connection"
+                " 'late' and must be onto the node's own participant"
+            ),
+        ),
+    ],
+)
+def test_a_connection_or_mapping_otherwise_than_planned_is_violated(
+    edit: Edit, expected: tuple[str, str, str], words: str
+) -> None:
+    assert findings(edit) == [expected]
+    assert message(edit) == words
+
+
+def test_the_own_participant_is_judged_by_its_urls_too() -> None:
+    viewer = dataclasses.replace(
+        PLAN.nodes[1], connections=ParticipantConnections(urls=("shm://",))
+    )
+    plan = dataclasses.replace(PLAN, nodes=(PLAN.nodes[0], viewer))
+    own = ConnectionReport(name="", urls=("udpv4://",))
+    assert findings(change_configuration("/viewer", connections=(own,)), plan) == [
+        ("connection.differs", "violated", "/viewer")
+    ]
+
+
+def test_what_a_foreign_node_is_connected_to_is_unverifiable() -> None:
+    plan = plan_of(run=Run(kind=RunKind.ATTACH))
+    found = [each for each in findings(unchanged, plan) if each[0].startswith("connection.")]
+    assert found == [("connection.missing", "unverifiable", "/camera")]
+
+
+def test_a_hidden_node_of_a_connection_is_nobody_else() -> None:
+    seen = perfect(PLAN)
+    assert "/_camera_net" in {each.full_name for each in seen.nodes}
+    assert findings(unchanged) == []
+
+
+# --- what discovery cannot show
+
+HIDDEN = both(drop_endpoint(PUB, "/video"), drop_node("/_camera_net"))
+
+
+def test_an_endpoint_that_discovery_cannot_show_is_proven_by_report_and_matches() -> None:
+    assert findings(HIDDEN) == []
+
+
+@pytest.mark.parametrize(
+    ("edit", "expected"),
+    [
+        (
+            change_report(PUB, "/video", matched=None),
+            ("graph.unseen-endpoint", "unverifiable", "/video"),
+        ),
+        (
+            change_report(PUB, "/video", matched=2),
+            ("graph.unseen-endpoint", "unverifiable", "/video"),
+        ),
+        (
+            change_report(PUB, "/video", mapped=False, gid=""),
+            ("graph.missing-endpoint", "violated", "/video"),
+        ),
+        (
+            both(change_report(PUB, "/video", matched=0), change_report(SUB, "/video", matched=0)),
+            ("graph.unmatched-flow", "violated", FLOW),
+        ),
+    ],
+)
+def test_without_such_a_proof_it_is_never_ok(edit: Edit, expected: tuple[str, str, str]) -> None:
+    assert findings(both(HIDDEN, edit)) == [expected]
+
+
+def test_who_else_is_matched_does_not_matter_in_an_open_system() -> None:
+    plan = dataclasses.replace(PLAN, policy=Policy(undeclared_nodes=EndpointPolicy.OPEN))
+    assert findings(both(HIDDEN, change_report(PUB, "/video", matched=2)), plan) == []
+
+
+def test_an_endpoint_on_a_participant_that_anybody_can_see_must_be_seen() -> None:
+    assert findings(drop_endpoint(SUB, "/video")) != []
+    plain = dataclasses.replace(
+        PLAN.nodes[0],
+        participants=(),
+        endpoints=(dataclasses.replace(PLAN.nodes[0].endpoints[0], participant=""),),
+    )
+    plan = dataclasses.replace(PLAN, nodes=(plain, PLAN.nodes[1]))
+    assert findings(drop_endpoint(PUB, "/video"), plan) == [
+        ("graph.missing-endpoint", "violated", "/video")
+    ]
+
+
+def test_a_hidden_endpoint_that_nobody_reports_is_unverifiable() -> None:
+    plan = plan_of(run=Run(kind=RunKind.ATTACH))
+    assert ("graph.unseen-endpoint", "unverifiable", "/video") in findings(HIDDEN, plan)
+
+
+BEYOND = dataclasses.replace(
+    PLAN,
+    discovery_mode=DiscoveryMode.STATIC,
+    nodes=tuple(
+        dataclasses.replace(each, connections=ParticipantConnections(urls=("shm://",)))
+        for each in PLAN.nodes
+    ),
+)
+NOTHING_OF_THE_CAMERA = both(HIDDEN, drop_node("/camera"), drop_report("/camera"))
+
+
+def test_a_node_beyond_reach_is_unverifiable_and_its_flow_proven_by_who_hears_it() -> None:
+    here = frozenset({"operator"})
+    assert findings(NOTHING_OF_THE_CAMERA, BEYOND, machines=here) == [
+        ("graph.missing-node", "unverifiable", "/camera")
+    ]
+    unheard = both(NOTHING_OF_THE_CAMERA, change_report(SUB, "/video", matched=0))
+    assert findings(unheard, BEYOND, machines=here) == [
+        ("graph.missing-node", "unverifiable", "/camera"),
+        ("graph.unmatched-flow", "violated", FLOW),
+    ]
+
+
+def test_a_node_of_our_own_machine_is_never_beyond_reach() -> None:
+    found = findings(NOTHING_OF_THE_CAMERA, BEYOND, machines=frozenset({"robot", "operator"}))
+    assert found[0] == ("graph.missing-node", "violated", "/camera")
+
+
+# --- what carries a flow
+
+WITH_UDP = change_report(PUB, "/video", nfes=(udp("0.0.0.0", 40000),))
+
+
+@pytest.mark.parametrize(
+    ("medium", "outcome"),
+    [("udpv4", None), ("tcpv4", "violated"), ("shm", "violated"), ("", None)],
+)
+def test_a_negotiated_medium_is_held_to(medium: str, outcome: str | None) -> None:
+    expected = [] if outcome is None else [("flow.wrong-medium", outcome, FLOW)]
+    assert findings(WITH_UDP, plan_of(medium=medium)) == expected
+
+
+def test_a_medium_that_nobody_tells_is_unverifiable() -> None:
+    unknown = both(change_report(PUB, "/video", nfes=None), change_report(SUB, "/video", nfes=None))
+    assert ("flow.wrong-medium", "unverifiable", FLOW) in findings(unknown, plan_of(medium="udpv4"))
+
+
+def test_the_message_says_both_media() -> None:
+    assert message(WITH_UDP, plan_of(medium="shm")) == (
+        "cannot accept what carries /camera → /viewer on /video: it must be shared memory, and it"
+        " is udpv4"
+    )
+
+
+def test_a_medium_that_nobody_asked_for_is_only_expected() -> None:
+    plan = planned(node("camera", publisher("video")), node("viewer", subscription("video")))
+    expected = dataclasses.replace(
+        plan, flows=tuple(dataclasses.replace(each, medium="udpv4") for each in plan.flows)
+    )
+    assert verify(expected, perfect(expected), stage=Stage.CONNECTED).verdict is Outcome.OK
+    asked = dataclasses.replace(expected, data_layer=DataLayer(at=at(5)))
+    assert verify(asked, perfect(asked), stage=Stage.CONNECTED).verdict is Outcome.VIOLATED
+
+
+def test_an_endpoint_without_any_nfe_goes_by_what_it_was_connected_to() -> None:
+    plan = plan_of(medium="tcpv4")
+    camera = connected(plan.nodes[0], "tcpv4://10.77.0.1:5100")
+    plan = dataclasses.replace(plan, nodes=(camera, plan.nodes[1]))
+    tcp = NetworkFlowEndpoint(
+        transport_protocol=TransportProtocol.TCP,
+        internet_protocol=InternetProtocol.IPV4,
+        transport_port=5101,
+        internet_address="10.77.0.2",
+    )
+    for listed in ((), (udp("0.0.0.0", 40000),)):
+        dialling = both(
+            change_report(PUB, "/video", nfes=listed), change_report(SUB, "/video", nfes=(tcp,))
+        )
+        assert findings(dialling, plan) == []
+
+
+def test_an_endpoint_that_a_node_may_make_is_no_finding_but_listed() -> None:
+    camera = dataclasses.replace(PLAN.nodes[0], endpoint_policy=EndpointPolicy.OPEN)
+    plan = dataclasses.replace(PLAN, nodes=(camera, PLAN.nodes[1]))
+    seen = add_endpoint(PUB, "/camera", "/news")(perfect(plan))
+    verdict = verify(plan, seen, stage=Stage.CONNECTED)
+    assert (verdict.verdict, verdict.findings) == (Outcome.OK, ())
+    assert verdict.open_endpoints == (
+        OpenEndpoint(kind=PUB, node="/camera", name="/news", type="std_msgs/msg/String"),
+    )
+    assert json.loads(to_json(verdict))["open_endpoints"] == [
+        {"kind": "publishers", "node": "/camera", "name": "/news", "type": "std_msgs/msg/String"}
+    ]
+    assert (
+        "endpoints that `endpoints: open` allows\n"
+        "  publisher of /news in /camera, std_msgs/msg/String\n"
+    ) in render_text(verdict)
+    closed = verify(
+        PLAN, add_endpoint(PUB, "/camera", "/news")(perfect(PLAN)), stage=Stage.CONNECTED
+    )
+    assert [each.rule for each in closed.findings] == ["graph.undeclared-publisher"]
+    assert closed.open_endpoints == ()
+
+
+REMAPPED = change_report(PUB, "/video", resolved="/stage/video")
+ALIASED = change_report(PUB, "/video", aliases=("/copy",))
+
+
+@pytest.mark.parametrize("shown", ["shown", "hidden"])
+def test_a_publisher_that_was_remapped_is_missing_whether_or_not_discovery_shows_it(shown: str):
+    edit = both(REMAPPED, drop_endpoint(PUB, "/video"))
+    if shown == "shown":
+        gid = next(e.gid for e in perfect(PLAN).endpoints if e.name == "/video" and e.kind is PUB)
+        edit = both(edit, add_endpoint(PUB, "/camera", "/stage/video", gid=gid, qos=None))
+    assert findings(edit) == [
+        ("graph.missing-endpoint", "violated", "/video"),
+        ("graph.undeclared-publisher", "violated", "/stage/video"),
+    ]
+
+
+def test_what_was_remapped_is_told_apart_from_what_was_never_made():
+    verdict = verify(
+        PLAN, both(REMAPPED, drop_endpoint(PUB, "/video"))(perfect(PLAN)), stage=Stage.CONNECTED
+    )
+    assert [each.hint for each in verdict.findings] == [
+        (
+            "publishers/video is /stage/video now: is a remap wrong, or did somebody call "
+            "/camera/remap? the name '' gives back the declared one"
+        ),
+        (
+            "it is publishers/video under another name: is a remap wrong, or did somebody call "
+            "/camera/remap?"
+        ),
+    ]
+
+
+def test_an_alias_that_discovery_does_not_show_is_not_declared_either():
+    verdict = verify(PLAN, ALIASED(perfect(PLAN)), stage=Stage.CONNECTED)
+    (finding,) = verdict.findings
+    assert (finding.rule, finding.subject) == ("graph.undeclared-publisher", "/copy")
+    assert finding.hint == "it is an alias of publishers/video: see who called /camera/alias"
+
+
+def test_an_open_node_may_be_given_aliases():
+    plan = dataclasses.replace(
+        PLAN,
+        nodes=tuple(
+            dataclasses.replace(each, endpoint_policy=EndpointPolicy.OPEN) for each in PLAN.nodes
+        ),
+    )
+    verdict = verify(plan, ALIASED(perfect(plan)), stage=Stage.CONNECTED)
+    assert verdict.findings == ()
+    assert [each.name for each in verdict.open_endpoints] == ["/copy"]

@@ -1,0 +1,781 @@
+"""State in, verdict out: one changed fact, and exactly the findings that follow from it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from lifecycle.manifest.model import (
+    EndpointKind,
+    EndpointPolicy,
+    Policy,
+    Run,
+    RunKind,
+)
+from lifecycle.manifest.qos import Durability, Liveliness, QosProfile, Reliability
+from lifecycle.network.nfe import (
+    InternetProtocol,
+    NetworkFlowEndpoint,
+    TransportProtocol,
+    UniqueRequirement,
+)
+from lifecycle.plan import Plan, build_plan
+from lifecycle.verify import (
+    RULES,
+    Finding,
+    Identity,
+    NodeConfiguration,
+    Outcome,
+    Stage,
+    verify,
+)
+from tests.unit.plan.samples import IMAGE, need, node, planned, publisher, subscription, teleop
+from tests.unit.verify.edits import (
+    Edit,
+    add_configuration,
+    add_endpoint,
+    add_node,
+    both,
+    change_announced_qos,
+    change_configuration,
+    change_endpoint,
+    change_node,
+    change_report,
+    change_reported_qos,
+    drop_endpoint,
+    drop_endpoint_report,
+    drop_node,
+    drop_report,
+)
+from tests.unit.verify.perfect import perfect
+
+PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
+SERVER, CLIENT = EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT
+ACTION_SERVER, ACTION_CLIENT = EndpointKind.ACTION_SERVER, EndpointKind.ACTION_CLIENT
+VIDEO, BATTERY, STATUS = "/robot/video", "/robot/battery", "/robot/status"
+FLOW = "/robot/video: /robot/camera → /viewer"
+ATTACH = Run(kind=RunKind.ATTACH)
+
+PLAN = build_plan(teleop(), environment={})
+
+
+def udp(port: int, address: str = "0.0.0.0") -> NetworkFlowEndpoint:
+    return NetworkFlowEndpoint(
+        transport_protocol=TransportProtocol.UDP,
+        internet_protocol=InternetProtocol.IPV4,
+        transport_port=port,
+        internet_address=address,
+    )
+
+
+def findings_after(
+    edit: Edit, *, plan: Plan = PLAN, stage: Stage = Stage.CONNECTED
+) -> list[tuple[str, str, str]]:
+    verdict = verify(plan, edit(perfect(plan, stage)), stage=stage)
+    return [(each.rule, each.outcome.value, each.subject) for each in verdict.findings]
+
+
+def the_finding(edit: Edit, *, plan: Plan = PLAN, stage: Stage = Stage.CONNECTED) -> Finding:
+    (finding,) = verify(plan, edit(perfect(plan, stage)), stage=stage).findings
+    return finding
+
+
+@pytest.mark.parametrize("stage", Stage)
+def test_a_system_exactly_as_planned_is_ok(stage: Stage):
+    verdict = verify(PLAN, perfect(PLAN, stage), stage=stage)
+    assert (verdict.verdict, verdict.blocking, verdict.findings) == (Outcome.OK, False, ())
+    assert [flow.outcome for flow in verdict.flows] == [Outcome.OK] * 3
+
+
+FIRES: dict[str, tuple[Edit, list[tuple[str, str, str]]]] = {
+    "a node is gone from the graph, its endpoints still there": (
+        drop_node("/viewer"),
+        [("graph.missing-node", "violated", "/viewer")],
+    ),
+    "nothing of a node is seen": (
+        both(
+            drop_node("/viewer"),
+            drop_report("/viewer"),
+            lambda seen: dataclasses.replace(
+                seen, endpoints=tuple(e for e in seen.endpoints if e.node != "/viewer")
+            ),
+        ),
+        [
+            ("graph.missing-node", "violated", "/viewer"),
+            ("graph.unmatched-link", "violated", FLOW),
+        ],
+    ),
+    "one more node": (
+        add_node("/spy"),
+        [("graph.undeclared-node", "violated", "/spy")],
+    ),
+    "an endpoint of a node that discovery does not list yet": (
+        add_endpoint(SUB, "/spy", STATUS, gid="99", qos=QosProfile(depth=0)),
+        [("graph.undeclared-node", "violated", "/spy")],
+    ),
+    "two nodes of one name": (
+        change_node("/viewer", count=2),
+        [("graph.duplicate-node", "violated", "/viewer")],
+    ),
+    "a node name listed twice": (
+        add_node("/viewer", state="inactive", managed=True),
+        [("graph.duplicate-node", "violated", "/viewer")],
+    ),
+    "a missing publisher that no link names": (
+        drop_endpoint(PUB, STATUS),
+        [("graph.missing-endpoint", "violated", STATUS)],
+    ),
+    "a missing publisher of a link": (
+        drop_endpoint(PUB, VIDEO),
+        [
+            ("graph.missing-endpoint", "violated", VIDEO),
+            ("graph.unmatched-link", "violated", FLOW),
+        ],
+    ),
+    "a missing subscription": (
+        drop_endpoint(SUB, BATTERY),
+        [("graph.missing-endpoint", "violated", BATTERY)],
+    ),
+    "a missing service server": (
+        drop_endpoint(SERVER, "/robot/camera/calibrate"),
+        [("graph.missing-endpoint", "violated", "/robot/camera/calibrate")],
+    ),
+    "a missing service client": (
+        drop_endpoint(CLIENT, "/robot/camera/calibrate"),
+        [("graph.missing-endpoint", "violated", "/robot/camera/calibrate")],
+    ),
+    "a missing action server": (
+        drop_endpoint(ACTION_SERVER, "/robot/dock"),
+        [("graph.missing-endpoint", "violated", "/robot/dock")],
+    ),
+    "a missing action client": (
+        drop_endpoint(ACTION_CLIENT, "/robot/dock"),
+        [("graph.missing-endpoint", "violated", "/robot/dock")],
+    ),
+    "an undeclared publisher": (
+        add_endpoint(PUB, "/viewer", "/extra", gid="99"),
+        [("graph.undeclared-publisher", "violated", "/extra")],
+    ),
+    "a second publisher where one is declared": (
+        add_endpoint(PUB, "/robot/camera", STATUS, gid="99", qos=QosProfile()),
+        [("graph.undeclared-publisher", "violated", STATUS)],
+    ),
+    "an undeclared subscription": (
+        add_endpoint(SUB, "/viewer", "/extra", gid="99"),
+        [("graph.undeclared-subscription", "violated", "/extra")],
+    ),
+    "an undeclared service server": (
+        add_endpoint(SERVER, "/viewer", "/extra", type="std_srvs/srv/Trigger"),
+        [("graph.undeclared-service-server", "violated", "/extra")],
+    ),
+    "an undeclared service client": (
+        add_endpoint(CLIENT, "/viewer", "/extra", type="std_srvs/srv/Trigger"),
+        [("graph.undeclared-service-client", "violated", "/extra")],
+    ),
+    "an undeclared action server": (
+        add_endpoint(ACTION_SERVER, "/viewer", "/extra", type="a/action/B"),
+        [("graph.undeclared-action-server", "violated", "/extra")],
+    ),
+    "an undeclared action client": (
+        add_endpoint(ACTION_CLIENT, "/viewer", "/extra", type="a/action/B"),
+        [("graph.undeclared-action-client", "violated", "/extra")],
+    ),
+    "an undeclared publisher in a hidden participant": (
+        add_endpoint(PUB, "/robot/_camera_flow_0", "/extra", gid="99"),
+        [("graph.undeclared-publisher", "violated", "/extra")],
+    ),
+    "a publisher of another type": (
+        both(
+            change_endpoint(PUB, STATUS, type="std_msgs/msg/Int32"),
+            change_report(PUB, STATUS, type="std_msgs/msg/Int32", matched=0),
+            change_report(SUB, STATUS, matched=0),
+        ),
+        [("graph.type-mismatch", "violated", STATUS)],
+    ),
+    "a publisher of a link of another type": (
+        both(
+            change_endpoint(PUB, VIDEO, type="std_msgs/msg/Int32"),
+            change_report(PUB, VIDEO, type="std_msgs/msg/Int32", matched=0),
+        ),
+        [
+            ("graph.type-mismatch", "violated", VIDEO),
+            ("graph.unmatched-link", "violated", FLOW),
+        ],
+    ),
+    "a service of another type": (
+        change_endpoint(SERVER, "/robot/camera/calibrate", type="std_srvs/srv/Empty"),
+        [("graph.type-mismatch", "violated", "/robot/camera/calibrate")],
+    ),
+    "a node that could not make an endpoint": (
+        both(
+            drop_endpoint(PUB, STATUS),
+            change_report(PUB, STATUS, gid="", nfes=None, matched=None, error="not feasible"),
+        ),
+        [("endpoint.error", "violated", STATUS)],
+    ),
+    "an endpoint whose node is not known": (
+        add_endpoint(PUB, "", "/extra", gid="99"),
+        [("graph.unattributed-endpoint", "violated", "/extra")],
+    ),
+    "an announced policy that differs": (
+        both(
+            change_announced_qos(SUB, STATUS, reliability=Reliability.BEST_EFFORT),
+        ),
+        [("graph.qos-differs", "violated", STATUS)],
+    ),
+    "a reported depth that differs": (
+        change_reported_qos(SUB, STATUS, depth=1),
+        [("graph.qos-differs", "violated", STATUS)],
+    ),
+    "two announced policies that differ": (
+        change_announced_qos(PUB, STATUS, deadline_ns=10**9, durability=Durability.TRANSIENT_LOCAL),
+        [("graph.qos-differs", "violated", STATUS), ("graph.qos-differs", "violated", STATUS)],
+    ),
+    "a report without QoS": (
+        change_report(SUB, STATUS, qos=None),
+        [("graph.qos-unverifiable", "unverifiable", STATUS)],
+    ),
+    "a pair that is incompatible": (
+        both(
+            change_announced_qos(PUB, STATUS, reliability=Reliability.BEST_EFFORT),
+            change_report(PUB, STATUS, matched=0),
+            change_report(SUB, STATUS, matched=0),
+        ),
+        [
+            ("graph.qos-differs", "violated", STATUS),
+            ("graph.qos-incompatible", "violated", "/robot/status: /robot/camera → /viewer"),
+        ],
+    ),
+    "an incompatible pair with an undeclared end": (
+        add_endpoint(
+            PUB, "/viewer", STATUS, gid="99", qos=QosProfile(reliability=Reliability.BEST_EFFORT)
+        ),
+        [
+            ("graph.undeclared-publisher", "violated", STATUS),
+            ("graph.qos-incompatible", "violated", "/robot/status: /viewer → /viewer"),
+        ],
+    ),
+    "a pair whose policy is not known": (
+        both(
+            change_announced_qos(PUB, STATUS, reliability=Reliability.UNKNOWN),
+            change_reported_qos(PUB, STATUS, reliability=Reliability.UNKNOWN),
+        ),
+        [
+            ("graph.qos-unverifiable", "unverifiable", STATUS),
+            ("graph.qos-incompatible", "unverifiable", "/robot/status: /robot/camera → /viewer"),
+        ],
+    ),
+    "a flow that both ends say is unmatched": (
+        both(change_report(PUB, STATUS, matched=0), change_report(SUB, STATUS, matched=0)),
+        [("graph.unmatched-flow", "violated", "/robot/status: /robot/camera → /viewer")],
+    ),
+    "a link that both ends say is unmatched": (
+        both(change_report(PUB, VIDEO, matched=0), change_report(SUB, VIDEO, matched=0)),
+        [("graph.unmatched-link", "violated", FLOW)],
+    ),
+    "a flow that the only end with a count says is unmatched": (
+        both(change_report(PUB, STATUS, matched=None), change_report(SUB, STATUS, matched=0)),
+        [("graph.unmatched-flow", "violated", "/robot/status: /robot/camera → /viewer")],
+    ),
+    "a node still unconfigured": (
+        both(
+            change_node("/viewer", state="unconfigured"),
+            change_configuration("/viewer", state="unconfigured", connected=False),
+        ),
+        [("state.wrong-state", "violated", "/viewer")],
+    ),
+    "a node active before the gate": (
+        change_node("/viewer", state="active"),
+        [("state.wrong-state", "violated", "/viewer")],
+    ),
+    "a node not connected": (
+        change_configuration("/viewer", connected=False),
+        [("state.wrong-state", "violated", "/viewer")],
+    ),
+    "a managed node without lifecycle services that tells no state": (
+        both(change_node("/viewer", managed=False), change_configuration("/viewer", state="")),
+        [("state.wrong-state", "violated", "/viewer")],
+    ),
+    "a node that does not report": (
+        drop_report("/robot/camera"),
+        [
+            ("graph.qos-unverifiable", "unverifiable", VIDEO),
+            ("graph.qos-unverifiable", "unverifiable", BATTERY),
+            ("graph.qos-unverifiable", "unverifiable", STATUS),
+            ("graph.qos-unverifiable", "unverifiable", "/robot/camera/calibrate"),
+            ("config.missing-report", "violated", "/robot/camera"),
+            ("flow.unverifiable", "unverifiable", VIDEO),
+            ("flow.unverifiable", "unverifiable", FLOW),
+            ("flow.dscp-unverifiable", "unverifiable", VIDEO),
+            ("flow.dscp-unverifiable", "unverifiable", BATTERY),
+        ],
+    ),
+    "a report that leaves an endpoint out": (
+        drop_endpoint_report(ACTION_CLIENT, "/robot/dock"),
+        [("config.incomplete-report", "violated", "/robot/dock")],
+    ),
+    "a strict publisher that shares its socket": (
+        both(
+            change_report(PUB, VIDEO, nfes=(udp(40000),), dscp=46),
+            change_report(PUB, STATUS, nfes=(udp(40000),), dscp=46),
+        ),
+        [
+            ("flow.not-unique", "violated", VIDEO),
+            ("flow.not-unique", "violated", FLOW),
+        ],
+    ),
+    "a strict subscription that shares its socket": (
+        both(
+            change_report(SUB, VIDEO, nfes=(udp(7413, "10.77.0.2"),)),
+            change_report(SUB, STATUS, nfes=(udp(7413, "10.77.0.2"),)),
+        ),
+        [
+            ("flow.not-unique", "violated", VIDEO),
+            ("flow.not-unique", "violated", FLOW),
+        ],
+    ),
+    "an RMW that does not tell NFEs": (
+        change_report(SUB, VIDEO, nfes=None),
+        [
+            ("flow.unverifiable", "unverifiable", VIDEO),
+            ("flow.unverifiable", "unverifiable", FLOW),
+        ],
+    ),
+    "a subscription without any NFE": (
+        change_report(SUB, STATUS, nfes=()),
+        [("flow.broken-endpoint", "violated", STATUS)],
+    ),
+    "a DSCP that was not applied": (
+        change_report(PUB, BATTERY, dscp=0),
+        [("flow.dscp-not-applied", "violated", BATTERY)],
+    ),
+    "a DSCP that nobody read back": (
+        change_report(PUB, BATTERY, dscp=None),
+        [("flow.dscp-unverifiable", "unverifiable", BATTERY)],
+    ),
+}
+
+
+@pytest.mark.parametrize("case", FIRES)
+def test_a_rule_fires_on(case: str):
+    edit, expected = FIRES[case]
+    assert findings_after(edit) == expected
+
+
+SILENT: dict[str, Edit] = {
+    "nodes of tools": both(
+        add_node("/_ros2cli_42"),
+        add_node("/launch_ros_4711"),
+        add_node("/rqt_gui_py_node_1"),
+        add_node("/rviz2"),
+        add_node("/robot/transform_listener_impl_55d0c0ffee"),
+    ),
+    "a tool that listens with another QoS": both(
+        add_node("/_ros2cli_42"),
+        add_endpoint(SUB, "/_ros2cli_42", VIDEO, type=IMAGE, gid="99", qos=QosProfile(depth=0)),
+    ),
+    "endpoints of client libraries": both(
+        *(
+            add_endpoint(kind, "/viewer", name, type=type_, gid="")
+            for kind, name, type_ in (
+                (PUB, "/rosout", "rcl_interfaces/msg/Log"),
+                (PUB, "/parameter_events", "rcl_interfaces/msg/ParameterEvent"),
+                (SUB, "/parameter_events", "rcl_interfaces/msg/ParameterEvent"),
+                (SUB, "/clock", "rosgraph_msgs/msg/Clock"),
+                (PUB, "/viewer/transition_event", "lifecycle_msgs/msg/TransitionEvent"),
+                (SERVER, "/viewer/get_parameters", "rcl_interfaces/srv/GetParameters"),
+                (SERVER, "/viewer/change_state", "lifecycle_msgs/srv/ChangeState"),
+                (
+                    SERVER,
+                    "/viewer/get_type_description",
+                    "type_description_interfaces/srv/GetTypeDescription",
+                ),
+                (SERVER, "/viewer/get_configuration", "std_srvs/srv/Trigger"),
+                (SERVER, "/viewer/disconnect", "rcl_interfaces/srv/SetParameters"),
+                (CLIENT, "/robot/camera/change_state", "lifecycle_msgs/srv/ChangeState"),
+            )
+        )
+    ),
+    "client library endpoints of a hidden participant": add_endpoint(
+        SERVER,
+        "/robot/_camera_flow_0",
+        "/robot/_camera_flow_0/get_parameters",
+        type="rcl_interfaces/srv/GetParameters",
+    ),
+    "an endpoint whose node is only known by its GID": change_endpoint(PUB, STATUS, node=""),
+    "a state that only the report tells": change_node("/viewer", state=None, managed=None),
+    "lifecycle services that the graph does not show yet": change_node(
+        "/viewer", state=None, managed=False
+    ),
+    "a state that only the graph tells": change_configuration("/viewer", state=""),
+    "one end that reports no count": change_report(PUB, STATUS, matched=None),
+    "more matches than the graph shows": change_report(PUB, STATUS, matched=5),
+    "one end that is late with its count": change_report(PUB, STATUS, matched=0),
+    "infinite durations however spelled": change_announced_qos(
+        SUB, STATUS, deadline_ns=2**63 - 1, liveliness_lease_duration_ns=0
+    ),
+    "a subscription's lifespan, which DDS does not have": change_announced_qos(
+        SUB, STATUS, lifespan_ns=5
+    ),
+    "another order of everything": lambda seen: dataclasses.replace(
+        seen,
+        nodes=seen.nodes[::-1],
+        endpoints=seen.endpoints[::-1],
+        configurations=seen.configurations[::-1],
+    ),
+}
+
+
+@pytest.mark.parametrize("case", SILENT)
+def test_no_rule_fires_on(case: str):
+    assert findings_after(SILENT[case]) == []
+
+
+def test_every_rule_has_a_case_in_which_it_fires():
+    elsewhere = {"state.unverifiable", "flow.wrong-transport", "flow.wrong-medium"}
+    elsewhere |= {"graph.unseen-endpoint"}
+    elsewhere |= {each.id for each in RULES if each.id.startswith("connection.")}
+    elsewhere |= {each.id for each in RULES if each.id.startswith("run.")}
+    fired = {rule for _, expected in FIRES.values() for rule, _, _ in expected}
+    assert fired | elsewhere == {rule.id for rule in RULES}
+
+
+# --- policies
+
+
+def with_policy(**fields: object) -> Plan:
+    return dataclasses.replace(PLAN, policy=Policy(**fields))
+
+
+def test_an_open_world_tolerates_nodes_and_endpoints_of_others():
+    plan = with_policy(undeclared_nodes=EndpointPolicy.OPEN)
+    edit = both(
+        add_node("/other"),
+        add_endpoint(PUB, "/other", "/elsewhere", gid="98"),
+        add_endpoint(PUB, "", "/nobody", gid="97"),
+    )
+    assert findings_after(edit, plan=plan) == []
+
+
+def test_an_open_world_still_compares_a_foreign_publisher_with_ours():
+    plan = with_policy(undeclared_nodes=EndpointPolicy.OPEN)
+    edit = both(
+        add_node("/other"),
+        add_endpoint(
+            PUB, "/other", STATUS, gid="98", qos=QosProfile(durability=Durability.VOLATILE)
+        ),
+        add_endpoint(PUB, "/other", VIDEO, gid="99", type="std_msgs/msg/Int32"),
+        change_announced_qos(SUB, STATUS, durability=Durability.TRANSIENT_LOCAL),
+    )
+    assert ("graph.type-mismatch", "violated", VIDEO) in findings_after(edit, plan=plan)
+    assert (
+        "graph.qos-incompatible",
+        "violated",
+        "/robot/status: /other → /viewer",
+    ) in findings_after(edit, plan=plan)
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "type_"),
+    [
+        (ACTION_SERVER, "/robot/dock", "a/action/Other"),
+        (CLIENT, "/robot/camera/calibrate", "std_srvs/srv/Empty"),
+    ],
+)
+def test_an_open_world_still_compares_a_foreign_end_of_a_service_or_action(kind, name, type_):
+    plan = with_policy(undeclared_nodes=EndpointPolicy.OPEN)
+    edit = both(add_node("/other"), add_endpoint(kind, "/other", name, type=type_))
+    assert findings_after(edit, plan=plan) == [("graph.type-mismatch", "violated", name)]
+    same = both(add_node("/other"), add_endpoint(kind, "/other", "/x", type=type_))
+    assert findings_after(same, plan=plan) == []
+
+
+def test_two_foreign_nodes_that_do_not_fit_are_none_of_our_business():
+    plan = with_policy(undeclared_nodes=EndpointPolicy.OPEN)
+    edit = both(
+        add_endpoint(
+            PUB, "/other", "/x", gid="98", qos=QosProfile(reliability=Reliability.BEST_EFFORT)
+        ),
+        add_endpoint(SUB, "/another", "/x", gid="99", qos=QosProfile()),
+    )
+    assert findings_after(edit, plan=plan) == []
+
+
+def test_a_node_with_open_endpoints_may_have_more_of_them():
+    plan = planned(node("a", endpoints=EndpointPolicy.OPEN))
+    assert findings_after(add_endpoint(PUB, "/a", "/extra", gid="1"), plan=plan) == []
+
+
+def test_an_unverifiable_finding_blocks_only_where_the_policy_says_so():
+    edit = change_report(SUB, STATUS, qos=None)
+    for blocks in (False, True):
+        plan = with_policy(unverifiable_blocks=blocks)
+        verdict = verify(plan, edit(perfect(plan)), stage=Stage.CONNECTED)
+        assert (verdict.verdict, verdict.blocking) == (Outcome.UNVERIFIABLE, blocks)
+
+
+def test_a_violated_finding_blocks_always():
+    verdict = verify(PLAN, drop_node("/viewer")(perfect(PLAN)), stage=Stage.CONNECTED)
+    assert (verdict.verdict, verdict.blocking) == (Outcome.VIOLATED, True)
+
+
+def test_a_dscp_that_is_not_enforced_is_reported_and_never_blocks():
+    marked = need(PUB, "a", dscp=46, enforce=False)
+    plan = planned(
+        node("one", publisher("a"), needs=[marked]),
+        policy=Policy(unverifiable_blocks=True),
+    )
+    verdict = verify(plan, change_report(PUB, "/a", dscp=0)(perfect(plan)), stage=Stage.CONNECTED)
+    (finding,) = verdict.findings
+    assert (verdict.verdict, verdict.blocking) == (Outcome.UNVERIFIABLE, False)
+    assert finding.message == (
+        "cannot accept the publisher of /a in /one: its sockets carry DF = DSCP 0 = TOS 0 (0x00)"
+        " and not EF = DSCP 46 = TOS 184 (0xb8); the manifest does not enforce it"
+    )
+
+
+# --- nodes that others start
+
+
+def foreign(**rest: object) -> Plan:
+    return planned(
+        node("talker", publisher("chatter"), run=ATTACH, **rest),
+        node("listener", subscription("chatter"), run=ATTACH, managed=False),
+    )
+
+
+@pytest.mark.parametrize("stage", Stage)
+def test_a_foreign_system_whose_discovery_tells_all_is_ok(stage: Stage):
+    plan = foreign()
+    assert findings_after(lambda seen: seen, plan=plan, stage=stage) == []
+
+
+def test_a_foreign_depth_is_unverifiable_under_fast_dds():
+    plan = foreign()
+    edit = both(
+        *(
+            change_announced_qos(
+                kind,
+                "/chatter",
+                history=type(QosProfile().history).UNKNOWN,
+                depth=0,
+            )
+            for kind in (PUB, SUB)
+        )
+    )
+    assert findings_after(edit, plan=plan) == [
+        ("graph.qos-unverifiable", "unverifiable", "/chatter"),
+        ("graph.qos-unverifiable", "unverifiable", "/chatter"),
+    ]
+
+
+def test_a_foreign_managed_node_of_unknown_state_is_unverifiable():
+    finding = the_finding(change_node("/talker", state=None, managed=None), plan=foreign())
+    assert (finding.rule, finding.outcome) == ("state.unverifiable", Outcome.UNVERIFIABLE)
+    assert finding.message == "cannot verify the state of node /talker: nobody tells it"
+
+
+def test_a_foreign_node_that_offers_no_lifecycle_services_is_violated():
+    finding = the_finding(change_node("/talker", state=None, managed=False), plan=foreign())
+    assert (finding.rule, finding.outcome) == ("state.wrong-state", Outcome.VIOLATED)
+    assert finding.message == "cannot accept node /talker: it offers no lifecycle services"
+
+
+def test_a_plain_node_has_no_state_to_judge():
+    edit = change_node("/listener", state=None, managed=False)
+    assert findings_after(edit, plan=foreign()) == []
+
+
+def test_a_foreign_node_that_needs_a_unique_flow_is_unverifiable():
+    strictly = need(PUB, "chatter", UniqueRequirement.STRICTLY_REQUIRED)
+    finding = the_finding(lambda seen: seen, plan=foreign(needs=[strictly]))
+    assert finding.message == (
+        "cannot verify that the publisher of /chatter in /talker has a unique network flow:"
+        " nobody tells its network flow endpoints"
+    )
+
+
+def test_an_optional_requirement_that_is_not_met_is_no_violation():
+    plan = planned(
+        node(
+            "one",
+            publisher("a"),
+            publisher("b"),
+            needs=[need(PUB, "a", UniqueRequirement.OPTIONALLY_REQUIRED)],
+        )
+    )
+    edit = both(
+        change_report(PUB, "/a", nfes=(udp(40000),)), change_report(PUB, "/b", nfes=(udp(40000),))
+    )
+    assert findings_after(edit, plan=plan) == []
+
+
+def test_uniqueness_is_judged_over_the_whole_system_and_not_per_process():
+    strictly = UniqueRequirement.STRICTLY_REQUIRED
+    plan = planned(
+        node("one", subscription("a"), needs=[need(SUB, "a", strictly)]),
+        node("two", subscription("b")),
+    )
+    edit = both(
+        change_report(SUB, "/a", nfes=(udp(7000, "239.255.0.1"),)),
+        change_report(SUB, "/b", nfes=(udp(7000, "239.255.0.1"),)),
+    )
+    finding = the_finding(edit, plan=plan)
+    assert finding.message == (
+        "cannot accept the subscription of /a in /one: it strictly requires a unique network flow"
+        " and shares udp 239.255.0.1:7000 with other subscriptions"
+    )
+
+
+def test_the_same_port_on_two_machines_is_not_shared():
+    strictly = UniqueRequirement.STRICTLY_REQUIRED
+    plan = planned(
+        node("one", publisher("a"), needs=[need(PUB, "a", strictly)], machine="m1"),
+        node("two", publisher("a"), needs=[need(PUB, "a", strictly)], machine="m2"),
+    )
+    assert findings_after(change_report(PUB, "/a", nfes=(udp(40000),)), plan=plan) == []
+
+
+def test_unknown_nfes_in_the_same_process_may_hide_an_equal_one():
+    strictly = UniqueRequirement.STRICTLY_REQUIRED
+    plan = planned(
+        node("one", subscription("a"), subscription("b"), needs=[need(SUB, "a", strictly)]),
+        node("two", subscription("c")),
+    )
+    assert findings_after(change_report(SUB, "/c", nfes=None), plan=plan) == []
+    assert findings_after(change_report(SUB, "/b", nfes=None), plan=plan) == [
+        ("flow.unverifiable", "unverifiable", "/a")
+    ]
+
+
+# --- what findings say
+
+
+def test_a_missing_endpoint_is_told_whole():
+    assert the_finding(drop_endpoint(PUB, STATUS)) == Finding(
+        rule="graph.missing-endpoint",
+        outcome=Outcome.VIOLATED,
+        subject="/robot/status",
+        expected="publisher of /robot/camera",
+        observed="no such publisher",
+        message="cannot find the publisher of /robot/status that /robot/camera declares",
+        at="robot.lifecycle.yaml:13:9",
+        node="/robot/camera",
+        endpoint=PUB,
+        hint="compare the declared name, remaps and namespace with what the node creates",
+    )
+
+
+def test_an_incompatible_pair_names_the_policy_and_both_ends():
+    edit = both(
+        change_announced_qos(SUB, VIDEO, reliability=Reliability.RELIABLE),
+        change_announced_qos(SUB, STATUS, liveliness=Liveliness.MANUAL_BY_TOPIC),
+    )
+    verdict = verify(PLAN, edit(perfect(PLAN)), stage=Stage.CONNECTED)
+    messages = [each.message for each in verdict.findings if each.rule == "graph.qos-incompatible"]
+    status = (
+        "cannot match /robot/camera → /viewer on /robot/status: /robot/camera offers"
+        " liveliness AUTOMATIC, /viewer requests liveliness MANUAL_BY_TOPIC"
+    )
+    video = (
+        "cannot match /robot/camera → /viewer on /robot/video: /robot/camera offers"
+        " reliability BEST_EFFORT, /viewer requests reliability RELIABLE"
+    )
+    assert messages == [status, video]
+
+
+def test_one_missing_and_one_undeclared_endpoint_of_a_type_hint_at_each_other_without_a_report():
+    edit = both(
+        change_endpoint(PUB, STATUS, name="/robot/stauts"), drop_endpoint_report(PUB, STATUS)
+    )
+    verdict = verify(PLAN, edit(perfect(PLAN)), stage=Stage.CONNECTED)
+    (undeclared,) = (each for each in verdict.findings if each.subject == "/robot/stauts")
+    assert undeclared.hint == (
+        "/robot/status of the same type is missing: is a remap or a name wrong?"
+    )
+
+
+def test_a_service_that_a_user_calls_as_the_node_interface_does_is_not_hidden():
+    edit = both(
+        drop_report("/viewer"),
+        add_endpoint(
+            SERVER, "/viewer", "/viewer/disconnect", type="rcl_interfaces/srv/SetParameters"
+        ),
+    )
+    assert ("graph.undeclared-service-server", "violated", "/viewer/disconnect") in findings_after(
+        edit
+    )
+
+
+def test_a_wrong_remap_shows_as_one_missing_and_one_undeclared_endpoint_that_hints_at_it():
+    edit = both(
+        change_endpoint(PUB, STATUS, name="/robot/stauts"),
+        change_report(PUB, STATUS, resolved="/robot/stauts"),
+    )
+    verdict = verify(PLAN, edit(perfect(PLAN)), stage=Stage.CONNECTED)
+    assert [(each.rule, each.subject) for each in verdict.findings] == [
+        ("graph.missing-endpoint", "/robot/status"),
+        ("graph.undeclared-publisher", "/robot/stauts"),
+    ]
+    assert verdict.findings[1].hint == (
+        "it is publishers/status under another name: is a remap wrong, or did somebody call "
+        "/robot/camera/remap?"
+    )
+
+
+def test_an_undeclared_node_is_told_with_what_it_does():
+    edit = both(add_node("/spy"), add_endpoint(PUB, "/spy", "/x", gid="1"))
+    assert the_finding(edit).observed == "node with publisher of /x"
+
+
+def test_an_endpoint_that_only_the_report_tells_of_is_undeclared_already():
+    camera = perfect(PLAN).configurations[0]
+    extra = dataclasses.replace(camera.endpoints[2], name="", resolved="/extra", gid="99")
+    edit = change_configuration("/robot/camera", endpoints=(*camera.endpoints, extra))
+    assert findings_after(edit) == [("graph.undeclared-publisher", "violated", "/extra")]
+
+
+def test_two_reports_of_one_name_are_two_nodes():
+    twin = dataclasses.replace(
+        perfect(PLAN).configurations[1],
+        identity=Identity(machine_id="other", process_id=1, node_id="/viewer@ff"),
+    )
+    assert isinstance(twin, NodeConfiguration)
+    assert ("graph.duplicate-node", "violated", "/viewer") in findings_after(
+        add_configuration(twin)
+    )
+
+
+@pytest.mark.parametrize(
+    "placeholder",
+    [
+        "/_NODE_NAME_UNKNOWN_",
+        "_NODE_NAMESPACE_UNKNOWN_/_NODE_NAME_UNKNOWN_",
+        "_CREATED_BY_BARE_DDS_APP_/_CREATED_BY_BARE_DDS_APP_",
+    ],
+)
+def test_a_placeholder_for_an_unknown_node_is_not_taken_for_a_name(placeholder: str):
+    edit = both(add_node(placeholder), add_endpoint(PUB, placeholder, "/extra", gid="99"))
+    assert findings_after(edit) == [("graph.unattributed-endpoint", "violated", "/extra")]
+    assert findings_after(change_endpoint(PUB, STATUS, node=placeholder)) == []
+
+
+def test_what_is_declared_is_no_noise():
+    plan = planned(
+        node("rviz2", subscription("/clock"), subscription("/one/transition_event")),
+        node("one", publisher("/rosout")),
+    )
+    assert findings_after(lambda seen: seen, plan=plan) == []
+    assert findings_after(drop_endpoint(SUB, "/clock"), plan=plan) == [
+        ("graph.missing-endpoint", "violated", "/clock")
+    ]
+    assert findings_after(drop_node("/rviz2"), plan=plan) == [
+        ("graph.missing-node", "violated", "/rviz2")
+    ]
+
+
+def test_after_the_gate_an_endpoint_of_an_unknown_node_is_unverifiable():
+    finding = the_finding(add_endpoint(PUB, "", "/extra", gid="99"), stage=Stage.ACTIVE)
+    assert finding.outcome is Outcome.UNVERIFIABLE
+    assert finding.message == "cannot tell whose publisher of /extra this is (GID 99)"
