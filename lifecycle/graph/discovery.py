@@ -20,6 +20,7 @@ from lifecycle.graph.asking import Asker
 from lifecycle.graph.events import GraphEvents
 from lifecycle.graph.transport import Remove
 from lifecycle.manifest.model import EndpointKind
+from lifecycle.middleware.census import Census
 from lifecycle.verify.noise import fold_actions, is_noise_node, known_node, without_noise
 from lifecycle.verify.observation import (
     EndpointReport,
@@ -60,6 +61,7 @@ class Discovery:
         self, node: Node, events: GraphEvents, asker: Asker, reread: Callable[[str], None]
     ) -> None:
         self._node = node
+        self._census = Census(node)
         self._events = events
         self._asker = asker
         self._reread = reread
@@ -79,7 +81,7 @@ class Discovery:
         self._due = None
         if self._closed:
             return
-        everybody = self._all_names()
+        everybody = tuple(self._census.count())
         names = frozenset(filter(_counts, everybody))
         hidden = sorted(each for each in everybody if each.rpartition("/")[2].startswith("_"))
         reporting = {each.node for each in self._events.members() if each.incarnation}
@@ -162,10 +164,6 @@ class Discovery:
         foreign = self._foreign.pop(name)
         if foreign.transitions is not None:
             self._node.destroy_subscription(foreign.transitions)
-
-    def _all_names(self) -> list[str]:
-        found = self._node.get_node_names_and_namespaces()
-        return [f"{namespace.rstrip('/')}/{name}" for name, namespace in found]
 
     def _endpoints(self, full_name: str) -> list[ObservedEndpoint]:
         """Return what a node has by name and type; nothing once it has left."""

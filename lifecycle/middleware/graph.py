@@ -11,12 +11,12 @@ import os
 import threading
 import time
 import typing
-from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator
 
 from rclpy.node import NodeNameNonExistentError
 
 from lifecycle.manifest.model import EndpointKind
+from lifecycle.middleware.census import Census
 from lifecycle.middleware.dead_connections import give_up_dead_connections
 from lifecycle.middleware.doors import knock_for
 from lifecycle.middleware.graph_guard import GraphGuard
@@ -28,6 +28,7 @@ from lifecycle.verify.noise import (
     fold_actions,
     is_noise_endpoint,
     is_noise_node,
+    known_node,
     without_noise,
 )
 from lifecycle.verify.observation import ObservedEndpoint, ObservedNode
@@ -84,6 +85,7 @@ class GraphObserver:
         self._context, self.node = quiet_node(
             f"_lifecycle_observer_{os.getpid()}", "/", domain_id, settings=settings
         )
+        self._census = Census(self.node)
         self._lock = threading.Lock()
         self._callbacks: tuple[Callable[[], None], ...] = ()
         self._destroyed = False
@@ -123,12 +125,11 @@ class GraphObserver:
         if self._guard.failure is not None:
             raise self._guard.failure
         self._known = frozenset()
-        counts = Counter(
-            _full_name(name, namespace)
-            for name, namespace in self.node.get_node_names_and_namespaces()
-        )
+        counts = self._census.count()
         names = sorted(
-            name for name in counts if name in keep or not (is_noise_node(name) or not name)
+            name
+            for name in counts
+            if name in keep or (known_node(name) and not is_noise_node(name))
         )
         endpoints = [
             endpoint
