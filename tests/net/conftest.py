@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.net.hosts import Hosts, lacking
+from tests.second_try import SECOND_TRY
 
 
 @pytest.fixture
@@ -18,11 +19,12 @@ def hosts() -> Iterator[Hosts]:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark everything below tests/net as `net`, and skip it where no host can be made."""
+    """Mark everything below tests/net, give it a second try, and skip it where no host can be."""
     here = Path(__file__).parent
     mine = [item for item in items if here in item.path.parents]
     reason = lacking() if mine else ""
     for item in mine:
         item.add_marker(pytest.mark.net)
+        item.add_marker(SECOND_TRY)
         if reason:
             item.add_marker(pytest.mark.skip(reason=reason))

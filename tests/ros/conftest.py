@@ -30,6 +30,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
 from lifecycle.middleware import discovery_environment, leftovers, segments_of
+from tests.second_try import SECOND_TRY
 
 # Their ports lie outside Linux's ephemeral range (32768–60999), where any socket may be in the way.
 _POOL = (*range(215, 232), *range(70, 102))
@@ -171,9 +172,10 @@ As an error it would end the executor, and the thread, of a server in this proce
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark everything below tests/ros as `ros`."""
+    """Mark everything below tests/ros as `ros`, and give it a second try."""
     here = Path(__file__).parent
     for item in items:
         if here in item.path.parents:
             item.add_marker(pytest.mark.ros)
+            item.add_marker(SECOND_TRY)
             item.add_marker(pytest.mark.filterwarnings(_DROPPED_REPLY))
