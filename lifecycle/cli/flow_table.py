@@ -1,14 +1,14 @@
-"""Flows as a table, JSON or CSV. Owns: their columns and how an endpoint is written."""
+"""Flows as a table, JSON or CSV. Owns: the columns of the table, and words for the unknown."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from lifecycle.codec import to_json
 from lifecycle.export.flows_csv import flows_to_csv
 from lifecycle.manifest.model import UniqueHow
 from lifecycle.network.dscp import describe
-from lifecycle.network.nfe import InternetProtocol, NetworkFlowEndpoint, TransportProtocol
+from lifecycle.network.nfe import NetworkFlowEndpoint
 from lifecycle.verify import FlowReport
 
 _HEADS = (
@@ -18,6 +18,7 @@ _HEADS = (
     "source",
     "destination",
     "protocol",
+    "flow_label",
     "dscp",
     "5qi",
     "unique",
@@ -32,8 +33,8 @@ _UNIQUE = {UniqueHow.NOT: "no", UniqueHow.WEAKLY: "weakly", UniqueHow.STRONGLY: 
 def render_flows(flows: Sequence[FlowReport], format_: str) -> str:
     """Return `flows` as "text", "json" (an array) or "csv" (with a head line).
 
-    In text, a pair is one line with all network flow endpoints of its ends; in CSV it has one for
-    each flow that they form. `transport` is what carries it, not what could.
+    In text and CSV a pair has one line for each network flow that its ends form, in JSON they are
+    its `tuples`. `transport` is what carries it, not what could.
     """
     if format_ == "json":
         return to_json(tuple(flows)).decode()
@@ -41,7 +42,7 @@ def render_flows(flows: Sequence[FlowReport], format_: str) -> str:
         return flows_to_csv(flows).rstrip("\n")
     if not flows:
         return "no flow"
-    rows = [_HEADS, *(_row(flow) for flow in flows)]
+    rows = [_HEADS, *(row for flow in flows for row in _rows(flow))]
     widths = [max(len(row[index]) for row in rows) for index in range(len(_HEADS))]
     return "\n".join(
         "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
@@ -49,14 +50,9 @@ def render_flows(flows: Sequence[FlowReport], format_: str) -> str:
     )
 
 
-def _row(flow: FlowReport) -> tuple[str, ...]:
-    return (
-        flow.topic,
-        flow.publisher,
-        flow.subscription,
-        _ends(flow.source),
-        _ends(flow.destination),
-        _protocols(flow),
+def _rows(flow: FlowReport) -> Iterator[tuple[str, ...]]:
+    pair = (flow.topic, flow.publisher, flow.subscription)
+    demands_and_verdict = (
         "–" if flow.dscp is None else describe(flow.dscp),
         _five_qi(flow),
         "unknown" if flow.unique is None else _UNIQUE[flow.unique],
@@ -65,6 +61,17 @@ def _row(flow: FlowReport) -> tuple[str, ...]:
         flow.effective_transport,
         flow.outcome.value,
     )
+    for each in _tuples(flow):
+        yield (*pair, *each, *demands_and_verdict)
+
+
+def _tuples(flow: FlowReport) -> Sequence[tuple[str, ...]]:
+    """Source, destination, protocol and flow label of each network flow of a pair."""
+    found = [
+        (each.source, each.destination, each.transport_protocol.value, each.label or "–")
+        for each in flow.tuples
+    ]
+    return found or [(_ends(flow.source), _ends(flow.destination), "–", "–")]
 
 
 def _five_qi(flow: FlowReport) -> str:
@@ -74,23 +81,5 @@ def _five_qi(flow: FlowReport) -> str:
 
 
 def _ends(nfes: Sequence[NetworkFlowEndpoint]) -> str:
-    """Write network flow endpoints, each as address:port, or address#label with a flow label."""
-    return " ".join(dict.fromkeys(_end(nfe) for nfe in nfes)) or "unknown"
-
-
-def _end(nfe: NetworkFlowEndpoint) -> str:
-    if nfe.transport_protocol is TransportProtocol.UNKNOWN:
-        return "shm"
-    v6 = nfe.internet_protocol is InternetProtocol.IPV6
-    address = f"[{nfe.internet_address}]" if v6 else nfe.internet_address
-    label = f"#{nfe.flow_label:#07x}" if nfe.flow_label else ""
-    return f"{address}:{nfe.transport_port}{label}"
-
-
-def _protocols(flow: FlowReport) -> str:
-    found = dict.fromkeys(
-        nfe.transport_protocol.value
-        for nfe in (*flow.source, *flow.destination)
-        if nfe.transport_protocol is not TransportProtocol.UNKNOWN
-    )
-    return "/".join(found) or "–"
+    """Write the network flow endpoints of an end that forms no IP flow with the other."""
+    return " ".join(dict.fromkeys(each.describe() for each in nfes)) or "unknown"

@@ -39,8 +39,8 @@ def _show(
 ) -> int:
     """Show every publisher → subscription pair of a running system.
 
-    One line per flow: its network flow endpoints, DSCP and TOS byte, how unique it is, what was
-    required and the verdict. Exits as `lifecycle verify` does.
+    One line per network flow: its 5-tuple, on IPv6 its flow label, DSCP and TOS byte, how unique it
+    is, what was required and the verdict. Exits as `lifecycle verify` does.
     """
     from lifecycle.cli.flow_table import render_flows
     from lifecycle.cli.verb_verify import exit_code

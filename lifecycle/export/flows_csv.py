@@ -10,7 +10,7 @@ import io
 from collections.abc import Iterable, Iterator
 
 from lifecycle.network.dscp import dscp_name, tos
-from lifecycle.network.flow import FlowTuple, flow_tuples
+from lifecycle.network.flow import FlowTuple
 from lifecycle.verify.verdict import FlowReport
 
 COLUMNS = (
@@ -38,7 +38,10 @@ COLUMNS = (
     "five_qi_reason",
     "effective_transport",
 )
-"""Header line. An empty cell is something that is not known or does not apply."""
+"""Header line. An empty cell is something that is not known or does not apply.
+
+`flow_label` is five hex digits, or `unset` where the sender sets none; empty on IPv4.
+"""
 
 
 def flows_to_csv(flows: Iterable[FlowReport]) -> str:
@@ -56,7 +59,7 @@ def flows_to_csv(flows: Iterable[FlowReport]) -> str:
 
 
 def _rows(report: FlowReport) -> Iterator[tuple[object, ...]]:
-    for flow in flow_tuples(report.source, report.destination) or (None,):
+    for flow in report.tuples or (None,):
         yield (
             report.topic,
             report.publisher,
@@ -85,7 +88,7 @@ def _tuple_cells(flow: FlowTuple | None) -> tuple[object, ...]:
         flow.source_port,
         flow.destination_address,
         flow.destination_port,
-        flow.flow_label or "",
+        flow.label,
     )
 
 

@@ -18,10 +18,10 @@ from lifecycle.export.packet_filter import (
     check_same_family,
 )
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.network.address import canonical, is_loopback, is_multicast, is_wildcard
+from lifecycle.network.address import canonical, is_loopback, is_multicast, is_wildcard, socket_text
 from lifecycle.network.dscp import parse_dscp
 from lifecycle.network.five_qi_dscp import DscpMapping
-from lifecycle.network.flow import FlowTuple, flow_tuples
+from lifecycle.network.flow import FlowTuple
 from lifecycle.network.nfe import InternetProtocol, TransportProtocol, is_ip
 from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedNode
 from lifecycle.verify.transport import INTRAPROCESS, SHARED_MEMORY, UNKNOWN
@@ -107,8 +107,8 @@ class FlowRule:
 
     def describe(self) -> str:
         """Return the tuple for people: `udp 10.77.0.1:17900 → 10.77.0.2:17910`."""
-        source = _end(self.source_address or "*", self.source_port)
-        destination = _end(self.destination_address, self.destination_port)
+        source = socket_text(self.source_address or "*", self.source_port)
+        destination = socket_text(self.destination_address, self.destination_port)
         return f"{self.transport_protocol.value} {source} → {destination}"
 
 
@@ -223,10 +223,9 @@ def _candidates(
     subscription = _node(plan, report.subscription)
     remote = publisher is None or subscription is None or not _same_host(plan, report)
     ask = _ask(report, publisher, subscription)
-    tuples = flow_tuples(report.source, report.destination)
-    if not tuples and not unknown:
+    if not report.tuples and not unknown:
         left_out.append(_left(report, "its two ends have no IP transport in common"))
-    for each in tuples:
+    for each in report.tuples:
         # A zone (`fe80::1%eth0`) names an interface of its own host and is not in the packet.
         flow = dataclasses.replace(
             each,
@@ -374,7 +373,3 @@ def _same_host(plan: Plan, report: FlowReport) -> bool:
     ends = [_node(plan, name) for name in (report.publisher, report.subscription)]
     places = {"" if end is None else addresses.get(end.machine, "") for end in ends}
     return len(places) == 1
-
-
-def _end(address: str, port: int) -> str:
-    return f"[{address}]:{port}" if ":" in address else f"{address}:{port}"

@@ -24,6 +24,11 @@ def canonical(text: str) -> str:
     return text if address is None else str(address)
 
 
+def socket_text(address: str, port: int) -> str:
+    """Return address and port as URLs write them: `10.0.0.1:7411`, `[fd00::1]:7411`."""
+    return f"[{address}]:{port}" if ":" in address else f"{address}:{port}"
+
+
 def is_wildcard(text: str) -> bool:
     """Whether this is `0.0.0.0` or `::`, which stands for every unicast address of its host."""
     address = parse_address(text)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Sequence
 
-from lifecycle.network.address import canonical, is_loopback, is_multicast, is_wildcard
+from lifecycle.network.address import canonical, is_loopback, is_multicast, is_wildcard, socket_text
 from lifecycle.network.nfe import (
     InternetProtocol,
     NetworkFlowEndpoint,
@@ -27,7 +27,8 @@ class FlowTuple:
         source_port: 0–65535.
         destination_address: unicast, or a group.
         destination_port: 0–65535.
-        flow_label: IPv6 flow label, 0–0xFFFFF; 0 if none is set.
+        flow_label: IPv6 flow label, 0–0xFFFFF; 0 if the sender sets none (RFC 6437 §2), which
+            leaves it to the kernel and to rules on the way.
         dscp: 0–63.
     """
 
@@ -44,6 +45,31 @@ class FlowTuple:
     def source_is_known(self) -> bool:
         """Whether the source address is one address, so that the whole 5-tuple is known."""
         return not is_wildcard(self.source_address)
+
+    @property
+    def source(self) -> str:
+        """`10.0.0.1:7411`, `[fd00::1]:7411`."""
+        return socket_text(self.source_address, self.source_port)
+
+    @property
+    def destination(self) -> str:
+        """As `source`."""
+        return socket_text(self.destination_address, self.destination_port)
+
+    @property
+    def label(self) -> str:
+        """The flow label in five hex digits, `unset`, or empty on IPv4, which has none."""
+        if self.internet_protocol is not InternetProtocol.IPV6:
+            return ""
+        return f"{self.flow_label:#07x}" if self.flow_label else "unset"
+
+    def describe(self) -> str:
+        """Return the 5-tuple, on IPv6 with the label that makes a 3-tuple of its addresses.
+
+        `udp 10.0.0.1:7411 → 10.0.0.2:7000`, `udp [fd00::1]:7411 → [fd00::2]:7000 flow_label unset`.
+        """
+        label = f" flow_label {self.label}" if self.label else ""
+        return f"{self.transport_protocol.value} {self.source} → {self.destination}{label}"
 
 
 def flow_tuples(

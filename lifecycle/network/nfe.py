@@ -19,7 +19,7 @@ import dataclasses
 import enum
 from collections.abc import Iterable, Sequence
 
-from lifecycle.network.address import may_be_same
+from lifecycle.network.address import may_be_same, socket_text
 
 
 class TransportProtocol(enum.Enum):
@@ -98,6 +98,12 @@ class NetworkFlowEndpoint:
     flow_label: int = 0
     dscp: int = 0
     internet_address: str = ""
+
+    def describe(self) -> str:
+        """Return it for people: `10.0.0.1:7411`, `[fd00::1]:7411`, or `shm`."""
+        if self.transport_protocol is TransportProtocol.UNKNOWN:
+            return "shm"
+        return socket_text(self.internet_address, self.transport_port)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

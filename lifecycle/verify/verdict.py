@@ -10,6 +10,7 @@ import enum
 from collections.abc import Iterable
 
 from lifecycle.manifest.model import EndpointKind, UniqueHow
+from lifecycle.network.flow import FlowTuple, flow_tuples
 from lifecycle.network.nfe import NetworkFlowEndpoint, UniqueRequirement
 
 
@@ -80,6 +81,8 @@ class FlowReport:
         effective_transport: what carries it: "intraprocess", "shm", "udpv4", "udpv6", "tcpv4",
             "tcpv6"; "unknown" where nobody tells, "none" where the ends have nothing in common.
         transport: "udp", "tcp", "shm or udp" …; what can carry it, as far as the NFEs tell.
+        tuples: IP flows that the two ends' NFEs form, each with its 5-tuple and flow label; follows
+            from source and destination. Where shared memory carries the flow, none of them does.
     """
 
     topic: str
@@ -97,6 +100,10 @@ class FlowReport:
     five_qi: int | None = None
     five_qi_reason: str = ""
     effective_transport: str = "unknown"
+    tuples: tuple[FlowTuple, ...] = dataclasses.field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "tuples", flow_tuples(self.source, self.destination))
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

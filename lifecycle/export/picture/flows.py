@@ -13,12 +13,7 @@ from lifecycle.export.picture.model import PicturedFlow, PicturedNode, Presence
 from lifecycle.export.picture.participants import carrier
 from lifecycle.manifest.model import EndpointKind, UniqueHow
 from lifecycle.network.dscp import describe
-from lifecycle.network.nfe import (
-    InternetProtocol,
-    NetworkFlowEndpoint,
-    TransportProtocol,
-    UniqueRequirement,
-)
+from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.verify.verdict import FlowReport, Outcome
 from lifecycle.verify.view import FlowView, Seen, View
 
@@ -96,7 +91,7 @@ def _as_found(drawn: PicturedFlow, report: FlowReport) -> PicturedFlow:
         drawn,
         outcome=report.outcome,
         medium=report.effective_transport,
-        tuples=_tuples(report),
+        tuples=tuple(each.describe() for each in report.tuples),
         dscp="" if report.dscp is None else describe(report.dscp),
         unique=_UNIQUE[report.unique],
     )
@@ -112,28 +107,6 @@ def _demands(flow: FlowView) -> Iterable[str]:
         yield f"at most {flow.planned.max_delay_ms:g} ms"
     if flow.five_qi is not None:
         yield f"5QI {flow.five_qi}"
-
-
-def _tuples(report: FlowReport) -> tuple[str, ...]:
-    """Source → destination for each protocol that both ends have; else what each end tells."""
-    found: dict[str, None] = {}
-    for source in report.source:
-        for destination in report.destination:
-            same = (
-                source.transport_protocol is destination.transport_protocol
-                and source.internet_protocol is destination.internet_protocol
-            )
-            if same and source.transport_protocol is not TransportProtocol.UNKNOWN:
-                protocol = source.transport_protocol.value
-                found[f"{protocol} {_address(source)} → {_address(destination)}"] = None
-    return tuple(found)
-
-
-def _address(nfe: NetworkFlowEndpoint) -> str:
-    v6 = nfe.internet_protocol is InternetProtocol.IPV6
-    address = f"[{nfe.internet_address}]" if v6 else nfe.internet_address
-    label = f"#{nfe.flow_label:#07x}" if nfe.flow_label else ""
-    return f"{address}:{nfe.transport_port}{label}"
 
 
 def _undeclared(

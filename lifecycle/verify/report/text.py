@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 from lifecycle.manifest.model import UniqueHow
 from lifecycle.network.dscp import describe
+from lifecycle.verify.transport import NETWORK
 from lifecycle.verify.verdict import Finding, FlowReport, Outcome, Verdict
 
 _COLOURS = {Outcome.OK: "\x1b[32m", Outcome.VIOLATED: "\x1b[31m", Outcome.UNVERIFIABLE: "\x1b[33m"}
@@ -105,6 +106,8 @@ def _flows(flows: Sequence[FlowReport], *, colour: bool) -> list[str]:
         cells = [cell.ljust(size) for cell, size in zip(row, widths, strict=True) if size]
         outcome = _paint(flow.outcome.value, flow.outcome, colour=colour)
         lines.append("  " + "  ".join([*cells, outcome]))
+        if flow.effective_transport in NETWORK:
+            lines += [f"    {each.describe()}" for each in flow.tuples]
     return lines
 
 

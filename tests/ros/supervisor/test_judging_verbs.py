@@ -5,8 +5,11 @@ from __future__ import annotations
 import csv
 import io
 import json
+import socket
 from pathlib import Path
 from xml.etree import ElementTree as ET
+
+import pytest
 
 from lifecycle.errors import ExitCode
 from tests.ros.supervisor.running import ENOUGH, pair, up, verb
@@ -39,6 +42,37 @@ def test_a_running_system_is_judged_from_outside(tmp_path: Path, fresh_domain: i
         assert ("graph.missing-node", "/third") in {(e["rule"], e["subject"]) for e in findings}
 
 
+def test_a_flow_over_ipv6_shows_its_3_tuple_and_that_no_label_is_set(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    try:
+        with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as probe:
+            probe.bind(("::1", 0))
+    except OSError as error:
+        pytest.skip(f"this host has no IPv6: {error}")
+    manifest = pair(tmp_path, fresh_domain, edit={"links": [{**_CHATTER, "transport": "udpv6"}]})
+    with up(manifest, runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        text, cells, document = (
+            verb("flows", str(manifest), *ENOUGH, "--format", each, runtime=tmp_path)
+            for each in ("text", "csv", "json")
+        )
+        judged = verb("verify", str(manifest), *ENOUGH, runtime=tmp_path)
+    rows = list(csv.DictReader(io.StringIO(cells.stdout)))
+    assert {(row["effective_transport"], row["flow_label"]) for row in rows} == {("udpv6", "unset")}
+    (flow,) = json.loads(document.stdout)
+    lines = text.stdout.splitlines()[1:]
+    assert len(flow["tuples"]) == len(lines) == len(rows)
+    for one, row, line in zip(flow["tuples"], rows, lines, strict=True):
+        source, destination = (
+            f"[{one[f'{end}_address']}]:{one[f'{end}_port']}" for end in ("source", "destination")
+        )
+        assert (one["source_address"], one["flow_label"]) == (row["source_address"], 0)
+        assert f"{source} {destination} udp unset" in " ".join(line.split())
+        assert f"    udp {source} → {destination} flow_label unset\n" in judged.stdout
+
+
+_CHATTER = {"topic": "/chatter", "from": "talker", "to": "listener"}
 _THIRD = {"run": {"attach": True}, "managed": False}
 
 

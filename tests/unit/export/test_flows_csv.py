@@ -64,6 +64,18 @@ def test_a_pair_with_several_flows_has_one_line_each() -> None:
     assert [row["destination_address"] for row in rows(report)] == ["10.0.0.2", "10.1.0.2"]
 
 
+def test_an_ipv6_flow_has_its_label_in_five_hex_digits_or_says_that_none_is_set() -> None:
+    def cell(flow_label: int) -> str:
+        source = dataclasses.replace(
+            udp("fd00::1", 7411), internet_protocol=InternetProtocol.IPV6, flow_label=flow_label
+        )
+        end = dataclasses.replace(udp("fd00::2", 7000), internet_protocol=InternetProtocol.IPV6)
+        (row,) = rows(dataclasses.replace(VIDEO, source=(source,), destination=(end,)))
+        return row["flow_label"]
+
+    assert (cell(0x12345), cell(0xABC), cell(0)) == ("0x12345", "0x00abc", "unset")
+
+
 def test_what_is_not_known_is_an_empty_cell_and_not_a_guess() -> None:
     report = dataclasses.replace(
         VIDEO,

@@ -54,6 +54,15 @@ def test_two_nfes_make_one_flow_that_carries_the_senders_dscp_and_label() -> Non
     )
 
 
+def test_a_flow_is_written_as_its_5_tuple_and_on_ipv6_with_its_label() -> None:
+    (flow,) = flow_tuples([nfe("10.0.0.1", 7411)], [nfe("10.0.0.2", 7000)])
+    assert (flow.describe(), flow.label) == ("udp 10.0.0.1:7411 → 10.0.0.2:7000", "")
+    (flow,) = flow_tuples([nfe("fd09::1", 7411, flow_label=5)], [nfe("fd09::2", 7000)])
+    assert flow.describe() == "udp [fd09::1]:7411 → [fd09::2]:7000 flow_label 0x00005"
+    (flow,) = flow_tuples([nfe("fd09::1", 7411)], [nfe("fd09::2", 7000)])
+    assert flow.describe() == "udp [fd09::1]:7411 → [fd09::2]:7000 flow_label unset"
+
+
 def test_fast_dds_sends_unicast_from_its_wildcard_socket() -> None:
     source = [SHARED_MEMORY, nfe("0.0.0.0", 45000), nfe("10.0.0.1", 45001)]
     (flow,) = flow_tuples(source, [SHARED_MEMORY, nfe("10.0.0.2", 7000)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import io
 import json
@@ -222,14 +223,14 @@ FLOW = FlowReport(
 def test_a_flow_shows_its_tuple_dscp_and_tos_requirement_and_verdict() -> None:
     head, row = render_flows([FLOW], "text").splitlines()
     assert " ".join(head.split()) == (
-        "topic publisher subscription source destination protocol dscp 5qi unique required "
-        "demanded transport verdict"
+        "topic publisher subscription source destination protocol flow_label dscp 5qi unique "
+        "required demanded transport verdict"
     )
     assert row.split()[-2:] == ["shm", "ok"]  # what carries it, not what could
     for cell in (
         "85 (auto)",
         "10.0.0.1:40000",
-        "10.0.0.1:7000 shm",
+        "10.0.0.1:7000 ",
         "udp",
         "46",
         "184",
@@ -243,6 +244,53 @@ def test_a_flow_shows_its_tuple_dscp_and_tos_requirement_and_verdict() -> None:
     assert (cells["dscp"], cells["dscp_name"], cells["tos"]) == ("46", "EF", "184")
     assert (cells["five_qi"], cells["effective_transport"]) == ("85", "shm")
     assert json.loads(render_flows([FLOW], "json"))[0]["topic"] == "/video"
+
+
+def _nfe6(address: str, port: int, flow_label: int = 0) -> NetworkFlowEndpoint:
+    return NetworkFlowEndpoint(
+        transport_protocol=TransportProtocol.UDP,
+        internet_protocol=InternetProtocol.IPV6,
+        transport_port=port,
+        flow_label=flow_label,
+        internet_address=address,
+    )
+
+
+@pytest.mark.parametrize(
+    ("label", "word"), [(0x12345, "0x12345"), (0xABC, "0x00abc"), (0, "unset")]
+)
+def test_an_ipv6_flow_shows_its_3_tuple_alike_in_every_format(label: int, word: str) -> None:
+    flow = dataclasses.replace(
+        FLOW,
+        source=(_nfe6("fd00::1", 7411, label),),
+        destination=(_nfe6("fd00::2", 7000), _nfe6("fd00::3", 7000)),
+        effective_transport="udpv6",
+    )
+    head, *rows = render_flows([flow], "text").splitlines()
+    at = {name: head.index(name) for name in ("source", "destination", "flow_label")}
+    shown = [[row[start:].split()[0] for start in at.values()] for row in rows]
+    assert shown == [
+        ["[fd00::1]:7411", "[fd00::2]:7000", word],
+        ["[fd00::1]:7411", "[fd00::3]:7000", word],
+    ]
+    cells = list(csv.DictReader(io.StringIO(render_flows([flow], "csv"))))
+    names = ("source_address", "destination_address", "flow_label")
+    assert [[each[name] for name in names] for each in cells] == [
+        ["fd00::1", "fd00::2", word],
+        ["fd00::1", "fd00::3", word],
+    ]
+    tuples = json.loads(render_flows([flow], "json"))[0]["tuples"]
+    assert [[each[name] for name in names] for each in tuples] == [
+        ["fd00::1", "fd00::2", label],
+        ["fd00::1", "fd00::3", label],
+    ]
+
+
+def test_ends_that_form_no_ip_flow_are_shown_as_what_they_tell() -> None:
+    memory = _nfe(7000, TransportProtocol.UNKNOWN)
+    flow = dataclasses.replace(FLOW, source=(memory,), destination=())
+    (_, row) = render_flows([flow], "text").splitlines()
+    assert " ".join(row.split()).startswith("/video /camera /viewer shm unknown – – EF = DSCP 46")
 
 
 @pytest.mark.parametrize(

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree as ET
 
 import jsonschema
@@ -12,6 +14,8 @@ import pytest
 
 from lifecycle import codec
 from lifecycle.manifest.model import EndpointKind
+from lifecycle.network.flow import FlowTuple
+from lifecycle.network.nfe import InternetProtocol, NetworkFlowEndpoint, TransportProtocol
 from lifecycle.plan import build_plan
 from lifecycle.verify import (
     RULES,
@@ -74,7 +78,7 @@ def schema(name: str) -> dict:
 # --- text
 
 
-def test_a_good_verdict_is_one_line_and_its_flows():
+def test_a_good_verdict_is_one_line_and_its_flows_with_the_tuples_that_carry_them():
     lines = render_text(after(perfectly)).splitlines()
     assert lines[:3] == ["verdict: ok (3 flows)", "", "flows"]
     pair, video, battery = (
@@ -84,9 +88,40 @@ def test_a_good_verdict_is_one_line_and_its_flows():
     )
     assert lines[3:] == [
         f"  /robot/video    {pair}  strongly unique  {video}  udpv4  ok",
+        "    udp 0.0.0.0:40001 → 10.77.0.2:7020",
         f"  /robot/battery  {pair}  weakly unique    {battery} = TOS 32 (0x20)   udpv4  ok",
+        "    udp 0.0.0.0:40002 → 10.77.0.2:7413",
         f"  /robot/status   {pair}  weakly unique    {'':29}  udpv4  ok",
+        "    udp 0.0.0.0:40000 → 10.77.0.2:7413",
     ]
+
+
+def with_first_flow(**changes: object) -> Verdict:
+    verdict = after(perfectly)
+    flow = dataclasses.replace(verdict.flows[0], **changes)
+    return dataclasses.replace(verdict, flows=(flow,))
+
+
+def test_an_ipv6_flow_shows_its_flow_label_or_that_the_sender_sets_none():
+    udp6 = functools.partial(
+        NetworkFlowEndpoint,
+        transport_protocol=TransportProtocol.UDP,
+        internet_protocol=InternetProtocol.IPV6,
+    )
+    ends: dict[str, Any] = {
+        "source": (udp6(internet_address="fd00::1", transport_port=7411, flow_label=0xABC),),
+        "destination": (udp6(internet_address="fd00::2", transport_port=7000),),
+        "effective_transport": "udpv6",
+    }
+    text = render_text(with_first_flow(**ends))
+    assert text.splitlines()[-1] == "    udp [fd00::1]:7411 → [fd00::2]:7000 flow_label 0x00abc"
+    ends["source"] = (udp6(internet_address="::", transport_port=7411),)
+    text = render_text(with_first_flow(**ends))
+    assert text.splitlines()[-1] == "    udp [::]:7411 → [fd00::2]:7000 flow_label unset"
+
+
+def test_a_flow_that_shared_memory_carries_shows_no_tuple_that_does_not_carry_it():
+    assert render_text(with_first_flow(effective_transport="shm")).endswith("  shm  ok\n")
 
 
 BAD_TEXT = """\
@@ -165,6 +200,7 @@ def test_json_can_be_indented_for_people():
     [
         ("verdict.v1.schema.json", "Finding", Finding),
         ("verdict.v1.schema.json", "FlowReport", FlowReport),
+        ("verdict.v1.schema.json", "FlowTuple", FlowTuple),
         ("node_configuration.v1.schema.json", "", NodeConfiguration),
     ],
 )
