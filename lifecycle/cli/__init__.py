@@ -13,6 +13,7 @@ import traceback
 
 import click
 
+from lifecycle.cli.own_stdout import keep_stdout
 from lifecycle.errors import ExitCode, LifecycleError
 
 VERBS: dict[str, str] = {
@@ -65,6 +66,13 @@ class _Verbs(click.Group):
 @click.version_option(package_name="ros-lifecycle-manifests")
 def cli() -> None:
     """Declare a ROS 2 system, start it, and activate it only once it is verified."""
+
+
+def program() -> int:
+    """Run `lifecycle` as a process of its own."""
+    if sys.argv[1:2] != ["run"]:  # whose standard output is the user's node's
+        keep_stdout()
+    return main()
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -2,6 +2,6 @@
 
 import sys
 
-from lifecycle.cli import main
+from lifecycle.cli import program
 
-sys.exit(main())
+sys.exit(program())

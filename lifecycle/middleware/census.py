@@ -2,9 +2,9 @@
 
 Owns: `Census`. rmw_dds_common learns node names from one topic and who has left from discovery, in
 two threads: what a leaving participant said last may be read after it was removed, and then its
-names stay for good (GraphCache::update_participant_entities enters it anew; measured: 1 of 160
-leavings under load, still there long after the lease of 20 s). A gate would take a node that comes
-again for two.
+names stay for good (GraphCache::update_participant_entities enters it anew; measured: 1 of 792
+leavings on a loaded machine, still there long after the lease of 20 s). A gate would take a node
+that comes again for two.
 """
 
 from __future__ import annotations

@@ -36,7 +36,9 @@ class Operation(enum.Enum):
     DISCONNECT_FROM = "disconnect_from"  # connection
     REMAP = "remap"  # endpoint, name
     ALIAS = "alias"  # endpoint, names; none takes them away
-    # Of the whole process: tell the graph anew which nodes are here.
+    # Of the whole process: a link is down, and send again soon what nobody acknowledged; and tell
+    # the graph anew which nodes are here.
+    SEND_AGAIN_SOON = "send_again_soon"
     TELL_NAMES = "tell_names"
 
 

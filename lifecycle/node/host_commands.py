@@ -28,12 +28,16 @@ class HostCommands:
 
     Args:
         nodes: the managed ones by full name, as they are at any time.
-        tell_names: tells the graph anew which nodes are here.
+        of_process: what the operations of the whole process do.
     """
 
-    def __init__(self, nodes: Mapping[str, LifecycleNode], tell_names: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        nodes: Mapping[str, LifecycleNode],
+        of_process: Mapping[Operation, Callable[[], object]],
+    ) -> None:
         self._nodes = nodes
-        self._tell_names = tell_names
+        self._of_process = of_process
 
     async def execute(self, command: Command) -> Event:
         """Carry out one command and return the answer to it, whatever happens."""
@@ -53,8 +57,8 @@ class HostCommands:
             raise LifecycleError(f"cannot find node {command.node!r}; this process hosts {known}")
         if command.operation is Operation.GET_CONFIGURATION:
             return self._reply(command, ok=True)
-        if command.operation is Operation.TELL_NAMES:
-            self._tell_names()
+        if command.operation in self._of_process:
+            self._of_process[command.operation]()
             return self._reply(command, ok=True)
         if command.operation in _NODE_INTERFACE:
             await _NODE_INTERFACE[command.operation](node.lifecycle.interface, command)

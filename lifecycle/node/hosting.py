@@ -15,8 +15,9 @@ from rclpy.node import Node
 
 from lifecycle import codec
 from lifecycle.middleware.busy_sign import BusySign
+from lifecycle.middleware.retransmission import send_again_soon
 from lifecycle.node.constructing import Participants, construct
-from lifecycle.node.control import Command, Event, HostSpec
+from lifecycle.node.control import Command, Event, HostSpec, Operation
 from lifecycle.node.host_channel import HostChannel, give_up
 from lifecycle.node.host_commands import HostCommands
 from lifecycle.node.loop import NodeLoop, on_signal
@@ -39,7 +40,13 @@ class Host:
             watchdog = Watchdog(sign, lambda _: channel.write(Event(kind="beat")))
         self._loop = NodeLoop(context, watchdog)
         self._nodes: dict[str, LifecycleNode] = {}
-        self._commands = HostCommands(self._nodes, self._loop.tell_names)
+        self._commands = HostCommands(
+            self._nodes,
+            {
+                Operation.SEND_AGAIN_SOON: send_again_soon,
+                Operation.TELL_NAMES: self._loop.tell_names,
+            },
+        )
 
     def run(self) -> NoReturn:
         """Construct, say ready, obey; never returns."""

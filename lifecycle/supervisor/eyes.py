@@ -123,6 +123,18 @@ class Eyes:
 
         call_out(self._graph.domain_id, addresses)
 
+    def send_again_soon(self) -> None:
+        """Have what waits for a link to come back be sent soon when it does."""
+        from lifecycle.middleware.retransmission import send_again_soon
+
+        send_again_soon()
+
+    def tell_names(self) -> None:
+        """Tell the graph anew that we are here."""
+        from lifecycle.middleware.healing import tell_names
+
+        tell_names([self._graph.node])
+
     def _ear(self, topic: str, to: Listener) -> AliveSubscription:
         from lifecycle.middleware.liveliness import AliveSubscription
 

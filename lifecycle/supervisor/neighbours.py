@@ -16,6 +16,7 @@ from typing import Any, Protocol
 from lifecycle.errors import BringUpError
 from lifecycle.manifest.model import RunKind
 from lifecycle.node.control import Operation
+from lifecycle.supervisor.channel import ControlChannel
 from lifecycle.supervisor.events import MachineConnection
 from lifecycle.supervisor.liveliness import Cause
 from lifecycle.supervisor.system import System
@@ -59,6 +60,12 @@ class Air(Protocol):
 
     def call_out(self, addresses: Iterable[str]) -> None:
         """Make everybody announce themselves; a few datagrams."""
+
+    def send_again_soon(self) -> None:
+        """Have what waits for a link to come back be sent soon when it does."""
+
+    def tell_names(self) -> None:
+        """Tell the graph anew that we are here."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -164,6 +171,8 @@ class Neighbours:
         detail = f"{neighbour.what} is not heard any more"
         self._system.liveliness.fell_silent(neighbour.nodes, Cause.LOST, detail)
         self._missing[neighbour.what] = neighbour
+        self._air.send_again_soon()
+        self._start(self._have_hosts(Operation.SEND_AGAIN_SOON))
         if self._calling is None:
             self._calling = asyncio.ensure_future(self._call())
 
@@ -172,7 +181,9 @@ class Neighbours:
         if neighbour.lost_at_s is not None:
             lost_s = self._loop.time() - neighbour.lost_at_s
             self._missing.pop(neighbour.what, None)
-            self._start(self._tell_names())
+            # DDS may have forgotten the names of those whom it lost for long.
+            self._air.tell_names()
+            self._start(self._have_hosts(Operation.TELL_NAMES))
         neighbour.lost_at_s = None
         if neighbour.machine:
             self._system.emit(
@@ -224,15 +235,21 @@ class Neighbours:
             await asyncio.sleep(CALL_EACH_S)
         self._calling = None
 
-    async def _tell_names(self) -> None:
-        """Have our hosts tell the names of their nodes anew: DDS may have forgotten them."""
-        for process in tuple(self._system.processes.values()):
-            if process.channel is None or process.ended.done():
-                continue
-            first = self._system.nodes[process.planned.nodes[0]]
-            # One that ends meanwhile has no name to tell.
+    async def _have_hosts(self, operation: Operation) -> None:
+        """Have our hosts do something with all of their process; one that hangs holds up none."""
+
+        async def have(channel: ControlChannel, node: str) -> None:
+            # One that ends meanwhile has nothing to do any more.
             with contextlib.suppress(BringUpError):
-                await process.channel.request(first.name, Operation.TELL_NAMES)
+                await channel.request(node, operation)
+
+        await asyncio.gather(
+            *(
+                have(each.channel, self._system.nodes[each.planned.nodes[0]].name)
+                for each in self._system.processes.values()
+                if each.channel is not None and not each.ended.done()
+            )
+        )
 
     def _start(self, doing: Coroutine[Any, Any, None]) -> None:
         task = asyncio.ensure_future(doing)

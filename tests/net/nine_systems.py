@@ -142,10 +142,12 @@ def on_two_hosts(hosts: Hosts, name: str, directory: Path, *options: str) -> Ite
 
 
 @contextlib.contextmanager
-def on_two_hosts_by_tcp(hosts: Hosts, name: str, directory: Path) -> Iterator[System]:
+def on_two_hosts_by_tcp(
+    hosts: Hosts, name: str, directory: Path, *options: str
+) -> Iterator[System]:
     """Likewise, of a system whose hosts are connected by TCP; it is active then."""
     for number in range(TRIES):
-        with on_two_hosts(hosts, name, directory / str(number)) as system:
+        with on_two_hosts(hosts, name, directory / str(number), *options) as system:
             if system.reaches_active():
                 yield system
                 return

@@ -160,6 +160,7 @@ class FakeAir:
         self.ears: dict[str, FakeEar] = {}
         self.voices: dict[str, FakeVoice] = {}
         self.calls: list[list[str]] = []
+        self.done: list[str] = []
 
     def machine_voice(self, system: str, machine: str) -> FakeVoice:
         return self.voices.setdefault(f"{system}/{machine}", FakeVoice())
@@ -172,6 +173,12 @@ class FakeAir:
 
     def call_out(self, addresses: Iterable[str]) -> None:
         self.calls.append(list(addresses))
+
+    def send_again_soon(self) -> None:
+        self.done.append("send_again_soon")
+
+    def tell_names(self) -> None:
+        self.done.append("tell_names")
 
 
 def two_machines() -> Plan:
@@ -350,7 +357,9 @@ def test_a_system_of_one_machine_neither_speaks_nor_listens(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("came_back", [True, False])
-def test_after_a_loss_hosts_tell_their_names_anew(tmp_path: Path, came_back: bool) -> None:
+def test_a_loss_has_us_and_our_hosts_prepare_and_after_it_tell_our_names_anew(
+    tmp_path: Path, came_back: bool
+) -> None:
     async def test() -> None:
         plan = two_machines()
         world = World(plan, tmp_path)
@@ -361,12 +370,20 @@ def test_after_a_loss_hosts_tell_their_names_anew(tmp_path: Path, came_back: boo
         await world.bring_up.connect(30)
         listener = air.ears["robot/desk"].listener
         listener.heard(True)
-        if came_back:
-            listener.heard(False)
-            listener.heard(True)
         await asyncio.sleep(1)
-        asked = f"/camera {Operation.TELL_NAMES.value}" in world.log
-        assert asked is came_back
+        assert air.done == []
+        listener.heard(False)
+        await asyncio.sleep(1)
+        done = ["send_again_soon"]
+        assert air.done == done
+        if came_back:
+            listener.heard(True)
+            await asyncio.sleep(1)
+            done.append("tell_names")
+        assert air.done == done
+        operations = (Operation.SEND_AGAIN_SOON, Operation.TELL_NAMES)
+        asked = [each for each in operations if f"/camera {each.value}" in world.log]
+        assert [each.value for each in asked] == done
         await neighbours.close()
         for process in world.system.processes.values():
             await process.end(((9, 5.0),), asyncio.Event())
