@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import ipaddress
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from lifecycle.manifest.build_connections import (
@@ -21,7 +21,7 @@ from lifecycle.manifest.build_network import build_network
 from lifecycle.manifest.build_node import Findings, build_node
 from lifecycle.manifest.cursor import Cursor
 from lifecycle.manifest.diagnostics import Diagnostic, Position, Severity
-from lifecycle.manifest.document import error
+from lifecycle.manifest.document import Place, error
 from lifecycle.manifest.model import (
     DataLayer,
     Discovery,
@@ -50,6 +50,7 @@ class Fragment:
         diagnostics: errors and warnings found while building; with an error among them, what is
             wrong is left out.
         positions: as `Manifest.positions`.
+        lost: keys of nodes that are declared and left out; None if there may be any.
     """
 
     system: str
@@ -63,15 +64,23 @@ class Fragment:
     links: tuple[Link, ...]
     diagnostics: tuple[Diagnostic, ...]
     positions: tuple[tuple[str, Position], ...] = ()
+    lost: frozenset[str] | None = frozenset()
 
 
-def build_fragment(root: Cursor, *, base: Path, environment: Mapping[str, str]) -> Fragment:
+def build_fragment(
+    root: Cursor,
+    *,
+    base: Path,
+    environment: Mapping[str, str],
+    unsound: Collection[Place] = (),
+) -> Fragment:
     """Build what a document declares.
 
     Args:
         root: a document that fits the schema, or what is left of it without the parts that do not.
         base: folder that its relative paths start from.
         environment: for AMENT_PREFIX_PATH, where interfaces by reference are searched.
+        unsound: links to leave out, which keep their place in the list.
     """
     found: Findings = []
     nodes = tuple(
@@ -87,7 +96,7 @@ def build_fragment(root: Cursor, *, base: Path, environment: Mapping[str, str]) 
         data_layer=build_data_layer(root, found),
         policy=_policy(root),
         nodes=nodes,
-        links=tuple(_link(cursor) for cursor in root.items("links")),
+        links=tuple(_link(each) for each in root.items("links") if each.place not in unsound),
         diagnostics=tuple(found),
         positions=section_positions(root),
     )

@@ -111,7 +111,10 @@ def move(fragment: Fragment, *, prefix: str, namespace: str) -> Fragment:
         )
         for link in fragment.links
     )
-    return dataclasses.replace(fragment, nodes=tuple(new.values()), links=links)
+    lost = fragment.lost
+    if lost is not None:
+        lost = frozenset(_join_key(prefix, key) for key in lost)
+    return dataclasses.replace(fragment, nodes=tuple(new.values()), links=links, lost=lost)
 
 
 def _move_node(node: Node, prefix: str, namespace: str) -> Node:
@@ -178,6 +181,7 @@ def join(outer: Fragment, inner: Fragment, at: Position, found: Findings) -> Fra
         nodes=tuple(nodes.values()),
         machines=tuple(machines.values()),
         links=(*outer.links, *inner.links),
+        lost=None if outer.lost is None or inner.lost is None else outer.lost | inner.lost,
     )
 
 

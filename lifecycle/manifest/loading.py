@@ -8,17 +8,16 @@ no ROS.
 from __future__ import annotations
 
 import dataclasses
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-from lifecycle.manifest import include
+from lifecycle.manifest import include, salvage
 from lifecycle.manifest.arguments import substitute
 from lifecycle.manifest.build import Fragment, build_fragment
 from lifecycle.manifest.cursor import Cursor
 from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, Severity
-from lifecycle.manifest.document import Document, Place, error, warning
-from lifecycle.manifest.model import Manifest, Node
+from lifecycle.manifest.document import Document, error, warning
+from lifecycle.manifest.model import Manifest
 from lifecycle.manifest.schema import validate
 from lifecycle.manifest.semantics import check, check_sound
 from lifecycle.manifest.source import read_document
@@ -65,8 +64,8 @@ def load_manifest(
         positions=fragment.positions,
     )
     if wrong := [each for each in found if each.severity is Severity.ERROR]:
-        sound = dataclasses.replace(manifest, nodes=_unaffected(manifest.nodes, wrong))
-        found += check_sound(sound, environment=environment)
+        part = salvage.partial(manifest, wrong, lost=fragment.lost, machines=loading.machines)
+        found += check_sound(part, environment=environment)
         raise ManifestError(_sorted(found, loading.files))
     found += check(manifest, environment=environment)
     if any(each.severity is Severity.ERROR for each in found):
@@ -80,6 +79,7 @@ class _Loading:
     def __init__(self, environment: Mapping[str, str]) -> None:
         self.found: list[Diagnostic] = []
         self.files: list[str] = []
+        self.machines: frozenset[str] | None = frozenset()
         self._environment = environment
         self._documents = 0
         self._outermost: Fragment | None = None
@@ -118,13 +118,25 @@ class _Loading:
         violations = validate(document, ignore=substituted.broken)
         self.found += [each for _, each in violations]
         unsound = [*substituted.broken, *(place for place, _ in violations)]
-        root = Cursor.root(_sound(document, unsound))
-        fragment = build_fragment(root, base=origin.path.parent, environment=self._environment)
+        root = Cursor.root(salvage.sound(document, unsound))
+        fragment = dataclasses.replace(
+            build_fragment(
+                root,
+                base=origin.path.parent,
+                environment=self._environment,
+                unsound=salvage.links(unsound),
+            ),
+            lost=salvage.lost(document, root.document),
+        )
+        names = salvage.entries(document, "machines")
+        self.machines = None if names is None or self.machines is None else self.machines | names
         self.found += fragment.diagnostics
         self._check_outermost(root, fragment)
         for each in Cursor.root(document).items("include") if _is_list(document) else ():
             if not any(place[: len(each.place)] == each.place for place in unsound):
                 fragment = self._include(fragment, each, (*chain, origin))
+            else:
+                fragment = self._unread(fragment)
         return fragment, substituted.arguments
 
     def _include(
@@ -132,21 +144,26 @@ class _Loading:
     ) -> Fragment:
         origin = include.locate(entry, chain, self.found)
         if origin is None:
-            return outer
+            return self._unread(outer)
         self._documents += 1
         if self._documents > include.MAX_DOCUMENTS:
             if self._documents == include.MAX_DOCUMENTS + 1:
                 message = f"cannot include more than {include.MAX_DOCUMENTS} manifests"
                 self.found.append(error("manifest.include", entry.at, message))
-            return outer
+            return self._unread(outer)
         given = {name: each.value.text for name, each in entry.entries("arguments")}
         result = self.read(origin, given, chain, entry)
         if result is None:
-            return outer
+            return self._unread(outer)
         inner = include.move(
             result[0], prefix=entry.text("prefix"), namespace=entry.text("namespace")
         )
         return include.join(outer, inner, entry.at, self.found)
+
+    def _unread(self, outer: Fragment) -> Fragment:
+        """Note that a manifest is missing which may declare whatever is looked for."""
+        self.machines = None
+        return dataclasses.replace(outer, lost=None)
 
     def _check_suffix(self, document: Document) -> None:
         if not document.file.endswith(SUFFIX):
@@ -179,43 +196,9 @@ class _Loading:
                 self.found.append(warning("manifest.include-ignored", at, message))
 
 
-def _unaffected(nodes: tuple[Node, ...], wrong: Iterable[Diagnostic]) -> tuple[Node, ...]:
-    """Return the nodes in which nothing is wrong, as far as that is known by its place."""
-    affected = {(each.at.file, *_SEGMENTS.findall(each.at.path)[:2]) for each in wrong}
-    return tuple(
-        node
-        for node in nodes
-        if (node.at.file, *_SEGMENTS.findall(node.at.path)[:2]) not in affected
-    )
-
-
-_SEGMENTS = re.compile(r"[^.\[]+")
-"""Finds `nodes`, `camera`, `interface` in `nodes.camera.interface[0]`."""
-
-
 def _is_list(document: Document) -> bool:
     section = document.find(("include",))
     return section is not None and isinstance(section.data, tuple)
-
-
-def _sound(document: Document, unsound: Iterable[Place]) -> Document:
-    """Return a document without the nodes, machines and sections that hold unsound values.
-
-    So the findings of what is left come in the same run as those of the schema.
-    """
-    drop = {place[: 2 if place[0] in {"nodes", "machines"} else 1] for place in unsound if place}
-    root = document.root
-    assert isinstance(root.data, Mapping)
-    sections = {}
-    for key, section in root.data.items():
-        if (key,) in drop:
-            continue
-        if key in {"nodes", "machines"} and isinstance(section.data, Mapping):
-            entries = {k: value for k, value in section.data.items() if (key, k) not in drop}
-            sections[key] = dataclasses.replace(section, data=entries)
-        else:
-            sections[key] = section
-    return dataclasses.replace(document, root=dataclasses.replace(root, data=sections))
 
 
 def _mark(each: Diagnostic) -> tuple[str, int, int]:

@@ -1,8 +1,8 @@
 """Everything a manifest's parts say about each other: the checks that need the whole system.
 
-Owns: `check`, which runs every topic's checks and collects what they find, and `check_sound`, which
-runs those that hold of a part; one file per topic, each a generator of diagnostics with rule ids
-`check.*`. Needs no ROS: types come from the ament index.
+Owns: `check`, which runs every topic's checks and collects what they find; one file per topic, each
+a generator of diagnostics with rule ids `check.*`. Those that hold of a part are run by `partial`.
+Needs no ROS: types come from the ament index.
 """
 
 from __future__ import annotations
@@ -33,9 +33,10 @@ from lifecycle.manifest.semantics import (
     remaps,
     types,
 )
+from lifecycle.manifest.semantics.partial import Partial, check_sound
 from lifecycle.manifest.semantics.system import System
 
-__all__ = ["check", "check_sound"]
+__all__ = ["Partial", "check", "check_sound"]
 
 
 def check(
@@ -66,8 +67,10 @@ def check(
         *parameter_files.check(system),
         *placement.check(system, needs, variables),
         *discovery.check(system, variables),
+        *declared_connections.endpoints(system),
         *declared_connections.check(system, needs),
         *connection_urls.check(system),
+        *flows.endpoints(system),
         *flows.check(system, needs),
         *flow_transport.check(system, needs, variables),
         *identifiers.check(system, needs),
@@ -78,26 +81,3 @@ def check(
     rank = {file: index for index, file in enumerate((manifest.path, *files))}
     found.sort(key=lambda each: (rank[each.at.file], each.at.line, each.at.column))
     return tuple(dict.fromkeys(found))
-
-
-def check_sound(
-    manifest: Manifest, *, environment: Mapping[str, str] | None = None
-) -> tuple[Diagnostic, ...]:
-    """Check what is left of a manifest without the nodes in which something is wrong already.
-
-    So that one run tells as much as it can. Only what whatever is missing could not put right: two
-    names that are one, two ends that do not fit, nodes that wait for each other.
-
-    Args:
-        manifest: sound nodes, as `load` has built them.
-        environment: as for `check`.
-    """
-    variables = os.environ if environment is None else environment
-    system = System.of(manifest)
-    return (
-        *names.check(system),
-        *types.check(system, search_prefixes(variables)),
-        *matching.check(system),
-        *order.cycles(system),
-        *parameters.check(system),
-    )

@@ -40,15 +40,20 @@ _CARRIERS = {
 
 
 def check(system: System, needs: FlowNeeds) -> Iterator[Diagnostic]:
-    """Yield findings about every declared connection."""
+    """Yield findings about every declared connection, but for `endpoints`."""
     hidden: dict[str, tuple[Node, ConnectionDeclaration]] = {}
     for node in system.manifest.nodes:
         if node.connections:
             yield from _foreign(system, node)
-        yield from _endpoints(node)
         for each in node.connections:
             yield from _name(system, node, each, hidden)
             yield from _flows(node, each, needs)
+
+
+def endpoints(system: System) -> Iterator[Diagnostic]:
+    """Yield findings about what connections carry, whatever their URLs are."""
+    for node in system.manifest.nodes:
+        yield from _endpoints(node)
 
 
 def _foreign(system: System, node: Node) -> Iterator[Diagnostic]:

@@ -153,7 +153,9 @@ def _server(system: System, section: Position) -> Iterator[Diagnostic]:
         message = f"cannot run the discovery server on machine {name!r}: there is no such machine"
         hint = did_you_mean(name, machines) or "declare it under 'machines:'"
         yield error("check.discovery-server", at, message, hint)
-    elif name not in {node.machine for node in system.manifest.nodes}:
+    elif system.lost == frozenset() and name not in {
+        node.machine for node in system.manifest.nodes
+    }:
         message = (
             f"cannot run the discovery server on machine {name!r}: no node runs there, so nobody "
             "starts a supervisor"

@@ -26,11 +26,17 @@ _KEPT_BY_CLASS = ("max_delay_ms", "loss")
 """What a class promises whatever the rate; the others depend on what an operator configures."""
 
 
+def endpoints(system: System) -> Iterator[Diagnostic]:
+    """Yield findings about flow needs of endpoints that are not declared."""
+    for node in system.manifest.nodes:
+        for need in node.flows:
+            yield from _endpoint(node, need)
+
+
 def check(system: System, needs: FlowNeeds) -> Iterator[Diagnostic]:
-    """Yield findings about flow needs."""
+    """Yield findings about flow needs, but for `endpoints`."""
     for node in system.manifest.nodes:
         for each in needs.of_node(node):
-            yield from _endpoint(node, each.need)
             yield from _marking(each)
             yield from _class(each)
             if node.run.kind is not RunKind.PYTHON:

@@ -33,7 +33,8 @@ def check(system: System, needs: FlowNeeds) -> Iterator[Diagnostic]:
         ]
         yield from (each for each in ends if isinstance(each, Diagnostic))
         resolved = [each for each in ends if isinstance(each, Resolved)]
-        if len(resolved) == len(ends):
+        both = link.from_node in system.nodes and link.to_node in system.nodes
+        if both and len(resolved) == len(ends):
             yield from _uniqueness(link, resolved, needs)
 
 
@@ -41,11 +42,13 @@ def _end(
     system: System, link: Link, key: str, kind: EndpointKind
 ) -> Iterator[Resolved | Diagnostic]:
     """Yield the endpoints at one end of a link, or why there are none."""
-    if key not in system.nodes:
+    if not system.may_exist(key):
         message = f"cannot link node {key!r}: there is no such node"
-        hint = did_you_mean(key, system.nodes)
+        hint = did_you_mean(key, system.known)
         yield error("check.link-unknown-node", link.at, message, hint)
         return
+    if key not in system.nodes:
+        return  # what is wrong in it comes first
     found = [each for each in system.named(kind, link.topic) if each.node.key == key]
     if found:
         yield from found

@@ -18,10 +18,12 @@ def check(system: System) -> Iterator[Diagnostic]:
     """Yield findings about the order in which nodes come up."""
     for node in system.manifest.nodes:
         for after in node.after:
-            if after.node not in system.nodes:
+            if not system.may_exist(after.node):
                 message = f"cannot wait for node {after.node!r}: there is no such node"
-                hint = did_you_mean(after.node, system.nodes)
+                hint = did_you_mean(after.node, system.known)
                 yield error("check.after-unknown", after.at, message, hint)
+            elif after.node not in system.nodes:
+                continue  # what is wrong in it comes first
             elif after.node == node.key:
                 message = f"cannot make {node.key!r} wait for itself"
                 yield error("check.after-self", after.at, message, "remove it")

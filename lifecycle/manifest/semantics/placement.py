@@ -7,7 +7,7 @@ check.process-name, check.domain, check.ports. Port arithmetic is `lifecycle.net
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 
 from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.document import error, warning
@@ -37,19 +37,24 @@ def check(system: System, needs: FlowNeeds, environment: Mapping[str, str]) -> I
 
     `environment` is asked for ROS_DOMAIN_ID, which holds where the manifest names no domain.
     """
-    machines = [each.name for each in system.manifest.machines]
-    for node in system.manifest.nodes:
-        if node.machine not in machines:
-            message = (
-                f"cannot run {node.key!r} on machine {node.machine!r}: there is no such machine"
-            )
-            hint = did_you_mean(node.machine, machines) or "declare it under 'machines:'"
-            yield error("check.unknown-machine", node.where("machine"), message, hint)
-    yield from _processes(system)
+    yield from machines(system, [each.name for each in system.manifest.machines])
+    yield from processes(system)
     yield from _ports(system, needs, environment)
 
 
-def _processes(system: System) -> Iterator[Diagnostic]:
+def machines(system: System, declared: Collection[str]) -> Iterator[Diagnostic]:
+    """Yield findings about nodes on machines that are not `declared`."""
+    for node in system.manifest.nodes:
+        if node.machine not in declared:
+            message = (
+                f"cannot run {node.key!r} on machine {node.machine!r}: there is no such machine"
+            )
+            hint = did_you_mean(node.machine, declared) or "declare it under 'machines:'"
+            yield error("check.unknown-machine", node.where("machine"), message, hint)
+
+
+def processes(system: System) -> Iterator[Diagnostic]:
+    """Yield findings about processes that nodes share."""
     first: dict[str, Node] = {}
     for node in system.manifest.nodes:
         if not node.process:

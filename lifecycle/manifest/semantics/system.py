@@ -55,14 +55,17 @@ class System:
     Attributes:
         endpoints: in the order of the manifest.
         unresolved: the endpoints that are missing from `endpoints`.
+        lost: keys of nodes that are declared, but left out because something is wrong in them; None
+            if there may be any, because a file or section that may declare them is unreadable.
     """
 
     manifest: Manifest
     endpoints: tuple[Resolved, ...]
     unresolved: tuple[Unresolved, ...]
+    lost: frozenset[str] | None = frozenset()
 
     @classmethod
-    def of(cls, manifest: Manifest) -> System:
+    def of(cls, manifest: Manifest, *, lost: frozenset[str] | None = frozenset()) -> System:
         """Resolve every endpoint of a manifest; rules that rcl refuses are left out."""
         resolved: list[Resolved] = []
         unresolved: list[Unresolved] = []
@@ -74,7 +77,21 @@ class System:
                     resolved.append(outcome)
                 else:
                     unresolved.append(outcome)
-        return cls(manifest=manifest, endpoints=tuple(resolved), unresolved=tuple(unresolved))
+        return cls(
+            manifest=manifest,
+            endpoints=tuple(resolved),
+            unresolved=tuple(unresolved),
+            lost=lost,
+        )
+
+    def may_exist(self, key: str) -> bool:
+        """Whether there is a node of this key, or may be once what is wrong has been put right."""
+        return key in self.nodes or self.lost is None or key in self.lost
+
+    @property
+    def known(self) -> list[str]:
+        """Keys of nodes that are declared, to suggest one of them."""
+        return [*self.nodes, *sorted(self.lost or ())]
 
     @functools.cached_property
     def nodes(self) -> dict[str, Node]:

@@ -25,7 +25,8 @@ INVALID = sorted((CORPUS / "invalid").glob("*.lifecycle.yaml"))
 REGENERATE = os.environ.get("LIFECYCLE_CORPUS") == "regenerate"
 
 
-def _pairs(text: str, keyword: str, separator: str) -> dict[str, str]:
+def pairs(text: str, keyword: str, separator: str) -> dict[str, str]:
+    """Return the words of a comment line `# KEYWORD: name=value …` in a document of the corpus."""
     words = [
         word
         for line in re.findall(rf"^# {keyword}: (.*)$", text, re.MULTILINE)
@@ -38,10 +39,10 @@ def _load(path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[bool, str]:
     """Return whether the document loads and its diagnostics as text."""
     text = path.read_bytes().decode("utf-8", errors="replace")
     monkeypatch.chdir(path.parent)
-    for name, value in _pairs(text, "corpus-environment", "=").items():
+    for name, value in pairs(text, "corpus-environment", "=").items():
         monkeypatch.setenv(name, value)
     try:
-        loaded = load(path.name, _pairs(text, "corpus-arguments", ":="))
+        loaded = load(path.name, pairs(text, "corpus-arguments", ":="))
     except ManifestError as error:
         return False, "".join(f"{each}\n" for each in error.diagnostics)
     return True, "".join(f"{each}\n" for each in loaded.warnings)
