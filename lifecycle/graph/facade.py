@@ -7,6 +7,7 @@ nodes that do neither; it sleeps until one of them has something to say.
 
 from __future__ import annotations
 
+import functools
 import os
 import threading
 import typing
@@ -22,7 +23,7 @@ from lifecycle.graph.events import SILENT_AFTER_S, GraphEvents
 from lifecycle.graph.scheduler import ThreadScheduler
 from lifecycle.graph.state import GraphState
 from lifecycle.graph.transport import GraphTransport, Remove
-from lifecycle.middleware import GraphGuard, GraphObserver
+from lifecycle.middleware import GraphObserver, on_graph_change
 from lifecycle.middleware.spinning import Spinner
 from lifecycle.plan.model import ParticipantConnections
 from lifecycle.verify.observation import NodeConfiguration
@@ -102,13 +103,7 @@ class Graph:
         Raises:
             MiddlewareError: rcl's graph guard condition could not be waited on.
         """
-        guards: list[GraphGuard] = []
-
-        def watch(callback: Callable[[], None]) -> Remove:
-            guards.append(GraphGuard(node, callback))
-            return guards[0].stop
-
-        return cls(node, watch, silent_after_s=silent_after_s)
+        return cls(node, functools.partial(on_graph_change, node), silent_after_s=silent_after_s)
 
     def wait_for(self, holds: Callable[[GraphState], object], *, timeout_s: float) -> bool:
         """Wait until something holds of the state; False if it did not within `timeout_s`.

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     )
     from lifecycle.middleware.dscp import get_dscp
     from lifecycle.middleware.graph import GraphObserver
-    from lifecycle.middleware.graph_guard import GraphGuard
+    from lifecycle.middleware.graph_changes import on_graph_change
     from lifecycle.middleware.interface_types import UnknownInterfaceError, import_interface
     from lifecycle.middleware.nfe import (
         SHARED_MEMORY,
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from lifecycle.middleware.process import adopt_orphans, die_with_parent, exit_after
     from lifecycle.middleware.profiles import discovery_environment
     from lifecycle.middleware.qos import from_rclpy, to_rclpy
+    from lifecycle.middleware.server_watch import ServerWatch, is_server_matched
     from lifecycle.middleware.service_calls import ServiceUnansweredError
     from lifecycle.middleware.settings import participant_settings
     from lifecycle.middleware.shm import leftovers, segments_of, sweep
@@ -43,11 +44,11 @@ if TYPE_CHECKING:
 __all__ = [
     "SHARED_MEMORY",
     "FlowParticipant",
-    "GraphGuard",
     "GraphObserver",
     "NetworkFlowEndpointsUnsupported",
     "NodeClients",
     "ParticipantSettings",
+    "ServerWatch",
     "ServiceUnansweredError",
     "UniqueFlowNotFeasible",
     "UnknownInterfaceError",
@@ -64,8 +65,10 @@ __all__ = [
     "get_network_flow_endpoints",
     "has_shared_memory",
     "import_interface",
+    "is_server_matched",
     "leave_and_exit",
     "leftovers",
+    "on_graph_change",
     "participant_settings",
     "segments_of",
     "sweep",
@@ -75,11 +78,11 @@ __all__ = [
 _HOME = {
     "SHARED_MEMORY": "nfe",
     "FlowParticipant": "participant",
-    "GraphGuard": "graph_guard",
     "GraphObserver": "graph",
     "NetworkFlowEndpointsUnsupported": "nfe",
     "NodeClients": "clients",
     "ParticipantSettings": "participant_profile",
+    "ServerWatch": "server_watch",
     "ServiceUnansweredError": "service_calls",
     "UniqueFlowNotFeasible": "unique",
     "UnknownInterfaceError": "interface_types",
@@ -96,8 +99,10 @@ _HOME = {
     "get_network_flow_endpoints": "nfe",
     "has_shared_memory": "nfe",
     "import_interface": "interface_types",
+    "is_server_matched": "server_watch",
     "leave_and_exit": "teardown",
     "leftovers": "shm",
+    "on_graph_change": "graph_changes",
     "participant_settings": "settings",
     "segments_of": "shm",
     "sweep": "shm",

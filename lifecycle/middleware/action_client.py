@@ -6,6 +6,7 @@ imports numpy, 100 ms.
 
 from __future__ import annotations
 
+import threading
 import typing
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -14,14 +15,12 @@ from rclpy.action import ActionClient
 from rclpy.task import Future
 
 from lifecycle.errors import MiddlewareError
+from lifecycle.middleware.server_watch import ServerWatch
 
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup
+    from rclpy.guard_condition import GuardCondition
     from rclpy.node import Node
-
-_LOOK_S = 0.05
-"""How often a goal that is held looks for its server; rclpy's wait_for_server looks four times a
-second, and tells of nothing by itself."""
 
 
 class ActionClientGoneError(MiddlewareError):
@@ -39,7 +38,6 @@ class GoalClient(ActionClient):  # type: ignore[misc]  # rclpy is not typed
         group: callback group of its answers.
         refuse_to_block: called with what blocks and what does not, before something blocks; raises
             where that would wait for ever.
-        after: calls back once, in so many seconds, in the executor; returns what calls that off.
 
     Attributes:
         action_name: fully qualified, set by who made it; empty while unknown.
@@ -53,11 +51,14 @@ class GoalClient(ActionClient):  # type: ignore[misc]  # rclpy is not typed
         *,
         group: CallbackGroup,
         refuse_to_block: Callable[[str, str], None],
-        after: Callable[[float, Callable[[], None]], Callable[[], None]],
     ) -> None:
         self._refuse_to_block = refuse_to_block
-        self._after = after
-        self._held: list[Future] = []
+        self._participant = node  # `_node` becomes whose executor it is, on a connection another
+        self._group = group
+        self._lock = threading.Lock()  # of the next three
+        self._held: list[_Held] = []
+        self._watch: ServerWatch | None = None
+        self._matched: GuardCondition | None = None
         self._destroyed = False
         self.action_name = ""
         super().__init__(node, action_type, name, callback_group=group)
@@ -71,36 +72,45 @@ class GoalClient(ActionClient):  # type: ignore[misc]  # rclpy is not typed
         """As rclpy's; a goal is held until a server is matched, before which DDS would lose it."""
         if self.server_is_ready() or not isinstance(goal, self._action_type.Goal):
             return super().send_goal_async(goal, *arguments, **options)
-        promised: Future = Future()
-        self._held.append(promised)
+        held = _Held(
+            send=lambda: super(GoalClient, self).send_goal_async(goal, *arguments, **options)
+        )
+        with self._lock:
+            self._held.append(held)
+            if self._watch is None:
+                self._matched = self._node.create_guard_condition(self._send_held, self._group)
+                self._watch = ServerWatch(self._participant, self, self._matched.trigger)
+        return held.promised
 
-        def tell(sent: Future) -> None:
-            error = sent.exception()
-            if error is not None:
-                promised.set_exception(error)
-            else:
-                promised.set_result(sent.result())
-
-        def send() -> None:
-            if self._destroyed:
+    def _send_held(self) -> None:
+        """Send what was held, if a server is matched now; in the executor."""
+        with self._lock:
+            if self._destroyed or not self.server_is_ready():
                 return
-            if not self.server_is_ready():
-                self._after(_LOOK_S, send)
-                return
-            self._held.remove(promised)
-            sent = super(GoalClient, self).send_goal_async(goal, *arguments, **options)
-            sent.add_done_callback(tell)
+            held = self._let_go()
+        for each in held:
+            each.send_on()
 
-        self._after(_LOOK_S, send)
-        return promised
+    def _let_go(self) -> list[_Held]:
+        """Hold nothing any more, with the lock taken; return what was held."""
+        held, self._held = self._held, []
+        if self._watch is not None:
+            self._watch.stop()
+            self._watch = None
+        if self._matched is not None:
+            self._node.destroy_guard_condition(self._matched)
+            self._matched = None
+        return held
 
     def destroy(self) -> None:
         """As rclpy's; whoever awaits an answer gets an ActionClientGoneError. Again is harmless."""
         if self._destroyed:
             return
-        self._destroyed = True
+        with self._lock:
+            self._destroyed = True
+            held = [each.promised for each in self._let_go()]
         for pending, what in (
-            (self._held, "whether a goal is accepted"),
+            (held, "whether a goal is accepted"),
             (self._pending_goal_requests.values(), "whether a goal is accepted"),
             (self._pending_cancel_requests.values(), "whether a goal is cancelled"),
             (self._pending_result_requests.values(), "the result of a goal"),
@@ -125,3 +135,30 @@ class GoalClient(ActionClient):  # type: ignore[misc]  # rclpy is not typed
             f"a result of action {self._action_name!r}", "goal_handle.get_result_async()"
         )
         return super()._get_result(goal_handle)
+
+
+@typing.final
+class _Held:
+    """A goal that waits for a server.
+
+    Args:
+        send: sends it; its future is the answer.
+
+    Attributes:
+        promised: the answer.
+    """
+
+    def __init__(self, *, send: Callable[[], Future]) -> None:
+        self._send = send
+        self.promised: Future = Future()
+
+    def send_on(self) -> None:
+        """Send it."""
+        self._send().add_done_callback(self._tell)
+
+    def _tell(self, sent: Future) -> None:
+        error = sent.exception()
+        if error is not None:
+            self.promised.set_exception(error)
+        else:
+            self.promised.set_result(sent.result())

@@ -72,7 +72,7 @@ class DataLayer:
     ) -> None:
         self._name = node.get_fully_qualified_name()
         self._changed = changed
-        self._maker = Maker(node, gate=gate, client_group=client_group, later=later, after=after)
+        self._maker = Maker(node, gate=gate, client_group=client_group, later=later)
         self._is_made = False
         self.endpoints = EndpointTable(node, gate, changed)
         mappings = self.endpoints.mappings

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
     from lifecycle.node.connections import Connection
     from lifecycle.node.gate import Gate, Later
-    from lifecycle.node.handover import After
 
+CLIENTS = frozenset({EndpointKind.SERVICE_CLIENT, EndpointKind.ACTION_CLIENT})
 _ACTIONS = frozenset({EndpointKind.ACTION_SERVER, EndpointKind.ACTION_CLIENT})
 
 
@@ -40,7 +40,6 @@ class Maker:
         gate: holds subscriptions back; publishers are held back by their handles.
         client_group: reentrant, so that an answer can come in while a callback awaits it.
         later: runs a coroutine function in the node's executor.
-        after: calls back once in the node's executor.
     """
 
     def __init__(
@@ -50,13 +49,11 @@ class Maker:
         gate: Gate,
         client_group: CallbackGroup,
         later: Later,
-        after: After,
     ) -> None:
         self._node = node
         self._gate = gate
         self._client_group = client_group
         self._later = later
-        self._after = after
         self._goals: dict[int, Goals] = {}  # by id of the action server
 
     def make(
@@ -296,7 +293,6 @@ class Maker:
                 called,
                 group=self._client_group,
                 refuse_to_block=refuse_to_block,
-                after=self._after,
             ),
         )
 
