@@ -17,7 +17,7 @@ from lifecycle.graph.messages import (
     Joined,
     StateChanged,
 )
-from lifecycle.graph.view import NodeView, altered
+from lifecycle.graph.view import NodeView, altered, kept
 from lifecycle.verify.observation import NodeConfiguration
 
 _LIVELINESS = {
@@ -87,7 +87,7 @@ class Record:
         self.reading = None
         self.view = dataclasses.replace(
             self.view,
-            configuration=configuration,
+            configuration=kept(configuration),
             state=configuration.state,
             connected=configuration.connected,
         )

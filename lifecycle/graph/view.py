@@ -125,6 +125,18 @@ def change(
     )
 
 
+def kept(configuration: NodeConfiguration) -> NodeConfiguration:
+    """Return a configuration without what no message brings up to date: matches of servers."""
+    if all(each.server_matched is None for each in configuration.endpoints):
+        return configuration
+    return dataclasses.replace(
+        configuration,
+        endpoints=tuple(
+            dataclasses.replace(each, server_matched=None) for each in configuration.endpoints
+        ),
+    )
+
+
 def altered(configuration: NodeConfiguration, message: GraphMessage) -> NodeConfiguration:
     """Return a configuration as it is after a message about a connection or a mapping.
 

@@ -17,7 +17,7 @@ _DIGITS = 16
 def checksum(configuration: NodeConfiguration) -> str:
     """Return 16 hex digits that change exactly when a reader must read the document again.
 
-    State, matched counts and what follows from them (whether a connection is established) change
+    State, matches and what follows from them (whether a connection is established) change
     all the time and are told by events, so they do not count.
     """
     stable = dataclasses.replace(
@@ -26,7 +26,8 @@ def checksum(configuration: NodeConfiguration) -> str:
         connected=False,
         checksum="",
         endpoints=tuple(
-            dataclasses.replace(each, matched=None) for each in configuration.endpoints
+            dataclasses.replace(each, matched=None, server_matched=None)
+            for each in configuration.endpoints
         ),
         connections=tuple(
             dataclasses.replace(each, established=False) for each in configuration.connections

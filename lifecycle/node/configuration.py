@@ -17,7 +17,12 @@ from lifecycle import codec
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import QosProfile
-from lifecycle.middleware import SHARED_MEMORY, from_rclpy, get_network_flow_endpoints
+from lifecycle.middleware import (
+    SHARED_MEMORY,
+    from_rclpy,
+    get_network_flow_endpoints,
+    is_server_matched,
+)
 from lifecycle.network.nfe import (
     InternetProtocol,
     NetworkFlowEndpoint,
@@ -30,7 +35,7 @@ from lifecycle.node.data_layer import DataLayer
 from lifecycle.node.declaring import interface_name
 from lifecycle.node.machine import NodeState
 from lifecycle.node.machine_id import machine_id
-from lifecycle.node.making import wire_name
+from lifecycle.node.making import CLIENTS, wire_name
 from lifecycle.node.mapping import Mapping
 from lifecycle.node.matches import count_peers
 from lifecycle.plan.model import PlannedNode
@@ -133,7 +138,11 @@ def _report(node: Node, mapping: Mapping) -> EndpointReport:
         lossy=mapping.lossy,
         size_bytes=mapping.size_bytes,
     )
-    if entity is None or not endpoint.kind.is_topic:
+    if entity is None:
+        return report
+    if endpoint.kind in CLIENTS:
+        return dataclasses.replace(report, server_matched=is_server_matched(entity))
+    if not endpoint.kind.is_topic:
         return report
     # A participant knows its own endpoints; the node's own need not know those of another.
     hidden = connection.participant if connection is not None else None

@@ -16,6 +16,7 @@ from lifecycle.manifest.model import EndpointKind
 from lifecycle.node.connections import Connection, Connections
 from lifecycle.node.endpoint_names import Key
 from lifecycle.node.handover import After, Handover, Overlap
+from lifecycle.node.making import CLIENTS
 from lifecycle.node.mapping import Mapping, Placement
 from lifecycle.node.placing import Placer
 from lifecycle.node.standing import Standing
@@ -24,8 +25,6 @@ if TYPE_CHECKING:
     from rclpy.node import Node
 
     from lifecycle.node.publisher import DeclaredPublisher
-
-_CLIENTS = (EndpointKind.SERVICE_CLIENT, EndpointKind.ACTION_CLIENT)
 
 
 class Mapper:
@@ -196,7 +195,7 @@ class Mapper:
 
         # Two servers would both answer; and a client's answers may still be under way.
         kind = mapping.endpoint.kind
-        lives_on = bool(peers) if kind.is_topic else kind in _CLIENTS
+        lives_on = bool(peers) if kind.is_topic else kind in CLIENTS
         handover = Handover(peers_before=peers or 1, after=self._after, finish=finish)
         self._handovers[mapping.key] = (handover, old)
         self._standing.mapped(mapping)
@@ -216,6 +215,9 @@ class Mapper:
 
     def _match(self, mapping: Mapping) -> None:
         """Some entity of a mapping has been matched or unmatched."""
+        if mapping.endpoint.kind in CLIENTS:
+            self._changed()  # nobody counts their peers
+            return
         has_changed = self._standing.matched(mapping)
         running = self._handovers.get(mapping.key)
         if running is not None:

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lifecycle.node.connections import Connection
 from lifecycle.node.endpoint_names import Key
 from lifecycle.node.making import wire_name
 from lifecycle.node.matches import MatchWatch
 from lifecycle.plan.model import PlannedEndpoint
+
+if TYPE_CHECKING:
+    from lifecycle.middleware.server_watch import ServerWatch
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -20,12 +23,12 @@ class Part:
     Attributes:
         name: fully qualified; empty for the one of the declared name.
         entity: the rclpy object.
-        watch: tells of its peers; None for services and actions.
+        watch: tells of its peers or its server; None for service and action servers.
     """
 
     name: str
     entity: Any
-    watch: MatchWatch | None = None
+    watch: MatchWatch | ServerWatch | None = None
 
 
 @dataclasses.dataclass(slots=True, kw_only=True, eq=False)

@@ -12,9 +12,11 @@ from typing import TYPE_CHECKING, Any
 from rclpy.duration import Duration
 
 from lifecycle.manifest.model import EndpointKind
+from lifecycle.middleware import ServerWatch
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.node.connections import ConnectError, Connection
 from lifecycle.node.handover import STRAGGLE_S, After, Overlap, drain
+from lifecycle.node.making import CLIENTS
 from lifecycle.node.mapping import Mapping, Part, Placement
 from lifecycle.node.matches import MatchWatch
 
@@ -74,7 +76,7 @@ class Placer:
             mapping: the endpoint; where it is now is left alone.
             connection: where it shall be.
             beside: every endpoint of the node.
-            matched: told when the peers of this placement change.
+            matched: told when the peers of this placement, or its server, change.
 
         Raises:
             LifecycleError: it cannot be made so.
@@ -164,11 +166,28 @@ class Placer:
         entity = self._maker.make(
             mapping.endpoint, mapping.interface, connection, handler=mapping.handler, name=name
         )
-        watch = None
-        if mapping.endpoint.kind.is_topic:
-            group = self._event_group
-            watch = MatchWatch(self._node, entity, group, lambda _: matched(mapping))
-        return Part(name=name, entity=entity, watch=watch)
+        return Part(
+            name=name, entity=entity, watch=self._watch(mapping, connection, entity, matched)
+        )
+
+    def _watch(
+        self,
+        mapping: Mapping,
+        connection: Connection,
+        entity: Any,
+        matched: Callable[[Mapping], None],
+    ) -> MatchWatch | ServerWatch | None:
+        kind = mapping.endpoint.kind
+        if kind.is_topic:
+            return MatchWatch(self._node, entity, self._event_group, lambda _: matched(mapping))
+        if kind not in CLIENTS:
+            return None
+
+        def changed() -> None:
+            self._later(lambda: matched(mapping))
+
+        hidden = connection.participant
+        return ServerWatch(self._node if hidden is None else hidden.node, entity, changed)
 
     def _unmake(self, mapping: Mapping, connection: Connection, parts: Iterable[Part]) -> None:
         for part in parts:

@@ -228,8 +228,9 @@ class Judge:
         """Whether a match is missing that nobody would tell us of: hosts tell of theirs."""
         telling = {each.name for each in self._system.nodes.values() if each.tells}
         return any(
-            each.rule.startswith("graph.unmatched-")
-            and telling.isdisjoint(each.subject.rpartition(": ")[2].split(" → "))
+            each.outcome is Outcome.VIOLATED
+            and each.rule.startswith("graph.unmatched-")
+            and telling.isdisjoint(_who_tells(each))
             for each in verdict.findings
         )
 
@@ -294,6 +295,13 @@ def _patience(verdict: Verdict) -> float | None:
     if any(not _may_heal(each) for each in violated):
         return SETTLED_S
     return None if violated else UNVERIFIABLE_S
+
+
+def _who_tells(finding: Finding) -> tuple[str, ...]:
+    """Return the nodes that know of a match that is missing: both ends; of a server its client."""
+    if finding.node:
+        return (finding.node,)
+    return tuple(finding.subject.rpartition(": ")[2].split(" → "))
 
 
 def _may_heal(finding: Finding) -> bool:

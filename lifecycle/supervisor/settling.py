@@ -8,7 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from lifecycle.manifest.model import EndpointKind
 from lifecycle.plan.model import Plan
+from lifecycle.verify.rules.clients import SERVER_OF
 from lifecycle.verify.rules.endpoints import UNATTRIBUTED_ENDPOINT
 from lifecycle.verify.verdict import Finding, Verdict
 
@@ -92,9 +94,15 @@ def _key(finding: Finding) -> _Key:
 def _demands(plan: Plan) -> Iterator[tuple[_Place, str]]:
     """Yield what must be there: where a finding would say that it is not, and how it must be."""
     names = {each.key: each.full_name for each in plan.nodes}
+    servers: dict[tuple[EndpointKind | None, str], list[str]] = {}
+    for node in plan.nodes:
+        for each in node.endpoints:
+            servers.setdefault((each.kind, each.resolved), []).append(node.full_name)
     for node in plan.nodes:
         for each in node.endpoints:
             yield (node.full_name, each.kind, each.resolved), each.participant
+            for server in servers.get((SERVER_OF.get(each.kind), each.resolved), ()):
+                yield (f"{each.resolved}: {node.full_name} → {server}",), ""
         for one in node.participants:
             yield ("connection", node.full_name), f"{one.connection} {one.connections.urls}"
     for flow in plan.flows:

@@ -23,7 +23,7 @@ def missing(verdict: Verdict) -> str:
     for finding in findings:
         phrase = _ABSENT.get(finding.rule)
         named = f"{finding.subject} ({finding.rule})"
-        if phrase is not None:
+        if phrase is not None and finding.outcome is Outcome.VIOLATED:
             absent[f"{finding.subject} ({_what(finding, phrase)})"] = None
         elif finding.rule == _UNATTRIBUTED:
             # Discovery tells of an endpoint before it tells of its node: most likely that one's.
@@ -62,6 +62,7 @@ _ABSENT = {
     "graph.missing-endpoint": "{kind} of {node}",
     "graph.unmatched-link": "match",
     "graph.unmatched-flow": "match",
+    "graph.unmatched-client": "match",
     "config.missing-report": "report",
     "config.incomplete-report": "{kind} in the report of {node}",
 }

@@ -60,6 +60,8 @@ class EndpointReport:
         nfes: this endpoint's own network flow endpoints; None where the RMW cannot tell.
         participant: base name of the hidden node that carries it; empty for the node's own.
         matched: number of matched remote endpoints; None where unknown.
+        server_matched: of a service or action client that exists: a server of its name is matched
+            with it both ways; None for everything else and where the RMW cannot tell.
         dscp: DSCP read back from the sender sockets with getsockopt, 0–63; None if not read.
         error: why the endpoint could not be made as asked; empty if it was.
         connection: name of the connection it is mapped onto; empty for the node's own participant,
@@ -80,6 +82,7 @@ class EndpointReport:
     nfes: tuple[NetworkFlowEndpoint, ...] | None = None
     participant: str = ""
     matched: int | None = None
+    server_matched: bool | None = None
     dscp: int | None = None
     error: str = ""
     connection: str = ""
@@ -101,8 +104,8 @@ class NodeConfiguration:
         serializations: wire formats, "cdr".
         paradigms: "publish-subscribe", "request-response".
         connections: every connection that exists or was asked for.
-        checksum: of everything but state, matched counts, whether connections are established, and
-            itself; changes exactly when a reader must read again. Hex SHA-256, 16 digits.
+        checksum: of everything but state, matches, whether connections are established, and itself;
+            changes exactly when a reader must read again. Hex SHA-256, 16 digits.
     """
 
     identity: Identity

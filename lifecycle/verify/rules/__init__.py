@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 
 from lifecycle.verify.rules import (
+    clients,
     configuration,
     connections,
     dscp,
@@ -28,6 +29,7 @@ _FAMILIES = (
     endpoints,
     qos,
     matching,
+    clients,
     state,
     configuration,
     connections,

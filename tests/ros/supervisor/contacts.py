@@ -24,6 +24,7 @@ NOT_HEARD = frozenset(
         "flow.wrong-medium",
         "graph.missing-node",
         "graph.unattributed-endpoint",
+        "graph.unmatched-client",
         "graph.unmatched-flow",
         "graph.unmatched-link",
         "run.deadline",

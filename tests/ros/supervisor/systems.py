@@ -64,3 +64,7 @@ class Listener(LifecycleNode):
         if not self._heard:
             self._heard = True
             print(f"heard {message.data}", flush=True)
+
+
+class Quiet(LifecycleNode):
+    """Has what its manifest declares, and does nothing with it."""

@@ -250,6 +250,17 @@ def test_a_configuration_may_be_given_instead_of_read(followed: Followed) -> Non
     assert [end.node.name for end in followed.state.publishers_of("/g")] == ["/given"]
 
 
+def test_a_match_of_which_no_message_tells_is_not_kept(followed: Followed) -> None:
+    client = dataclasses.replace(
+        endpoint(1, "/ask"), kind=EndpointKind.SERVICE_CLIENT, server_matched=True
+    )
+    followed.state.put_configuration(configuration("/given", client))
+    followed.settle()
+    seen = followed.state.node("/given")
+    assert seen is not None
+    assert seen.endpoints == (dataclasses.replace(client, server_matched=None),)
+
+
 def test_a_state_that_begins_late_learns_who_is_there_already(followed: Followed) -> None:
     late = Reader(followed.system)
     followed.settle()

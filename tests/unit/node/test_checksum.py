@@ -64,9 +64,10 @@ def test_a_checksum_is_sixteen_hex_digits() -> None:
         dataclasses.replace(CAMERA, checksum="0123456789abcdef"),
         _with(endpoint=dataclasses.replace(VIDEO, matched=2)),
         _with(endpoint=dataclasses.replace(VIDEO, matched=None)),
+        _with(endpoint=dataclasses.replace(VIDEO, server_matched=True)),
         _with(connection=dataclasses.replace(NET, established=False)),
     ],
-    ids=["state", "connected", "checksum", "matched", "not counted", "established"],
+    ids=["state", "connected", "checksum", "matched", "not counted", "server", "established"],
 )
 def test_what_events_tell_makes_nobody_read_again(changed: NodeConfiguration) -> None:
     assert changed != CAMERA

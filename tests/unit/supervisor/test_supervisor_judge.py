@@ -180,6 +180,36 @@ def test_a_node_that_tells_of_its_matches_is_not_asked_for_them(tmp_path: Path) 
     _run(tmp_path, test, unmatched)
 
 
+@pytest.mark.parametrize(("client", "server"), [("/viewer", "/camera"), ("/camera", "/viewer")])
+def test_of_a_server_that_is_matched_only_its_client_tells(
+    tmp_path: Path, client: str, server: str
+) -> None:
+    finding = dataclasses.replace(
+        UNMATCHED.findings[0],
+        rule="graph.unmatched-client",
+        subject=f"/calibrate: {client} → {server}",
+        node=client,
+    )
+
+    async def test(bench: _Bench) -> None:
+        bench.world.system.nodes["camera"].tells = True
+
+        def match() -> None:
+            bench.verdicts = (OK,)
+
+        def tell() -> None:
+            event = Event(kind="configuration", node="/camera", configuration=None)
+            bench.world.system.on_host_event(event)
+
+        asyncio.get_running_loop().call_later(0.1, match)
+        asyncio.get_running_loop().call_later(5.0, tell)
+        assert await bench.judge.until_clear(Stage.CONNECTED, 30.0) == OK
+        told = client == "/camera"
+        assert (bench.now > 4.9, len(bench.looks) == 2) == (told, told)
+
+    _run(tmp_path, test, dataclasses.replace(UNMATCHED, findings=(finding,)))
+
+
 def test_a_burst_of_changes_is_one_look(tmp_path: Path) -> None:
     async def test(bench: _Bench) -> None:
         for index in range(10):

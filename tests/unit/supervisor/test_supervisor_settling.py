@@ -140,3 +140,24 @@ def test_each_newcomer_has_a_moment_of_its_own() -> None:
 def test_the_first_verdict_of_all_is_told_whatever_it_is() -> None:
     bad = found((UNATTRIBUTED, "/rosout", ""))
     assert Settling().standing(None, bad, BEFORE, 0.0) == (bad, None)
+
+
+def test_a_client_that_has_only_just_become_expected_may_be_unmatched_for_a_moment() -> None:
+    settling = Settling()
+    settling.standing(None, OK, BEFORE, 10.0)
+    asks = dataclasses.replace(
+        AFTER.nodes[0].endpoints[0], kind=EndpointKind.SERVICE_CLIENT, resolved="/ask"
+    )
+    answers = dataclasses.replace(asks, kind=EndpointKind.SERVICE_SERVER)
+    client, server = AFTER.nodes[:2]
+    plan = dataclasses.replace(
+        AFTER,
+        nodes=(
+            dataclasses.replace(client, endpoints=(*client.endpoints, asks)),
+            dataclasses.replace(server, endpoints=(*server.endpoints, answers)),
+        ),
+    )
+    names = client.full_name, server.full_name
+    bad = found(("graph.unmatched-client", f"/ask: {names[0]} → {names[1]}", names[0]))
+    assert settling.standing(OK, bad, plan, 20.0) == (OK, PASSING_S)
+    assert settling.standing(OK, bad, plan, 20.0 + PASSING_S) == (bad, None)

@@ -171,7 +171,23 @@ def _report(plan: Plan, node: PlannedNode, index: int) -> EndpointReport:
         connection=connection_of(node, planned),
         mapped=True,
         matched=_matched(plan, planned) if is_topic else None,
+        server_matched=_server_matched(plan, planned),
         dscp=planned.dscp,
+    )
+
+
+def _server_matched(plan: Plan, planned: PlannedEndpoint) -> bool | None:
+    """What a client says of the declared servers of its service or action."""
+    kind = {
+        EndpointKind.SERVICE_CLIENT: EndpointKind.SERVICE_SERVER,
+        EndpointKind.ACTION_CLIENT: EndpointKind.ACTION_SERVER,
+    }.get(planned.kind)
+    if kind is None:
+        return None
+    return any(
+        (each.kind, each.resolved) == (kind, planned.resolved)
+        for node in plan.nodes
+        for each in node.endpoints
     )
 
 

@@ -30,7 +30,16 @@ from lifecycle.verify import (
     Stage,
     verify,
 )
-from tests.unit.plan.samples import IMAGE, need, node, planned, publisher, subscription, teleop
+from tests.unit.plan.samples import (
+    IMAGE,
+    endpoint,
+    need,
+    node,
+    planned,
+    publisher,
+    subscription,
+    teleop,
+)
 from tests.unit.verify.edits import (
     Edit,
     add_configuration,
@@ -55,6 +64,7 @@ SERVER, CLIENT = EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT
 ACTION_SERVER, ACTION_CLIENT = EndpointKind.ACTION_SERVER, EndpointKind.ACTION_CLIENT
 VIDEO, BATTERY, STATUS = "/robot/video", "/robot/battery", "/robot/status"
 FLOW = "/robot/video: /robot/camera → /viewer"
+CALIBRATE = "/robot/camera/calibrate: /viewer → /robot/camera"
 ATTACH = Run(kind=RunKind.ATTACH)
 
 PLAN = build_plan(teleop(), environment={})
@@ -278,6 +288,25 @@ FIRES: dict[str, tuple[Edit, list[tuple[str, str, str]]]] = {
         both(change_report(PUB, STATUS, matched=None), change_report(SUB, STATUS, matched=0)),
         [("graph.unmatched-flow", "violated", "/robot/status: /robot/camera → /viewer")],
     ),
+    "a service client that counts no server": (
+        change_report(CLIENT, "/robot/camera/calibrate", server_matched=False),
+        [("graph.unmatched-client", "violated", CALIBRATE)],
+    ),
+    "an action client that counts no server": (
+        change_report(ACTION_CLIENT, "/robot/dock", server_matched=False),
+        [("graph.unmatched-client", "violated", "/robot/dock: /viewer → /robot/camera")],
+    ),
+    "a client whose RMW does not tell": (
+        change_report(CLIENT, "/robot/camera/calibrate", server_matched=None),
+        [("graph.unmatched-client", "unverifiable", CALIBRATE)],
+    ),
+    "a client that has a server, with several of that name": (
+        add_endpoint(SERVER, "/viewer", "/robot/camera/calibrate", type="std_srvs/srv/Trigger"),
+        [
+            ("graph.undeclared-service-server", "violated", "/robot/camera/calibrate"),
+            ("graph.unmatched-client", "unverifiable", CALIBRATE),
+        ],
+    ),
     "a node still unconfigured": (
         both(
             change_node("/viewer", state="unconfigured"),
@@ -409,6 +438,9 @@ SILENT: dict[str, Edit] = {
         "/viewer", state=None, managed=False
     ),
     "a state that only the graph tells": change_configuration("/viewer", state=""),
+    "a client that is about to go": change_report(
+        CLIENT, "/robot/camera/calibrate", mapped=False, server_matched=None
+    ),
     "one end that reports no count": change_report(PUB, STATUS, matched=None),
     "more matches than the graph shows": change_report(PUB, STATUS, matched=5),
     "one end that is late with its count": change_report(PUB, STATUS, matched=0),
@@ -489,6 +521,31 @@ def test_an_open_world_still_compares_a_foreign_end_of_a_service_or_action(kind,
     assert findings_after(edit, plan=plan) == [("graph.type-mismatch", "violated", name)]
     same = both(add_node("/other"), add_endpoint(kind, "/other", "/x", type=type_))
     assert findings_after(same, plan=plan) == []
+
+
+def test_a_client_that_counts_no_server_is_told_of_at_its_declaration():
+    finding = the_finding(change_report(CLIENT, "/robot/camera/calibrate", server_matched=False))
+    assert finding.message == (
+        "cannot see /viewer → /robot/camera matched on service /robot/camera/calibrate: the client"
+        " counts no server as available"
+    )
+    assert (finding.node, finding.endpoint) == ("/viewer", CLIENT)
+
+
+def test_a_foreign_client_cannot_tell_whether_its_server_is_matched():
+    reset = endpoint(CLIENT, "reset", "std_srvs/srv/Trigger", qos=None)
+    plan = planned(
+        node("base", endpoint(SERVER, "reset", "std_srvs/srv/Trigger", qos=None)),
+        node("tool", reset, run=ATTACH, managed=False),
+    )
+    assert the_finding(lambda seen: seen, plan=plan).message == (
+        "cannot verify that /tool → /base are matched on service /reset: its client does not tell"
+    )
+
+
+def test_a_client_without_a_declared_server_is_not_judged():
+    plan = planned(node("tool", endpoint(CLIENT, "reset", "std_srvs/srv/Trigger")))
+    assert findings_after(lambda seen: seen, plan=plan) == []
 
 
 def test_two_foreign_nodes_that_do_not_fit_are_none_of_our_business():
