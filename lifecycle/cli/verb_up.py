@@ -89,7 +89,7 @@ def command(
                 from lifecycle.cli.report import write_report
                 from lifecycle.cli.up_output import output
                 from lifecycle.plan import build_plan
-                from lifecycle.supervisor import Until, UpOptions, up
+                from lifecycle.supervisor import Until, UpOptions, ended_early, up
 
                 plan = build_plan(load_manifest(manifest, assignments).manifest)
                 options = UpOptions(
@@ -103,14 +103,17 @@ def command(
                     treatment=_treatment(targets, mapping=mapping, flow_labels=flow_labels),
                 )
                 with output(format_) as listener:
-                    result = up(
-                        plan,
-                        options,
-                        [listener],
-                        forerunner=forerunner,
-                        ending=ending,
-                        on_start=listener.watch,
-                    )
+                    try:
+                        result = up(
+                            plan,
+                            options,
+                            [listener],
+                            forerunner=forerunner,
+                            ending=ending,
+                            on_start=listener.watch,
+                        )
+                    except Ended as ended:
+                        result = ended_early(ended.reason, ended.exit_code)
                     listener.finish(result)
                 if report is not None:
                     write_report(report, result.verdict, plan)

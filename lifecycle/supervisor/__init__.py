@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from lifecycle.supervisor.attach import follow_running, judge_running
     from lifecycle.supervisor.events import Emitter, Event, Listener, to_record
+    from lifecycle.supervisor.failure import ended_early
     from lifecycle.supervisor.options import Until, UpOptions, UpResult
     from lifecycle.supervisor.remote import down, find_run, running, status
     from lifecycle.supervisor.run import Forerunner, up
@@ -31,6 +32,7 @@ __all__ = [
     "UpOptions",
     "UpResult",
     "down",
+    "ended_early",
     "find_run",
     "follow_running",
     "judge_running",
@@ -54,6 +56,7 @@ _HOME = {
     "UpOptions": "options",
     "UpResult": "options",
     "down": "remote",
+    "ended_early": "failure",
     "find_run": "remote",
     "follow_running": "attach",
     "judge_running": "attach",

@@ -139,6 +139,11 @@ class BringUp:
     def _some(self, nodes: Iterable[NodeRun] | None) -> tuple[NodeRun, ...]:
         return tuple(self._system.nodes.values() if nodes is None else nodes)
 
+    def unfinished(self) -> str:
+        """Say what every node is doing, or waits for, that is in a step; empty if none is."""
+        busy = [node for node in self._system.nodes.values() if node.doing]
+        return "; ".join(f"{node.name} {_is(node.doing)}" for node in busy)
+
     async def close(self) -> None:
         """Stop waiting for plain nodes that have not appeared."""
         for task in self._appearing:
@@ -333,10 +338,10 @@ class BringUp:
         missing = [node for node in self._system.nodes.values() if node.doing]
         for node in missing:
             node.stuck = node.stuck or node.doing in _ING.values()
-        listed = "; ".join(f"{node.name} {_is(node.doing)}" for node in missing)
         culprit = next((node for node in missing if not node.doing.startswith("waits")), None)
         return StepFailedError(
-            f"cannot bring up {self._system.plan.system!r} within {timeout_s:.3g} s: {listed}",
+            f"cannot bring up {self._system.plan.system!r} within {timeout_s:.3g} s: "
+            f"{self.unfinished()}",
             rule=DEADLINE,
             subject=culprit.name if culprit else self._system.plan.system,
             log_tail=_tail(culprit) if culprit else (),

@@ -35,6 +35,11 @@ class Ended(KeyboardInterrupt):
         self.number = number
 
     @property
+    def reason(self) -> str:
+        """Of the end, in words."""
+        return ENDED_BY[self.number][0]
+
+    @property
     def exit_code(self) -> ExitCode:
         """Of a run that ended so."""
         return ENDED_BY[self.number][1]

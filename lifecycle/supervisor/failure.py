@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import dataclasses
 
-from lifecycle.errors import BringUpError
+from lifecycle.errors import BringUpError, ExitCode
 from lifecycle.supervisor.events import Failure
+from lifecycle.supervisor.options import UpResult
 from lifecycle.verify.rules import rule, run
-from lifecycle.verify.verdict import Finding, Outcome, Verdict
+from lifecycle.verify.verdict import Finding, Outcome, RunEnd, Verdict
 
 PROCESS_DIED = run.PROCESS_DIED.id
 START_FAILED = run.START_FAILED.id
@@ -38,6 +39,12 @@ class StepFailedError(BringUpError):
         self.subject = subject
         self.log_tail = log_tail
 
+    @property
+    def reason(self) -> str:
+        """What failed, in words that stand alone: with the subject, if the message has it not."""
+        named = self.subject in self.message
+        return self.message if named else f"{self.subject}: {self.message}"
+
     def event(self) -> Failure:
         """Return the failure as listeners hear of it."""
         return Failure(
@@ -59,6 +66,18 @@ def finding_of(failure: StepFailedError) -> Finding:
         message=failure.message,
         node=failure.subject if failure.subject.startswith("/") else "",
     )
+
+
+def ended_early(reason: str, exit_code: ExitCode) -> UpResult:
+    """Return the result of a run that ended before there was anything to judge."""
+    verdict = never_connected(NOT_JUDGED, reason, exit_code)
+    return UpResult(exit_code=exit_code, verdict=verdict)
+
+
+def never_connected(verdict: Verdict, reason: str, exit_code: ExitCode) -> Verdict:
+    """Return `verdict` as the last one of a run that ended before its system was connected."""
+    run = RunEnd(reason=reason, reached=None, exit_code=exit_code)
+    return dataclasses.replace(verdict, run=run)
 
 
 def with_failure(verdict: Verdict, failure: StepFailedError) -> Verdict:

@@ -60,8 +60,8 @@ class Holding:
         self._keep_going = keep_going
         self._mailbox = Mailbox()
 
-    async def hold(self, stage: Stage, hold_s: float | None) -> bool:
-        """Keep the system as it is, or as it is ordered; return whether it was violated.
+    async def hold(self, stage: Stage, hold_s: float | None) -> str:
+        """Keep the system as it is, or as it is ordered; return what was violated, else nothing.
 
         Args:
             stage: what it has come to; a violation counts only of an active system, and only if it
@@ -74,7 +74,7 @@ class Holding:
         """
         await self._note_segments()
         deadline = None if hold_s is None else asyncio.get_running_loop().time() + hold_s
-        violated = False
+        violated = ""
         while True:
             watch = Watch(self._judge, self._changes, stage)
             watching = asyncio.ensure_future(watch.run())
@@ -82,7 +82,8 @@ class Holding:
                 pending = await self._until_ordered(deadline, watching)
             finally:
                 await ended(watching)
-            violated = violated or (watch.violated and stage is Stage.ACTIVE)
+            if stage is Stage.ACTIVE:
+                violated = violated or watch.violated
             if pending is None:
                 return violated
             await self._carry_out(pending)

@@ -20,7 +20,7 @@ from lifecycle.supervisor import discovery_server
 from lifecycle.supervisor.ending import Ending
 from lifecycle.supervisor.events import Emitter, Listener, Notice, RunStarted
 from lifecycle.supervisor.eyes import Eyes
-from lifecycle.supervisor.failure import NOT_JUDGED, StepFailedError, with_failure
+from lifecycle.supervisor.failure import NOT_JUDGED, StepFailedError, never_connected, with_failure
 from lifecycle.supervisor.logs import log_directory
 from lifecycle.supervisor.networks import open_networks
 from lifecycle.supervisor.options import (
@@ -173,7 +173,9 @@ def _up(
                 return await session.run()
             except StepFailedError as failure:
                 emit(failure.event())
-                verdict = with_failure(NOT_JUDGED, failure)
+                verdict = never_connected(
+                    with_failure(NOT_JUDGED, failure), failure.reason, failure.exit_code
+                )
                 return UpResult(exit_code=failure.exit_code, verdict=verdict)
             finally:
                 await discovery_server.end(system, asyncio.Event())

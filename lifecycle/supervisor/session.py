@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import dataclasses
 import os
 import signal
 from collections.abc import AsyncIterator, Coroutine, Iterable, Iterator
@@ -48,7 +49,8 @@ from lifecycle.supervisor.together import ended
 from lifecycle.supervisor.vigil import Vigil
 from lifecycle.supervisor.wiring import authority_of
 from lifecycle.supervisor.zygote import Zygote
-from lifecycle.verify.verdict import Outcome, Stage, Verdict
+from lifecycle.verify.missing import missing, not_ok
+from lifecycle.verify.verdict import Outcome, RunEnd, Stage, Verdict
 
 _GLANCE_S = 1.0
 """How long `--until connected` looks for a verdict to report; it gates nothing."""
@@ -97,6 +99,8 @@ class Session:
         self._networks = networks
         self._emit = emit
         self._ending = ending
+        self._furthest: str | None = None
+        self._violated = ""
         self._hurry = asyncio.Event()
         self._stop: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._gate = Gate(strict=options.strict)
@@ -210,24 +214,38 @@ class Session:
 
     async def _until_over(self) -> UpResult:
         """Run the phases; whatever ends them becomes an exit code and a verdict."""
-        reason = "done"
+        reason = stopping = "done"
+        verdict: Verdict | None = None
         try:
             exit_code = await self._unless_stopped(self._phases())
+            if self._violated:
+                reason = f"done, and violated; {self._violated}"
         except _Stop as stop:
-            reason, exit_code = stop.reason, stop.exit_code
+            reason = stopping = stop.reason
+            exit_code = stop.exit_code
+            if waits := self._waits():
+                reason = f"{reason}; {waits}"
         except StepFailedError as failure:
             self._emit(failure.event())
-            self._gate.close()
-            self._regulator.phase = "stopping"
-            self._emit(Stopping(reason="rolling back"))
+            reason, stopping, exit_code = failure.reason, "rolling back", failure.exit_code
             verdict = with_failure(self._judge.latest or _empty(), failure)
-            return UpResult(exit_code=failure.exit_code, verdict=verdict)
         except VerificationError as error:
-            reason, exit_code = "the verdict keeps the gate closed", error.exit_code
+            stopping, exit_code = "the verdict keeps the gate closed", error.exit_code
+            if self._regulator.phase == "activating":
+                stopping = "what became active is not what was verified"
+            reason = f"{stopping}; {not_ok(error.verdict) or error.verdict.verdict.value}"
         self._gate.close()
         self._regulator.phase = "stopping"
-        self._emit(Stopping(reason=reason))
-        return UpResult(exit_code=exit_code, verdict=self._judge.latest or NOT_JUDGED)
+        self._emit(Stopping(reason=stopping))
+        run = RunEnd(reason=reason, reached=self._furthest, exit_code=exit_code)
+        verdict = dataclasses.replace(verdict or self._judge.latest or NOT_JUDGED, run=run)
+        return UpResult(exit_code=exit_code, verdict=verdict)
+
+    def _waits(self) -> str:
+        """Say what a run still waits for that is asked to end before its system is up."""
+        latest = self._judge.latest
+        verifies = self._regulator.phase == "verifying" and latest is not None
+        return self._bring_up.unfinished() or (missing(latest) if verifies and latest else "")
 
     async def _phases(self) -> ExitCode:
         loop = asyncio.get_running_loop()
@@ -275,12 +293,17 @@ class Session:
         hold_s = self._options.stop_after_s
         if hold_s is None and self._options.until is not Until.ACTIVE:
             hold_s = 0.0
-        violated = await self._holding.hold(stage, hold_s)
+        meanwhile = await self._holding.hold(stage, hold_s)
         if self._options.until is Until.CONNECTED:
             return ExitCode.OK
         verdict = self._judge.latest
-        violated = violated or (verdict is not None and verdict.verdict is Outcome.VIOLATED)
-        return ExitCode.VIOLATED if violated else ExitCode.OK
+        if verdict is not None and verdict.verdict is Outcome.VIOLATED:
+            self._violated = not_ok(verdict)
+        elif meanwhile:
+            self._violated = f"meanwhile, {meanwhile}"
+        else:
+            return ExitCode.OK
+        return ExitCode.VIOLATED
 
     async def _unless_stopped(self, phases: Coroutine[Any, Any, ExitCode]) -> ExitCode:
         running = asyncio.ensure_future(phases)
@@ -341,6 +364,7 @@ class Session:
             self._authority.replan(self._system.plan, frozenset(nodes))
 
     def _reached(self, reached: str) -> None:
+        self._furthest = reached
         self._emit(SystemReached(reached=reached, elapsed_s=self._emit.elapsed_s))
 
 

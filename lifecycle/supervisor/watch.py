@@ -11,6 +11,7 @@ from lifecycle.supervisor.judge import SETTLED_S, Changes, Judge
 from lifecycle.supervisor.process import ManagedProcess
 from lifecycle.supervisor.states import ProcessState
 from lifecycle.supervisor.system import System
+from lifecycle.verify.missing import not_ok
 from lifecycle.verify.verdict import Outcome, Stage
 
 
@@ -42,14 +43,14 @@ class Watch:
     """Judges a system again and again while it is held.
 
     Attributes:
-        violated: it was seen violated for longer than a passing moment.
+        violated: what was seen violated for longer than a passing moment; empty if nothing was.
     """
 
     def __init__(self, judge: Judge, changes: Changes, stage: Stage) -> None:
         self._judge = judge
         self._changes = changes
         self._stage = stage
-        self.violated = False
+        self.violated = ""
 
     async def run(self) -> None:
         """Judge at every change, until cancelled."""
@@ -61,4 +62,4 @@ class Watch:
             if await self._changes.beyond(count, wait_s):
                 await self._judge.quiet()
             elif again_s is None:
-                self.violated = True  # nothing moved: it stands
+                self.violated = not_ok(verdict) or verdict.verdict.value  # nothing moved: it stands

@@ -20,7 +20,7 @@ from lifecycle.verify.observation import (
 )
 from lifecycle.verify.report import render_text, to_json, to_junit, to_sarif
 from lifecycle.verify.rules import RULES, Rule
-from lifecycle.verify.verdict import Finding, FlowReport, Outcome, Stage, Verdict
+from lifecycle.verify.verdict import Finding, FlowReport, Outcome, RunEnd, Stage, Verdict
 
 __all__ = [
     "RULES",
@@ -34,6 +34,7 @@ __all__ = [
     "ObservedNode",
     "Outcome",
     "Rule",
+    "RunEnd",
     "Stage",
     "Verdict",
     "action_part",

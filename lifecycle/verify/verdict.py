@@ -121,6 +121,34 @@ class OpenEndpoint:
     type: str
 
 
+_ENDED = {
+    None: "before it was connected",
+    "connected": "when connected, before it was verified",
+    "verified": "when verified, before it was active",
+    "active": "after it was active",
+}
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class RunEnd:
+    """How a run of a supervisor ended.
+
+    Attributes:
+        reason: why: "interrupted", what failed, what kept the gate closed; "done" if it did what
+            was asked for.
+        reached: how far the system came: "connected", "verified" or "active"; None before.
+        exit_code: of the command that ran it.
+    """
+
+    reason: str
+    reached: str | None
+    exit_code: int
+
+    def describe(self) -> str:
+        """Return it in one line."""
+        return f"ended {_ENDED[self.reached]}, exit code {self.exit_code}: {self.reason}"
+
+
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Verdict:
     """The result of `verify`.
@@ -129,6 +157,7 @@ class Verdict:
         verdict: VIOLATED if any finding is; else UNVERIFIABLE if any finding is; else OK.
         blocking: the gate stays closed: VIOLATED, or UNVERIFIABLE where the policy says so.
         open_endpoints: what nodes made in code and may make; no finding, but nothing is hidden.
+        run: how the run ended that this is the last verdict of; None of a system that is running.
     """
 
     verdict: Outcome
@@ -136,3 +165,4 @@ class Verdict:
     findings: tuple[Finding, ...]
     flows: tuple[FlowReport, ...]
     open_endpoints: tuple[OpenEndpoint, ...] = ()
+    run: RunEnd | None = None

@@ -12,7 +12,7 @@ from xml.etree import ElementTree as ET
 from lifecycle.plan.model import Plan
 from lifecycle.verify.rules import RULES
 from lifecycle.verify.rules.catalogue import Rule
-from lifecycle.verify.verdict import Finding, FlowReport, Outcome, Verdict
+from lifecycle.verify.verdict import Finding, FlowReport, Outcome, RunEnd, Verdict
 
 _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 """Characters that XML 1.0 §2.2 cannot hold, not even escaped."""
@@ -33,6 +33,8 @@ def to_junit(verdict: Verdict, plan: Plan) -> str:
                 _finding_case(suite, finding)
             if not findings:
                 ET.SubElement(suite, "testcase", classname=rule.id, name=_legal(rule.meaning))
+        if family == "run" and verdict.run is not None:
+            _end_case(suite, verdict.run)
         _count(suite, total)
     suite = ET.SubElement(root, "testsuite", name="flows")
     for flow in verdict.flows:
@@ -42,6 +44,13 @@ def to_junit(verdict: Verdict, plan: Plan) -> str:
         root.set(name, str(value))
     ET.indent(root)
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(root, encoding="unicode") + "\n"
+
+
+def _end_case(suite: ET.Element, run: RunEnd) -> None:
+    """An interrupted run, whose system nobody judged, must not read as one without fault."""
+    case = ET.SubElement(suite, "testcase", classname="run", name="end")
+    outcome = Outcome.OK if run.exit_code == 0 else Outcome.VIOLATED
+    _result(case, outcome, run.reason, run.describe())
 
 
 def _finding_case(suite: ET.Element, finding: Finding) -> None:

@@ -10,7 +10,7 @@ import json
 from urllib.parse import quote
 
 from lifecycle.verify.rules import RULES
-from lifecycle.verify.verdict import Finding, Outcome, Verdict
+from lifecycle.verify.verdict import Finding, Outcome, RunEnd, Verdict
 
 _SCHEMA = "https://json.schemastore.org/sarif-2.1.0.json"
 _LEVELS = {Outcome.VIOLATED: "error", Outcome.UNVERIFIABLE: "warning", Outcome.OK: "none"}
@@ -39,10 +39,22 @@ def to_sarif(verdict: Verdict) -> str:
                 "columnKind": "unicodeCodePoints",
                 "results": [_result(each, index[each.rule]) for each in verdict.findings],
                 "properties": {"verdict": verdict.verdict.value},
+                **_invocations(verdict.run),
             }
         ],
     }
     return json.dumps(log, ensure_ascii=False, indent=2) + "\n"
+
+
+def _invocations(run: RunEnd | None) -> _Json:
+    if run is None:
+        return {}
+    ended = {
+        "executionSuccessful": run.exit_code == 0,
+        "exitCode": run.exit_code,
+        "exitCodeDescription": run.describe(),
+    }
+    return {"invocations": [ended]}
 
 
 def _result(finding: Finding, rule_index: int) -> _Json:

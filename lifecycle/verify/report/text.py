@@ -26,7 +26,7 @@ _UNIQUE = {
 def render_text(
     verdict: Verdict, *, colour: bool = False, flows: bool = True, width: int = 100
 ) -> str:
-    """Write a verdict: violated findings first, then unverifiable ones, then the flows.
+    """Write a verdict: violated findings first, then unverifiable ones, the flows, the run's end.
 
     Args:
         verdict: what to write.
@@ -50,6 +50,8 @@ def render_text(
         ]
     if flows and verdict.flows:
         lines += ["", "flows", *_flows(verdict.flows, colour=colour)]
+    if verdict.run is not None:
+        lines += ["", *_wrap(verdict.run.describe(), max(width, 40))]
     return "\n".join(lines) + "\n"
 
 
@@ -78,15 +80,20 @@ def _finding(finding: Finding, *, colour: bool, width: int) -> list[str]:
     for label, text in rows:
         if text:
             indent = "  " + (f"{label:<10}" if label else "")
-            lines += textwrap.wrap(
-                text,
-                width,
-                initial_indent=indent,
-                subsequent_indent=" " * len(indent),
-                break_long_words=False,
-                break_on_hyphens=False,
-            )
+            lines += _wrap(text, width, first=indent)
     return lines
+
+
+def _wrap(text: str, width: int, *, first: str = "") -> list[str]:
+    """Wrap between words only: names and addresses stay whole. `first` starts the first line."""
+    return textwrap.wrap(
+        text,
+        width,
+        initial_indent=first,
+        subsequent_indent=" " * len(first),
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
 
 
 def _flows(flows: Sequence[FlowReport], *, colour: bool) -> list[str]:

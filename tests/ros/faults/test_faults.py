@@ -55,6 +55,11 @@ def test_a_broken_system_is_refused_named_and_cleared_away(fault: Fault, tmp_pat
     assert run.exit_code == fault.exit_code, said
     assert fault.subject in said
     assert fault.message in said
+    if run.events:
+        end = run.events[-1]["run"]
+        assert isinstance(end, dict)
+        assert end["exit_code"] == fault.exit_code
+        assert fault.subject in end["reason"]
     if fault.rule:
         findings = run.events[-1]["findings"]
         assert isinstance(findings, list)

@@ -47,6 +47,7 @@ def test_until_stops_short_of_activating(tmp_path: Path, fresh_domain: int, unti
     with up(pair(tmp_path, fresh_domain), "--until", until, runtime=tmp_path) as run:
         assert run.finish() == ExitCode.OK
         assert run.of_kind("system")[-1]["reached"] == until
+        assert run.verdict["run"] == {"reason": "done", "reached": until, "exit_code": 0}
         assert run.of_kind("gate") == []
         assert "activate" not in [each["operation"] for each in run.of_kind("request")]
         run.assert_nothing_left()
@@ -60,6 +61,11 @@ def test_an_interrupt_takes_the_system_down_in_reverse_order(
         run.note_segments()
         run.signal(signal.SIGINT)
         assert run.finish() == ExitCode.INTERRUPTED
+        assert run.verdict["run"] == {
+            "reason": "interrupted",
+            "reached": "active",
+            "exit_code": ExitCode.INTERRUPTED,
+        }
         last = [each["node"] for each in run.of_kind("request") if each["operation"] == "shutdown"]
         assert last == ["/listener", "/talker"]
         run.assert_nothing_left()
@@ -72,6 +78,8 @@ def test_a_signal_during_bring_up_rolls_back(tmp_path: Path, fresh_domain: int) 
         run.note_segments()
         run.signal(signal.SIGINT)
         assert run.finish() == ExitCode.INTERRUPTED
+        assert run.verdict["run"].pop("reason").endswith("; /talker is still configuring")
+        assert run.verdict["run"] == {"reached": None, "exit_code": ExitCode.INTERRUPTED}
         run.assert_nothing_left()
 
 
@@ -87,6 +95,8 @@ def test_a_signal_while_the_supervisor_itself_is_starting_leaves_nothing(
         run.note_segments()
         run.signal(signal.SIGTERM)
         assert run.finish() == ExitCode.OK
+        assert run.verdict["verdict"] == "unverifiable"
+        assert run.verdict["run"]["reason"].startswith("terminated")
         run.assert_gate_held()
         run.assert_nothing_left()
 
@@ -125,6 +135,11 @@ def test_a_process_that_dies_in_a_step_ends_the_run_and_is_named_with_its_last_w
         assert failure["log_tail"][-1] == "about to kill in activate"
         assert run.verdict["verdict"] == "violated"
         assert run.verdict["findings"][0]["rule"] == "run.process-died"
+        assert run.verdict["run"] == {
+            "reason": failure["message"],
+            "reached": "verified",
+            "exit_code": ExitCode.BRING_UP_FAILED,
+        }
         run.assert_gate_held()
         run.assert_nothing_left()
 

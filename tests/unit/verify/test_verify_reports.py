@@ -23,6 +23,7 @@ from lifecycle.verify import (
     FlowReport,
     NodeConfiguration,
     Outcome,
+    RunEnd,
     Stage,
     Verdict,
     render_text,
@@ -201,6 +202,7 @@ def test_json_can_be_indented_for_people():
         ("verdict.v1.schema.json", "Finding", Finding),
         ("verdict.v1.schema.json", "FlowReport", FlowReport),
         ("verdict.v1.schema.json", "FlowTuple", FlowTuple),
+        ("verdict.v1.schema.json", "RunEnd", RunEnd),
         ("node_configuration.v1.schema.json", "", NodeConfiguration),
     ],
 )
@@ -222,6 +224,56 @@ def test_a_node_configuration_fits_its_schema_and_one_with_an_unknown_key_does_n
 @pytest.mark.parametrize("path", sorted(SCHEMAS.glob("*.json")), ids=lambda path: path.name)
 def test_every_shipped_schema_is_a_schema(path: Path):
     jsonschema.Draft202012Validator.check_schema(json.loads(path.read_text(encoding="utf-8")))
+
+
+# --- the end of a run
+
+UNJUDGED = Verdict(
+    verdict=Outcome.UNVERIFIABLE,
+    blocking=True,
+    findings=(),
+    flows=(),
+    run=RunEnd(reason="interrupted; /talker is still configuring", reached=None, exit_code=130),
+)
+
+
+def test_the_last_line_of_a_run_says_why_it_ended_and_how_far_it_came():
+    assert render_text(UNJUDGED) == (
+        "verdict: unverifiable\n\n"
+        "ended before it was connected, exit code 130: interrupted; /talker is still configuring\n"
+    )
+    for reached, place in (
+        ("connected", "when connected, before it was verified"),
+        ("verified", "when verified, before it was active"),
+        ("active", "after it was active"),
+    ):
+        run = RunEnd(reason="done", reached=reached, exit_code=0)
+        assert run.describe() == f"ended {place}, exit code 0: done"
+
+
+def test_the_json_of_a_run_has_its_reason_and_fits_the_schema():
+    document = json.loads(to_json(UNJUDGED))
+    jsonschema.Draft202012Validator(schema("verdict.v1.schema.json")).validate(document)
+    assert document["run"] == {
+        "reason": "interrupted; /talker is still configuring",
+        "reached": None,
+        "exit_code": 130,
+    }
+
+
+def test_a_run_that_nobody_judged_is_no_success_in_junit_and_sarif():
+    root = ET.fromstring(to_junit(UNJUDGED, PLAN))
+    assert root.get("failures") == "1"
+    (case,) = (each for each in root.iter("testcase") if each.find("failure") is not None)
+    assert (case.get("classname"), case.get("name")) == ("run", "end")
+    (run,) = json.loads(to_sarif(UNJUDGED))["runs"]
+    assert run["invocations"] == [
+        {
+            "executionSuccessful": False,
+            "exitCode": 130,
+            "exitCodeDescription": UNJUDGED.run.describe(),
+        }
+    ]
 
 
 # --- JUnit
