@@ -34,7 +34,7 @@ class ControlChannel:
 
     Args:
         spec: what it hosts.
-        on_state: told what it says of its nodes unasked.
+        on_state: told what it says of its nodes unasked, and of each reply with a configuration.
         on_hang: told True when its executor hangs in a callback, False when it came back.
     """
 
@@ -149,6 +149,9 @@ class ControlChannel:
 
     def _dispatch(self, event: Event) -> None:
         if event.kind == "reply":
+            if event.configuration is not None:
+                # Now, in its turn: who awaits the reply goes on after what comes next.
+                self._on_state(event)
             reply = self._replies.get(event.id)
             if reply is not None and not reply.done():
                 reply.set_result(event)

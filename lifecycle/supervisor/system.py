@@ -114,9 +114,17 @@ class NodeRun:
         self.reach = reach
         if standing is not None:
             self._take(standing.state, connected=standing.connected)
-            if standing.configuration is not None:
-                self.configuration = standing.configuration
+            self.learn(standing.configuration)
         self._tell()
+
+    def learn(self, configuration: NodeConfiguration | None) -> None:
+        """Take the configuration that somebody asked for; None is nothing to take.
+
+        Of a node whose host tells, every configuration has been taken in the order of its channel
+        by now (System.on_host_event): what a reply carried may be older than what was told since.
+        """
+        if configuration is not None and not self.tells:
+            self.configuration = configuration
 
     def report(self, state: str, *, connected: bool) -> None:
         """Note a state that the node itself told, whoever asked for it."""
@@ -244,13 +252,18 @@ class System:
         )
 
     def on_host_event(self, event: HostEvent) -> None:
-        """Take a host's unasked word on one of its nodes."""
+        """Take a host's word on one of its nodes, in the order in which it comes.
+
+        Of a reply this is the configuration; the rest is for who asked.
+        """
         node = self._by_name.get(event.node)
         if node is None:
             return
         if event.configuration is not None:
             node.configuration = event.configuration
             node.tells = node.tells or event.kind == "configuration"
+        if event.kind == "reply":
+            return
         if event.state:
             node.report(event.state, connected=event.connected)
         self.touched.set()
@@ -309,5 +322,4 @@ class System:
             fresh = await asyncio.wait_for(node.driver.configuration(), _REFRESH_S)
         except (BringUpError, asyncio.TimeoutError):
             return
-        if fresh is not None:
-            node.configuration = fresh
+        node.learn(fresh)

@@ -168,8 +168,7 @@ class Authority:
         """
         assert node.driver is not None
         configuration = await node.driver.interface()
-        if configuration is not None:
-            node.configuration = configuration
+        node.learn(configuration)
         wanted = self._negotiate().get(node.name)
         if self._source.problems:
             raise BringUpError("\n".join(self._source.problems))
@@ -387,7 +386,7 @@ class Authority:
                 node.connections = tuple(wiring.ours)
             if configuration is not None:
                 if node is not None:
-                    node.configuration = configuration
+                    node.learn(configuration)
                 else:
                     self._others[configuration.name] = configuration
             self._emit(event)

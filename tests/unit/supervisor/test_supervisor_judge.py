@@ -12,13 +12,27 @@ import pytest
 
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.node.control import Event
-from lifecycle.supervisor.events import VerdictChanged
+from lifecycle.supervisor.driver import Standing
+from lifecycle.supervisor.events import Reach, VerdictChanged
 from lifecycle.supervisor.judge import Changes, Judge, without
 from lifecycle.supervisor.settling import PASSING_S
 from lifecycle.supervisor.watch import Watch
-from lifecycle.verify.observation import Observation, ObservedEndpoint, ObservedNode
+from lifecycle.verify.observation import (
+    NodeConfiguration,
+    Observation,
+    ObservedEndpoint,
+    ObservedNode,
+)
 from lifecycle.verify.verdict import Outcome, Stage, Verdict
-from tests.unit.supervisor.fakes import FakeGraph, World, plan_of, planned_node, run, verdict_of
+from tests.unit.supervisor.fakes import (
+    FakeGraph,
+    World,
+    interface_of,
+    plan_of,
+    planned_node,
+    run,
+    verdict_of,
+)
 
 OK = verdict_of(Outcome.OK)
 MISSING = verdict_of(Outcome.VIOLATED, "graph.missing-node")
@@ -178,6 +192,29 @@ def test_a_node_that_tells_of_its_matches_is_not_asked_for_them(tmp_path: Path) 
         assert len(bench.looks) == 2  # the first, and the one after it told
 
     _run(tmp_path, test, unmatched)
+
+
+def test_a_reply_does_not_undo_what_was_told_after_it(tmp_path: Path) -> None:
+    def of(*, matched: bool) -> NodeConfiguration:
+        told = interface_of("/camera", "service_clients/ask")
+        (end,) = told.endpoints
+        end = dataclasses.replace(end, server_matched=matched)
+        return dataclasses.replace(told, endpoints=(end,))
+
+    async def test(bench: _Bench) -> None:
+        system = bench.world.system
+        node = system.nodes["camera"]
+        before, after = of(matched=False), of(matched=True)
+        reply = Event(kind="reply", node="/camera", state="inactive", configuration=before)
+        system.on_host_event(reply)
+        assert node.configuration == before
+        system.on_host_event(dataclasses.replace(reply, kind="configuration", configuration=after))
+        # Who awaited the reply goes on only now.
+        node.advance(Reach.CONNECTED, Standing(state="inactive", configuration=before))
+        assert node.configuration is not None
+        assert node.configuration.endpoints == after.endpoints
+
+    _run(tmp_path, test, OK)
 
 
 @pytest.mark.parametrize(("client", "server"), [("/viewer", "/camera"), ("/camera", "/viewer")])
