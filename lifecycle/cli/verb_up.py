@@ -12,6 +12,7 @@ from lifecycle.cli.flows_program import chosen, program_options, treatment_of, t
 from lifecycle.errors import UsageError
 
 if TYPE_CHECKING:
+    from lifecycle.supervisor.options import UpResult
     from lifecycle.supervisor.programming import TargetOptions, Treatment
 
 
@@ -78,6 +79,7 @@ def command(
     """
     from lifecycle.supervisor.ending import Ended, Ending
 
+    result: UpResult | None = None
     try:
         with Ending() as ending:
             from lifecycle.supervisor.run import Forerunner
@@ -120,6 +122,8 @@ def command(
             finally:
                 forerunner.close()
     except Ended as ended:
+        if result is None:
+            click.echo(f"ended before anything was started: {ended.reason}", err=True)
         return ended.exit_code
     return result.exit_code
 
