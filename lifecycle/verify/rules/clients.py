@@ -32,7 +32,7 @@ SERVER_OF = {
 
 
 def check(view: View) -> Iterator[Finding]:
-    """Judge every declared client of which declared servers are there, and of its type."""
+    """Judge every declared client that reports and of which declared servers are there."""
     servers: dict[_Place, list[str]] = {}
     for actual in view.actual:
         if actual.observed is not None:
@@ -42,8 +42,10 @@ def check(view: View) -> Iterator[Finding]:
         kind = SERVER_OF.get(client.planned.kind)
         if kind is None or client.observed is None:
             continue
-        if client.report is None and view.ours(client.node):
-            continue  # that has its own finding
+        if client.report is None:
+            # Of ours that has its own finding; of others no more can be seen than that both ends
+            # are there and of one type, as of their topics.
+            continue
         place = kind, client.observed.name, client.observed.type
         found = servers.get(place, ())
         for server in dict.fromkeys(found):
@@ -56,12 +58,12 @@ def _place(seen: ObservedEndpoint) -> _Place:
 
 def _judge(client: Actual, server: str, *, count: int) -> Iterator[Finding]:
     report = client.report
-    if report is not None and not report.mapped:
+    assert report is not None
+    if not report.mapped:
         return  # it is about to go, or discovery is ahead of the report
-    matched = None if report is None else report.server_matched
-    if matched is False:
+    if report.server_matched is False:
         outcome, reason = Outcome.VIOLATED, "the client counts no server as available"
-    elif matched is None:
+    elif report.server_matched is None:
         outcome, reason = Outcome.UNVERIFIABLE, "its client does not tell"
     elif count > 1:
         outcome = Outcome.UNVERIFIABLE

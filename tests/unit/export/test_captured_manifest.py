@@ -28,11 +28,6 @@ from lifecycle.verify.observation import (
 
 PUBLISHER, SUBSCRIPTION = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
 SERVER, CLIENT = EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT
-UNTOLD = (
-    "cannot verify that /on → /left/base are matched on service /left/lights: its client does not "
-    "tell"
-)
-"""The one thing that nobody can see of nodes that are not ours."""
 ANNOUNCED = QosProfile(history=History.UNKNOWN, depth=0)
 LATCHED = dataclasses.replace(
     ANNOUNCED, durability=Durability.TRANSIENT_LOCAL, deadline_ns=500_000_000
@@ -118,8 +113,8 @@ def test_a_captured_system_is_valid_and_verified_by_what_it_was_captured_from(
     ]
     assert {node.run.kind for node in manifest.nodes} == {RunKind.ATTACH}
     verdict = verify(build_plan(manifest, environment={}), FOREIGN, stage=Stage.ACTIVE)
-    assert [each.message for each in verdict.findings] == [UNTOLD]
-    assert (verdict.verdict, verdict.blocking) == (Outcome.UNVERIFIABLE, False)
+    assert [each.message for each in verdict.findings] == []
+    assert verdict.verdict is Outcome.OK
 
 
 def test_what_is_not_told_is_marked_on_its_line(tmp_path: Path) -> None:
@@ -208,7 +203,7 @@ def test_nodl_documents_stand_in_for_interfaces(tmp_path: Path) -> None:
 
     assert interfaces(by_reference) == interfaces(inline)
     verdict = verify(build_plan(by_reference, environment={}), FOREIGN, stage=Stage.ACTIVE)
-    assert [each.message for each in verdict.findings] == [UNTOLD]
+    assert verdict.findings == ()
 
 
 @pytest.mark.parametrize(
