@@ -17,7 +17,7 @@ from lifecycle.manifest.model import EndpointPolicy
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.eyes import Eyes
 from lifecycle.supervisor.gate import closes
-from lifecycle.supervisor.judge import SETTLED_S, with_findings
+from lifecycle.supervisor.judge import with_findings
 from lifecycle.supervisor.options import onlooker_connections
 from lifecycle.supervisor.remote import look, running
 from lifecycle.supervisor.renegotiation import Expectation, is_negotiated
@@ -28,7 +28,11 @@ from lifecycle.verify.observation import NodeConfiguration, Observation
 from lifecycle.verify.verdict import Outcome, Stage, Verdict
 
 _ASK_AGAIN_S = 0.5
-"""Nodes are asked again so long after: their matched counts change without a graph change."""
+"""Nodes are asked again so long after: their matched counts change without a graph change ..."""
+
+_ASK_AT_MOST_S = 8.0
+"""... a moment after one, so whoever only looks on asks half as often each time, down to this: that
+a node hangs or somebody was reconfigured nobody tells those who stand outside."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,12 +80,19 @@ async def following(plan: Plan, on_look: Callable[[Seen], None]) -> None:
     settling = Settling()
     last: Verdict | None = None
     clock = asyncio.get_running_loop().time
+    pause_s = _ASK_AGAIN_S
     with _looking(plan) as eyes:
         while True:
             seen = await _see(plan, eyes)
-            last, _ = settling.standing(last, seen.verdict, seen.plan, clock())
+            now, again_s = settling.standing(last, seen.verdict, seen.plan, clock())
+            if now != last or again_s is not None:
+                pause_s = _ASK_AGAIN_S
+            last = now
             on_look(dataclasses.replace(seen, verdict=last))
-            await _change(eyes, SETTLED_S)
+            if await _change(eyes, pause_s):
+                pause_s = _ASK_AGAIN_S
+            else:
+                pause_s = min(pause_s * 2, _ASK_AT_MOST_S)
 
 
 def follow_running(plan: Plan, on_verdict: Callable[[Verdict], None]) -> None:
@@ -157,12 +168,13 @@ def _worth_waiting(verdict: Verdict, *, strict: bool) -> bool:
     return closes(verdict, strict=strict) or verdict.verdict is not Outcome.OK
 
 
-async def _change(eyes: Eyes, timeout_s: float) -> None:
-    """Wait for a change of the graph, or until it is time to ask the nodes again."""
+async def _change(eyes: Eyes, timeout_s: float) -> bool:
+    """Wait for a change of the graph; False when it is time to ask the nodes again without one."""
     try:
         await asyncio.wait_for(eyes.wait_change(), timeout_s)
     except asyncio.TimeoutError:
-        return
+        return False
+    return True
 
 
 __all__ = ["Seen", "follow_running", "following", "judge_running", "where"]
