@@ -74,6 +74,7 @@ class Host:
         self.name = name
         self.addresses: dict[str, list[str]] = {}
         self.machine_id = uuid.uuid4().hex
+        self._started: list[subprocess.Popen[str]] = []
         self._holder = subprocess.Popen(
             [*_UNSHARE, _HOLD],
             stdin=subprocess.PIPE,
@@ -128,8 +129,10 @@ class Host:
         }
 
     def popen(self, *argv: str, **options: typing.Any) -> subprocess.Popen[str]:
-        """Start a program here; it is told to end if this thread ends first."""
-        return subprocess.Popen(self.command(*argv, guarded=True), text=True, **options)
+        """Start a program here; it is told to end if this thread ends first, and ends with us."""
+        process = subprocess.Popen(self.command(*argv, guarded=True), text=True, **options)
+        self._started.append(process)
+        return process
 
     def run(self, *argv: str, check: bool = True, stdin: str | None = None) -> str:
         """Run a program here to its end and return what it wrote.
@@ -212,6 +215,13 @@ class Host:
             assert stream is not None
             stream.close()
         self._holder.wait(_END_S)
+        # A test that failed has left them: what they hold would be held against the next one.
+        for process in self._started:
+            process.wait(_END_S)
+            for pipe in (process.stdin, process.stdout, process.stderr):
+                if pipe is not None:
+                    with contextlib.suppress(BrokenPipeError):  # what nobody read
+                        pipe.close()
 
     def _enter(self) -> None:
         """Take the calling thread, and it alone, into this host's network."""
