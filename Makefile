@@ -4,13 +4,14 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
-.PHONY: demo test check check-static bench clean help
+.PHONY: demo test check check-static bench mutate clean help
 
 help:
 	@echo "make demo    bring up a small robot from its manifest, verified, then shut it down"
 	@echo "make test    set up and run the tests that need no privilege"
 	@echo "make check   everything CI runs: lint, types, import contracts, all tests"
 	@echo "make bench   run the benchmarks and print their ratios"
+	@echo "make mutate  change what judges, one small change at a time, and list what no test notices"
 
 $(STAMP): pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit("lifecycle needs CPython 3.10 to 3.13, this is " + sys.version.split()[0]) if not (3, 10) <= sys.version_info[:2] <= (3, 13) else None'
@@ -37,5 +38,12 @@ check: check-static test
 bench: $(STAMP)
 	@for each in benchmarks/*.py; do echo "== $$each"; $(BIN)/python $$each || exit 1; done
 
+# Half an hour and more. MUTANTS='lifecycle.verify.rules.qos*' tries some only; `make clean` forgets results.
+MUTANTS ?=
+mutate: $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[mutate]'
+	CI=1 $(BIN)/mutmut run $(MUTANTS) > mutants.log 2>&1 || { tail -n 40 mutants.log; exit 1; }
+	$(BIN)/python -m tests.mutation.report --at-least 95
+
 clean:
-	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf mutants mutants.log $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -18,13 +18,27 @@ def to_json(value: object) -> bytes:
     return msgspec.json.encode(value)
 
 
-def from_json(data: bytes | str, type_: type[T]) -> T:
-    """Decode and validate JSON as `type_`.
+def from_json(data: bytes | str, type_: type[T], *, longest: int | None = None) -> T:
+    """Decode and validate JSON as `type_`; nothing that it may hold raises anything else.
+
+    How deep it may nest is bounded by `type_`, and where a field is passed over by Python's
+    recursion limit.
+
+    Args:
+        data: from anywhere.
+        type_: what it must be.
+        longest: bytes, or characters of a text, that are read at all; None for what we wrote.
 
     Raises:
-        ValueError: the JSON is malformed or does not fit (msgspec.ValidationError).
+        ValueError: the JSON is too long or too deep, malformed, or does not fit
+            (msgspec.ValidationError).
     """
-    return msgspec.json.decode(data, type=type_)
+    if longest is not None and len(data) > longest:
+        raise ValueError(f"{len(data)} characters of JSON; at most {longest} are read")
+    try:
+        return msgspec.json.decode(data, type=type_)
+    except (RecursionError, OverflowError, MemoryError) as error:
+        raise ValueError("JSON that is nested too deep, or a number too large") from error
 
 
 def to_plain(value: object) -> object:

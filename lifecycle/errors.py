@@ -10,7 +10,10 @@ import enum
 
 
 class ExitCode(enum.IntEnum):
-    """Exit codes of every `lifecycle` verb."""
+    """Exit codes of every `lifecycle` verb.
+
+    Those of signals are 128 + the signal's number, as shells have it.
+    """
 
     OK = 0
     USAGE = 2
@@ -20,7 +23,9 @@ class ExitCode(enum.IntEnum):
     BRING_UP_FAILED = 6
     SUPERVISION_GAVE_UP = 7
     INTERNAL = 70
+    HUNG_UP = 129
     INTERRUPTED = 130
+    TERMINATED = 143
 
 
 class LifecycleError(Exception):

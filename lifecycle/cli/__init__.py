@@ -8,6 +8,7 @@ code (None means 0).
 from __future__ import annotations
 
 import importlib
+import os
 import sys
 import traceback
 
@@ -15,6 +16,7 @@ import click
 
 from lifecycle.cli.own_stdout import keep_stdout
 from lifecycle.errors import ExitCode, LifecycleError
+from lifecycle.printable import lines
 
 VERBS: dict[str, str] = {
     "check": "check a manifest without running anything; needs no ROS",
@@ -34,8 +36,22 @@ VERBS: dict[str, str] = {
 }
 
 
+_PARTICIPANTS = frozenset({"up", "verify", "flows", "graph", "capture", "run"})
+"""Verbs that make participants, here or in processes that they start."""
+
+
 class _Verbs(click.Group):
     """Loads a verb's module on first use."""
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Look first whether a verb that needs the RMW can have it."""
+        if args and args[0] in _PARTICIPANTS and not {"-h", "--help"} & {*args}:
+            from lifecycle.middleware.rmw_choice import check_rmw
+
+            check_rmw(os.environ)
+        return super().resolve_command(ctx, args)
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 - click's signature
         """Verbs in the order of the pipeline."""
@@ -89,7 +105,7 @@ def main(arguments: list[str] | None = None) -> int:
     except (click.Abort, KeyboardInterrupt):
         return ExitCode.INTERRUPTED
     except LifecycleError as error:
-        click.echo(str(error), err=True)
+        click.echo(lines(str(error)), err=True)
         return error.exit_code
     except BrokenPipeError:
         sys.stderr.close()

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
 from lifecycle.errors import UsageError
+from lifecycle.printable import lines
 
 if TYPE_CHECKING:
-    from lifecycle.manifest import Loaded
+    from lifecycle.manifest import Loaded, Manifest
+    from lifecycle.plan.programs import Resolution
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -57,16 +60,48 @@ def parse_assignments(assignments: tuple[str, ...]) -> dict[str, str]:
     return values
 
 
-def load_manifest(path: str, assignments: tuple[str, ...], *, quiet: bool = False) -> Loaded:
+def load_manifest(
+    path: str, assignments: tuple[str, ...], *, quiet: bool = False, machine: str | None = None
+) -> Loaded:
     """Load and check a manifest; print warnings to stderr unless `quiet`.
+
+    Args:
+        path: the file.
+        assignments: `name:=value` words.
+        quiet: print nothing.
+        machine: what its nodes run is looked for, too, as `up --machine` would start it; None looks
+            for nothing.
 
     Raises:
         ManifestError: with every diagnostic.
     """
-    from lifecycle.manifest import load
+    from lifecycle.manifest import ManifestError, Severity, load
 
     loaded = load(path, parse_assignments(assignments))
+    warnings = loaded.warnings
+    if machine is not None:
+        found = resolve(loaded.manifest, machine).diagnostics
+        if any(each.severity is Severity.ERROR for each in found):
+            raise ManifestError((*warnings, *found))
+        warnings = (*warnings, *found)
     if not quiet:
-        for warning in loaded.warnings:
-            click.echo(str(warning), err=True)
+        for warning in warnings:
+            click.echo(lines(str(warning)), err=True)
     return loaded
+
+
+def resolve(manifest: Manifest, machine: str = "") -> Resolution:
+    """Look for what the nodes of a manifest run, without running it.
+
+    Args:
+        manifest: valid.
+        machine: the machine that this host is; empty for all whose address is this host's.
+
+    Raises:
+        UsageError: the manifest declares no such machine.
+    """
+    from lifecycle.plan.programs import resolve_programs
+    from lifecycle.supervisor.options import own_machines
+
+    own = own_machines(manifest, machine)
+    return resolve_programs(manifest, environment=os.environ, is_ours=own.__contains__)

@@ -9,6 +9,7 @@ from lifecycle.export.flows_csv import flows_to_csv
 from lifecycle.manifest.model import UniqueHow
 from lifecycle.network.dscp import describe
 from lifecycle.network.nfe import NetworkFlowEndpoint
+from lifecycle.printable import json_text, lines, one_line
 from lifecycle.verify import FlowReport
 
 _HEADS = (
@@ -37,12 +38,12 @@ def render_flows(flows: Sequence[FlowReport], format_: str) -> str:
     its `tuples`. `transport` is what carries it, not what could.
     """
     if format_ == "json":
-        return to_json(tuple(flows)).decode()
+        return json_text(to_json(tuple(flows)).decode())
     if format_ == "csv":
-        return flows_to_csv(flows).rstrip("\n")
+        return lines(flows_to_csv(flows).replace("\r\n", "\n").rstrip("\n"))
     if not flows:
         return "no flow"
-    rows = [_HEADS, *(row for flow in flows for row in _rows(flow))]
+    rows = [_HEADS, *(tuple(map(one_line, row)) for flow in flows for row in _rows(flow))]
     widths = [max(len(row[index]) for row in rows) for index in range(len(_HEADS))]
     return "\n".join(
         "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
@@ -53,7 +54,7 @@ def render_flows(flows: Sequence[FlowReport], format_: str) -> str:
 def _rows(flow: FlowReport) -> Iterator[tuple[str, ...]]:
     pair = (flow.topic, flow.publisher, flow.subscription)
     demands_and_verdict = (
-        "–" if flow.dscp is None else describe(flow.dscp),
+        _dscps(flow),
         _five_qi(flow),
         "unknown" if flow.unique is None else _UNIQUE[flow.unique],
         " / ".join(each.value for each in flow.requirement),
@@ -72,6 +73,12 @@ def _tuples(flow: FlowReport) -> Sequence[tuple[str, ...]]:
         for each in flow.tuples
     ]
     return found or [(_ends(flow.source), _ends(flow.destination), "–", "–")]
+
+
+def _dscps(flow: FlowReport) -> str:
+    """What the data carry, and where that is known what the subscription acknowledges with."""
+    data = "–" if flow.dscp is None else describe(flow.dscp)
+    return data if flow.reader_dscp is None else f"{data}; back {describe(flow.reader_dscp)}"
 
 
 def _five_qi(flow: FlowReport) -> str:

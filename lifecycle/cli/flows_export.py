@@ -12,6 +12,7 @@ import click
 
 from lifecycle.cli.flows_program import chosen, treatment_of
 from lifecycle.errors import UsageError
+from lifecycle.printable import lines
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -74,7 +75,7 @@ class Export:
         click.echo(text, nl=not text.endswith("\n"))
         if self._name != "csv":
             for each in given.rules.left_out:
-                click.echo(f"left out: {each}", err=True)
+                click.echo(lines(f"left out: {each}"), err=True)
 
 
 def _settings(options: Sequence[TargetOptions]) -> ExportSettings:

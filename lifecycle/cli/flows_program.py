@@ -6,6 +6,7 @@ Owns: their options and what they print. `with_subcommands` puts them behind `li
 from __future__ import annotations
 
 import os
+import shlex
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -14,6 +15,7 @@ import click
 
 from lifecycle.cli.common import load_manifest, manifest_arguments, timeout_option
 from lifecycle.errors import ExitCode, UsageError
+from lifecycle.printable import lines
 
 if TYPE_CHECKING:
     from lifecycle.plan.model import Plan
@@ -101,6 +103,12 @@ def network_options(function: F) -> F:
                 help="tc: rate of a class, ef=2mbit; above its burst peak.",
             ),
             click.option(
+                "--queue",
+                metavar="TIME",
+                default="",
+                help="tc: how long the queue of a class may become at that rate; else 50ms.",
+            ),
+            click.option(
                 "--match",
                 type=click.Choice(("flow", "mark")),
                 default="flow",
@@ -127,6 +135,7 @@ def chosen(
     guarantees: Iterable[str],
     match: str,
     config: str,
+    queue: str = "",
     option: str = "--target",
 ) -> tuple[TargetOptions, ...]:
     """Return the options of `target_options` as the supervisor takes them.
@@ -138,21 +147,25 @@ def chosen(
         guarantees: see `network_options`.
         match: see `network_options`.
         config: see `network_options`.
+        queue: see `network_options`.
         option: what chose the targets, for messages.
 
     Raises:
         UsageError: they do not fit together.
     """
     from lifecycle.export.tc_settings import TcMatch
-    from lifecycle.supervisor.programming import TargetOptions, parse_rate
+    from lifecycle.supervisor.programming import TargetOptions, parse_queue, parse_rate
 
     kinds = tuple(dict.fromkeys(targets))
     if "tc" not in kinds and (device or rate or any(guarantees)):
         raise UsageError(f"cannot use --device, --rate or --guarantee without {option} tc")
+    if queue and not rate:
+        raise UsageError("cannot use --queue without --rate: how long it is follows from both")
     if config and not {"nef", "camara"} & set(kinds):
         raise UsageError(f"cannot use --config without {option} nef or camara")
     try:
         link_kbit = parse_rate(rate) if rate else None
+        queue_ms = parse_queue(queue) if queue else None
         guaranteed_kbit = {name: parse_rate(text) for name, text in map(_guarantee, guarantees)}
     except ValueError as error:
         raise UsageError(str(error)) from error
@@ -163,6 +176,7 @@ def chosen(
             link_kbit=link_kbit,
             guaranteed_kbit=guaranteed_kbit,
             match=TcMatch(match),
+            queue_ms=queue_ms if kind == "tc" else None,
             settings=config if kind in ("nef", "camara") else "",
         )
         for kind in kinds
@@ -214,12 +228,19 @@ def apply(
 
     What is made stays until `remove`, or until the system is brought down.
     """
+    from lifecycle.supervisor.programming import PartlyError
+
     programmer = _open(plan, options, treatment)
     try:
         if dry_run:
             click.echo(programmer.dry_run(flows), nl=False)
         else:
-            _show(programmer.update(flows), done=True)
+            try:
+                _show(programmer.update(flows), done=True)
+            except PartlyError as error:
+                if error.done:
+                    error.hint = f"take back what was done: lifecycle flows remove {_spell(plan)}"
+                raise
         _show_left_out(programmer)
     finally:
         programmer.release()
@@ -339,7 +360,7 @@ def _judged(manifest: str, assignments: tuple[str, ...], timeout_s: float) -> tu
 
     seen = judge_running(_plan(manifest, assignments), timeout_s=timeout_s, strict=False)
     if seen.where:
-        click.echo(seen.where, err=True)
+        click.echo(lines(seen.where), err=True)
     return seen.plan, seen.verdict
 
 
@@ -347,6 +368,10 @@ def _exit_code(verdict: Verdict) -> int:
     from lifecycle.cli.verb_verify import exit_code
 
     return exit_code(verdict, strict=False)
+
+
+def _spell(plan: Plan) -> str:
+    return shlex.quote(plan.manifest_path)
 
 
 def _open(
@@ -365,4 +390,4 @@ def _show(changes: Iterable[Changes], *, done: bool) -> None:
 def _show_left_out(programmer: Programmer) -> None:
     """On stderr, beside a ruleset or bodies that go to a file."""
     for each in programmer.left_out:
-        click.echo(f"left out: {each}", err=True)
+        click.echo(lines(f"left out: {each}"), err=True)

@@ -15,7 +15,8 @@ from rich.live import Live as RichLive
 from rich.table import Table
 from rich.text import Text
 
-from lifecycle.cli.up_output import describe, verdict_line
+from lifecycle.cli.up_output import Rollback, describe, verdict_line
+from lifecycle.printable import log_line, one_line
 from lifecycle.supervisor.events import (
     Event,
     Failure,
@@ -51,6 +52,7 @@ class Live:
         self._verdict = ""
         self._drawn_s = 0.0
         self._processes: list[str] = []
+        self._rollback = Rollback()
 
     def __enter__(self) -> Live:  # noqa: PYI034 - typing.Self is not in Python 3.10
         self._live.start()
@@ -66,10 +68,12 @@ class Live:
 
     def __call__(self, event: Event) -> None:
         """Show one event."""
+        hidden = self._rollback.hides(event)
         if isinstance(event, VerdictChanged):
             self._verdict = verdict_line(event.verdict)
         elif isinstance(event, LogLine):
-            self._console.print(self._log_line(event))
+            if not hidden:
+                self._console.print(self._log_line(event))
         elif not isinstance(event, NodeChanged | ProcessChanged) and (line := describe(event)):
             style = "red" if isinstance(event, Failure) else "dim"
             self._console.print(Text(line, style=style))
@@ -83,8 +87,8 @@ class Live:
         """Show the verdict below the last table."""
         self._draw()
         self._live.stop()
-        whole = result.verdict.verdict is not Outcome.OK
-        text = render_text(result.verdict, flows=not whole, width=self._console.width)
+        flows = result.verdict.verdict is not Outcome.VIOLATED
+        text = render_text(result.verdict, flows=flows, width=self._console.width)
         style = _OUTCOMES[result.verdict.verdict]
         head, _, rest = text.partition("\n")
         self._console.print(Text(head, style=f"bold {style}"))
@@ -108,13 +112,13 @@ class Live:
         if event.process not in self._processes:
             self._processes.append(event.process)
         index = self._processes.index(event.process) % len(_PROCESS_COLOURS)
-        return Text.assemble((f"[{event.process}] ", _PROCESS_COLOURS[index]), event.line)
+        return Text.assemble((f"[{event.process}] ", _PROCESS_COLOURS[index]), log_line(event.line))
 
 
 def _head(status: SystemStatus) -> Text:
     """The pipeline, with the phase that the system is in."""
     head = Text.assemble(
-        (status.system, "bold"),
+        (one_line(status.system), "bold"),
         (f"  domain {status.domain_id}  {status.elapsed_s:.1f} s   ", "dim"),
     )
     reached = status.phase in _PHASES
@@ -125,7 +129,7 @@ def _head(status: SystemStatus) -> Text:
         head.append(" ▸ " if index else "", "dim")
         head.append(phase, "green" if done else style)
     if not reached:
-        head.append(f"   {status.phase}", "bold yellow")
+        head.append(f"   {one_line(status.phase)}", "bold yellow")
     return head
 
 
@@ -137,12 +141,16 @@ def _row(node: NodeStatus) -> tuple[RenderableType, ...]:
         process = Text(f"{word} {node.pid or ''}".strip(), style=_PROCESS.get(word, ""))
     nested = " · connected" if node.state == "inactive" and node.matched else ""
     state = node.state if node.managed else node.reach.value
+    state = "dead" if node.died else state
     complete = "green" if node.matched >= node.endpoints else "yellow"
     return (
-        Text(node.node, style="red" if node.findings else "bold"),
+        Text(one_line(node.node), style="red" if node.findings else "bold"),
         process,
-        Text(f"{state or '–'}{nested}", style=_STATES.get(node.state, "yellow")),
+        Text(
+            f"{one_line(state) or '–'}{nested}",
+            style="red" if node.died else _STATES.get(node.state, "yellow"),
+        ),
         Text(f"{node.matched}/{node.endpoints}", style=complete if node.endpoints else "dim"),
         Text(f"{node.unique_flows}/{node.flows}" if node.flows else "–", style="dim"),
-        Text(node.doing, style="yellow"),
+        Text(one_line(node.died or node.doing), style="red" if node.died else "yellow"),
     )

@@ -1,34 +1,260 @@
-"""Writing a verdict to a file in the format that its suffix says. Owns: `write_report`."""
+"""`--report FILE`: a verdict in the format that the suffix says, whatever the command's end.
+
+Owns: which suffix means which format, and `Report`: the file is emptied before anything is started,
+so that nothing old is taken for new, and written on every exit code. Imports next to nothing: it is
+opened before the rest of a command is imported.
+"""
 
 from __future__ import annotations
 
+import dataclasses
+import os
+import stat
+from collections.abc import Callable
 from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from lifecycle.errors import UsageError
-from lifecycle.plan import Plan
-from lifecycle.verify import Verdict, render_text, to_json, to_junit, to_sarif
+import click
+
+from lifecycle.errors import ExitCode, LifecycleError, UsageError
+
+if TYPE_CHECKING:
+    from lifecycle.plan import Plan
+    from lifecycle.verify import Verdict
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+SUFFIXES = {
+    ".json": "json",
+    ".xml": "junit",
+    ".sarif": "sarif",
+    ".sarif.json": "sarif",
+    ".txt": "text",
+}
+"""End of a file's name → format; SARIF 2.1.0 §3.2 recommends both of its own."""
 
 
-def format_verdict(verdict: Verdict, plan: Plan, format_: str, *, colour: bool = False) -> str:
-    """Return `verdict` as "text", "json", "junit" or "sarif"."""
+def report_format(path: Path) -> str:
+    """Return the format that a file's suffix says: "json", "junit", "sarif" or "text".
+
+    Raises:
+        UsageError: the suffix says none.
+    """
+    name = path.name.lower()
+    for suffix in sorted(SUFFIXES, key=len, reverse=True):
+        if name.endswith(suffix) and name != suffix:
+            return SUFFIXES[suffix]
+    raise UsageError(
+        f"cannot tell the format of report {str(path)!r} by its suffix {path.suffix!r}; "
+        "allowed: .json, .xml (JUnit), .sarif, .txt"
+    )
+
+
+def open_report(path: Path) -> None:
+    """Make sure that a report can be written, and that nothing old is in it.
+
+    Raises:
+        UsageError: its suffix says no format, or it cannot be written.
+    """
+    report_format(path)
+    try:
+        if _is_file(path):
+            path.write_bytes(b"")
+        elif not os.access(path, os.W_OK):
+            raise PermissionError(13, "Permission denied")
+    except OSError as error:
+        raise _unwritable(path, error) from error
+
+
+def write_report(path: Path, text: str) -> None:
+    """Replace what is in a report.
+
+    Raises:
+        UsageError: it cannot be written any more.
+    """
+    try:
+        path.write_text(text.rstrip("\n") + "\n", encoding="utf-8")
+    except OSError as error:
+        raise _unwritable(path, error) from error
+
+
+def report_option(function: F) -> F:
+    """Add `--report FILE`; it is opened while the command line is read."""
+
+    def opened(ctx: click.Context, _: click.Parameter, path: Path | None) -> Path | None:
+        if path is not None and not ctx.resilient_parsing:
+            open_report(path)
+        return path
+
+    return click.option(
+        "--report",
+        type=click.Path(path_type=Path),
+        metavar="FILE",
+        callback=opened,
+        is_eager=True,
+        help="Write the result to FILE, too, on every exit code: by suffix JSON (.json), JUnit "
+        "(.xml), SARIF (.sarif) or text (.txt).",
+    )(function)
+
+
+def format_verdict(
+    verdict: Verdict,
+    plan: Plan | None,
+    format_: str,
+    *,
+    colour: bool = False,
+    strict: bool = False,
+) -> str:
+    """Return `verdict` as "text", "json", "junit" or "sarif".
+
+    Args:
+        verdict: what to write.
+        plan: None where there is none, because the manifest cannot be used.
+        format_: see above.
+        colour: mark outcomes of text with ANSI colours.
+        strict: what cannot be verified counts as refused.
+    """
+    from lifecycle.verify import render_text, to_json, to_junit, to_sarif
+
     if format_ == "json":
         return to_json(verdict)
     if format_ == "junit":
-        return to_junit(verdict, plan)
+        return to_junit(verdict, plan, strict=strict)
     if format_ == "sarif":
         return to_sarif(verdict)
     return render_text(verdict, colour=colour)
 
 
-def write_report(path: Path, verdict: Verdict, plan: Plan) -> None:
-    """Write `verdict` to `path`: JUnit for .xml, SARIF for .sarif, text for .txt, else JSON.
+class Report:
+    """The report of one command; use it in a `with` around all that may fail.
+
+    Whatever leaves the block, the file says how the command ended: the verdict given to `end`, or
+    the exception. Until then it says that there was no end, for whoever finds it after a SIGKILL.
+
+    Args:
+        path: opened by `report_option`; None writes nothing.
+        strict: what cannot be verified counts as refused.
+    """
+
+    def __init__(self, path: Path | None, *, strict: bool = False) -> None:
+        self._path = path
+        self._strict = strict
+        self._waits = path is not None and not _is_file(path)
+        self._plan: Plan | None = None
+        self._ended = False
+
+    def __enter__(self) -> Report:  # noqa: PYI034 - typing.Self is not in Python 3.10
+        return self
+
+    def begin(self, plan: Plan) -> None:
+        """Take the plan that the verdict will be of."""
+        self._plan = plan
+        if not self._waits:
+            reason = "it never came to its end: the process was killed"
+            self._write(_unjudged(reason, ExitCode.INTERNAL))
+
+    def end(self, verdict: Verdict) -> None:
+        """Write how it ended."""
+        self._ended = True
+        self._write(verdict)
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if error is None or self._ended or self._path is None:
+            return
+        try:
+            self._write(_verdict_of(error))
+        except UsageError as unwritable:
+            # What went wrong first decides the exit code.
+            click.echo(str(unwritable), err=True)
+
+    def _write(self, verdict: Verdict) -> None:
+        """Replace what is in the file; raises UsageError if it cannot be written any more."""
+        if self._path is not None:
+            format_ = report_format(self._path)
+            write_report(
+                self._path, format_verdict(verdict, self._plan, format_, strict=self._strict)
+            )
+
+
+def exit_code_of(error: BaseException) -> ExitCode:
+    """Return the exit code of a command that ended by an exception."""
+    from lifecycle.supervisor.ending import Ended
+
+    if isinstance(error, LifecycleError | Ended):
+        return error.exit_code
+    if isinstance(error, KeyboardInterrupt | click.Abort):
+        return ExitCode.INTERRUPTED
+    return ExitCode.USAGE if isinstance(error, click.ClickException) else ExitCode.INTERNAL
+
+
+def _verdict_of(error: BaseException) -> Verdict:
+    """Return the verdict of a command that ended by an exception before anything was judged."""
+    from lifecycle.manifest import ManifestError, Severity
+    from lifecycle.supervisor.ending import Ended
+    from lifecycle.verify import Finding, Outcome
+
+    code = exit_code_of(error)
+    if isinstance(error, ManifestError):
+        found = [each for each in error.diagnostics if each.severity is Severity.ERROR]
+        return dataclasses.replace(
+            _unjudged(f"the manifest is invalid: {_errors(len(found))}", code),
+            verdict=Outcome.VIOLATED,
+            findings=tuple(
+                Finding(
+                    rule=each.rule,
+                    outcome=Outcome.VIOLATED,
+                    subject=each.at.path or each.at.file,
+                    expected="",
+                    observed="",
+                    message=each.message,
+                    at=f"{each.at.file}:{each.at.line}:{each.at.column}",
+                    hint=each.hint,
+                )
+                for each in found
+            ),
+        )
+    if isinstance(error, Ended):
+        return _unjudged(error.reason, code)
+    if isinstance(error, click.ClickException):
+        return _unjudged(error.format_message(), code)
+    if isinstance(error, LifecycleError):
+        return _unjudged(str(error), code)
+    if code is ExitCode.INTERRUPTED:
+        return _unjudged("interrupted", code)
+    return _unjudged(f"a bug in lifecycle: {type(error).__name__}: {error}", code)
+
+
+def _unjudged(reason: str, code: ExitCode) -> Verdict:
+    from lifecycle.verify import NOT_JUDGED, RunEnd
+
+    run = RunEnd(reason=reason, reached=None, exit_code=code)
+    return dataclasses.replace(NOT_JUDGED, run=run)
+
+
+def _errors(count: int) -> str:
+    return f"{count} error{'' if count == 1 else 's'}"
+
+
+def _is_file(path: Path) -> bool:
+    """Whether it is a file or will be one; a pipe or a terminal is written once, in the end.
 
     Raises:
-        UsageError: the file cannot be written.
+        OSError: it is a directory, or cannot be looked at.
     """
-    formats = {".xml": "junit", ".sarif": "sarif", ".txt": "text"}
-    text = format_verdict(verdict, plan, formats.get(path.suffix, "json"))
     try:
-        path.write_text(text.rstrip("\n") + "\n", encoding="utf-8")
-    except OSError as error:
-        raise UsageError(f"cannot write report {str(path)!r}: {error.strerror}") from error
+        mode = path.stat().st_mode
+    except FileNotFoundError:
+        return True
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(21, "it is a directory")
+    return stat.S_ISREG(mode)
+
+
+def _unwritable(path: Path, error: OSError) -> UsageError:
+    return UsageError(f"cannot write report {str(path)!r}: {error.strerror}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from lifecycle.printable import one_line
 from lifecycle.supervisor.status import NodeStatus, SystemStatus
 from lifecycle.verify.observation import ConnectionReport
 
@@ -12,17 +13,21 @@ def status_text(status: SystemStatus) -> str:
     """Return a status as lines: one for the system, one for each node and each connection."""
     verdict = "not judged yet" if status.verdict is None else status.verdict.value
     verdict += f" ({status.not_ok})" if status.not_ok else ""
-    rows = [_HEADS, *(_row(node) for node in status.nodes)]
+    rows = [_HEADS, *(tuple(map(one_line, _row(node))) for node in status.nodes)]
     widths = [max(len(row[index]) for row in rows) for index in range(len(_HEADS))]
+    living = sum(not node.died for node in status.nodes)
+    count = "" if living == len(status.nodes) else f" {living}/{len(status.nodes)}"
     head = (
-        f"{status.system}: {status.phase}, verdict {verdict}, domain {status.domain_id}, "
+        f"{status.system}: {status.phase}{count}, verdict {verdict}, domain {status.domain_id}, "
         f"supervisor {status.supervisor}, up for {status.elapsed_s:.1f} s"
     )
-    lines = [head]
+    lines = [one_line(head)]
     for row, node in zip(rows, (None, *status.nodes), strict=True):
         cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
         lines.append("  ".join(cells).rstrip())
-        lines += [f"  {connection_text(each)}" for each in (node.connections if node else ())]
+        lines += [
+            one_line(f"  {connection_text(each)}") for each in (node.connections if node else ())
+        ]
     return "\n".join(lines)
 
 
@@ -40,8 +45,8 @@ def _row(node: NodeStatus) -> tuple[str, ...]:
         node.node,
         process,
         str(node.pid or "–"),
-        (node.state if node.managed else node.reach.value) or "–",
+        "dead" if node.died else (node.state if node.managed else node.reach.value) or "–",
         f"{node.matched}/{node.endpoints}",
         f"{node.unique_flows}/{node.flows}",
-        f"silent: {node.silent}" if node.silent else node.doing,
+        node.died or (f"silent: {node.silent}" if node.silent else node.doing),
     )

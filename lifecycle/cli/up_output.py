@@ -9,11 +9,14 @@ from __future__ import annotations
 import contextlib
 import functools
 import json
+import os
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from typing import Protocol, TextIO
 
 from lifecycle.node.control import Operation
+from lifecycle.printable import json_text, log_line, one_line
 from lifecycle.supervisor.events import (
     Event,
     Failure,
@@ -36,6 +39,7 @@ from lifecycle.supervisor.events import (
     to_record,
 )
 from lifecycle.supervisor.options import UpResult
+from lifecycle.supervisor.states import ProcessState
 from lifecycle.supervisor.status import SystemStatus
 from lifecycle.verify import Outcome, Stage, Verdict, missing, not_ok, render_text, to_json
 
@@ -67,37 +71,82 @@ def output(format_: str) -> Iterator[Output]:
         yield PlainLines(sys.stdout)
 
 
+class _Lines:
+    """Writes lines at once.
+
+    A reader that goes away, as `head` does, ends the run like a terminal that is closed: nobody
+    could see any more what happens. What it comes to is then in the exit code and the report.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def __call__(self, text: str) -> None:
+        try:
+            self._stream.write(text)
+            self._stream.flush()
+        except BrokenPipeError:
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, self._stream.fileno())
+            os.close(nowhere)
+            signal.raise_signal(signal.SIGHUP)
+
+
 class JsonLines:
     """One JSON object per line; `event` names its kind, and the last one is the verdict."""
 
     def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
+        self._lines = _Lines(stream)
 
     def watch(self, status: Callable[[], SystemStatus]) -> None:
         """Need nothing more than the events."""
 
     def __call__(self, event: Event) -> None:
         """Write one event."""
-        self._write(json.dumps(to_record(event), ensure_ascii=False, separators=(",", ":")))
+        record = json.dumps(to_record(event), ensure_ascii=False, separators=(",", ":"))
+        self._write(json_text(record))
 
     def finish(self, result: UpResult) -> None:
         """Write the verdict."""
         self._write(to_json(result.verdict))
 
     def _write(self, line: str) -> None:
-        self._stream.write(line + "\n")
-        self._stream.flush()
+        self._lines(line + "\n")
+
+
+class Rollback:
+    """Which lines of processes bury the cause of a failed run, once it is rolled back.
+
+    They are what processes write that are ended because of another's failure: all of it is in their
+    log files.
+    """
+
+    def __init__(self) -> None:
+        self._failed: set[str] = set()
+        self._ended: set[str] = set()
+
+    def hides(self, event: Event) -> bool:
+        """Take the next event; whether a person is spared it."""
+        if isinstance(event, Failure) and event.ends_run:
+            self._failed.add(event.process)
+        elif isinstance(event, ProcessChanged) and event.state is ProcessState.STOPPING:
+            self._ended.add(event.process)
+        elif isinstance(event, LogLine):
+            mine = event.process in self._failed
+            return bool(self._failed) and event.process in self._ended and not mine
+        return False
 
 
 class PlainLines:
     """One line per event, for logs and pipes."""
 
     def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
+        self._lines = _Lines(stream)
         self._reached: dict[str, Reach] = {}
         self._stopping = False
         self._judged: str | None = None
         self._active = False
+        self._rollback = Rollback()
 
     def watch(self, status: Callable[[], SystemStatus]) -> None:
         """Need nothing more than the events."""
@@ -105,7 +154,8 @@ class PlainLines:
     def __call__(self, event: Event) -> None:
         """Write one event, if it has something to tell a person."""
         self._stopping = self._stopping or isinstance(event, Stopping)
-        if isinstance(event, NodeChanged) and self._is_on_the_way(event):
+        hidden = self._rollback.hides(event)
+        if hidden or (isinstance(event, NodeChanged) and self._is_on_the_way(event)):
             return
         if isinstance(event, SystemReached):
             self._active = event.reached == "active"
@@ -113,14 +163,13 @@ class PlainLines:
         if isinstance(event, VerdictChanged):
             if event.stage is Stage.ACTIVE and not self._active and missing(event.verdict):
                 # Not a system that broke: nodes become active one by one, and host by host.
-                line = f"not active yet; {missing(event.verdict)}"
+                line = one_line(f"not active yet; {missing(event.verdict)}")
             # A verdict changes with every count in it; a person is told what reads differently.
             if line == self._judged:
                 return
             self._judged = line
         if line is not None:
-            self._stream.write(line + "\n")
-            self._stream.flush()
+            self._lines(line + "\n")
 
     def _is_on_the_way(self, event: NodeChanged) -> bool:
         """Whether a change is one of the many between two steps, which a log need not hold."""
@@ -131,19 +180,25 @@ class PlainLines:
 
     def finish(self, result: UpResult) -> None:
         """Write the verdict, in full where it is not ok."""
-        whole = result.verdict.verdict is not Outcome.OK
-        self._stream.write(render_text(result.verdict, flows=not whole))
-        self._stream.flush()
+        flows = result.verdict.verdict is not Outcome.VIOLATED
+        self._lines(render_text(result.verdict, flows=flows))
+
+
+def describe(event: Event) -> str | None:
+    """Return the line that tells a person of `event`, printable; None if it has none."""
+    line = _describe(event)
+    if line is None:
+        return None
+    return log_line(line) if isinstance(event, LogLine) else one_line(line)
 
 
 @functools.singledispatch
-def describe(event: Event) -> str | None:
-    """Return the line that tells a person of `event`; None if it has none."""
+def _describe(event: Event) -> str | None:
     del event
     return None
 
 
-@describe.register
+@_describe.register
 def _(event: RunStarted) -> str:
     return (
         f"{event.system}: {_count(len(event.nodes), 'node')} in "
@@ -152,7 +207,7 @@ def _(event: RunStarted) -> str:
     )
 
 
-@describe.register
+@_describe.register
 def _(event: ProcessChanged) -> str:
     pid = f" (pid {event.pid})" if event.pid else ""
     return f"process {event.process}: {event.state.value}{pid}" + (
@@ -160,13 +215,13 @@ def _(event: ProcessChanged) -> str:
     )
 
 
-@describe.register
+@_describe.register
 def _(event: NodeChanged) -> str:
     same = not event.state or event.reach is not Reach.ACTIVE or event.state == "active"
     return f"{event.node}: {event.reach.value}" + ("" if same else f", but {event.state}")
 
 
-@describe.register
+@_describe.register
 def _(event: WiringChanged) -> str:
     again = f" (try {event.attempt})" if event.attempt > 1 else ""
     if event.error:
@@ -179,36 +234,39 @@ def _(event: WiringChanged) -> str:
     return f"{event.node}: disconnected from {event.connection}"
 
 
-@describe.register
+@_describe.register
 def _(event: WiringLost) -> str:
     what = f"{event.endpoint} on " if event.endpoint else ""
     return f"{event.node}: lost {what}{event.connection or 'its own participant'}"
 
 
-@describe.register
+@_describe.register
 def _(event: NodeSilent) -> str:
     return f"{event.node}: silent; {event.message}"
 
 
-@describe.register
+@_describe.register
 def _(event: NodeAlive) -> str:
+    if not event.there:
+        return f"{event.node}: not silent any more after {event.silent_s:.1f} s, but not there yet"
     return f"{event.node}: alive again after {event.silent_s:.1f} s"
 
 
-@describe.register
+@_describe.register
 def _(event: MachineConnection) -> str:
     if not event.established:
-        return f"machine {event.machine}: connection lost"
+        what = "was shut down by its supervisor" if event.left else "connection lost"
+        return f"machine {event.machine}: {what}"
     again = f" again after {event.lost_s:.1f} s" if event.lost_s else ""
     return f"machine {event.machine}: connected{again}"
 
 
-@describe.register
+@_describe.register
 def _(event: LogLine) -> str:
     return f"[{event.process}] {event.line}"
 
 
-@describe.register
+@_describe.register
 def _(event: VerdictChanged) -> str:
     waits = missing(event.verdict)
     if waits and event.stage is Stage.CONNECTED:
@@ -216,44 +274,51 @@ def _(event: VerdictChanged) -> str:
     return f"{event.stage.value}: {verdict_line(event.verdict)}"
 
 
-@describe.register
+@_describe.register
 def _(event: GateOpened) -> str:
-    return f"gate open on verdict {event.outcome}: activating {_count(len(event.nodes), 'node')}"
+    trusted = f"; taken on trust: {event.trusted}" if event.trusted else ""
+    activating = f"activating {_count(len(event.nodes), 'node')}"
+    return f"gate open on verdict {event.outcome}: {activating}{trusted}"
 
 
-@describe.register
+@_describe.register
 def _(event: SystemReached) -> str:
     return f"system {event.reached} after {event.elapsed_s:.2f} s"
 
 
-@describe.register
+@_describe.register
 def _(event: Failure) -> str:
-    tail = "".join(f"\n    | {line}" for line in event.log_tail)
-    return f"{event.rule}: {event.message}{tail}"
+    # What ends the run is the first that the last verdict says; once is enough.
+    named = f"failed: {event.subject} ({event.rule})"
+    return named if event.ends_run else f"{named}: {event.message}"
 
 
-@describe.register
+@_describe.register
 def _(event: Notice) -> str:
     return event.message
 
 
-@describe.register
+@_describe.register
 def _(event: Stopping) -> str:
     return f"stopping: {event.reason}"
 
 
-@describe.register
+@_describe.register
 def _(event: Stopped) -> str:
     return f"stopped after {event.elapsed_s:.2f} s"
 
 
 def verdict_line(verdict: Verdict) -> str:
-    """Return a verdict in one line, with what keeps it from being ok."""
+    """Return a verdict in one printable line, with what keeps it from being ok."""
     text = f"verdict {verdict.verdict.value}"
     why = not_ok(verdict)
     if why:
-        return f"{text}; {why}"
-    return f"{text}, {_count(len(verdict.flows), 'flow')}" if verdict.flows else text
+        return one_line(f"{text}; {why}")
+    if verdict.flows:
+        text += f", {_count(len(verdict.flows), 'flow')}"
+    if verdict.tolerated:
+        text += f"; tolerated: {', '.join(each.describe() for each in verdict.tolerated)}"
+    return one_line(text)
 
 
 def _count(number: int, noun: str) -> str:

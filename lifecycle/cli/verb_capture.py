@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from lifecycle.errors import ExitCode, UsageError
+from lifecycle.printable import one_line
 
 if TYPE_CHECKING:
     from lifecycle.export.captured import CapturedSystem
@@ -102,7 +103,7 @@ def command(
 
 def _say_gaps(captured: CapturedSystem) -> None:
     for gap in captured.gaps:
-        click.echo(f"gap: {gap}", err=True)
+        click.echo(one_line(f"gap: {gap}"), err=True)
 
 
 def _check_name(system: str) -> None:

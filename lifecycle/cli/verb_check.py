@@ -2,68 +2,92 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
+from pathlib import Path
 
 import click
 
-from lifecycle.cli.common import format_option, manifest_arguments, parse_assignments
-from lifecycle.codec import to_json
-from lifecycle.errors import ExitCode
+from lifecycle.cli.check_report import CheckReport, write_check
+from lifecycle.cli.common import format_option, manifest_arguments, parse_assignments, resolve
+from lifecycle.cli.report import report_format, report_option, write_report
+from lifecycle.errors import LifecycleError
 from lifecycle.manifest import Diagnostic, Manifest, ManifestError, Severity, load
+from lifecycle.manifest.diagnostics import Position
 from lifecycle.plan import check_plan, effective_domain
-
-
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class CheckReport:
-    """What `check --format json` prints (schema: schemas/check.v1.schema.json).
-
-    Attributes:
-        ok: the exit code is 0.
-        system: empty where the manifest could not be loaded.
-        nodes: number of nodes; likewise endpoints and links. 0 where it could not be loaded.
-        diagnostics: by position.
-    """
-
-    manifest: str
-    ok: bool
-    system: str
-    nodes: int
-    endpoints: int
-    links: int
-    diagnostics: tuple[Diagnostic, ...]
+from lifecycle.plan.programs import Resolution
 
 
 @click.command()
 @manifest_arguments
-@format_option("text", "json")
-@click.option("--strict", is_flag=True, help="Let warnings fail the check, too.")
-def command(manifest: str, assignments: tuple[str, ...], format_: str, *, strict: bool) -> int:
-    """Check MANIFEST: schema, names, QoS compatibility, order, flows. Runs nothing, needs no ROS.
+@format_option("text", "json", "sarif", "junit")
+@click.option(
+    "--strict", is_flag=True, help="Let warnings and what could not be resolved fail it, too."
+)
+@click.option(
+    "--machine",
+    default="",
+    metavar="NAME",
+    help="The machine that this host is; default: all whose address is this host's.",
+)
+@report_option
+def command(
+    *,
+    manifest: str,
+    assignments: tuple[str, ...],
+    format_: str,
+    strict: bool,
+    machine: str,
+    report: Path | None,
+) -> int:
+    """Check MANIFEST: schema, names, QoS compatibility, order, flows, and what its nodes run.
 
-    Exits with 0 if it can be used, with 3 if not.
+    Programs, packages, Python classes and their handlers are looked for without running them, as
+    `lifecycle up` would find them here. Needs no ROS. Exits with 0 if it can be used, with 3 if
+    not; under --strict with 5 if all that is missing is something that could not be resolved.
     """
-    report = check(manifest, assignments, strict=strict)
-    if format_ == "json":
-        click.echo(to_json(report))
-    else:
-        for each in report.diagnostics:
-            click.echo(str(each))
-        click.echo(summary(report))
-    return ExitCode.OK if report.ok else ExitCode.MANIFEST_INVALID
+    try:
+        found = check(manifest, assignments, strict=strict, machine=machine)
+    except LifecycleError as error:
+        if report is not None:
+            write_report(
+                report, write_check(_refused(manifest, error), report_format(report), strict=strict)
+            )
+        raise
+    if report is not None:
+        write_report(report, write_check(found, report_format(report), strict=strict))
+    click.echo(write_check(found, format_, strict=strict))
+    return found.exit_code(strict=strict)
 
 
-def check(path: str, assignments: tuple[str, ...], *, strict: bool) -> CheckReport:
-    """Load and plan a manifest and report on it instead of raising.
+def _refused(path: str, error: LifecycleError) -> CheckReport:
+    """Return what is reported of a manifest that was not looked at, and why it was not."""
+    at = Position(file=path, line=1, column=1)
+    why = Diagnostic(rule="check.usage", severity=Severity.ERROR, at=at, message=str(error))
+    return CheckReport(
+        manifest=path, ok=False, system="", nodes=0, endpoints=0, links=0, diagnostics=(why,)
+    )
+
+
+def check(
+    path: str, assignments: tuple[str, ...], *, strict: bool, machine: str = ""
+) -> CheckReport:
+    """Load and plan a manifest, look for what it runs, and report on it instead of raising.
 
     Raises:
-        UsageError: an argument is malformed, or ROS_DOMAIN_ID is needed and no domain.
+        UsageError: an argument is malformed, ROS_DOMAIN_ID is needed and no domain, or the
+            manifest declares no such machine.
     """
     loaded: Manifest | None = None
+    resolution = Resolution()
     try:
         result = load(path, parse_assignments(assignments))
         effective_domain(result.manifest.discovery, os.environ)
-        diagnostics = (*result.warnings, *check_plan(result.manifest))
+        resolution = resolve(result.manifest, machine)
+        diagnostics = (
+            *result.warnings,
+            *check_plan(result.manifest),
+            *resolution.diagnostics,
+        )
         if all(each.severity is Severity.WARNING for each in diagnostics):
             loaded = result.manifest
     except ManifestError as error:
@@ -71,33 +95,11 @@ def check(path: str, assignments: tuple[str, ...], *, strict: bool) -> CheckRepo
     nodes = loaded.nodes if loaded else ()
     return CheckReport(
         manifest=path,
-        ok=loaded is not None and not (strict and diagnostics),
+        ok=loaded is not None and not (strict and (diagnostics or resolution.unresolved)),
         system=loaded.system if loaded else "",
         nodes=len(nodes),
         endpoints=sum(len(node.interface.endpoints) for node in nodes),
         links=len(loaded.links) if loaded else 0,
         diagnostics=diagnostics,
+        unresolved=resolution.unresolved,
     )
-
-
-def summary(report: CheckReport) -> str:
-    """Return one line, `teleop: 6 nodes, 14 endpoints, 3 links: ok`."""
-    severities = [each.severity for each in report.diagnostics]
-    errors, warnings = severities.count(Severity.ERROR), severities.count(Severity.WARNING)
-    found = [_count(errors, "error")] * bool(errors) + [_count(warnings, "warning")] * bool(
-        warnings
-    )
-    outcome = "ok" if report.ok else "not ok"
-    verdict = f"{outcome} ({', '.join(found)})" if found else outcome
-    if not report.system:
-        return f"{report.manifest}: {verdict}"
-    counts = (
-        _count(report.nodes, "node"),
-        _count(report.endpoints, "endpoint"),
-        _count(report.links, "link"),
-    )
-    return f"{report.system}: {', '.join(counts)}: {verdict}"
-
-
-def _count(number: int, word: str) -> str:
-    return f"{number} {word}{'' if number == 1 else 's'}"

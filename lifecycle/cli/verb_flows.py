@@ -13,6 +13,7 @@ from lifecycle.cli.common import format_option, load_manifest, manifest_argument
 from lifecycle.cli.flows_export import NAMES, Export
 from lifecycle.cli.flows_program import network_options, treatment_options, with_subcommands
 from lifecycle.errors import UsageError
+from lifecycle.printable import lines
 
 
 @click.command("flows")
@@ -67,7 +68,7 @@ def _show(
         follow_running(plan, show)
     seen = judge_running(plan, timeout_s=timeout, strict=False)
     if seen.where:
-        click.echo(seen.where, err=True)
+        click.echo(lines(seen.where), err=True)
     if exporter is not None:
         exporter.write(seen.plan, seen.verdict.flows)
     else:

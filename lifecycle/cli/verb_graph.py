@@ -14,6 +14,7 @@ import click
 from lifecycle.cli.common import format_option, timeout_option
 from lifecycle.cli.target import target_arguments
 from lifecycle.errors import ExitCode, UsageError
+from lifecycle.printable import json_text
 
 if TYPE_CHECKING:
     from lifecycle.export.picture import Picture
@@ -143,7 +144,7 @@ def render(picture: Picture, format_: str) -> str:
     if format_ == "json":
         from lifecycle.codec import to_json
 
-        return to_json(picture).decode()
+        return json_text(to_json(picture).decode())
     from lifecycle.export.picture import WRITERS
 
     return WRITERS[format_](picture)

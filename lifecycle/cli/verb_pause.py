@@ -14,6 +14,7 @@ def command(target: str, assignments: tuple[str, ...], machine: str, timeout: fl
     """Deactivate every managed node of a running system, in reverse order: data stops.
 
     Processes, connections and flows stay as they are. TARGET is a manifest, or the name of a
-    running system as `lifecycle status` shows it. Only an active system can be paused.
+    running system as `lifecycle status` shows it. Only an active system can be paused; a manifest
+    that has changed since it was started is said, and does not keep it from being paused.
     """
     return give_order("pause", target, assignments, machine, timeout)

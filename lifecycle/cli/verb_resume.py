@@ -14,6 +14,7 @@ def command(target: str, assignments: tuple[str, ...], machine: str, timeout: fl
     """Verify a paused system again, and activate it only if the gate opens.
 
     TARGET is a manifest, or the name of a running system as `lifecycle status` shows it. Exits
-    with 4 if the gate stays closed: then the system stays paused, and can be asked again.
+    with 4 if the gate stays closed: then the system stays paused, and can be asked again; with 2 if
+    the manifest is not the one that runs.
     """
     return give_order("resume", target, assignments, machine, timeout)

@@ -13,7 +13,9 @@ import click
 from lifecycle.cli.common import load_manifest
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest.model import DiscoveryRange, RunKind
+from lifecycle.middleware.doors import peers_environment
 from lifecycle.plan import Plan, PlannedNode, build_plan
+from lifecycle.plan.contacts import reached_hosts
 
 _ROS_ARGUMENTS = "--ros-args"
 
@@ -45,6 +47,7 @@ def command(manifest: str, node: str, words: tuple[str, ...], *, auto: bool) -> 
     environment = {"ROS_DOMAIN_ID": str(plan.domain_id)}
     if plan.discovery_range is not DiscoveryRange.SYSTEM_DEFAULT:
         environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] = plan.discovery_range.value.upper()
+    environment.update(peers_environment(reached_hosts(plan, {planned.machine}), os.environ))
     os.environ.update({**environment, **dict(planned.run.environment)})
     if planned.run.kind is RunKind.ATTACH:
         raise UsageError(

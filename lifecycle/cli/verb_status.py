@@ -8,6 +8,7 @@ import click
 
 from lifecycle.cli.common import format_option
 from lifecycle.errors import ExitCode, UsageError
+from lifecycle.printable import json_text
 
 
 @click.command("status")
@@ -40,7 +41,7 @@ def command(target: str | None, assignments: tuple[str, ...], machine: str, form
     except TimeoutError as error:
         raise UsageError(f"cannot ask {path.name!r}: its supervisor does not answer") from error
     if format_ == "json":
-        click.echo(to_json(seen).decode())
+        click.echo(json_text(to_json(seen).decode()))
     else:
         from lifecycle.cli.status_text import status_text
 

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from lifecycle.cli.common import format_option, load_manifest, manifest_arguments, timeout_option
 from lifecycle.cli.flows_program import chosen, program_options, treatment_of, treatment_options
-from lifecycle.errors import UsageError
+from lifecycle.cli.report import Report, report_option
+from lifecycle.errors import ExitCode, UsageError
+from lifecycle.printable import lines
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
+    from lifecycle.cli.up_output import Output
     from lifecycle.supervisor.options import UpResult
     from lifecycle.supervisor.programming import TargetOptions, Treatment
 
@@ -30,14 +34,10 @@ if TYPE_CHECKING:
     "--stop-after",
     type=click.FloatRange(min=0),
     metavar="SECONDS",
-    help="Hold it so long, then shut down; exits 4 if it was found violated meanwhile.",
+    help="Hold it so long, then shut down; no success if it ended before, or was violated.",
 )
 @timeout_option(30.0, "For everything from the first start to the system being active.")
-@click.option(
-    "--report",
-    type=click.Path(dir_okay=False, path_type=Path),
-    help="Write the last verdict: JSON, or by suffix JUnit (.xml) or SARIF (.sarif).",
-)
+@report_option
 @click.option("--strict", is_flag=True, help="What cannot be verified keeps the gate closed.")
 @click.option(
     "--machine",
@@ -71,29 +71,31 @@ def command(
 ) -> int:
     """Bring a system up: start, configure, connect, verify, and only then activate.
 
-    Ctrl-C ends it in reverse order (exit 130), as `lifecycle down` does (exit 0); a second Ctrl-C
-    kills. If a process dies, the others are taken down and the exit code is 6.
+    Ctrl-C ends it in reverse order (exit 130), a second one kills. SIGTERM, SIGHUP and `lifecycle
+    down` do so too: exit 0 if it was verified and as far up as was asked for, else 143, 129 and 6.
+    If a process dies, the others are taken down and the exit code is 6.
 
     --program tells networks which flows were verified before anything is activated, and takes it
     back in the end.
     """
     from lifecycle.supervisor.ending import Ended, Ending
 
-    result: UpResult | None = None
     try:
-        with Ending() as ending:
+        with Ending() as ending, Report(report, strict=strict) as written:
+            from lifecycle.supervisor.networks import token_variables
             from lifecycle.supervisor.run import Forerunner
 
             # Its imports and ours, and reading the manifest, take as long as each other: side by
             # side.
-            forerunner = Forerunner()
+            program = _networks(targets, **rest)
+            forerunner = Forerunner(without=token_variables(program))
             try:
-                from lifecycle.cli.report import write_report
                 from lifecycle.cli.up_output import output
                 from lifecycle.plan import build_plan
                 from lifecycle.supervisor import Until, UpOptions, ended_early, up
 
-                plan = build_plan(load_manifest(manifest, assignments).manifest)
+                plan = build_plan(load_manifest(manifest, assignments, machine=machine).manifest)
+                written.begin(plan)
                 options = UpOptions(
                     until=Until(until),
                     stop_after_s=stop_after,
@@ -101,10 +103,10 @@ def command(
                     strict=strict,
                     machine=machine,
                     keep_going=keep_going,
-                    program=_networks(targets, **rest),
+                    program=program,
                     treatment=_treatment(targets, mapping=mapping, flow_labels=flow_labels),
                 )
-                with output(format_) as listener:
+                with output(format_) as listener, ending.noted():
                     try:
                         result = up(
                             plan,
@@ -116,15 +118,23 @@ def command(
                         )
                     except Ended as ended:
                         result = ended_early(ended.reason, ended.exit_code)
-                    listener.finish(result)
-                if report is not None:
-                    write_report(report, result.verdict, plan)
+                    return _finished(result, listener, written)
             finally:
                 forerunner.close()
     except Ended as ended:
-        if result is None:
-            click.echo(f"ended before anything was started: {ended.reason}", err=True)
+        click.echo(f"ended before anything was started: {ended.reason}", err=True)
         return ended.exit_code
+
+
+def _finished(result: UpResult, listener: Output, written: Report) -> int:
+    """Write and show how a run ended; return its exit code, no success without its report."""
+    try:
+        written.end(result.verdict)
+    except UsageError as error:
+        click.echo(lines(str(error)), err=True)
+        return result.exit_code or ExitCode.USAGE
+    finally:
+        listener.finish(result)
     return result.exit_code
 
 

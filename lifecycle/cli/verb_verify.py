@@ -8,7 +8,9 @@ from pathlib import Path
 import click
 
 from lifecycle.cli.common import format_option, load_manifest, manifest_arguments, timeout_option
+from lifecycle.cli.report import Report, format_verdict, report_option
 from lifecycle.errors import ExitCode
+from lifecycle.printable import lines
 
 
 @click.command("verify")
@@ -16,11 +18,7 @@ from lifecycle.errors import ExitCode
 @format_option("text", "json", "junit", "sarif")
 @timeout_option(5.0, "How long a graph that is not ok may still become so.")
 @click.option("--strict", is_flag=True, help="Exit 5 if anything could not be verified.")
-@click.option(
-    "--report",
-    type=click.Path(dir_okay=False, path_type=Path),
-    help="Write the verdict too: JSON, or by suffix JUnit (.xml) or SARIF (.sarif).",
-)
+@report_option
 def command(  # noqa: PLR0917 - click passes options by name
     manifest: str,
     assignments: tuple[str, ...],
@@ -34,19 +32,27 @@ def command(  # noqa: PLR0917 - click passes options by name
     Exits with 0 if it is what was declared, 4 if it is not, and 5 under --strict, or where the
     manifest says that it blocks, if something could not be verified.
     """
-    from lifecycle.cli.report import format_verdict, write_report
-    from lifecycle.plan import build_plan
-    from lifecycle.supervisor.attach import judge_running
+    from lifecycle.supervisor.ending import Ended, Ending
 
-    plan = build_plan(load_manifest(manifest, assignments).manifest)
-    seen = judge_running(plan, timeout_s=timeout, strict=strict)
-    if seen.where:
-        click.echo(seen.where, err=True)
-    colour = format_ == "text" and sys.stdout.isatty()
-    click.echo(format_verdict(seen.verdict, plan, format_, colour=colour).rstrip("\n"))
-    if report is not None:
-        write_report(report, seen.verdict, plan)
-    return exit_code(seen.verdict, strict=strict)
+    try:
+        with Ending() as ending, Report(report, strict=strict) as written:
+            from lifecycle.plan import build_plan
+            from lifecycle.supervisor.attach import judge_running
+
+            plan = build_plan(load_manifest(manifest, assignments).manifest)
+            written.begin(plan)
+            seen = judge_running(plan, timeout_s=timeout, strict=strict)
+            with ending.noted():
+                written.end(seen.verdict)
+                if seen.where:
+                    click.echo(lines(seen.where), err=True)
+                colour = format_ == "text" and sys.stdout.isatty()
+                text = format_verdict(seen.verdict, plan, format_, colour=colour, strict=strict)
+                click.echo(text.rstrip("\n"))
+                return exit_code(seen.verdict, strict=strict)
+    except Ended as ended:
+        click.echo(f"ended before it was judged: {ended.reason}", err=True)
+        return ended.exit_code
 
 
 def exit_code(verdict: object, *, strict: bool) -> ExitCode:

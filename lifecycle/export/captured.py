@@ -11,6 +11,12 @@ import re
 from collections.abc import Iterable, Mapping
 
 from lifecycle.manifest.model import DiscoveryRange, EndpointKind, ParameterValue
+from lifecycle.manifest.names import (
+    full_name_problem,
+    name_problem,
+    namespace_problem,
+    node_name_problem,
+)
 from lifecycle.manifest.qos import History, QosProfile
 from lifecycle.network.nfe import InternetProtocol, UniqueRequirement
 from lifecycle.verify.noise import is_noise_endpoint, is_noise_node, known_node
@@ -151,7 +157,9 @@ def capture(
     configurations = {each.name: each for each in observation.configurations}
     owners = _owners(configurations)
     nodes = _counted(observation.nodes, owners)
-    chosen = {name: node for name, node in nodes.items() if _is_within(name, namespaces)}
+    within = {name: node for name, node in nodes.items() if _is_within(name, namespaces)}
+    illegal = {name: _node_problem(name) for name in within}
+    chosen = {name: node for name, node in within.items() if not illegal[name]}
     endpoints: dict[str, list[ObservedEndpoint]] = {name: [] for name in chosen}
     unknown: list[ObservedEndpoint] = []
     for endpoint in observation.endpoints:
@@ -167,6 +175,7 @@ def capture(
     machines = _machines(configurations, chosen)
     keys = _keys(chosen)
     gaps = [unsettled] if unsettled else []
+    gaps += [f"node {name} is left out: {why}" for name, why in illegal.items() if why]
     gaps += [
         f"{node.count} nodes are named {name}; they cannot be told apart"
         for name, node in chosen.items()
@@ -220,6 +229,12 @@ def _counted(nodes: Iterable[ObservedNode], owners: Mapping[str, str]) -> dict[s
         count = node.count + (other.count if other else 0)
         found[name] = dataclasses.replace(node, count=count)
     return found
+
+
+def _node_problem(name: str) -> str:
+    """Return why no manifest can declare a node of this name; empty if one can."""
+    namespace, _, base = name.rpartition("/")
+    return node_name_problem(base) or namespace_problem(namespace or "/" * name.startswith("/"))
 
 
 def _is_within(name: str, namespaces: tuple[str, ...]) -> bool:
@@ -293,6 +308,9 @@ def _node(
         if not _TYPE.fullmatch(endpoint.type):
             gaps.append(f"{endpoint.kind.value}: {endpoint.name} has no ROS type: {endpoint.type}")
             continue
+        if problem := full_name_problem(endpoint.name):
+            gaps.append(f"{endpoint.kind.value}: {endpoint.name} is left out: {problem}")
+            continue
         captured = _endpoint(endpoint, reports)
         if (captured.kind, captured.name) in taken:
             repeated.append(captured)
@@ -352,7 +370,8 @@ def _endpoint(endpoint: ObservedEndpoint, reports: Iterable[EndpointReport]) -> 
     return CapturedEndpoint(
         kind=endpoint.kind,
         name=endpoint.name,
-        declared=(report.name if report else "") or endpoint.name,
+        # A node may report what it likes; a manifest is of what can be declared.
+        declared=endpoint.name if report is None or name_problem(report.name) else report.name,
         type=endpoint.type,
         qos=qos,
         unique=report.unique if report else UniqueRequirement.NOT_REQUIRED,

@@ -266,6 +266,6 @@ def _need(endpoint: CapturedEndpoint) -> dict[str, Tree]:
         )
     elif endpoint.unique is not UniqueRequirement.NOT_REQUIRED:
         need["unique"] = endpoint.unique.value
-    if endpoint.dscp is not None and endpoint.kind is EndpointKind.PUBLISHER:
+    if endpoint.dscp is not None:
         need["dscp"] = Noted(value=endpoint.dscp, note=describe(endpoint.dscp))
     return need

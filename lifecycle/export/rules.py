@@ -357,13 +357,19 @@ def _node(plan: Plan, full_name: str) -> PlannedNode | None:
 
 
 def _endpoint(node: PlannedNode | None, kind: EndpointKind, topic: str) -> PlannedEndpoint | None:
-    """The planned endpoint; of several on one topic the one that asks for something."""
+    """The planned endpoint; of several on one topic the one that asks something of its data.
+
+    The DSCP of a subscription is of what it sends back, which no rule is about.
+    """
     found = [
         each
         for each in (() if node is None else node.endpoints)
         if each.kind is kind and each.resolved == topic
     ]
-    asking = [each for each in found if each.dscp is not None or each.five_qi is not None]
+    publishes = kind is EndpointKind.PUBLISHER
+    asking = [
+        each for each in found if (publishes and each.dscp is not None) or each.five_qi is not None
+    ]
     return next(iter((*asking, *found)), None)
 
 

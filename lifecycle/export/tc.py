@@ -1,9 +1,10 @@
 """Flow rules as lines for `tc -batch`: a queue per class on one network device, filters per flow.
 
-Owns: the qdisc `1f10:` at the root of a device, its classes and filters. The handle is the mark of
-ownership: tc has no comments, so only what hangs below this handle is ours. `tc -batch` is neither
-atomic nor dry-runnable, and a second `qdisc add` fails: look whether the handle is there first, and
-then send `render_tc(…, with_qdisc=False)`, whose lines all replace. Pure.
+Owns: the qdisc `1f10:` at the root of a device, its classes, their queues and filters. The handle
+is the mark of ownership: tc has no comments, so only what hangs below this handle is ours.
+`tc -batch` is neither atomic nor dry-runnable, and a second `qdisc add` fails: look whether the
+handle is there first, and then send `render_tc(…, with_qdisc=False)`, whose lines all replace.
+Pure.
 """
 
 from __future__ import annotations
@@ -25,6 +26,9 @@ from lifecycle.export.wording import asks, named
 
 _PRIO_BANDS = 16
 """TCQ_PRIO_BANDS."""
+
+_QUEUE = "2"
+"""First hex digit of the handles of queues; the others are the minor number of their class."""
 
 _QUANTUM_BYTES = 3028
 """Two full Ethernet frames; HTB's own guess is too large for fast links and it says so."""
@@ -124,6 +128,10 @@ def _htb(
         yield (
             f"class replace dev {device} parent {major}1 classid {major}{minor:x} "
             f"htb rate {rate}kbit ceil {link_kbit}kbit prio {prio} quantum {_QUANTUM_BYTES}"
+        )
+        yield (
+            f"qdisc replace dev {device} parent {major}{minor:x} handle {_QUEUE}{minor:03x}: "
+            f"bfifo limit {settings.queue_bytes}"
         )
 
 

@@ -19,10 +19,9 @@ from rclpy.node import Node
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
-from lifecycle.codec import from_json
 from lifecycle.graph.scheduler import Scheduler
 from lifecycle.graph.transport import Remove
-from lifecycle.verify.observation import NodeConfiguration
+from lifecycle.verify.observation import ConfigurationError, NodeConfiguration, decode_configuration
 
 _logger = logging.getLogger(__name__)
 
@@ -151,7 +150,7 @@ def _configuration(node: str, response: Any) -> NodeConfiguration | None:
         _logger.info("%s could not give its configuration: %s", node, response.message)
         return None
     try:
-        return from_json(response.message, NodeConfiguration)
-    except ValueError as error:
+        return decode_configuration(response.message, node)
+    except ConfigurationError as error:
         _logger.warning("cannot read the configuration of %s: %s", node, error)
         return None

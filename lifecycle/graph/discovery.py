@@ -8,12 +8,11 @@ the nodes that do not report; it is taken when the graph changed.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 from collections.abc import Callable, Sequence
 
 from lifecycle_msgs.msg import TransitionEvent
-from rclpy.node import Node, NodeNameNonExistentError
+from rclpy.node import Node
 from rclpy.subscription import Subscription
 
 from lifecycle.graph.asking import Asker
@@ -21,6 +20,7 @@ from lifecycle.graph.events import GraphEvents
 from lifecycle.graph.transport import Remove
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.middleware.census import Census
+from lifecycle.middleware.graph_queries import endpoints_of_node
 from lifecycle.verify.noise import fold_actions, is_noise_node, known_node, without_noise
 from lifecycle.verify.observation import (
     EndpointReport,
@@ -33,6 +33,12 @@ _TOGETHER_S = 0.05
 """Changes of the graph come in bursts; one look is enough for all that come within so long."""
 
 _EVENT_DEPTH = 10
+_KINDS = (
+    EndpointKind.PUBLISHER,
+    EndpointKind.SUBSCRIPTION,
+    EndpointKind.SERVICE_SERVER,
+    EndpointKind.SERVICE_CLIENT,
+)
 _MANAGED = frozenset({"change_state", "get_state"})
 
 
@@ -166,24 +172,12 @@ class Discovery:
             self._node.destroy_subscription(foreign.transitions)
 
     def _endpoints(self, full_name: str) -> list[ObservedEndpoint]:
-        """Return what a node has by name and type; nothing once it has left."""
-        namespace, _, name = full_name.rpartition("/")
-        node = self._node
-        queries = (
-            (EndpointKind.PUBLISHER, node.get_publisher_names_and_types_by_node),
-            (EndpointKind.SUBSCRIPTION, node.get_subscriber_names_and_types_by_node),
-            (EndpointKind.SERVICE_SERVER, node.get_service_names_and_types_by_node),
-            (EndpointKind.SERVICE_CLIENT, node.get_client_names_and_types_by_node),
-        )
-        found: list[ObservedEndpoint] = []
-        with contextlib.suppress(NodeNameNonExistentError):
-            for kind, query in queries:
-                found += (
-                    ObservedEndpoint(kind=kind, node=full_name, name=topic, type=type_)
-                    for topic, types in query(name, namespace or "/")
-                    for type_ in types
-                )
-        return found
+        """Return what a node has by name and type; nothing once it left, or of an illegal name."""
+        return [
+            ObservedEndpoint(kind=kind, node=full_name, name=topic, type=type_)
+            for kind in _KINDS
+            for topic, type_ in endpoints_of_node(self._node, kind, full_name) or ()
+        ]
 
 
 def _counts(name: str) -> bool:

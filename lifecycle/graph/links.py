@@ -118,8 +118,16 @@ def _mismatch(publisher: End, subscription: End) -> str:
 def _matched(
     publisher: EndpointReport, subscription: EndpointReport, publishers: int, subscriptions: int
 ) -> tuple[Outcome, str]:
-    """Conclude from the number of peers that each end has matched."""
+    """Conclude from the peers of each end, or from their number where it cannot tell them apart."""
     counts = (publisher.matched, subscriptions), (subscription.matched, publishers)
+    named = [
+        other.gid in end.peers
+        for end, other in ((publisher, subscription), (subscription, publisher))
+        if end.peers is not None and other.gid and len(end.peers) == end.matched
+    ]
+    if named:
+        matched = all(named)
+        return (Outcome.OK, "") if matched else (Outcome.VIOLATED, "they have not matched")
     if any(matched is not None and matched >= there for matched, there in counts):
         return Outcome.OK, ""
     if 0 in (publisher.matched, subscription.matched):

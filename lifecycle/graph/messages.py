@@ -277,7 +277,7 @@ def decode(data: bytes | str) -> GraphMessage:
                 f" known are version {VERSION} and {', '.join(_TYPES)}"
             )
         return codec.from_json(data, _TYPES[head.kind])
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise GraphMessageError(f"cannot read a graph message: {error}") from error
 
 

@@ -16,8 +16,11 @@ from collections.abc import Callable, Collection, Iterable
 from typing import Protocol
 
 from lifecycle.errors import MiddlewareError
+from lifecycle.graph.parameters import Clients as ParameterClients
+from lifecycle.graph.parameters import ParameterReadings
 from lifecycle.graph.waiting import set_within
 from lifecycle.plan.model import Plan
+from lifecycle.verify.noise import NO_NAMES, DeclaredNames, tolerating_pattern
 from lifecycle.verify.observation import (
     NodeConfiguration,
     Observation,
@@ -34,7 +37,7 @@ class Graph(Protocol):
     """Discovery, see lifecycle.middleware.GraphObserver."""
 
     def snapshot(
-        self, *, keep: Collection[str] = ()
+        self, *, declared: Collection[str] = (), names: DeclaredNames = NO_NAMES
     ) -> tuple[tuple[ObservedNode, ...], tuple[ObservedEndpoint, ...]]:
         """Return the nodes and endpoints that discovery shows now."""
 
@@ -48,7 +51,7 @@ class Graph(Protocol):
         """Leave the graph."""
 
 
-class Clients(Protocol):
+class Clients(ParameterClients, Protocol):
     """Nodes' services, see lifecycle.middleware.NodeClients."""
 
     async def get_state(self, node: str, *, timeout_s: float) -> str:
@@ -99,8 +102,10 @@ class Observer:
         self._seen: frozenset[str] = frozenset()
         self._asked: set[str] = set()
         self._checksums: dict[str, str] = {}
+        self._parameters = ParameterReadings(clients, self._wake)
         self._changed = asyncio.Event()
         self._changed.set()  # nothing was looked at yet
+        self._count = 0
         self._loop: asyncio.AbstractEventLoop | None = None
         self._remove = graph.on_change(self._wake)
 
@@ -116,6 +121,11 @@ class Observer:
         graph = GraphObserver(domain_id)
         return cls(graph, NodeClients(graph), quiet_s=quiet_s, burst_s=burst_s)
 
+    @property
+    def changes(self) -> int:
+        """Changes so far, each counted at once: before its burst has passed (`wait_change`)."""
+        return self._count
+
     async def observe(self, plan: Plan) -> Observation:
         """Return what is there now.
 
@@ -123,21 +133,30 @@ class Observer:
         an observation that misses a participant would prove nothing about undeclared nodes.
 
         Planned nodes whose configuration was not put here are asked for their state and their
-        configuration; what they do not answer within a second stays unknown.
+        configuration; what they do not answer within a second stays unknown. Those that report no
+        parameters, and of which some are planned, are asked for these (graph/parameters.py).
 
         Raises:
             MiddlewareError: the graph can no longer be watched.
         """
         self._bind()
         planned = {node.full_name for node in plan.nodes}
+        names = DeclaredNames.of(plan)
         while True:
             self._changed.clear()
-            nodes, endpoints = self._graph.snapshot(keep=planned)
+            nodes, endpoints = self._graph.snapshot(declared=planned, names=names)
             settling_s = self._graph.settling_s()
             if settling_s <= 0:
                 break
             await set_within(self._changed, settling_s)
         self._forget_the_gone(node.full_name for node in nodes)
+        present = {node.full_name for node in nodes} - set(self._configurations)
+        judged = {
+            node.full_name: frozenset(each.name for each in node.expected_parameters)
+            for node in plan.nodes
+            if node.expected_parameters and node.full_name in present
+        }
+        self._parameters.listen(judged)
         answers = dict(
             await asyncio.gather(
                 *(
@@ -153,13 +172,18 @@ class Observer:
                     *(
                         self._ask_guest(node)
                         for node in nodes
-                        if node.managed and node.full_name not in planned
+                        if node.managed
+                        and node.full_name not in planned
+                        and not tolerating_pattern(node.full_name, plan.policy.tolerated_nodes)
                     )
                 )
             )
         told = {name: configuration for name, (_, configuration) in answers.items()}
         self._checksums = {name: each.checksum for name, each in told.items() if each is not None}
         configurations = {**self._configurations, **told}
+        reporting = {name for name, each in configurations.items() if _reports_parameters(each)}
+        if await self._parameters.follow(sorted(judged.keys() - reporting), reporting=reporting):
+            return await self.observe(plan)  # each node is waited for once
         return Observation(
             nodes=tuple(
                 dataclasses.replace(
@@ -169,6 +193,7 @@ class Observer:
             ),
             endpoints=endpoints,
             configurations=tuple(each for each in configurations.values() if each is not None),
+            parameters=self._parameters.latest,
         )
 
     def hear(self, node: str, checksum: str = "") -> None:
@@ -211,6 +236,7 @@ class Observer:
     def destroy(self) -> None:
         """Leave the graph."""
         self._remove()
+        self._parameters.close()
         self._clients.destroy()
         self._graph.destroy()
 
@@ -259,6 +285,7 @@ class Observer:
         present = frozenset(names)
         for name in self._seen - present:
             self._configurations.pop(name, None)
+            self._parameters.forget(name)
             if name in self._asked:
                 self._asked.discard(name)
                 self._clients.forget(name)
@@ -273,7 +300,15 @@ class Observer:
         # Any thread. Before the first use there is no loop, and nobody who waits.
         if self._loop is not None:
             with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
-                self._loop.call_soon_threadsafe(self._changed.set)
+                self._loop.call_soon_threadsafe(self._note)
+
+    def _note(self) -> None:
+        self._count += 1
+        self._changed.set()
+
+
+def _reports_parameters(configuration: NodeConfiguration | None) -> bool:
+    return configuration is not None and configuration.parameters is not None
 
 
 _Answer = tuple[str | None, NodeConfiguration | None]

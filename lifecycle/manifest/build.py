@@ -18,11 +18,12 @@ from lifecycle.manifest.build_connections import (
     section_positions,
 )
 from lifecycle.manifest.build_network import build_network
-from lifecycle.manifest.build_node import Findings, build_node
+from lifecycle.manifest.build_node import Findings, build_node, quantities
 from lifecycle.manifest.cursor import Cursor
 from lifecycle.manifest.diagnostics import Diagnostic, Position, Severity
 from lifecycle.manifest.document import Place, error
 from lifecycle.manifest.model import (
+    TOLERATED_NODES,
     DataLayer,
     Discovery,
     EndpointPolicy,
@@ -133,6 +134,9 @@ def _policy(root: Cursor) -> Policy:
         return Policy()
     return Policy(
         undeclared_nodes=cursor.choice("undeclared_nodes", EndpointPolicy, EndpointPolicy.DECLARED),
+        tolerated_nodes=tuple(each.value.text for each in cursor.items("tolerated_nodes"))
+        if "tolerated_nodes" in cursor
+        else TOLERATED_NODES,
         unverifiable_blocks=cursor.text("unverifiable") == "block",
         unpublished=_SEVERITIES[cursor.text("unpublished", "error")],
         unheard=_SEVERITIES[cursor.text("unheard", "warning")],
@@ -148,5 +152,6 @@ def _link(cursor: Cursor) -> Link:
         unique=cursor.choice("unique", UniqueHow, UniqueHow.NOT),
         max_delay_ms=None if delay is None else float(delay),
         transport=cursor.choice("transport", FlowTransport, FlowTransport.ANY),
+        quantities=quantities(cursor),
         at=cursor.at,
     )

@@ -21,12 +21,14 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.manifest.nodl import read_interface
 from lifecycle.manifest.qos import (
+    POLICIES,
     PRESETS,
     Durability,
     History,
     Liveliness,
     QosProfile,
     Reliability,
+    not_written,
     problems,
 )
 from lifecycle.manifest.scalars import quote
@@ -90,11 +92,13 @@ def _inline(cursor: Cursor, found: Findings) -> Interface:
 
 def _endpoint(kind: EndpointKind, cursor: Cursor, found: Findings) -> Endpoint:
     preset = _DEFAULT_PRESET.get(kind)
+    qos = cursor.get("qos")
     return Endpoint(
         kind=kind,
         name=cursor.text("name"),
         type=cursor.text("type"),
         qos=None if preset is None else _qos(cursor, PRESETS[preset], found),
+        qos_defaults=() if preset is None else _defaults(qos),
         at=cursor.at,
     )
 
@@ -124,6 +128,15 @@ def _qos(endpoint: Cursor, default: QosProfile, found: Findings) -> QosProfile:
     at = cursor.document.at((*cursor.place, "depth"))
     found.extend(error("manifest.qos", at, f"cannot {each}") for each in problems(profile))
     return profile
+
+
+def _defaults(qos: Cursor | None) -> tuple[str, ...]:
+    """Return the policies that are not written; whoever names a preset writes all of it."""
+    if qos is None:
+        return POLICIES
+    if not isinstance(qos.value.data, Mapping) or "preset" in qos:
+        return ()
+    return not_written([name for name, _ in qos.entries()])
 
 
 def _depth(history: History, depth: int) -> int:

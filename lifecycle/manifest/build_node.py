@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from lifecycle.manifest.build_connections import build_connections, connection_positions
@@ -25,6 +25,7 @@ from lifecycle.manifest.model import (
     FlowTransport,
     Node,
     ParameterValue,
+    Quantity,
     Run,
     RunKind,
     Timeouts,
@@ -33,8 +34,9 @@ from lifecycle.manifest.scalars import YAML_1_1_BOOLEANS, has_leading_zero
 from lifecycle.network.dscp import parse_dscp
 from lifecycle.network.nfe import UniqueRequirement
 
-__all__ = ["Findings", "build_node"]
+__all__ = ["Findings", "build_node", "quantities"]
 
+_PROGRAMS = ("python", "command", "package", "executable")
 _POSITIONED = ("machine", "namespace", "name", "process", "run", "interface", "log_level")
 
 
@@ -88,6 +90,7 @@ def build_node(
             *connection_positions(cursor),
             *((f"parameters.{name}", at) for name, (_, at) in parameters.items()),
         ),
+        written_paths=tuple(_written_paths(cursor)),
         at=cursor.key_at,
     )
 
@@ -195,10 +198,28 @@ def _flows(node: Cursor) -> list[FlowNeed]:
                     transport=cursor.choice("transport", FlowTransport, FlowTransport.ANY),
                     non_blocking_send=cursor.flag("non_blocking_send", default=False),
                     lossy=cursor.flag("lossy", default=False) if "lossy" in cursor else None,
+                    quantities=quantities(cursor),
                     at=cursor.key_at,
                 )
             )
     return needs
+
+
+_QUANTITIES = ("max_delay_ms", "loss", "rate_hz", "max_message_size", "five_qi")
+"""Numbers of a flow or a link that nothing but a measurement could prove."""
+
+
+def quantities(cursor: Cursor) -> tuple[Quantity, ...]:
+    """Return the numbers of a flow or a link that only a measurement could prove.
+
+    `five_qi: auto` is none: it follows from the others.
+    """
+    found = []
+    for name in _QUANTITIES:
+        value = cursor.get(name)
+        if value is not None and isinstance(value.scalar, (int, float)):
+            found.append(Quantity(name=name, value=value.scalar, at=value.at))
+    return tuple(found)
 
 
 def _float(cursor: Cursor, key: str) -> float | None:
@@ -211,6 +232,15 @@ def _dscp_word(cursor: Cursor) -> str | int:
     return cursor.scalar if isinstance(cursor.scalar, str) else int(cursor.scalar)
 
 
+def _written_paths(node: Cursor) -> Iterator[tuple[str, str]]:
+    """Yield the paths of a node as they are written, by place."""
+    for index, each in enumerate(node.items("parameter_files")):
+        yield f"parameter_files.{index}", each.value.text
+    run = node.get("run")
+    if run is not None and "working_directory" in run:
+        yield "run.working_directory", run.text("working_directory")
+
+
 def _positions(cursor: Cursor) -> list[tuple[str, Position]]:
     """Return where the parts of a node stand that later checks point at."""
     positions = []
@@ -218,6 +248,10 @@ def _positions(cursor: Cursor) -> list[tuple[str, Position]]:
         value = cursor.get(part)
         if value is not None:
             positions.append((part, value.at))
+    run = cursor.get("run")
+    if run is not None:
+        # A program is looked for where its name stands; an `attach: true` has none.
+        positions += [(f"run.{name}", each.at) for name, each in run.entries() if name in _PROGRAMS]
     positions += [(f"remap.{name}", each.key_at) for name, each in cursor.entries("remap")]
     files = enumerate(cursor.items("parameter_files"))
     return positions + [(f"parameter_files.{index}", each.at) for index, each in files]

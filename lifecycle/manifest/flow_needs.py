@@ -40,7 +40,7 @@ class ResolvedNeed:
         need: as declared.
         topic: fully qualified name; empty if it cannot be resolved.
         unique: it must get an NFE of its own.
-        marking: DSCP; publishers only.
+        marking: DSCP, of a publisher's data or of a subscription's acknowledgements.
         flow_class: 5QI; publishers only.
         max_delay_ms: declared, else the shortest of the links from this node on the topic.
         max_message_size: declared, else the type's bound, bytes; None without either.
@@ -80,15 +80,17 @@ class ResolvedNeed:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class ParticipantGroup:
-    """Publishers of one node that share an extra participant.
+    """Endpoints of one kind and node that share an extra participant.
 
     Attributes:
-        publishers: declared names, in the interface's order.
+        kind: PUBLISHER, or SUBSCRIPTION: then what they acknowledge with carries the DSCP.
+        names: declared, in the interface's order.
         unique: it carries one publisher that needs an NFE of its own.
         five_qi: the class by which a network tells it from others; None if it need not.
     """
 
-    publishers: tuple[str, ...]
+    kind: EndpointKind = EndpointKind.PUBLISHER
+    names: tuple[str, ...]
     unique: bool
     dscp: int | None
     five_qi: int | None
@@ -139,22 +141,34 @@ class FlowNeeds:
         the node's can.
         """
         for each in self.of_node(node):
-            if each.need.kind is EndpointKind.SUBSCRIPTION and each.transports:
+            if each.need.kind is not EndpointKind.SUBSCRIPTION or each.dscp is not None:
+                continue  # a marked one receives on a participant beside it
+            if each.transports:
                 return each.transports
         return ()
 
     def groups(self, node: Node) -> tuple[ParticipantGroup, ...]:
-        """Return the extra participants that a node's publishers need: as few as meet every need.
+        """Return the extra participants that a node's endpoints need: as few as meet every need.
 
         A publisher that needs an NFE of its own shares with none. Others share if they ask for the
-        same DSCP, 5QI, transports and way of sending; the smaller datagram size serves both. Within
+        same DSCP, 5QI, transports and way of sending; the smaller datagram size serves both.
+        Subscriptions need one if they are marked, because acknowledgements leave by the sockets of
+        the participant; they share it with those of the same DSCP and transports, not with
+        publishers: a network that looks at marks must not take the one for the other's flow. Within
         one node only: a participant belongs to a node, whose hidden node is what the graph shows.
         """
         found: dict[object, ParticipantGroup] = {}
         own = (None, None, self.node_transports(node), False)
         for endpoint in node.interface.endpoints:
             each = self.of(node.key, endpoint.kind, endpoint.name)
-            if each is None or endpoint.kind is not EndpointKind.PUBLISHER:
+            if each is None or endpoint.kind not in (
+                EndpointKind.PUBLISHER,
+                EndpointKind.SUBSCRIPTION,
+            ):
+                continue
+            if endpoint.kind is EndpointKind.SUBSCRIPTION:
+                if each.dscp is not None:
+                    _add_subscription(found, each, each.transports or own[2])
                 continue
             five_qi = None if each.unique or each.told_apart else each.five_qi
             transports = each.transports or own[2]
@@ -165,7 +179,7 @@ class FlowNeeds:
             known = found.get(key)
             sizes = (each.max_datagram_bytes, known.max_datagram_bytes if known else None)
             found[key] = ParticipantGroup(
-                publishers=(*(known.publishers if known else ()), endpoint.name),
+                names=(*(known.names if known else ()), endpoint.name),
                 unique=each.unique,
                 dscp=each.dscp,
                 five_qi=five_qi,
@@ -234,6 +248,23 @@ class FlowNeeds:
         if small:
             return each
         return dataclasses.replace(each, max_datagram_bytes=declared or SAFE_DATAGRAM_BYTES)
+
+
+def _add_subscription(
+    found: dict[object, ParticipantGroup], each: ResolvedNeed, transports: tuple[str, ...]
+) -> None:
+    key = (EndpointKind.SUBSCRIPTION, each.dscp, transports)
+    known = found.get(key)
+    found[key] = ParticipantGroup(
+        kind=EndpointKind.SUBSCRIPTION,
+        names=(*(known.names if known else ()), each.need.name),
+        unique=False,
+        dscp=each.dscp,
+        five_qi=None,
+        transports=transports,
+        max_datagram_bytes=None,
+        non_blocking_send=False,
+    )
 
 
 def _topic(node: Node, kind: EndpointKind, name: str) -> str:

@@ -20,7 +20,7 @@ from lifecycle.manifest.document import Document, error, warning
 from lifecycle.manifest.model import Manifest
 from lifecycle.manifest.schema import validate
 from lifecycle.manifest.semantics import check, check_sound
-from lifecycle.manifest.source import read_document
+from lifecycle.manifest.source import is_outside, read_document
 
 SUFFIX = ".lifecycle.yaml"
 """What a manifest's name ends in; plain `.yaml` belongs to ROS launch files."""
@@ -46,8 +46,13 @@ def load_manifest(
     origin = include.Origin.of(path)
     result = loading.read(origin, arguments, ())
     found = loading.found
+
+    def every() -> tuple[Diagnostic, ...]:
+        quoted = _without_outside_text(found, str(path), environment)
+        return _sorted(quoted, loading.files)
+
     if result is None:
-        raise ManifestError(_sorted(found, loading.files))
+        raise ManifestError(every())
     fragment, values = result
     manifest = Manifest(
         path=origin.shown,
@@ -66,11 +71,11 @@ def load_manifest(
     if wrong := [each for each in found if each.severity is Severity.ERROR]:
         part = salvage.partial(manifest, wrong, lost=fragment.lost, machines=loading.machines)
         found += check_sound(part, environment=environment)
-        raise ManifestError(_sorted(found, loading.files))
+        raise ManifestError(every())
     found += check(manifest, environment=environment)
     if any(each.severity is Severity.ERROR for each in found):
-        raise ManifestError(_sorted(found, loading.files))
-    return manifest, _sorted(found, loading.files)
+        raise ManifestError(every())
+    return manifest, every()
 
 
 class _Loading:
@@ -203,6 +208,35 @@ def _is_list(document: Document) -> bool:
 
 def _mark(each: Diagnostic) -> tuple[str, int, int]:
     return each.at.file, each.at.line, each.at.column
+
+
+_READING = ("yaml.", "manifest.", "nodl.", "check.parameter")
+"""Rules whose messages quote what a file holds before anything says that it is one of ours."""
+
+
+def _without_outside_text(
+    found: Sequence[Diagnostic], manifest: str, environment: Mapping[str, str]
+) -> list[Diagnostic]:
+    """Return findings that quote nothing of files outside the manifest's tree."""
+    outside: dict[str, bool] = {}
+    kept = []
+    for each in found:
+        file = each.at.file
+        if file not in outside:
+            outside[file] = is_outside(file, manifest, environment)
+        if outside[file] and each.rule.startswith(_READING) and each.rule not in _QUOTES_NOTHING:
+            each = dataclasses.replace(  # noqa: PLW2901 - the same finding, without the text
+                each,
+                at=dataclasses.replace(each.at, path=""),
+                message=f"cannot use what is written here ({each.rule})",
+                hint=f"not quoted, as the file is outside the folder of {manifest}; open it there, "
+                "or move it",
+            )
+        kept.append(each)
+    return kept
+
+
+_QUOTES_NOTHING = frozenset({"yaml.file", "yaml.empty", "manifest.suffix"})
 
 
 def _sorted(found: Sequence[Diagnostic], read: Iterable[str]) -> tuple[Diagnostic, ...]:

@@ -1,4 +1,4 @@
-"""Which DSCP a publisher's need comes to, and why.
+"""Which DSCP an endpoint's need comes to, and why.
 
 Owns: the ways to a DSCP besides writing it: a TRANSPORT_PRIORITY through its mapping, a 5QI through
 a mapping, and a value of one's own where the DSCP is the identifier. Pure.
@@ -39,19 +39,22 @@ class Marking:
 
 
 def marking_of(need: FlowNeed, network: Network, five_qi: int | None) -> Marking:
-    """Return the marking of one publisher.
+    """Return the marking of one endpoint.
+
+    The priority of a publisher is of its data, that of a subscription of its acknowledgements, and
+    neither follows from the other (*RTI Connext Micro, Transport Priority*, "Configuring transport
+    priority"). A 5QI is of data and marks publishers only.
 
     Args:
         need: what it asks for.
         network: the system's mappings.
         five_qi: its 5QI, `auto` resolved.
     """
-    if need.kind is not EndpointKind.PUBLISHER:
-        return Marking()
     if need.transport_priority is not None and need.dscp is None:
         mapping = network.transport_priority_mapping or DIRECT
         return _mapped(map_priority(need.transport_priority, mapping))
-    if need.dscp is not None or network.five_qi_dscp is None or five_qi is None:
+    publishes = need.kind is EndpointKind.PUBLISHER
+    if need.dscp is not None or not publishes or network.five_qi_dscp is None or five_qi is None:
         return Marking(dscp=need.dscp)
     name, dscp = network.five_qi_dscp.name, network.five_qi_dscp.dscp_for(five_qi)
     if dscp is None:

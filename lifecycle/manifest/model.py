@@ -31,6 +31,7 @@ from lifecycle.manifest.node_model import (
     Node,
     ParameterDeclaration,
     ParameterValue,
+    Quantity,
     Run,
     Timeouts,
 )
@@ -38,6 +39,7 @@ from lifecycle.network.five_qi_dscp import DscpMapping
 from lifecycle.network.transport_priority import TransportPriorityMapping
 
 __all__ = [
+    "TOLERATED_NODES",
     "After",
     "Authority",
     "Condition",
@@ -62,6 +64,7 @@ __all__ = [
     "ParameterDeclaration",
     "ParameterValue",
     "Policy",
+    "Quantity",
     "Run",
     "RunKind",
     "Timeouts",
@@ -137,18 +140,36 @@ class Network:
     at: Position | None = None
 
 
+TOLERATED_NODES = (
+    "_ros2cli_*",
+    "launch_ros_*",
+    "rqt_*",
+    "rviz",
+    "rviz2",
+    "rviz_*",
+    "rosbag2_recorder",
+    "rosbag2_player",
+    "transform_listener_impl_*",
+)
+"""Names of nodes that tools make, as the tools choose them: the default of `tolerated_nodes`."""
+
+
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Policy:
     """How strict checks and verification are.
 
     Attributes:
         undeclared_nodes: OPEN tolerates nodes of other systems in the graph.
+        tolerated_nodes: patterns of names of nodes that may be there although nobody declared them,
+            as long as they only listen: `*` stands for any characters, `?` for one; a pattern with
+            a slash is compared with the full name, any other with the base name.
         unverifiable_blocks: an unverifiable finding closes the gate.
         unpublished: severity of a subscription that nobody publishes; None ignores it.
         unheard: severity of a publisher that nobody hears; None ignores it.
     """
 
     undeclared_nodes: EndpointPolicy = EndpointPolicy.DECLARED
+    tolerated_nodes: tuple[str, ...] = TOLERATED_NODES
     unverifiable_blocks: bool = False
     unpublished: Severity | None = Severity.ERROR
     unheard: Severity | None = Severity.WARNING
@@ -164,6 +185,7 @@ class Link:
         to_node: manifest key of the subscribing node.
         max_delay_ms: > 0; None if not asked for.
         transport: overrides what would be negotiated for this pair.
+        quantities: each of its numbers that only a measurement could prove, as it is written.
     """
 
     topic: str
@@ -172,6 +194,7 @@ class Link:
     unique: UniqueHow = UniqueHow.NOT
     max_delay_ms: float | None = None
     transport: FlowTransport = FlowTransport.ANY
+    quantities: tuple[Quantity, ...] = ()
     at: Position
 
 

@@ -79,13 +79,16 @@ class Endpoint:
     Attributes:
         name: as declared; relative, absolute or `~/private`, before remapping.
         type: `package/msg/Type`, `package/srv/Type` or `package/action/Type`.
-        qos: None for actions.
+        qos: what it is made with; None for actions.
+        qos_defaults: policies of `qos` that no manifest writes: they are the default of the kind,
+            good for making the endpoint, and nobody requires them.
     """
 
     kind: EndpointKind
     name: str
     type: str
     qos: QosProfile | None
+    qos_defaults: tuple[str, ...] = ()
     at: Position
 
 
@@ -120,14 +123,32 @@ class Interface:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Quantity:
+    """A number that a manifest promises or asks for, and where it is written.
+
+    Attributes:
+        name: the manifest's key, which has the unit: `max_delay_ms`, `rate_hz`, `five_qi`.
+    """
+
+    name: str
+    value: float
+    at: Position
+
+    def __str__(self) -> str:
+        """Return `max_delay_ms 5`."""
+        return f"{self.name} {self.value:g}" if self.value < 1e6 else f"{self.name} {self.value}"
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class FlowNeed:
     """What one endpoint asks of its network flow.
 
     Attributes:
         kind: PUBLISHER or SUBSCRIPTION.
         name: the endpoint's declared name.
-        dscp: 0–63, publishers only; None leaves it alone.
-        transport_priority: DDS TRANSPORT_PRIORITY, publishers only, mapped to a TOS byte by
+        dscp: 0–63, of all that the endpoint sends: data, or a subscription's acknowledgements; None
+            leaves it alone.
+        transport_priority: DDS TRANSPORT_PRIORITY, mapped to a TOS byte by
             `Network.transport_priority_mapping`; None if not given. Never beside `dscp`.
         enforce: a DSCP that could not be applied is violated (True) or a warning (False).
         five_qi: 3GPP TS 23.501 Table 5.7.4-1 value; None if not asked for, or left to us.
@@ -140,6 +161,7 @@ class FlowNeed:
         non_blocking_send: a send never waits; what finds the socket's buffer full is lost.
         lossy: the data bear an unreliable transport (True), or do not (False); None leaves that to
             the QoS and to the node's own hint, which this overrides.
+        quantities: each of its numbers that only a measurement could prove, as it is written.
     """
 
     kind: EndpointKind
@@ -157,6 +179,7 @@ class FlowNeed:
     transport: FlowTransport = FlowTransport.ANY
     non_blocking_send: bool = False
     lossy: bool | None = None
+    quantities: tuple[Quantity, ...] = ()
     at: Position
 
 
@@ -191,6 +214,8 @@ class Node:
         positions: where parts of the node stand, by path below it: `machine`, `namespace`, `name`,
             `process`, `remap.scan`, `parameters.rate`, `parameter_files.0`; sorted, read with
             `where`.
+        written_paths: paths as the manifest writes them, by place: `parameter_files.0`,
+            `run.working_directory`; what other fields have of them is absolute.
     """
 
     key: str
@@ -211,6 +236,7 @@ class Node:
     connections: tuple[ConnectionDeclaration, ...] = ()
     log_level: str = ""
     positions: tuple[tuple[str, Position], ...] = ()
+    written_paths: tuple[tuple[str, str], ...] = ()
     at: Position
 
     def where(self, part: str) -> Position:

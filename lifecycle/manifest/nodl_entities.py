@@ -19,6 +19,7 @@ from lifecycle.manifest.qos import (
     Liveliness,
     QosProfile,
     Reliability,
+    not_written,
     problems,
 )
 from lifecycle.manifest.scalars import quote
@@ -135,8 +136,16 @@ class NodlReader:
         elif not is_action:
             qos = PRESETS["services_default"]
         if name and type_ and (qos or is_action):
-            at = self._document.at(place)
-            self.endpoints.append(Endpoint(kind=kind, name=name, type=type_, qos=qos, at=at))
+            self.endpoints.append(
+                Endpoint(
+                    kind=kind,
+                    name=name,
+                    type=type_,
+                    qos=qos,
+                    qos_defaults=() if is_action else not_written(self._keys((*place, "qos"))),
+                    at=self._document.at(place),
+                )
+            )
 
     def _type(self, kind: EndpointKind, place: Place) -> str:
         text = self._text(place, required=True)
@@ -231,6 +240,10 @@ class NodlReader:
             return data
         self._error(place, f"cannot use {quote(data)} as {what}; it must be a mapping")
         return {}
+
+    def _keys(self, place: Place) -> tuple[str, ...]:
+        data = self._data(place)
+        return tuple(data) if isinstance(data, Mapping) else ()
 
     def _items(self, place: Place) -> tuple[object, ...]:
         found = self._document.find(place)

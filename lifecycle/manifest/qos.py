@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import enum
 import types
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import TypeVar
 
 
@@ -67,6 +67,29 @@ class QosProfile:
     lifespan_ns: int | None = None
     liveliness: Liveliness = Liveliness.AUTOMATIC
     liveliness_lease_duration_ns: int | None = None
+
+
+POLICIES = (
+    "history",
+    "depth",
+    "reliability",
+    "durability",
+    "deadline_ns",
+    "lifespan_ns",
+    "liveliness",
+    "liveliness_lease_duration_ns",
+)
+"""Every policy, in the order of rmw_qos_profile_t."""
+
+
+def not_written(written: Collection[str]) -> tuple[str, ...]:
+    """Return the policies that a manifest leaves to the default of the endpoint's kind.
+
+    Args:
+        written: keys of a profile; a depth means nothing without KEEP_LAST, and writes it too.
+    """
+    found = {*written, "history"} if "depth" in written else set(written)
+    return tuple(policy for policy in POLICIES if policy not in found)
 
 
 _Policy = TypeVar("_Policy", Reliability, Durability, Liveliness)

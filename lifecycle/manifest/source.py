@@ -7,6 +7,7 @@ byte over the limit. Touches the file system; knows nothing of what a manifest m
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import stat
@@ -81,15 +82,26 @@ def read_bytes(path: str | Path, *, file: str) -> bytes:
     except (OSError, ValueError) as problem:
         reason = problem.strerror if isinstance(problem, OSError) else str(problem)
         raise _refuse(file, f"cannot open {quote(str(path), limit=200)}: {reason}") from problem
-    mode = os.fstat(descriptor).st_mode
+    status = os.fstat(descriptor)
+    mode = status.st_mode
     if not stat.S_ISREG(mode):
         os.close(descriptor)
         raise _refuse(file, f"cannot read {_kind(mode)} as a manifest", "name a regular file")
+    if status.st_dev in _kernel_devices():
+        os.close(descriptor)
+        message = "cannot read a file that the kernel makes up (/proc, /sys) as a manifest"
+        raise _refuse(file, message, "name a regular file")
     with os.fdopen(descriptor, "rb") as stream:
         try:
-            data = stream.read(MAX_BYTES + 1)
+            data: bytes | None = stream.read(MAX_BYTES + 1)
         except OSError as problem:  # a network file system, a broken disk, much of /proc
             raise _refuse(file, f"cannot read this file: {problem.strerror}") from problem
+        if data is None:  # O_NONBLOCK: /proc/kmsg and its like never end, they wait
+            raise _refuse(
+                file,
+                "cannot read a file that has no end and nothing to read",
+                "name a regular file",
+            )
         if len(data) > MAX_BYTES:
             size = max(os.fstat(descriptor).st_size, len(data))
             raise _refuse(
@@ -98,6 +110,41 @@ def read_bytes(path: str | Path, *, file: str) -> bytes:
                 "split it with 'include:'",
             )
     return data
+
+
+def is_outside(file: str, manifest: str, environment: Mapping[str, str]) -> bool:
+    """Whether a file is neither in the folder of a manifest nor of an installed package.
+
+    What such a file holds is not for whoever wrote the manifest: `include: /etc/shadow` must not
+    have root print it. Links are followed, so that none leads out of the folder.
+
+    Args:
+        file: any file.
+        manifest: the outermost manifest.
+        environment: for AMENT_PREFIX_PATH, which is the user's choice.
+    """
+    try:
+        folder = os.path.realpath(Path(manifest).parent)
+        if _is_below(os.path.realpath(file), folder):
+            return False
+    except (OSError, ValueError):  # a name that no file can have
+        return True
+    prefixes = [each for each in environment.get("AMENT_PREFIX_PATH", "").split(":") if each]
+    written = os.path.abspath(file)  # noqa: PTH100 - an installation made of links is one too
+    return not any(_is_below(written, os.path.abspath(each)) for each in prefixes)  # noqa: PTH100
+
+
+def _is_below(path: str, folder: str) -> bool:
+    return path.startswith(folder.rstrip("/") + "/")
+
+
+def _kernel_devices() -> set[int]:
+    """Where every file claims to be a regular one; reading /proc/kmsg waits, and takes away."""
+    found = set()
+    for each in ("/proc", "/sys"):
+        with contextlib.suppress(OSError):
+            found.add(os.stat(each).st_dev)  # noqa: PTH116 - of a text
+    return found
 
 
 def decode(data: bytes, *, file: str) -> str:

@@ -18,13 +18,16 @@ if TYPE_CHECKING:
     from lifecycle.middleware.dscp import get_dscp
     from lifecycle.middleware.graph import GraphObserver
     from lifecycle.middleware.graph_changes import on_graph_change
+    from lifecycle.middleware.graph_queries import EndpointInfo, endpoints_of
     from lifecycle.middleware.interface_types import UnknownInterfaceError, import_interface
+    from lifecycle.middleware.matched_peers import guid_of, matched_with
     from lifecycle.middleware.nfe import (
         SHARED_MEMORY,
         NetworkFlowEndpointsUnsupported,
         get_network_flow_endpoints,
         has_shared_memory,
     )
+    from lifecycle.middleware.parameters import parameter_value, type_word
     from lifecycle.middleware.participant import FlowParticipant
     from lifecycle.middleware.participant_profile import ParticipantSettings
     from lifecycle.middleware.process import adopt_orphans, die_with_parent, exit_after
@@ -43,6 +46,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "SHARED_MEMORY",
+    "EndpointInfo",
     "FlowParticipant",
     "GraphObserver",
     "NetworkFlowEndpointsUnsupported",
@@ -59,24 +63,30 @@ __all__ = [
     "discovery_environment",
     "discovery_server_command",
     "discovery_server_listens",
+    "endpoints_of",
     "exit_after",
     "from_rclpy",
     "get_dscp",
     "get_network_flow_endpoints",
+    "guid_of",
     "has_shared_memory",
     "import_interface",
     "is_server_matched",
     "leave_and_exit",
     "leftovers",
+    "matched_with",
     "on_graph_change",
+    "parameter_value",
     "participant_settings",
     "segments_of",
     "sweep",
     "to_rclpy",
+    "type_word",
 ]
 
 _HOME = {
     "SHARED_MEMORY": "nfe",
+    "EndpointInfo": "graph_queries",
     "FlowParticipant": "participant",
     "GraphObserver": "graph",
     "NetworkFlowEndpointsUnsupported": "nfe",
@@ -93,20 +103,25 @@ _HOME = {
     "discovery_environment": "profiles",
     "discovery_server_command": "discovery_server",
     "discovery_server_listens": "discovery_server",
+    "endpoints_of": "graph_queries",
     "exit_after": "process",
     "from_rclpy": "qos",
     "get_dscp": "dscp",
     "get_network_flow_endpoints": "nfe",
+    "guid_of": "matched_peers",
     "has_shared_memory": "nfe",
     "import_interface": "interface_types",
     "is_server_matched": "server_watch",
     "leave_and_exit": "teardown",
     "leftovers": "shm",
+    "matched_with": "matched_peers",
     "on_graph_change": "graph_changes",
+    "parameter_value": "parameters",
     "participant_settings": "settings",
     "segments_of": "shm",
     "sweep": "shm",
     "to_rclpy": "qos",
+    "type_word": "parameters",
 }
 
 

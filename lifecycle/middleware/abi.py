@@ -283,6 +283,21 @@ def type_support(message_type: object) -> int:
     return int(pointer(capsule, name(capsule)))
 
 
+def bind(library: str, symbol: str, result: Any, arguments: Sequence[Any] = ()) -> Any:
+    """Return a function of a library, or of one that it needs, after `load`.
+
+    Args:
+        library: "rcl" for librcl.so.
+        symbol: its C name.
+        result: ctypes type.
+        arguments: ctypes types.
+
+    Raises:
+        MiddlewareError: there is none.
+    """
+    return _bind(_open(f"lib{library}.so"), symbol, result, arguments)
+
+
 def _ament_version() -> str:
     try:
         from ament_index_python.packages import get_package_share_path

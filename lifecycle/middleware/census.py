@@ -15,13 +15,16 @@ from collections.abc import Mapping
 
 from rclpy.node import Node
 
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.middleware.graph_queries import endpoints_of, node_names
+
 _NODES_TOPIC = "ros_discovery_info"
 """Every participant of rmw_fastrtps writes it, and no other; a plain DDS name."""
 
 _EACH_NODE_TOPIC = "/parameter_events"
 """rclcpp and rclpy give every node one publisher of it."""
 
-_PREFIX_BYTES = 12
+_PREFIX_DIGITS = 24
 
 Homes = Mapping[str, Counter[str]]
 """By full name of a node: the prefixes of the participants it is on, and how often it is there."""
@@ -40,26 +43,32 @@ class Census:
 
     def count(self) -> Counter[str]:
         """Return by full name how many nodes there are; a name that is not known yet included."""
-        shown = Counter(
-            f"{namespace.rstrip('/')}/{name}"
-            for name, namespace in self._node.get_node_names_and_namespaces()
-        )
-        homes: dict[str, Counter[str]] = {}
-        for each in self._node.get_publishers_info_by_topic(_EACH_NODE_TOPIC):
-            name = f"{each.node_namespace.rstrip('/')}/{each.node_name}"
-            homes.setdefault(name, Counter())[_prefix(each.endpoint_gid)] += 1
+        shown = Counter(node_names(self._node))
+        homes = self.homes()
         if any(
             count > homes.get(name, Counter()).total() and self._homes.get(name)
             for name, count in shown.items()
         ):
-            alive = frozenset(
-                _prefix(each.endpoint_gid)
-                for each in self._node.get_publishers_info_by_topic(_NODES_TOPIC, no_mangle=True)
-            )
-            shown = without_ghosts(shown, homes, self._homes, alive)
+            shown = without_ghosts(shown, homes, self._homes, self.participants())
         for name, where in homes.items():
             self._homes[name] = self._homes.get(name, frozenset()) | where.keys()
         return shown
+
+    def homes(self) -> dict[str, Counter[str]]:
+        """Return by full name the prefixes of the participants that nodes are on now."""
+        homes: dict[str, Counter[str]] = {}
+        for each in endpoints_of(self._node, EndpointKind.PUBLISHER, _EACH_NODE_TOPIC):
+            homes.setdefault(each.node, Counter())[each.gid[:_PREFIX_DIGITS]] += 1
+        return homes
+
+    def participants(self) -> frozenset[str]:
+        """Return the prefixes of every participant of rmw_fastrtps that discovery has."""
+        return frozenset(
+            each.gid[:_PREFIX_DIGITS]
+            for each in endpoints_of(
+                self._node, EndpointKind.PUBLISHER, _NODES_TOPIC, no_mangle=True
+            )
+        )
 
 
 def without_ghosts(
@@ -85,7 +94,3 @@ def without_ghosts(
         gone = before.get(name, frozenset()) - alive
         counts[name] = min(count, max(homes.get(name, Counter()).total(), count - len(gone)))
     return +counts
-
-
-def _prefix(gid: bytes) -> str:
-    return bytes(gid[:_PREFIX_BYTES]).hex()

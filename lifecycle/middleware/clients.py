@@ -8,22 +8,27 @@ so the state is read again (rcl_lifecycle, lifecycle_msgs/srv/*).
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Sequence
+from collections.abc import Awaitable, Callable, Collection, Sequence
 
 from lifecycle_msgs.msg import TransitionEvent
 from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.msg import Parameter, ParameterEvent, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
+from rclpy.qos import qos_profile_parameter_events
 from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
-from lifecycle.codec import from_json
 from lifecycle.errors import MiddlewareError
 from lifecycle.export.captured import CapturedParameter
 from lifecycle.middleware.graph import GraphObserver
-from lifecycle.middleware.parameters import read_parameters
+from lifecycle.middleware.parameters import read_parameters, report_parameters
 from lifecycle.middleware.service_calls import ServiceCalls, ServiceUnansweredError
-from lifecycle.verify.observation import NodeConfiguration
+from lifecycle.verify.observation import (
+    ConfigurationError,
+    NodeConfiguration,
+    ParameterReport,
+    decode_configuration,
+)
 
 TIMEOUT_S = 5.0
 """For services that answer at once; a transition takes as long as the node's callback does."""
@@ -40,6 +45,8 @@ _GOALS = {
 }
 """Transition label → label of the state it leads to (lifecycle_msgs/Transition)."""
 
+_PARAMETER_SERVICES = ("list_parameters", "describe_parameters", "get_parameters")
+
 
 class NodeClients:
     """Asks and drives nodes through their services. `destroy` it before the observer."""
@@ -48,6 +55,7 @@ class NodeClients:
         self._observer = observer
         self._calls = ServiceCalls(observer)
         self._transitions: dict[str, Subscription] = {}
+        self._parameter_events: Subscription | None = None
 
     async def get_state(self, node: str, *, timeout_s: float = TIMEOUT_S) -> str:
         """Return the label of a managed node's state (lifecycle_msgs/State).
@@ -82,7 +90,14 @@ class NodeClients:
         )
         return tuple(each.transition.label for each in response.available_transitions)
 
-    async def change_state(self, node: str, transition: str, *, timeout_s: float) -> bool:
+    async def change_state(
+        self,
+        node: str,
+        transition: str,
+        *,
+        timeout_s: float,
+        before: Callable[[], Awaitable[None]] | None = None,
+    ) -> bool:
         """Ask for one transition and wait until it is over.
 
         The request is sent once. While the reply is missing, the state is read now and then: one
@@ -92,6 +107,7 @@ class NodeClients:
             node: fully qualified name.
             transition: label, "configure", "activate", …
             timeout_s: seconds, > 0, for service, callback and reply together.
+            before: awaited when the request is about to leave; what it raises keeps it back.
 
         Returns:
             Whether the node accepted and completed it.
@@ -111,7 +127,9 @@ class NodeClients:
         request.transition.label = transition
         left_s = max(deadline - loop.time(), _LEAST_S)
         reply = asyncio.ensure_future(
-            self._calls.call(service, ChangeState, request, timeout_s=left_s, repeat=False)
+            self._calls.call(
+                service, ChangeState, request, timeout_s=left_s, repeat=False, before=before
+            )
         )
         try:
             while not reply.done():
@@ -151,8 +169,8 @@ class NodeClients:
                 f"cannot read the configuration of {node!r}: it says {response.message!r}"
             )
         try:
-            return from_json(response.message, NodeConfiguration)
-        except ValueError as error:
+            return decode_configuration(response.message, node)
+        except ConfigurationError as error:
             raise MiddlewareError(
                 f"cannot read the configuration of {node!r}: {error}",
                 hint="the node may run another version of lifecycle",
@@ -167,6 +185,47 @@ class NodeClients:
             ServiceUnansweredError: the node serves no parameters, or did not answer.
         """
         return await read_parameters(self._calls, node, timeout_s=timeout_s)
+
+    async def report_parameters(
+        self, node: str, names: Collection[str], *, timeout_s: float = TIMEOUT_S
+    ) -> tuple[ParameterReport, ...]:
+        """Read those parameters of `node` that are named and that it has.
+
+        Raises:
+            ServiceUnansweredError: the node serves no parameters, or did not answer.
+        """
+        return await report_parameters(self._calls, node, names, timeout_s=timeout_s)
+
+    def serves_parameters(self, node: str) -> bool | None:
+        """Tell whether `node` has parameter services; None while discovery may not show them yet.
+
+        Client libraries make them before the type description service, and discovery tells of one
+        participant's services in order: where it shows the latter alone, there are none.
+        """
+        offered = self._observer.services_of(node)
+        if {f"{node}/{each}" for each in _PARAMETER_SERVICES} <= offered:
+            return True
+        return False if f"{node}/get_type_description" in offered else None
+
+    def on_parameters(self, callback: Callable[[str, frozenset[str]], None]) -> None:
+        """Have `callback` called in the executor thread with each change of any node's parameters.
+
+        It is given the node's full name and the names of the parameters. Once: whoever asks again
+        changes nothing.
+        """
+        if self._parameter_events is None:
+
+            def arrived(event: ParameterEvent) -> None:
+                changed = (
+                    *event.new_parameters,
+                    *event.changed_parameters,
+                    *event.deleted_parameters,
+                )
+                callback(event.node, frozenset(each.name for each in changed))
+
+            self._parameter_events = self._observer.node.create_subscription(
+                ParameterEvent, "/parameter_events", arrived, qos_profile_parameter_events
+            )
 
     async def connect_to(
         self, node: str, name: str, urls: Sequence[str], *, timeout_s: float = TIMEOUT_S
@@ -253,6 +312,9 @@ class NodeClients:
         self._calls.destroy()
         for node in tuple(self._transitions):
             self.forget(node)
+        if self._parameter_events is not None:
+            self._observer.node.destroy_subscription(self._parameter_events)
+            self._parameter_events = None
 
     async def _reached(self, node: str, transition: str) -> bool:
         goal = _GOALS.get(transition)

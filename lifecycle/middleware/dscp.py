@@ -1,4 +1,4 @@
-"""DSCP marks on the sockets that a publisher sends from.
+"""DSCP marks on the sockets that a participant sends from: data, and what its readers acknowledge.
 
 Owns: their IP_TOS and IPV6_TCLASS options (ip(7), ipv6(7), RFC 2474). Fast DDS 2.14 has no DSCP
 setting and always lists 0 in its NFEs; the socket option is what the kernel puts into packets. It

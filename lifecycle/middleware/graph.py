@@ -1,33 +1,39 @@
 """The ROS graph as discovery shows it, read in one go and watched without polling.
 
-Owns: the observer's participant, and the translation of rclpy's graph queries into observation
+Owns: the observer's participant, and the translation of graph queries into observation
 types. What tools bring along is left out by `lifecycle.verify.noise`.
 """
 
 from __future__ import annotations
 
-import contextlib
+import dataclasses
 import os
 import threading
 import time
 import typing
 from collections.abc import Callable, Collection, Iterable, Iterator
 
-from rclpy.node import NodeNameNonExistentError
-
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.middleware.census import Census
-from lifecycle.middleware.dead_connections import give_up_dead_connections
+from lifecycle.middleware.dead_connections import give_up_dead_connections, is_used
+from lifecycle.middleware.dead_participants import (
+    PROCESS_DIGITS,
+    is_of_process,
+    remove_participants,
+)
 from lifecycle.middleware.doors import knock_for
 from lifecycle.middleware.graph_guard import GraphGuard
+from lifecycle.middleware.graph_queries import endpoints_of, endpoints_of_node, topic_endpoints
 from lifecycle.middleware.hidden_node import quiet_node
 from lifecycle.middleware.participant_profile import ParticipantSettings
-from lifecycle.middleware.qos import from_rclpy
+from lifecycle.middleware.type_hash import with_service_hashes
+from lifecycle.network.connection_url import ConnectionTransport
 from lifecycle.plan.model import ParticipantConnections
 from lifecycle.verify.noise import (
+    NO_NAMES,
+    DeclaredNames,
     fold_actions,
     is_noise_endpoint,
-    is_noise_node,
     known_node,
     without_noise,
 )
@@ -51,11 +57,13 @@ _UNCOUNTED_S = 0.6
 _TOLD_S = 2.5
 """Within so long a discovery server has told of everybody (measured: up to 1.6 s)."""
 
+_AGREED_S = 5.0
+"""A server that listens agrees within 0.1 s, on a machine with both processors busy within 1 s."""
+
+_LOOK_S = 0.005
 _PREFIX_DIGITS = 24
-_UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"
 _CHANGE_STATE = "lifecycle_msgs/srv/ChangeState"
 _GET_STATE = "lifecycle_msgs/srv/GetState"
-_Names = typing.Callable[[str, str], list[tuple[str, list[str]]]]
 
 Snapshot = tuple[tuple[ObservedNode, ...], tuple[ObservedEndpoint, ...]]
 
@@ -72,6 +80,9 @@ class GraphObserver:
         connections: how it is connected; as a client of a discovery server it is a super client,
             which is told of everything.
 
+    Attributes:
+        urls: of its connections; none where the RMW chooses.
+
     Raises:
         ConnectionUrlError: a URL that is none.
         MiddlewareError: no participant could be made.
@@ -85,6 +96,8 @@ class GraphObserver:
         self._context, self.node = quiet_node(
             f"_lifecycle_observer_{os.getpid()}", "/", domain_id, settings=settings
         )
+        self._name = self.node.get_fully_qualified_name()
+        self.urls = settings.urls
         self._census = Census(self.node)
         self._lock = threading.Lock()
         self._callbacks: tuple[Callable[[], None], ...] = ()
@@ -92,6 +105,7 @@ class GraphObserver:
         self._known: frozenset[str] = frozenset()
         self._guard = GraphGuard(self.node, self._changed)
         self._knocks = knock_for(domain_id, settings.urls, os.environ)
+        self._asked_for: set[str] = set()
         self._limit_s = _TOLD_S if any(url.server for url in settings.urls) else _UNASKED_S
         self._made_s = time.monotonic()
 
@@ -113,11 +127,18 @@ class GraphObserver:
 
         return remove
 
-    def snapshot(self, *, keep: Collection[str] = ()) -> Snapshot:
+    def snapshot(
+        self, *, declared: Collection[str] = (), names: DeclaredNames = NO_NAMES
+    ) -> Snapshot:
         """Return the nodes and the endpoints that discovery shows now, in a stable order.
 
+        All but ourselves. The housekeeping of client libraries is left out. Services are known by
+        their nodes, so those of nobody known are looked for by name.
+
         Args:
-            keep: fully qualified names of nodes to show although they are named as a tool's.
+            declared: fully qualified names of nodes that are looked for.
+            names: of topics, services and actions that are looked for: whoever offers one of them
+                and is not `declared` is shown, whatever it looks like.
 
         Raises:
             MiddlewareError: the graph is no longer watched; the message says why.
@@ -126,24 +147,23 @@ class GraphObserver:
             raise self._guard.failure
         self._known = frozenset()
         counts = self._census.count()
-        names = sorted(
-            name
-            for name in counts
-            if name in keep or (known_node(name) and not is_noise_node(name))
-        )
+        ourselves = {} if counts[self._name] > 1 else {self._name}
         endpoints = [
-            endpoint
-            for endpoint in self._topic_endpoints()
-            if not endpoint.node or endpoint.node in keep or not is_noise_node(endpoint.node)
+            each for each in self._topic_endpoints(declared, names) if each.node not in ourselves
         ]
-        nodes = []
-        for name in names:
+        nodes, untold = [], {""}
+        for name in sorted(name for name in counts if known_node(name) and name not in ourselves):
             services = self._services(name)
             nodes.append(
                 ObservedNode(full_name=name, count=counts[name], managed=_managed(name, services))
             )
+            if services is None:
+                untold.add(name)
             endpoints += services or ()
-        kept = fold_actions(without_noise(endpoints))
+        endpoints += self._services_of_others(names, untold)
+        wanted = without_noise(each for each in endpoints if each.node in declared)
+        others = without_noise((each for each in endpoints if each.node not in declared), but=names)
+        kept = self._located(fold_actions(with_service_hashes(self.node, (*wanted, *others))))
         return tuple(nodes), tuple(sorted(kept, key=_order))
 
     def settling_s(self) -> float:
@@ -160,16 +180,82 @@ class GraphObserver:
             return max(0.0, _UNCOUNTED_S - age_s)
         if age_s < ANSWER_S:
             return ANSWER_S - age_s
-        if all(knock.answered() <= self._known for knock in self._knocks):
+        unknown = frozenset().union(*(each.answered() for each in self._knocks)) - self._known
+        if not unknown:
             return 0.0
+        if not unknown <= self._asked_for:
+            self._asked_for |= unknown
+            for knock in self._knocks:
+                knock.ask_again(to_count=False)
         return max(0.0, PATIENCE_S - age_s)
 
     def offers(self, node: str, service: str) -> bool:
         """Tell whether discovery shows `service` (a fully qualified name) on `node`."""
-        return any(
-            each.kind is EndpointKind.SERVICE_SERVER and each.name == service
+        return service in self.services_of(node)
+
+    def services_of(self, node: str) -> frozenset[str]:
+        """Return the fully qualified names of the services that discovery shows on `node`."""
+        return frozenset(
+            each.name
             for each in self._services(node) or ()
+            if each.kind is EndpointKind.SERVICE_SERVER
         )
+
+    def reaches_servers(self) -> bool:
+        """Wait, bounded, until the TCP discovery servers of its URLs can be asked; False if not.
+
+        What Fast DDS has not agreed on with a server by then it never will: make another observer,
+        on another port. Without such servers there is nothing to wait for.
+        """
+        deadline = time.monotonic() + _AGREED_S
+        servers = [
+            (server.address, server.port)
+            for url in self.urls
+            if url.transport is ConnectionTransport.TCPV4
+            for server in url.server
+            if server.port is not None
+        ]
+        for address, port in servers:
+            while not (used := is_used(address, port)):
+                if used is False or time.monotonic() > deadline:
+                    return False
+                time.sleep(_LOOK_S)  # the kernel tells nobody
+        return True
+
+    def participants_of(
+        self, pid: int, *, nodes: Iterable[str], reported: Iterable[str]
+    ) -> frozenset[str]:
+        """Return the GUID prefixes (24 hex digits) of a process's participants in the graph.
+
+        Args:
+            pid: of a process on this host.
+            nodes: fully qualified names of nodes that it runs.
+            reported: GUID prefixes that these nodes said are theirs. Of both only those count
+                that bear this host and this pid.
+        """
+        if self._destroyed:
+            return frozenset()
+        homes = self._census.homes()
+        own = next(iter(homes.get(self.node.get_fully_qualified_name(), ())), "")
+        claimed = {*reported, *(prefix for name in nodes for prefix in homes.get(name, ()))}
+        processes = {
+            each[:PROCESS_DIGITS] for each in claimed if own and is_of_process(each, pid, own)
+        }
+        processes.discard(own[:PROCESS_DIGITS])
+        return frozenset(
+            each for each in self._census.participants() if each[:PROCESS_DIGITS] in processes
+        )
+
+    def remove_participants(self, prefixes: Iterable[str], pids: Iterable[int]) -> None:
+        """Have everybody forget participants whose process is known to be dead.
+
+        Over UDP only, see `lifecycle.middleware.dead_participants`.
+
+        Args:
+            prefixes: GUID prefixes, 24 hex digits each.
+            pids: of processes on this host that run; they are reached wherever they listen.
+        """
+        remove_participants(prefixes, self.domain_id, self.urls, os.environ, (os.getpid(), *pids))
 
     def destroy(self) -> None:
         """Stop watching and leave the graph; again is harmless."""
@@ -194,45 +280,93 @@ class GraphObserver:
         for callback in self._callbacks:
             callback()
 
-    def _topic_endpoints(self) -> Iterator[ObservedEndpoint]:
-        for topic, _ in self.node.get_topic_names_and_types():
-            for kind, query in (
-                (EndpointKind.PUBLISHER, self.node.get_publishers_info_by_topic),
-                (EndpointKind.SUBSCRIPTION, self.node.get_subscriptions_info_by_topic),
+    def _topic_endpoints(
+        self, declared: Collection[str], names: DeclaredNames
+    ) -> Iterator[ObservedEndpoint]:
+        for kind, topic, info in topic_endpoints(self.node):
+            if info.node:
+                self._known |= {info.gid[:_PREFIX_DIGITS]}
+            node = known_node(info.node)
+            feeds = node not in declared and names.fed_by(kind, topic)
+            if not feeds and is_noise_endpoint(kind, node, topic, info.type, ours=False):
+                continue
+            yield ObservedEndpoint(
+                kind=kind,
+                node=node,
+                name=topic,
+                type=info.type,
+                qos=info.qos,
+                gid=info.gid,
+                type_hash=info.type_hash,
+            )
+
+    def _services_of_others(
+        self, names: DeclaredNames, untold: Collection[str]
+    ) -> Iterator[ObservedEndpoint]:
+        """Yield who offers or asks for declared services and is a node of which rcl does not tell.
+
+        A node that is about to be known has them too; a plain DDS program never is one, and no rcl
+        tells of a node whose name it would not give.
+        """
+        services = [
+            *names.of_kind(EndpointKind.SERVICE_SERVER),
+            *(
+                f"{action}/_action/{part}"
+                for action in names.of_kind(EndpointKind.ACTION_SERVER)
+                for part in ("send_goal", "cancel_goal", "get_result")
+            ),
+        ]
+        publishers, subscriptions = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
+        for service in services:
+            shown: set[tuple[EndpointKind, str]] = set()
+            for kind, side, topic in (
+                (EndpointKind.SERVICE_SERVER, subscriptions, f"rq{service}Request"),
+                (EndpointKind.SERVICE_SERVER, publishers, f"rr{service}Reply"),
+                (EndpointKind.SERVICE_CLIENT, publishers, f"rq{service}Request"),
+                (EndpointKind.SERVICE_CLIENT, subscriptions, f"rr{service}Reply"),
             ):
-                for info in query(topic):
-                    node = _full_name(info.node_name, info.node_namespace)
-                    gid = bytes(info.endpoint_gid).hex()
-                    if node:
-                        self._known |= {gid[:_PREFIX_DIGITS]}
-                    if is_noise_endpoint(kind, node, topic, info.topic_type, ours=False):
+                for info in endpoints_of(self.node, side, topic, no_mangle=True):
+                    node = known_node(info.node)
+                    if node not in untold or (kind, info.gid[:_PREFIX_DIGITS]) in shown:
                         continue
+                    shown.add((kind, info.gid[:_PREFIX_DIGITS]))
+                    type_ = _service_type(info.type)
                     yield ObservedEndpoint(
-                        kind=kind,
-                        node=node,
-                        name=topic,
-                        type=info.topic_type,
-                        qos=from_rclpy(info.qos_profile),
-                        gid=gid,
+                        kind=kind, node=node, name=service, type=type_, gid=info.gid
                     )
 
+    def _located(self, endpoints: Iterable[ObservedEndpoint]) -> Iterator[ObservedEndpoint]:
+        """Add where the participants of endpoints are that nobody is known to have.
+
+        One whose address is not known is asked for it: it answers within a moment, and the next
+        look has it.
+        """
+        known: dict[str, str] = {}
+        for knock in self._knocks:
+            known.update(knock.addresses())
+        for endpoint in endpoints:
+            prefix = endpoint.gid[:_PREFIX_DIGITS]
+            if endpoint.node or not prefix:
+                yield endpoint
+                continue
+            if prefix not in known and prefix not in self._asked_for:
+                self._asked_for.add(prefix)
+                for knock in self._knocks:
+                    knock.ask_again(to_count=True)
+            yield dataclasses.replace(endpoint, address=known.get(prefix, ""))
+
     def _services(self, full_name: str) -> tuple[ObservedEndpoint, ...] | None:
-        """Return the service endpoints of a node; None when it has left meanwhile."""
-        namespace, _, name = full_name.rpartition("/")
-        queries: tuple[tuple[EndpointKind, _Names], ...] = (
-            (EndpointKind.SERVICE_SERVER, self.node.get_service_names_and_types_by_node),
-            (EndpointKind.SERVICE_CLIENT, self.node.get_client_names_and_types_by_node),
-        )
+        """Return the service endpoints of a node; None if rcl does not tell them."""
         found: list[ObservedEndpoint] = []
-        with contextlib.suppress(NodeNameNonExistentError):
-            for kind, query in queries:
-                found += (
-                    ObservedEndpoint(kind=kind, node=full_name, name=service, type=type_)
-                    for service, types in query(name, namespace or "/")
-                    for type_ in types
-                )
-            return tuple(found)
-        return None
+        for kind in (EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT):
+            listed = endpoints_of_node(self.node, kind, full_name)
+            if listed is None:
+                return None
+            found += (
+                ObservedEndpoint(kind=kind, node=full_name, name=service, type=type_)
+                for service, type_ in listed
+            )
+        return tuple(found)
 
 
 def _managed(node: str, services: Iterable[ObservedEndpoint] | None) -> bool | None:
@@ -245,8 +379,10 @@ def _managed(node: str, services: Iterable[ObservedEndpoint] | None) -> bool | N
     return {(f"{node}/change_state", _CHANGE_STATE), (f"{node}/get_state", _GET_STATE)} <= offered
 
 
-def _full_name(name: str, namespace: str) -> str:
-    return "" if name == _UNKNOWN_NODE else f"{namespace.rstrip('/')}/{name}"
+def _service_type(dds_type: str) -> str:
+    """Return `std_srvs/srv/Trigger` for `std_srvs::srv::dds_::Trigger_Request_`."""
+    package, _, name = dds_type.replace("::dds_::", "::").replace("::", "/").rpartition("/")
+    return f"{package}/{name.removesuffix('_Request_').removesuffix('_Response_')}"
 
 
 def _order(endpoint: ObservedEndpoint) -> tuple[str, ...]:

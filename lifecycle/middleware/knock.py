@@ -21,8 +21,6 @@ import struct
 import time
 from collections.abc import Iterable
 
-import psutil
-
 from lifecycle.middleware.sockets import own_udp_socket
 from lifecycle.middleware.url_check import open_sockets
 from lifecycle.network.ports import DG, participant_ports
@@ -32,9 +30,8 @@ RANGE_VARIABLE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 _LEASE_S = 0.5
 """Whoever answered forgets the participant that does not exist after so long."""
 
-MULTICAST_GROUP = "239.255.0.1"
 _PREFIX_BYTES = 12
-_HEADER = b"RTPS\x02\x03\x01\x0f"  # protocol 2.3, vendor eProsima: who else would be answered?
+HEADER = b"RTPS\x02\x03\x01\x0f"  # protocol 2.3, vendor eProsima: who else would be answered?
 _UDPV4, _UDPV6 = 1, 2
 """LOCATOR_KIND_UDPv4 and LOCATOR_KIND_UDPv6 (DDSI-RTPS 9.3.1)."""
 
@@ -78,38 +75,57 @@ class Knock:
         output_port: int | None = None,
     ) -> None:
         self.counts = output_port is None
-        self._heard: set[str] = set()
-        doors, addresses = tuple(doors), tuple(addresses)
-        self._ipv6 = any(":" in door.address for door in doors)
+        self._answers: dict[str, str] = {}
+        self._doors, self._addresses = tuple(doors), tuple(addresses)
+        self._ipv6 = any(":" in door.address for door in self._doors)
         family = socket.AF_INET6 if self._ipv6 else socket.AF_INET
         self._socket: socket.socket | None = None
-        ports = tuple(receiver_ports)
+        self._receivers = tuple(receiver_ports)
+        own: tuple[int, ...] = ()
         if output_port is not None:
             self._socket = own_udp_socket(family, output_port)
         else:
             self._socket = socket.socket(family, socket.SOCK_DGRAM)
             self._socket.bind(("", 0))  # answers come to every address we name
-            ports = (self._socket.getsockname()[1], *ports)
-        if self._socket is None:
-            return
-        message = announcement([(a, p) for p in ports for a in addresses])
-        for door in doors:
-            # A full buffer or an interface without a route costs one listener, not the observer.
-            with contextlib.suppress(OSError):
-                if door.interface:
-                    self._send_by(self._socket, door.interface)
-                self._socket.sendto(message, socket.MSG_DONTWAIT, (door.address, door.port))
+            own = (self._socket.getsockname()[1],)
+        self._send((*own, *self._receivers))
         if not self.counts:
             self.close()
 
+    def ask_again(self, *, to_count: bool) -> None:
+        """Send one more announcement, of another participant that does not exist.
+
+        Not everybody answers to each address that an announcement has: Cyclone DDS chooses one, and
+        does not announce itself again for 8 s and more.
+
+        Args:
+            to_count: it is answered to us alone, so that it is known where everybody is; else to
+                our participant alone, so that it discovers who was only counted so far.
+        """
+        if self._socket is not None:
+            self._send((self._socket.getsockname()[1],) if to_count else self._receivers)
+
+    def _send(self, ports: Iterable[int]) -> None:
+        if self._socket is None:
+            return
+        send(
+            self._socket,
+            announcement([(a, p) for p in ports for a in self._addresses]),
+            self._doors,
+        )
+
     def answered(self) -> frozenset[str]:
         """Return the GUID prefixes (24 hex digits) of all participants that answered so far."""
+        return frozenset(self.addresses())
+
+    def addresses(self) -> dict[str, str]:
+        """Return the IP address from which each participant answered so far, by GUID prefix."""
         with contextlib.suppress(BlockingIOError):
             while self._socket is not None:
-                data = self._socket.recv(65536, socket.MSG_DONTWAIT)
-                if data.startswith(b"RTPS") and len(data) > len(_HEADER) + _PREFIX_BYTES:
-                    self._heard.add(data[8 : 8 + _PREFIX_BYTES].hex())
-        return frozenset(self._heard)
+                data, source = self._socket.recvfrom(65536, socket.MSG_DONTWAIT)
+                if data.startswith(b"RTPS") and len(data) > len(HEADER) + _PREFIX_BYTES:
+                    self._answers[data[8 : 8 + _PREFIX_BYTES].hex()] = source[0]
+        return dict(self._answers)
 
     def close(self) -> None:
         """Hear no more answers."""
@@ -117,13 +133,26 @@ class Knock:
             self._socket.close()
             self._socket = None
 
-    def _send_by(self, sender: socket.socket, interface: str) -> None:
-        index = socket.if_nametoindex(interface)
-        if self._ipv6:
-            sender.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_MULTICAST_IF, index)
-            return
-        chosen = struct.pack("=4s4si", bytes(4), bytes(4), index)  # struct ip_mreqn of ip(7)
-        sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, chosen)
+
+def send(sender: socket.socket, message: bytes, doors: Iterable[Door]) -> None:
+    """Send a datagram to each door, without waiting.
+
+    A full buffer or an interface without a route costs one listener, not the sender.
+    """
+    for door in doors:
+        with contextlib.suppress(OSError):
+            if door.interface:
+                _send_by(sender, door.interface)
+            sender.sendto(message, socket.MSG_DONTWAIT, (door.address, door.port))
+
+
+def _send_by(sender: socket.socket, interface: str) -> None:
+    index = socket.if_nametoindex(interface)
+    if sender.family is socket.AF_INET6:
+        sender.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_MULTICAST_IF, index)
+        return
+    chosen = struct.pack("=4s4si", bytes(4), bytes(4), index)  # struct ip_mreqn of ip(7)
+    sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, chosen)
 
 
 def announcement(locators: Iterable[tuple[str, int]]) -> bytes:
@@ -152,7 +181,7 @@ def announcement(locators: Iterable[tuple[str, int]]) -> bytes:
     reader, writer = b"\x00\x01\x00\xc7", b"\x00\x01\x00\xc2"  # SPDP builtin endpoints
     body = struct.pack("<HH", 0, 16) + reader + writer + struct.pack("<iI", 0, 1) + payload
     info_timestamp = struct.pack("<BBHII", 0x09, 0x01, 8, int(time.time()), 0)
-    return _HEADER + prefix + info_timestamp + struct.pack("<BBH", 0x15, 0x05, len(body)) + body
+    return HEADER + prefix + info_timestamp + struct.pack("<BBH", 0x15, 0x05, len(body)) + body
 
 
 def discovery_ports(domain_id: int, kind: str = "udpv4") -> tuple[int, ...]:
@@ -168,14 +197,3 @@ def discovery_ports(domain_id: int, kind: str = "udpv4") -> tuple[int, ...]:
     last = participant_ports(domain_id, 0).discovery_multicast + DG
     ports = {each.port for each in open_sockets() if each.kind == kind}
     return tuple(sorted(p for p in ports if first <= p < last and (p - first) % 2 == 0))
-
-
-def host_addresses() -> tuple[str, ...]:
-    """IPv4 addresses of this host's interfaces but the loopback."""
-    found = [
-        each.address
-        for addresses in psutil.net_if_addrs().values()
-        for each in addresses
-        if each.family is socket.AF_INET
-    ]
-    return tuple(sorted(a for a in found if not ipaddress.ip_address(a).is_loopback))

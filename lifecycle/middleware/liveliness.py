@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import functools
 import json
+import logging
 import typing
 from collections.abc import Callable, Mapping
 
@@ -28,6 +29,8 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Empty, String
 
+from lifecycle.codec import from_json
+
 UNHEARD_S = 0.85
 """Who was not heard for so long is lost: within a second with all that follows."""
 
@@ -39,6 +42,10 @@ _LEASE_PER_PERIOD = 1.5
 """rmw_fastrtps asserts each two thirds of the lease that a writer offers."""
 
 
+_LONGEST_NOTICE = 1 << 16
+"""Characters of a notice; a line for each silent node."""
+
+_logger = logging.getLogger(__name__)
 _PULSE = "_pulse"
 """Ends the name of the topic that is asserted; the other one says what there is to say."""
 
@@ -153,8 +160,11 @@ class AliveSubscription:
                 on_left()
 
         def told(message: String) -> None:
-            said = json.loads(message.data)
-            on_told({str(name): str(why) for name, why in said.items()})
+            try:
+                on_told(from_json(message.data, dict[str, str], longest=_LONGEST_NOTICE))
+            except ValueError as error:
+                # Anybody may write the topic, and no executor thread may end by it.
+                _logger.warning("cannot read what is silent: %s", error)
 
         self._node = node
         self._subscriptions = (

@@ -199,6 +199,11 @@ class FlowParticipant:
                 callback_group=self._group(callback_group),
                 event_callbacks=event_callbacks,
             )
+        try:
+            self.ensure_dscp()
+        except BaseException:
+            self.node.destroy_subscription(subscription)
+            raise
         self._receive(subscription)
         return subscription
 
@@ -279,30 +284,43 @@ class FlowParticipant:
     def ensure_dscp(self) -> None:
         """Mark sender sockets that came, or lost their mark, since the participant was made.
 
-        Half a millisecond. It is called before a publisher is handed out and
-        whenever `read_dscp` is asked, so what is reported holds. No socket of Fast DDS 2.14 is
-        known to come later (see `lifecycle.middleware.dscp`).
+        Half a millisecond. It is called before a publisher or subscription is handed out, and by
+        no reading: what reads and marks at once finds every mark in place. No socket of Fast DDS
+        2.14 is known to come later (see `lifecycle.middleware.dscp`).
 
         Raises:
             MiddlewareError: the mark cannot be set.
         """
+        if self._context is None:
+            return  # nothing of the user's can be sent
+        changed = self._look_at_sockets()
+        if self._dscp is not None and (changed or marks.get_dscps(self._nfes) != {self._dscp}):
+            marks.set_dscp(self._nfes, self._dscp)
+
+    def read_dscp(self) -> int:
+        """Return the DSCP (0–63) the kernel puts on what this participant sends; marks nothing.
+
+        Of sockets that differ it is one that the participant was not to be marked with: all that
+        it sends must carry the mark, so a single socket without it is what counts.
+
+        Raises:
+            MiddlewareError: it has no socket, or its sockets differ and none was to be marked.
+        """
+        self._look_at_sockets()
+        if self._dscp is None:
+            return marks.get_dscp(self._nfes)
+        others = marks.get_dscps(self._nfes) - {self._dscp}
+        return min(others, default=self._dscp)
+
+    def _look_at_sockets(self) -> bool:
+        """List the sender sockets anew, as far as a publisher tells them; whether they changed."""
         publisher = next(iter(self.node.publishers), None)
         if self._context is None or publisher is None:
-            return  # nothing of the user's can be sent
+            return False  # those that were there when it was made
         nfes = get_network_flow_endpoints(publisher)
         changed = nfes != self._nfes
         self._nfes = nfes
-        if self._dscp is not None and (changed or marks.get_dscps(nfes) != {self._dscp}):
-            marks.set_dscp(nfes, self._dscp)
-
-    def read_dscp(self) -> int:
-        """Return the DSCP (0–63) the kernel puts on what this participant sends.
-
-        Raises:
-            MiddlewareError: it has no socket, or its sockets differ.
-        """
-        self.ensure_dscp()
-        return marks.get_dscp(self._nfes)
+        return changed
 
     def never_waits(self) -> bool:
         """Return whether its sockets drop what finds their buffer full, asked of the kernel.

@@ -9,7 +9,7 @@ children of a supervisor, whatever they are written in, inherit it. Must not imp
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from lifecycle.errors import MiddlewareError
@@ -19,15 +19,20 @@ DEFAULT_FILE = "DEFAULT_FASTRTPS_PROFILES.xml"
 """What Fast DDS loads from the working directory, unless SKIP_DEFAULT_XML=1."""
 
 _USER_VARIABLES = (PROFILES_FILE_VARIABLE, "FASTDDS_DEFAULT_PROFILES_FILE")
+PROFILE_NAME = "lifecycle_quick_discovery"
 _FILE_NAME = "quick_discovery.xml"
 
 
-def discovery_profile(*, announcements: int = 40, period_ms: int = 50) -> str:
-    """Return the profile as XML, a default participant profile that only sets announcements.
+def discovery_profile(
+    *, announcements: int = 40, period_ms: int = 50, peers: Iterable[tuple[str, int]] = ()
+) -> str:
+    """Return the profile as XML, a default participant profile that only sets discovery.
 
     Args:
         announcements: how often a new participant announces itself at once, > 0.
         period_ms: between two of them, 1–999.
+        peers: IP address and UDP port of whom it is announced to; all of them, because they replace
+            the groups by which Fast DDS otherwise does.
 
     Raises:
         ValueError: out of range.
@@ -37,14 +42,20 @@ def discovery_profile(*, announcements: int = 40, period_ms: int = 50) -> str:
             f"cannot announce {announcements} times each {period_ms} ms: allowed are once or more, "
             "each 1–999 ms"
         )
+    locators = "".join(
+        f"<locator><{kind}><address>{address}</address><port>{port}</port></{kind}></locator>"
+        for address, port in peers
+        for kind in ("udpv6" if ":" in address else "udpv4",)
+    )
+    searched = f"<initialPeersList>{locators}</initialPeersList>" if locators else ""
     return f"""<?xml version="1.0" encoding="UTF-8"?>
 <dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
   <profiles>
-    <participant profile_name="lifecycle_quick_discovery" is_default_profile="true">
+    <participant profile_name="{PROFILE_NAME}" is_default_profile="true">
       <rtps><builtin><discovery_config><initialAnnouncements>
         <count>{announcements}</count>
         <period><nanosec>{period_ms * 1_000_000}</nanosec></period>
-      </initialAnnouncements></discovery_config></builtin></rtps>
+      </initialAnnouncements></discovery_config>{searched}</builtin></rtps>
     </participant>
   </profiles>
 </dds>
@@ -52,7 +63,10 @@ def discovery_profile(*, announcements: int = 40, period_ms: int = 50) -> str:
 
 
 def discovery_environment(
-    directory: Path, environment: Mapping[str, str] | None = None
+    directory: Path,
+    environment: Mapping[str, str] | None = None,
+    *,
+    peers: Iterable[tuple[str, int]] = (),
 ) -> dict[str, str]:
     """Write the profile into `directory` and return the variables that apply it.
 
@@ -62,6 +76,7 @@ def discovery_environment(
     Args:
         directory: exists; it must outlive every process that is given the variables.
         environment: what those processes otherwise get; None for this process's.
+        peers: see `discovery_profile`.
 
     Raises:
         MiddlewareError: the file cannot be written.
@@ -73,7 +88,7 @@ def discovery_environment(
     # Renamed into place: a process that starts meanwhile reads the whole file or an older one.
     part = path.with_name(f".{_FILE_NAME}.{os.getpid()}")
     try:
-        part.write_text(discovery_profile(), encoding="utf-8")
+        part.write_text(discovery_profile(peers=peers), encoding="utf-8")
         part.replace(path)
     except OSError as error:
         raise MiddlewareError(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from collections.abc import Awaitable, Callable
 from typing import Any
 
 from rclpy.client import Client
@@ -66,6 +67,7 @@ class ServiceCalls:
         *,
         timeout_s: float,
         repeat: bool,
+        before: Callable[[], Awaitable[None]] | None = None,
     ) -> Any:
         """Wait for `service`, send `request`, and return the response.
 
@@ -75,6 +77,7 @@ class ServiceCalls:
             request: of that class.
             timeout_s: seconds, > 0, for all of it.
             repeat: the request does no harm when it arrives twice.
+            before: awaited when the first request is about to leave; what it raises keeps it back.
 
         Raises:
             ServiceUnansweredError: at the deadline.
@@ -84,6 +87,8 @@ class ServiceCalls:
         client = self._client(service, type_)
         if not await self._found(client, service, deadline):
             raise ServiceUnansweredError(service, found=False, timeout_s=timeout_s)
+        if before is not None:
+            await before()
         answer: asyncio.Future[Any] = loop.create_future()
 
         def arrived(pending: Future) -> None:

@@ -1,32 +1,45 @@
 """Fast DDS's shared memory files that nobody uses any more.
 
-Owns: finding and removing them in /dev/shm. A killed process leaves one segment of some 540 kB per
-participant and the files of its ports; Fast DDS never reclaims a segment. Must not import rclpy.
+Owns: who owns which of them in /dev/shm, and removing what a killed process left: one segment of
+some 540 kB per participant and the files of its ports, which Fast DDS never reclaims. Must not
+import rclpy.
 
 A file belongs to a group, `fastrtps_<segment>` or `fastrtps_port<number>`, each with a lock file
 (`_el` exclusive, `_sl` shared) that the owner keeps open and locked, and a port with a named
-semaphore. Files are judged per group: the semaphore of a live port is neither mapped nor open.
-A port is in use while any process maps or has open one of its files, or holds its lock: a sender
-may be about to look for it. A segment is in use while its owner lives; its readers keep a dead
-owner's mapping for a while, which removing the name does not touch.
+semaphore under which it is opened (sem_overview(7)).
+
+/proc hides the processes of other PID namespaces, which may share /dev/shm (containers with the
+host's IPC do). So it never proves that a file is unused; what the kernel grants to one holder does:
+
+- the lock file of the group, locked exclusively (flock(2)): no owner lives.
+- a write lease on every other file (fcntl(2), Leases): no process has it open or mapped, and none
+  can open it until the lease is given back. A port needs that too, a sender may be about to look
+  for it; a segment that has a lock file does not: its readers keep a dead owner's mapping for a
+  while, which removing the name does not touch.
 """
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import dataclasses
+import fcntl
 import os
 import re
-from collections.abc import Callable, Collection, Iterable
+import signal
+import struct
+from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path
 
-from lifecycle.middleware.shm_lock import PortMutex, port_mutexes
-from lifecycle.network.ports import DG, PB
+from lifecycle.middleware.libc import libc
 
 _DIRECTORY = Path("/dev/shm")  # noqa: S108 - where shm_open(3) keeps them
 _FILE = re.compile(
     r"(?P<semaphore>sem\.)?(?P<group>fastrtps_(?:port\d+|[0-9a-f]{16}))(?P<rest>_el|_sl|_mutex)?"
 )
+_IN_CREATE = 0x100
+_EVENT = struct.Struct("iIII")
+_EVENT_BYTES = 65536
 
 _Inode = tuple[int, int]
 """(device, inode number)."""
@@ -38,7 +51,6 @@ class _File:
     group: str
     inode: _Inode
     uid: int
-    modified_s: float
 
     @property
     def is_lock(self) -> bool:
@@ -56,7 +68,7 @@ class _File:
 def segments_of(pids: Iterable[int]) -> frozenset[str]:
     """Return the names of the Fast DDS files that these processes own now.
 
-    Remember them while a process lives; `sweep(only=…)` then removes what it left behind.
+    Remember them while a process lives; `sweep` then removes what it left behind.
     """
     held = {inode for pid in pids for inode in _peek(_open_inodes, pid)}
     files = _files() if held else []
@@ -64,102 +76,147 @@ def segments_of(pids: Iterable[int]) -> frozenset[str]:
     return frozenset(file.path.name for file in files if file.group in owned)
 
 
-def port_files_of(domain_id: int) -> frozenset[str]:
-    """Return the names that the files of a domain's ports have, whether they exist or not.
+class Creations:
+    """Notices that a process, ours or not, begins to own a segment or a port (inotify(7)).
 
-    Unique ports are not among them, they are the same in every domain (rmw_fastrtps).
-
-    Args:
-        domain_id: 0–232.
+    Attributes:
+        descriptor: readable as soon as a lock file was created.
     """
-    first = PB + DG * domain_id
-    return frozenset(f"fastrtps_port{port}" for port in range(first, first + DG))
+
+    def __init__(self) -> None:
+        """Begin.
+
+        Raises:
+            OSError: there is no /dev/shm, or this user has too many inotify instances.
+        """
+        self.descriptor = libc().inotify_init1(os.O_NONBLOCK | os.O_CLOEXEC)
+        if self.descriptor < 0:
+            raise _failed()
+        path = os.fsencode(_DIRECTORY)
+        if libc().inotify_add_watch(self.descriptor, path, _IN_CREATE) < 0:
+            error = _failed()
+            os.close(self.descriptor)
+            raise error
+
+    def take(self) -> bool:
+        """Take what came; return whether a lock file was created."""
+        try:
+            data = os.read(self.descriptor, _EVENT_BYTES)
+        except BlockingIOError:
+            return False
+        return any(_group(name) and name.endswith(("_el", "_sl")) for name in _created(data))
+
+    def close(self) -> None:
+        """End it."""
+        os.close(self.descriptor)
 
 
-def sweep(
-    *, only: Collection[str] | None = None, created_after_s: float | None = None
-) -> tuple[str, ...]:
-    """Remove the files of this user that are no longer in use.
+def _created(data: bytes) -> Iterator[str]:
+    start = 0
+    while start < len(data):
+        *_, length = _EVENT.unpack_from(data, start)
+        start += _EVENT.size
+        yield os.fsdecode(data[start : start + length].rstrip(b"\0"))
+        start += length
+
+
+def _failed() -> OSError:
+    return OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()), str(_DIRECTORY))
+
+
+def sweep(only: Collection[str]) -> tuple[str, ...]:
+    """Remove the files of this user in the groups of these names that are proven to be unused.
 
     Args:
-        only: names; other groups than theirs are left alone. None considers all.
-        created_after_s: seconds since the epoch; groups with an older file are left alone. Fast
-            DDS writes these files through mappings only, which leaves their times alone.
+        only: names that processes which have ended were seen to own.
 
     Returns:
         The names removed, sorted; empty where there is no /dev/shm.
     """
-    candidates = frozenset(_unused(only, created_after_s))
-    if not candidates:
-        return ()
-    removed = []
-    with port_mutexes(file.path for file in candidates if file.is_mutex) as mutexes:
-        # Looked at again where nobody can open a port any more.
-        unused = _unused(only, created_after_s, ignore=mutexes)
-        spared = {
-            file.group
-            for file in unused
-            if file not in candidates or (file.is_mutex and file.path not in mutexes)
-        }
-        spared |= {_group(path.name) for path, mutex in mutexes.items() if _was_alive(mutex)}
-        for file in unused:
-            if file.group not in spared:
-                with contextlib.suppress(FileNotFoundError):
-                    file.path.unlink()
-                    removed.append(file.path.name)
-    return tuple(sorted(removed))
-
-
-def _was_alive(mutex: PortMutex) -> bool:
-    """Tell whether a mutex that was taken before is free now: its holder has gone on.
-
-    One that stays taken, and that nobody maps, was left so by a process that was killed.
-    """
-    return not mutex.held and mutex.acquire()
+    return _unused(only, remove=True)
 
 
 def leftovers(*, only: Collection[str] | None = None) -> tuple[str, ...]:
-    """Return what `sweep` would remove, sorted, and remove nothing."""
-    return tuple(sorted(file.path.name for file in _unused(only, None)))
+    """Return what `sweep` would remove, sorted, and remove nothing; None considers all groups."""
+    return _unused(only, remove=False)
 
 
-def _unused(
-    only: Collection[str] | None, created_after_s: float | None, ignore: Collection[Path] = ()
-) -> list[_File]:
-    """Return the files that may go; that we map the semaphores `ignore` is no use of them."""
-    files = _files()
-    wanted = None if only is None else {_group(name) for name in only}
-    # Listed before looking at processes: whoever made a listed file is looked at afterwards.
-    ours = {file.inode for file in files if file.path in ignore}
-    held, mapped = _inodes_in_use(ours)
-    locks = {file.group for file in files if file.is_lock}
-    spared = {
-        file.group
-        for file in files
-        if file.inode in held
-        or (file.inode in mapped and (file.is_port or file.group not in locks))
-        or file.uid != os.getuid()
-        or (wanted is not None and file.group not in wanted)
-        or (created_after_s is not None and file.modified_s < created_after_s)
-    }
-    return [file for file in files if file.group not in spared]
+def _unused(only: Collection[str] | None, *, remove: bool) -> tuple[str, ...]:
+    groups: dict[str, list[_File]] = {}
+    for file in _files():
+        groups.setdefault(file.group, []).append(file)
+    wanted = groups if only is None else {_group(name) for name in only} & set(groups)
+    found = []
+    for group in sorted(wanted):
+        with _claimed(groups[group]) as claimed:
+            for file in groups[group] if claimed else ():
+                if remove:
+                    file.path.unlink(missing_ok=True)
+                found.append(file.path.name)
+    return tuple(sorted(found))
 
 
-def _files() -> list[_File]:
+@contextlib.contextmanager
+def _claimed(files: Collection[_File]) -> Iterator[bool]:
+    """Hold a group against all other processes for the length of the block.
+
+    Yields:
+        Whether it is: False where a file is in use, another user's, or not as it was listed.
+    """
+    if any(file.uid != os.getuid() for file in files):
+        yield False
+        return
+    locked = any(file.is_lock for file in files)
+    with contextlib.ExitStack() as claims:
+        try:
+            # The semaphore first: who opens the port after this waits until we are done.
+            for file in sorted(files, key=lambda each: not each.is_mutex):
+                if file.is_lock or file.is_port or not locked:
+                    claims.enter_context(_claim(file))
+            # What came meanwhile belongs to a process that just opens it.
+            same = set(_files(next(iter(files)).group)) == set(files)
+        except OSError:
+            same = False
+        yield same
+
+
+@contextlib.contextmanager
+def _claim(file: _File) -> Iterator[None]:
+    """Hold one file.
+
+    Raises:
+        OSError: another process uses it, or the kernel cannot tell.
+    """
+    mode = os.O_RDONLY if file.is_lock else os.O_RDWR
+    flags = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+    descriptor = os.open(file.path, mode | flags)
+    try:
+        if file.is_lock:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        else:
+            # Who then opens it is announced by a signal, by default one that kills.
+            fcntl.fcntl(descriptor, fcntl.F_SETSIG, signal.SIGURG)
+            fcntl.fcntl(descriptor, fcntl.F_SETLEASE, fcntl.F_WRLCK)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _files(group: str = "") -> list[_File]:
+    """Return the files of one group, or of all."""
     found = []
     for entry in _listing(_DIRECTORY):
-        group = _group(entry.name)
-        if not group:
+        of = _group(entry.name)
+        if not of or (group and of != group):
             continue
         with contextlib.suppress(FileNotFoundError):
             status = entry.stat(follow_symlinks=False)
             found.append(
                 _File(
                     path=Path(entry.path),
-                    group=group,
+                    group=of,
                     inode=(status.st_dev, status.st_ino),
                     uid=status.st_uid,
-                    modified_s=status.st_mtime,
                 )
             )
     return found
@@ -178,25 +235,8 @@ def _group(name: str) -> str:
     return match["group"] if match else ""
 
 
-def _all_pids() -> list[int]:
-    return [int(entry.name) for entry in _listing(Path("/proc")) if entry.name.isdigit()]
-
-
-def _inodes_in_use(ours: set[_Inode]) -> tuple[set[_Inode], set[_Inode]]:
-    """Return what any process has open or locked, and what any process maps.
-
-    Processes of other users cannot be looked into; /proc/locks shows their locks all the same.
-    """
-    held, mapped = _locked_inodes(), set()
-    for pid in _all_pids():
-        # Open files first: a file is opened, mapped, and then closed.
-        held |= _peek(_open_inodes, pid)
-        mapped |= _peek(_mapped_inodes, pid) - (ours if pid == os.getpid() else set())
-    return held, mapped
-
-
 def _peek(look: Callable[[int], set[_Inode]], pid: int) -> set[_Inode]:
-    """Look into a process; nothing where it has ended or belongs to somebody else."""
+    """Look into a process; nothing where it has ended or belongs to another user."""
     try:
         return look(pid)
     except (FileNotFoundError, PermissionError, ProcessLookupError):
@@ -211,29 +251,3 @@ def _open_inodes(pid: int) -> set[_Inode]:
                 status = entry.stat()
                 found.add((status.st_dev, status.st_ino))
     return found
-
-
-def _mapped_inodes(pid: int) -> set[_Inode]:
-    found: set[_Inode] = set()
-    with Path(f"/proc/{pid}/maps").open("rb") as maps:
-        for line in maps:
-            if b" /dev/shm/" in line:
-                fields = line.split(maxsplit=5)
-                found.add(_device_inode(fields[3].decode(), int(fields[4])))
-    return found
-
-
-def _locked_inodes() -> set[_Inode]:
-    """Return (device, inode) of every file lock held on this machine, see proc_locks(5)."""
-    found: set[_Inode] = set()
-    for line in Path("/proc/locks").read_text(encoding="ascii").splitlines():
-        place = next((word for word in line.split() if word.count(":") == 2), "")
-        if place:
-            device, _, inode = place.rpartition(":")
-            found.add(_device_inode(device, int(inode)))
-    return found
-
-
-def _device_inode(device: str, inode: int) -> _Inode:
-    major, minor = (int(part, 16) for part in device.split(":"))
-    return os.makedev(major, minor), inode

@@ -32,7 +32,7 @@ _LISTEN = "0A"  # TCP_LISTEN of linux/tcp_states.h
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class OpenSocket:
-    """A bound UDP or listening TCP socket of this process.
+    """A bound UDP or listening TCP socket of a process.
 
     Attributes:
         inode: tells it apart for as long as it is open.
@@ -117,9 +117,16 @@ def check_sockets(urls: Sequence[ConnectionUrl], opened: Sequence[OpenSocket]) -
             )
 
 
-def open_sockets() -> tuple[OpenSocket, ...]:
-    """Return the UDP and listening TCP sockets of this process."""
-    ours = set(_socket_inodes())
+def open_sockets(pid: int | None = None) -> tuple[OpenSocket, ...]:
+    """Return the UDP and listening TCP sockets of a process in our network namespace.
+
+    Args:
+        pid: of the process; None for this one.
+
+    Raises:
+        OSError: there is no such process, or it is not ours to look at.
+    """
+    ours = set(_socket_inodes("self" if pid is None else str(pid)))
     return tuple(each for each in _bound_sockets() if each.inode in ours)
 
 
@@ -185,8 +192,8 @@ def _address(family: int, text: str) -> str:
     return socket.inet_ntop(family, struct.pack(f"={len(words)}I", *words))
 
 
-def _socket_inodes() -> Iterator[int]:
-    for descriptor in Path("/proc/self/fd").iterdir():
+def _socket_inodes(process: str) -> Iterator[int]:
+    for descriptor in Path("/proc", process, "fd").iterdir():
         with contextlib.suppress(OSError):  # closed meanwhile
             target = str(descriptor.readlink())
             if target.startswith("socket:["):

@@ -19,16 +19,20 @@ from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware import (
     SHARED_MEMORY,
+    EndpointInfo,
+    endpoints_of,
     from_rclpy,
     get_network_flow_endpoints,
+    guid_of,
     is_server_matched,
+    matched_with,
 )
 from lifecycle.network.nfe import (
     InternetProtocol,
     NetworkFlowEndpoint,
     TransportProtocol,
 )
-from lifecycle.node import supported
+from lifecycle.node import parameters, supported
 from lifecycle.node.checksum import checksum
 from lifecycle.node.connections import Connection
 from lifecycle.node.data_layer import DataLayer
@@ -48,8 +52,11 @@ from lifecycle.verify.observation import (
 
 if TYPE_CHECKING:
     from rclpy.node import Node
-    from rclpy.topic_endpoint_info import TopicEndpointInfo
 
+_OTHER = {
+    EndpointKind.PUBLISHER: EndpointKind.SUBSCRIPTION,
+    EndpointKind.SUBSCRIPTION: EndpointKind.PUBLISHER,
+}
 _GID_PREFIX_DIGITS = 24
 """A DDS GUID is a 12-byte participant prefix and a 4-byte entity id (DDSI-RTPS §9.3.1)."""
 
@@ -90,6 +97,7 @@ def collect(
         paradigms=supported.PARADIGMS,
         endpoints=endpoints,
         connections=connection_reports(spec, data_layer),
+        parameters=parameters.reports(node),
     )
     return dataclasses.replace(configuration, checksum=checksum(configuration))
 
@@ -147,14 +155,9 @@ def _report(node: Node, mapping: Mapping) -> EndpointReport:
     # A participant knows its own endpoints; the node's own need not know those of another.
     hidden = connection.participant if connection is not None else None
     witness = node if hidden is None else hidden.node
-    info = own_endpoint(witness, report.resolved, endpoint.kind, node_name=witness.get_name())
+    report = _with_matches(report, witness, entity)
     return dataclasses.replace(
-        report,
-        qos=_actual_qos(entity, info),
-        gid=_hex(info.endpoint_gid) if info is not None else "",
-        nfes=_nfes(endpoint.kind, entity, connection),
-        matched=count_peers(entity),
-        dscp=_dscp(mapping),
+        report, nfes=_nfes(endpoint.kind, entity, connection), dscp=_dscp(mapping)
     )
 
 
@@ -167,44 +170,49 @@ def _undeclared_report(node: Node, kind: EndpointKind, entity: Any) -> EndpointR
     )
     if not kind.is_topic:
         return report
-    info = own_endpoint(node, resolved, kind, node_name=node.get_name())
+    return dataclasses.replace(_with_matches(report, node, entity), nfes=_nfes(kind, entity, None))
+
+
+def _with_matches(report: EndpointReport, witness: Node, entity: Any) -> EndpointReport:
+    """Add to the report on a publisher or subscription its GID, QoS, type hash and matched peers.
+
+    Args:
+        report: the topic's name and the kind count.
+        witness: the node whose participant carries it.
+        entity: its rclpy object.
+    """
+    info = _own_endpoint(witness, report.resolved, report.kind, guid_of(entity))
+    # Counted before the peers are asked for: who comes meanwhile must not count as unknown.
+    matched = count_peers(entity)
+    others = endpoints_of(witness, _OTHER[report.kind], report.resolved)
     return dataclasses.replace(
         report,
         qos=_actual_qos(entity, info),
-        gid=_hex(info.endpoint_gid) if info is not None else "",
-        nfes=_nfes(kind, entity, None),
-        matched=count_peers(entity),
+        gid=info.gid if info is not None else "",
+        matched=matched,
+        peers=matched_with(entity, (each.gid for each in others)),
+        type_hash=info.type_hash if info is not None else None,
     )
 
 
-def own_endpoint(
-    node: Node, topic: str, kind: EndpointKind, *, node_name: str
-) -> TopicEndpointInfo | None:
+def _own_endpoint(node: Node, topic: str, kind: EndpointKind, gid: str = "") -> EndpointInfo | None:
     """Return what this process's graph cache says of the node's own endpoint on `topic`.
 
     It knows own endpoints at once, discovery has no part in it. None if there is none, or if
-    there are several: then it cannot be told which is which.
+    there are several and no GID tells which is which.
     """
-    list_endpoints = node.get_publishers_info_by_topic
-    if kind is EndpointKind.SUBSCRIPTION:
-        list_endpoints = node.get_subscriptions_info_by_topic
-    own = [
-        info
-        for info in list_endpoints(topic)
-        if info.node_name == node_name and info.node_namespace == node.get_namespace()
-    ]
+    name = node.get_fully_qualified_name()
+    own = [info for info in endpoints_of(node, kind, topic) if info.node == name]
+    if len(own) > 1 and gid:
+        own = [info for info in own if info.gid == gid]
     return own[0] if len(own) == 1 else None
 
 
 def _gid_prefix(node: Node) -> str:
     """Return the participant's part of the node's GIDs in hex; empty if unknown."""
     topic = node.resolve_topic_name("~/transition_event")
-    info = own_endpoint(node, topic, EndpointKind.PUBLISHER, node_name=node.get_name())
-    return _hex(info.endpoint_gid)[:_GID_PREFIX_DIGITS] if info is not None else ""
-
-
-def _hex(gid: Iterable[int]) -> str:
-    return bytes(gid).hex()
+    info = _own_endpoint(node, topic, EndpointKind.PUBLISHER)
+    return info.gid[:_GID_PREFIX_DIGITS] if info is not None else ""
 
 
 def _nfes(
@@ -232,12 +240,12 @@ def _dscp(mapping: Mapping) -> int | None:
         return None  # likewise: sockets that cannot be read are "not read"
 
 
-def _actual_qos(entity: Any, info: TopicEndpointInfo | None) -> QosProfile:
+def _actual_qos(entity: Any, info: EndpointInfo | None) -> QosProfile:
     """Return the QoS in force; history and depth, which the graph lacks, as they were asked for."""
     asked = from_rclpy(entity.qos_profile)
     if info is None:
         return asked
-    actual = from_rclpy(info.qos_profile)
+    actual = info.qos
     return dataclasses.replace(actual, history=asked.history, depth=asked.depth)
 
 

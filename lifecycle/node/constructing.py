@@ -19,6 +19,7 @@ from lifecycle.node.control import HostSpec
 from lifecycle.node.loading import load_class
 from lifecycle.node.node import LifecycleNode
 from lifecycle.node.spec import Construction, Mode, constructing, ros_arguments
+from lifecycle.plan.command import parameter_text
 from lifecycle.plan.model import PlannedNode
 
 
@@ -26,10 +27,12 @@ def process_context(spec: HostSpec) -> Context:
     """Initialise rclpy for a process and return its default context."""
     arguments: list[str] = []
     if len(spec.nodes) == 1 and not spec.nodes[0].managed:
-        # A plain node names itself; only process-wide remaps can give it the planned name.
+        # A plain node names itself; only process-wide arguments can give it name and parameters.
         node = spec.nodes[0]
         words = ros_arguments(node) or ["--ros-args"]
         arguments = [*words, "-r", f"__node:={node.name}", "-r", f"__ns:={node.namespace}"]
+        for name, value in node.parameters:
+            arguments += ["-p", f"{name}:={parameter_text(value)}"]
     rclpy.init(
         args=arguments,
         domain_id=spec.domain_id,
@@ -75,11 +78,15 @@ class Participants:
         self._made[settings] = context
 
 
-def construct(planned: PlannedNode, context: Context, *, alone: bool) -> Node:
-    """Construct one planned node.
+def class_of(planned: PlannedNode, *, alone: bool) -> type[Node]:
+    """Import the class of one planned node.
+
+    Args:
+        planned: names it.
+        alone: it is the only node of its process.
 
     Raises:
-        LifecycleError: the class cannot be used as planned. What its constructor raises passes.
+        LifecycleError: the class cannot be used as planned. What its module raises passes.
     """
     node_class = load_class(planned.run.python)
     managed = issubclass(node_class, LifecycleNode)
@@ -94,6 +101,15 @@ def construct(planned: PlannedNode, context: Context, *, alone: bool) -> Node:
             "and remaps from its process",
             hint="give it a process of its own",
         )
-    construction = Construction(spec=planned, mode=Mode.MANUAL, context=context)
+    return node_class
+
+
+def construct(planned: PlannedNode, node_class: type[Node], context: Context, system: str) -> Node:
+    """Construct one planned node of a supervised system; what its constructor raises passes."""
+    # Of a plain node the supervisor drives no states.
+    supervisor = system if planned.managed else ""
+    construction = Construction(
+        spec=planned, mode=Mode.MANUAL, context=context, supervisor=supervisor
+    )
     with constructing(construction):
         return node_class()

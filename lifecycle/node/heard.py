@@ -13,7 +13,7 @@ import threading
 import typing
 from collections.abc import Callable
 
-from lifecycle.middleware.busy_sign import BusySign
+from lifecycle.middleware.busy_sign import BusySign, Overdue
 from lifecycle.middleware.liveliness import AlivePublisher, node_topic
 from lifecycle.node.node import LifecycleNode
 from lifecycle.node.watchdog import Watchdog
@@ -54,10 +54,16 @@ class Heard:
 
     def _watch(self) -> None:
         while select.select([self._sign], [], []):
-            if self._sign.overdue():
+            why = self._sign.overdue()
+            if why is Overdue.HANGS:
                 self._tell(
                     f"a callback in its process (pid {os.getpid()}) has been running for "
                     f"{self._sign.limit_s:g} s"
+                )
+            elif why is Overdue.UNSERVED and not self._silent:
+                self._tell(
+                    f"its process (pid {os.getpid()}) gets no processor for its callback: the "
+                    "machine is overloaded"
                 )
 
     def _tell(self, why: str) -> None:

@@ -5,17 +5,23 @@ Owns: reading and writing its lines, and the descriptors that come beside the fi
 
 from __future__ import annotations
 
+import importlib
 import logging
 import os
 import socket
 import sys
 import threading
 import traceback
+from pathlib import Path
+from types import TracebackType
 from typing import NoReturn
 
 from lifecycle import codec
 from lifecycle.errors import LifecycleError
 from lifecycle.node.control import SIGN_DESCRIPTORS, Event
+
+_OURS = f"{Path(__file__).parent}{os.sep}"
+"""Where the host's own modules are."""
 
 
 class HostChannel:
@@ -55,12 +61,32 @@ class HostChannel:
                 logging.getLogger(__name__).debug("cannot tell the supervisor: %s", error)
 
 
-def give_up(channel: HostChannel, node: str, error: Exception) -> NoReturn:
-    """Tell the supervisor why there is nothing to host, leave the trace in the log, and go."""
-    traceback.print_exception(type(error), error, error.__traceback__)
-    sys.stderr.flush()
+def report_failure(channel: HostChannel, node: str, error: Exception) -> None:
+    """Notify the supervisor why a node cannot be hosted, and leave the user's trace in the log."""
+    trace = _of_user(error.__traceback__)
+    if trace is not None or not isinstance(error, LifecycleError):
+        traceback.print_exception(type(error), error, trace)
+        sys.stderr.flush()
     reason = str(error) if isinstance(error, LifecycleError) else f"{type(error).__name__}: {error}"
     channel.write(Event(kind="failed", node=node, ok=False, error=reason))
+
+
+def give_up(channel: HostChannel, node: str, error: Exception) -> NoReturn:
+    """Report a failure, and end the process."""
+    report_failure(channel, node, error)
     from lifecycle.middleware.teardown import leave_and_exit
 
     leave_and_exit(1)
+
+
+def _of_user(trace: TracebackType | None) -> TracebackType | None:
+    """Return a traceback from the first frame on that is the user's; None if all are ours.
+
+    Ours, and those of the import system, are the same for every node that cannot be imported.
+    """
+    while trace is not None:
+        file = trace.tb_frame.f_code.co_filename
+        if not file.startswith((_OURS, "<frozen importlib")) and file != importlib.__file__:
+            return trace
+        trace = trace.tb_next
+    return None

@@ -63,7 +63,7 @@ class HostCommands:
         if command.operation in _NODE_INTERFACE:
             await _NODE_INTERFACE[command.operation](node.lifecycle.interface, command)
             return self._reply(command, ok=True)
-        result = await node.lifecycle.change(command.operation.value)
+        result = await node.lifecycle.change_for_supervisor(command.operation.value)
         return self._reply(command, ok=result.outcome is Outcome.SUCCESS, error=result.error)
 
     def _reply(
@@ -73,7 +73,11 @@ class HostCommands:
         if node is None:
             return Event(kind="reply", node=command.node, id=command.id, ok=ok, error=error)
         state = node.lifecycle.state
-        carries = describe and command.operation not in _ANSWERED_WITHOUT_CONFIGURATION
+        carries = describe and (
+            command.operation not in _ANSWERED_WITHOUT_CONFIGURATION
+            # Of its sockets nobody tells: what its callback did to them is read when it has ended.
+            or (command.operation is Operation.ACTIVATE and node.lifecycle.is_marked)
+        )
         return Event(
             kind="reply",
             node=command.node,

@@ -61,6 +61,11 @@ class NodeLoop:
         self._done = False
         self._code = 0
 
+    @property
+    def nodes(self) -> tuple[Node, ...]:
+        """Those that were added."""
+        return tuple(self._nodes)
+
     def add(self, node: Node) -> None:
         """Spin a node from now on; shut down in reverse order of addition."""
         self._nodes.append(node)

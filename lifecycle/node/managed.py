@@ -40,6 +40,9 @@ from lifecycle.verify.observation import NodeConfiguration
 if TYPE_CHECKING:
     from lifecycle.node.node import LifecycleNode
 
+_WITHOUT_DATA_LAYER = (NodeState.INACTIVE_DISCONNECTED, NodeState.UNCONFIGURED, NodeState.FINALIZED)
+"""A node that comes to one of these is not the one that was verified any more."""
+
 BRING_UP = (Request.CONFIGURE, Request.CONNECT, Request.ACTIVATE)
 
 
@@ -59,8 +62,13 @@ class Managed:
         call_soon: runs a function, sync or async, in its executor; returns whether there is one.
     """
 
-    def __init__(self, node: LifecycleNode, spec: PlannedNode, mode: Mode, gate: Gate) -> None:
+    def __init__(
+        self, node: LifecycleNode, spec: PlannedNode, mode: Mode, gate: Gate, supervisor: str = ""
+    ) -> None:
         self._node = node
+        self._supervisor = supervisor
+        # By its supervisor, through the gate; a node without one needs nobody's leave.
+        self._let_through = not supervisor
         self.mode = mode
         self.gate = gate
         # Reentrant: others may ask, and answers come in, while a transition's callback runs.
@@ -75,6 +83,7 @@ class Managed:
         self.configuration_changes = ConfigurationChanges(
             self.call_soon, self.get_configuration, failed=node.get_logger().error
         )
+        node.add_post_set_parameters_callback(lambda _: self.configuration_changes.touch())
         self.undeclared = Undeclared(self.configuration_changes.touch)
         self.data_layer = DataLayer(
             node,
@@ -128,21 +137,38 @@ class Managed:
         """Run a transition from inside the executor: `await node.lifecycle.change("connect")`.
 
         Raises:
-            RefusedError: not allowed in this state, or another transition is running.
+            RefusedError: not allowed in this state, another transition is running, or the gate of
+                the node's supervisor is closed.
             LifecycleError: no such transition.
         """
-        try:
-            known = Request(request)
-        except ValueError as error:
-            hint = alternatives(str(request), [each.value for each in Request])
-            raise LifecycleError(f"cannot take transition {request!r}", hint=hint) from error
-        return await self._controller.change(known)
+        return await self._change(_known(request))
+
+    async def change_for_supervisor(self, request: Request | str) -> Result:
+        """Run a transition that the supervisor asked for; its activate is the gate's permit.
+
+        Whoever it lets through may be deactivated and activated again by anybody, until the
+        supervisor deactivates it or its data layer goes, which is what was verified. A node that
+        somebody else has deactivated already is where the supervisor wants it.
+
+        Raises:
+            RefusedError: as for `change`.
+            LifecycleError: likewise.
+        """
+        known = _known(request)
+        if self._supervisor and known is Request.DEACTIVATE:
+            self._let_through = False
+            if self.state is NodeState.INACTIVE_CONNECTED:
+                return SUCCESS
+        result = await self._controller.change(known)
+        if known is Request.ACTIVATE and result.outcome is Outcome.SUCCESS:
+            self._let_through = True
+        return result
 
     async def bring_up(self) -> Result:
         """Configure, connect and activate; stops at the first that does not succeed."""
         result = SUCCESS
         for request in BRING_UP:
-            result = await self._controller.change(request)
+            result = await self._change(request)
             if result.outcome is not Outcome.SUCCESS:
                 break
         return result
@@ -173,6 +199,11 @@ class Managed:
     async def shut_down(self, reason: str) -> Result:
         """Bring the node to finalized from any state; a running async callback is cancelled."""
         return await self._controller.shut_down(reason)
+
+    @property
+    def is_marked(self) -> bool:
+        """Whether the plan says what DSCP any of its endpoints sends with."""
+        return any(each.dscp is not None for each in self.spec.endpoints)
 
     def get_configuration(self) -> NodeConfiguration:
         """Return who this node is and what its endpoints really are."""
@@ -247,9 +278,18 @@ class Managed:
             self._member.connection_event(event)
         self.connection_events.tell(event)
 
+    async def _change(self, request: Request) -> Result:
+        if request is Request.ACTIVATE and not self._let_through:
+            raise RefusedError(
+                f"cannot activate {self.full_name}: the gate of its supervisor is closed",
+                hint=f"it is activated once {self._supervisor!r} is verified; a paused system: "
+                f"lifecycle resume {self._supervisor}",
+            )
+        return await self._controller.change(request)
+
     async def _change_by_service(self, request: Request) -> bool:
         try:
-            result = await self._controller.change(request)
+            result = await self._change(request)
         except RefusedError as refused:
             self._node.get_logger().warning(str(refused))
             return False
@@ -261,9 +301,19 @@ class Managed:
             self.gate.open()
         elif change.start is NodeState.ACTIVE:
             self.gate.close()
+        if self._supervisor and change.goal in _WITHOUT_DATA_LAYER:
+            self._let_through = False
         if change.event is not None:
             self._services.publish(change.event)
         if self._member is not None:
             self._member.state_changed(change.goal)
         for listener in self._listeners:
             listener(self._node)
+
+
+def _known(request: Request | str) -> Request:
+    try:
+        return Request(request)
+    except ValueError as error:
+        hint = alternatives(str(request), [each.value for each in Request])
+        raise LifecycleError(f"cannot take transition {request!r}", hint=hint) from error

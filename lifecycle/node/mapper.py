@@ -218,12 +218,11 @@ class Mapper:
         if mapping.endpoint.kind in CLIENTS:
             self._changed()  # nobody counts their peers
             return
-        has_changed = self._standing.matched(mapping)
+        self._standing.matched(mapping)
         running = self._handovers.get(mapping.key)
         if running is not None:
             running[0].peers_changed(mapping.peers or 0)
-        if has_changed:
-            self._changed()
+        self._changed()  # as many peers as before may be others
 
 
 def _done() -> Future:

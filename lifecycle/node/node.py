@@ -130,7 +130,8 @@ class LifecycleNode(Declarations, LocalInterface, GatedFactories):
         )
         if spec.log_level:
             self.get_logger().set_level(LoggingSeverity[spec.log_level.upper()])
-        self.lifecycle: Managed = Managed(self, spec, mode, self._gate)
+        supervisor = construction.supervisor if construction is not None else ""
+        self.lifecycle: Managed = Managed(self, spec, mode, self._gate, supervisor)
         if construction is None and mode is Mode.AUTO:
             self.lifecycle.bring_up_when_spun()
 
@@ -180,6 +181,11 @@ class LifecycleNode(Declarations, LocalInterface, GatedFactories):
         goes on meanwhile, requests to cancel a goal included.
         """
         return self.lifecycle.sleep(seconds)
+
+    def undeclare_parameter(self, name: str) -> None:
+        """As rclpy's, which tells nobody; the node's configuration has changed."""
+        super().undeclare_parameter(name)
+        self.lifecycle.configuration_changes.touch()
 
     def destroy_node(self) -> None:
         """As rclpy's; participants of its own go with it."""

@@ -1,8 +1,9 @@
 """Parameters of a node: what its interface declares, with the values the plan gives.
 
-Owns: from ParameterDeclaration to rclpy's declared parameters. Values come, weakest first, from
-the interface's default, parameter files, and the manifest's `parameters:`. Parameters stay
-declared through cleanup, so that what an operator set survives into the next configure.
+Owns: from ParameterDeclaration to rclpy's declared parameters, and what a node reports of them.
+Values come, weakest first, from the interface's default, parameter files, and the manifest's
+`parameters:`. Parameters stay declared through cleanup, so that what an operator set survives into
+the next configure.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ from rclpy.parameter import Parameter
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import ParameterDeclaration, ParameterValue
+from lifecycle.middleware import parameter_value, type_word
+from lifecycle.verify.observation import ParameterReport
 
 if TYPE_CHECKING:
     from rclpy.node import Node
@@ -68,6 +71,21 @@ def declare(node: Node, spec: PlannedNode) -> None:
             problems.append(_problem(declared, error))
     if problems:
         raise LifecycleError("\n".join(problems))
+
+
+def reports(node: Node) -> tuple[ParameterReport, ...]:
+    """Return what every parameter that `node` has declared is now, sorted by name."""
+    found = sorted(node.get_parameters_by_prefix("").items())
+    descriptors = node.describe_parameters([name for name, _ in found])
+    return tuple(
+        ParameterReport.of(
+            name,
+            type_word(parameter.type_.value) or type_word(descriptor.type),
+            parameter_value(parameter.value),
+            read_only=descriptor.read_only,
+        )
+        for (name, parameter), descriptor in zip(found, descriptors, strict=True)
+    )
 
 
 def to_rclpy(value: ParameterValue, type_: str) -> Any:

@@ -43,12 +43,15 @@ class Construction:
             also does it: the node does not bring itself up.
         context: the rclpy context to live in; None for the default one.
         use_global_arguments: take remaps from the process's own --ros-args.
+        supervisor: name of the system whose supervisor alone may activate the node, once its gate
+            is open; empty for a node that runs by itself.
     """
 
     spec: PlannedNode | None
     mode: Mode | None = None
     context: Context | None = None
     use_global_arguments: bool = False
+    supervisor: str = ""
 
 
 _CURRENT: contextvars.ContextVar[Construction | None] = contextvars.ContextVar(

@@ -84,19 +84,18 @@ class Standing:
             )
         )
 
-    def matched(self, mapping: Mapping) -> bool:
-        """Count the peers of a mapping again; returns whether they are more or fewer."""
+    def matched(self, mapping: Mapping) -> None:
+        """Count the peers of a mapping again, and tell if they are more or fewer."""
         before = mapping.peers or 0
         self._count(mapping)
         now = mapping.peers or 0
         if mapping.connection is None or now == before:
-            return False
+            return
         kind = ConnectionEventKind.MAPPING_ESTABLISHED
         if now < before:
             kind = ConnectionEventKind.MAPPING_LOST
         self._tell_mapping(mapping, kind)
         self._judge(mapping.connection, lost=now < before)
-        return True
 
     def _known(self, connection: Connection) -> Connection:
         """Return the connection as which others know it."""

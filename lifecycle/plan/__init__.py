@@ -1,6 +1,7 @@
 """Manifest → Plan: the computational and the data layer graph of a system, ready to run. Pure."""
 
-from lifecycle.plan.build import build_plan, check_plan, effective_domain
+from lifecycle.plan.build import build_plan, check_plan, effective_domain, with_files_of_now
+from lifecycle.plan.comparison import Change, changes, differences, plan_checksum
 from lifecycle.plan.data_layer import (
     DataLayerGraph,
     NegotiatedConnection,
@@ -17,6 +18,7 @@ from lifecycle.plan.model import (
     ParticipantConnections,
     Plan,
     PlannedEndpoint,
+    PlannedFile,
     PlannedFlow,
     PlannedNode,
     PlannedParticipant,
@@ -26,11 +28,12 @@ from lifecycle.plan.model import (
 from lifecycle.plan.negotiate import negotiate
 from lifecycle.plan.participants import ParticipantCost, owner_of, participants_cost
 from lifecycle.plan.parties import party_of_node, wishes_of
-from lifecycle.plan.restart import is_restarted_url, restarted
+from lifecycle.plan.restart import is_restarted_url, moved_observer, moving_nodes, restarted
 from lifecycle.plan.terms import hosts_of, terms_of
 from lifecycle.plan.wiring import with_graph
 
 __all__ = [
+    "Change",
     "DataLayerGraph",
     "NegotiatedConnection",
     "NegotiatedFlow",
@@ -43,6 +46,7 @@ __all__ = [
     "Plan",
     "PlanError",
     "PlannedEndpoint",
+    "PlannedFile",
     "PlannedFlow",
     "PlannedNode",
     "PlannedParticipant",
@@ -50,17 +54,23 @@ __all__ = [
     "PlannedServer",
     "Terms",
     "build_plan",
+    "changes",
     "check_plan",
     "difference",
+    "differences",
     "effective_domain",
     "hosts_of",
     "is_restarted_url",
+    "moved_observer",
+    "moving_nodes",
     "negotiate",
     "owner_of",
     "participants_cost",
     "party_of_node",
+    "plan_checksum",
     "restarted",
     "terms_of",
     "wishes_of",
+    "with_files_of_now",
     "with_graph",
 ]

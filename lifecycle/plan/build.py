@@ -1,19 +1,21 @@
 """Manifest → Plan.
 
 Owns: `build_plan`, which puts the parts of this room together, and `check_plan`, which only says
-whether that can be done. Nothing here starts anything. Pure
-but for the environment and for finding executables.
+whether that can be done. Nothing here starts anything. Pure but for the environment, for finding
+executables and for reading parameter files.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 from lifecycle.errors import UsageError
 from lifecycle.manifest.ament_index import search_prefixes
-from lifecycle.manifest.diagnostics import Diagnostic, Position
+from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position
 from lifecycle.manifest.document import error
 from lifecycle.manifest.flow_needs import FlowNeeds, ParticipantGroup, ResolvedNeed
 from lifecycle.manifest.model import (
@@ -27,14 +29,17 @@ from lifecycle.manifest.model import (
     RunKind,
 )
 from lifecycle.manifest.names import resolve
+from lifecycle.manifest.source import read_bytes
+from lifecycle.manifest.type_hash import installed_hash
 from lifecycle.network.ports import MAX_DOMAIN_ID, domain_of
 from lifecycle.network.rmw_capabilities import DEFAULT_RMW
 from lifecycle.plan.declared_connections import place_declared
 from lifecycle.plan.errors import PlanError
 from lifecycle.plan.flows import planned_flows
 from lifecycle.plan.levels import dependency_levels
-from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedNode
-from lifecycle.plan.participants import place_publishers
+from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedFile, PlannedNode
+from lifecycle.plan.parameters import ParameterFiles
+from lifecycle.plan.participants import place_flows
 from lifecycle.plan.processes import planned_processes, process_name
 from lifecycle.plan.wiring import Wired, variables_of, wire
 
@@ -81,10 +86,25 @@ def build_plan(manifest: Manifest, *, environment: Mapping[str, str] | None = No
         discovery_mode=manifest.discovery.mode,
         discovery=manifest.discovery,
         max_datagram_bytes=manifest.network.max_datagram_bytes,
+        network=manifest.network,
         server=wired.server,
         observers=wired.observers,
     )
     return _told(plan)
+
+
+def with_files_of_now(plan: Plan) -> Plan:
+    """Return a plan with the digests that its parameter files have now."""
+    nodes = tuple(
+        dataclasses.replace(
+            node,
+            files=tuple(
+                _planned_file(node.parameter_files, each.place, each.written) for each in node.files
+            ),
+        )
+        for node in plan.nodes
+    )
+    return dataclasses.replace(plan, nodes=nodes)
 
 
 def check_plan(
@@ -113,8 +133,10 @@ def check_plan(
 
 def _wired(manifest: Manifest, variables: Mapping[str, str], *, domain_id: int, rmw: str) -> Wired:
     """Plan nodes, flows and how they are connected."""
-    needs = FlowNeeds(manifest, search_prefixes(variables))
-    nodes = tuple(_planned_node(node, needs) for node in manifest.nodes)
+    prefixes = search_prefixes(variables)
+    needs = FlowNeeds(manifest, prefixes)
+    files = ParameterFiles(manifest.path)
+    nodes = tuple(_planned_node(node, needs, prefixes, files) for node in manifest.nodes)
     return wire(
         manifest,
         nodes,
@@ -189,16 +211,20 @@ def effective_range(discovery: Discovery, environment: Mapping[str, str]) -> Dis
         ) from None
 
 
-def _planned_node(node: Node, needs: FlowNeeds) -> PlannedNode:
+def _planned_node(
+    node: Node, needs: FlowNeeds, prefixes: Sequence[Path], files: ParameterFiles
+) -> PlannedNode:
     endpoints = tuple(
-        _planned_endpoint(node, endpoint, needs.of(node.key, endpoint.kind, endpoint.name))
+        _planned_endpoint(
+            node, endpoint, needs.of(node.key, endpoint.kind, endpoint.name), prefixes
+        )
         for endpoint in node.interface.endpoints
     )
     # Only a node in our own host can be given more participants; what others start keeps its own.
     ours = node.run.kind is RunKind.PYTHON
     groups: tuple[ParticipantGroup, ...] = needs.groups(node) if ours else ()
     endpoints, connected, groups = place_declared(node.name, endpoints, node.connections, groups)
-    endpoints, participants = place_publishers(node.name, endpoints, groups)
+    endpoints, participants = place_flows(node.name, endpoints, groups)
     return PlannedNode(
         key=node.key,
         name=node.name,
@@ -211,6 +237,8 @@ def _planned_node(node: Node, needs: FlowNeeds) -> PlannedNode:
         declared_parameters=node.interface.parameters,
         parameters=node.parameters,
         parameter_files=node.parameter_files,
+        expected_parameters=files.expected(node),
+        unread_parameter_files=files.unread(node),
         remap=node.remap,
         participants=(*connected, *participants),
         after=node.after,
@@ -218,11 +246,29 @@ def _planned_node(node: Node, needs: FlowNeeds) -> PlannedNode:
         endpoint_policy=node.endpoints,
         log_level=node.log_level,
         transports=needs.node_transports(node) if ours else (),
+        files=tuple(
+            _planned_file(node.parameter_files, place, text) for place, text in node.written_paths
+        ),
         at=node.at,
     )
 
 
-def _planned_endpoint(node: Node, endpoint: Endpoint, need: ResolvedNeed | None) -> PlannedEndpoint:
+def _planned_file(files: tuple[str, ...], place: str, written: str) -> PlannedFile:
+    part, _, index = place.partition(".")
+    if part != "parameter_files":
+        return PlannedFile(place=place, written=written)
+    try:
+        contents = read_bytes(files[int(index)], file=written)
+    except ManifestError:
+        return PlannedFile(place=place, written=written)  # check.parameter-file says so
+    return PlannedFile(
+        place=place, written=written, digest=hashlib.sha256(contents).hexdigest()[:16]
+    )
+
+
+def _planned_endpoint(
+    node: Node, endpoint: Endpoint, need: ResolvedNeed | None, prefixes: Sequence[Path]
+) -> PlannedEndpoint:
     resolved = resolve(
         endpoint.name,
         node_name=node.name,
@@ -236,6 +282,8 @@ def _planned_endpoint(node: Node, endpoint: Endpoint, need: ResolvedNeed | None)
         resolved=resolved,
         type=endpoint.type,
         qos=endpoint.qos,
+        qos_defaults=endpoint.qos_defaults,
+        type_hash=installed_hash(endpoint.type, prefixes),
         at=endpoint.at,
     )
     if need is None:
@@ -256,5 +304,9 @@ def _planned_endpoint(node: Node, endpoint: Endpoint, need: ResolvedNeed | None)
         loss=need.need.loss,
         rate_hz=need.need.rate_hz,
         max_message_size=need.max_message_size,
+        max_message_size_reason=""
+        if need.max_message_size == need.need.max_message_size
+        else "the bound of its type",
         lossy=need.need.lossy,
+        quantities=need.need.quantities,
     )

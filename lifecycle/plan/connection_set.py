@@ -109,9 +109,8 @@ def _drafts(wanted: Sequence[Wanted]) -> list[_Draft]:
     groups: dict[tuple[str, tuple[str, ...], str, str], list[Wanted]] = {}
     for each in wanted:
         alone = each.endpoint.label if each.endpoint.alone else ""
-        publishes = each.endpoint.kind is EndpointKind.PUBLISHER
-        group = each.endpoint.group if publishes else ""
-        groups.setdefault((each.party.key, each.transports, group, alone), []).append(each)
+        place = (each.party.key, each.transports, each.endpoint.group, alone)
+        groups.setdefault(place, []).append(each)
     drafts = []
     names: dict[str, set[str]] = {}
     for (key, transports, group, alone), members in sorted(groups.items()):

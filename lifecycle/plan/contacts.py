@@ -1,17 +1,23 @@
 """Where participants listen for each other, as far as that is planned.
 
-Owns: `Contact`, reading contacts out of connection URLs, and spelling the URL of a participant
-whose ports are fixed. Pure.
+Owns: `Contact`, reading contacts out of connection URLs, spelling the URL of a participant whose
+ports are fixed, and `reached_hosts`, where multicast alone may not reach everybody. Pure.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+import ipaddress
+from collections.abc import Collection, Iterable, Mapping, Sequence
 
+from lifecycle.manifest.model import DiscoveryMode, DiscoveryRange, FlowTransport
 from lifecycle.network.connection_url import ConnectionTransport, ConnectionUrl, Peer, parse
+from lifecycle.plan.model import Plan
 
 UDP = (ConnectionTransport.UDPV4, ConnectionTransport.UDPV6, ConnectionTransport.UDPM)
+
+_SPARE = 4
+"""Participants of other systems and tools on a host, which take ports before or between ours."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True, order=True)
@@ -122,3 +128,35 @@ def fixed_url(
         peers=tuple(peers),
         multicast=False,
     )
+
+
+def reached_hosts(plan: Plan, own: Collection[str]) -> Mapping[str, int]:
+    """Return the other hosts of a system that are looked for by address, beside multicast.
+
+    A router does not pass multicast. Where discovery finds whoever comes, beyond this host, the
+    addresses of `machines:` are as good as ROS_STATIC_PEERS; other modes have their own peers.
+    IPv6 hosts are found by multicast only: rmw_fastrtps resolves no IPv6 address of a peer.
+
+    Args:
+        plan: the system.
+        own: machines that are this host.
+
+    Returns:
+        By IPv4 address, how many participants may be there: the supervisor, each process, each
+        participant that the plan adds, and a few of others.
+    """
+    far = plan.discovery_range in (DiscoveryRange.SUBNET, DiscoveryRange.SYSTEM_DEFAULT)
+    by_ipv4 = plan.discovery.transport in (FlowTransport.ANY, FlowTransport.UDPV4)
+    if plan.discovery_mode is not DiscoveryMode.DYNAMIC or not far or not by_ipv4:
+        return {}
+    hosts: dict[str, int] = {}
+    for machine in plan.machines:
+        if machine.name in own or not machine.address:
+            continue
+        address = ipaddress.ip_address(machine.address)
+        nodes = [each for each in plan.nodes if each.machine == machine.name]
+        if nodes and address.version == 4 and not address.is_loopback:
+            count = len({each.process for each in nodes})
+            count += sum(len(each.participants) for each in nodes)
+            hosts[str(address)] = hosts.get(str(address), 1 + _SPARE) + count
+    return hosts

@@ -39,7 +39,7 @@ class PartyEndpoint:
             is spelled `udpm@239.255.1.9:7901`.
         fixed: it cannot be mapped elsewhere.
         alone: it shares its participant with no other.
-        group: publishers that may share a participant have the same.
+        group: endpoints that may share a participant have the same.
         transport: what its node's manifest asks for.
         lossy: the data bear an unreliable transport; None if nobody said.
         size_bytes: largest serialized message; None if not known.

@@ -1,7 +1,7 @@
 """Connections that a manifest spells out → participants of the plan.
 
 Owns: placing a node's endpoints on the connections that `connections:` declares for it, with what
-`flows:` asks of the publishers among them. Pure.
+`flows:` asks of them. Pure.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import dataclasses
 from collections.abc import Sequence
 
 from lifecycle.manifest.flow_needs import ParticipantGroup
-from lifecycle.manifest.model import ConnectionDeclaration, EndpointKind
+from lifecycle.manifest.model import ConnectionDeclaration
 from lifecycle.plan.model import ParticipantConnections, PlannedEndpoint, PlannedParticipant
 
 
@@ -33,11 +33,11 @@ def place_declared(
         node_name: the node's base name.
         endpoints: all of the node's endpoints.
         declared: its connections.
-        groups: publishers that must share, or not share, a participant.
+        groups: endpoints that must share, or not share, a participant.
 
     Returns:
         The endpoints with `participant` filled in where a connection carries them, a participant
-        for each connection, and the groups without the publishers that are placed now.
+        for each connection, and the groups without the endpoints that are placed now.
     """
     places = {
         entry: participant_name(node_name, connection.name)
@@ -48,11 +48,10 @@ def place_declared(
         dataclasses.replace(each, participant=places.get((each.kind, each.name), each.participant))
         for each in endpoints
     )
-    on = {name for kind, name in places if kind is EndpointKind.PUBLISHER}
     left = tuple(
-        dataclasses.replace(group, publishers=remaining)
+        dataclasses.replace(group, names=remaining)
         for group in groups
-        if (remaining := tuple(name for name in group.publishers if name not in on))
+        if (remaining := tuple(name for name in group.names if (group.kind, name) not in places))
     )
     return placed, tuple(_participant(node_name, each, groups) for each in declared), left
 
@@ -60,8 +59,11 @@ def place_declared(
 def _participant(
     node_name: str, connection: ConnectionDeclaration, groups: Sequence[ParticipantGroup]
 ) -> PlannedParticipant:
-    publishers = {name for kind, name in connection.map if kind is EndpointKind.PUBLISHER}
-    needs = [group for group in groups if publishers & {*group.publishers}]
+    needs = [
+        group
+        for group in groups
+        if {*connection.map} & {(group.kind, name) for name in group.names}
+    ]
     marks = [url.dscp for url in connection.urls] + [group.dscp for group in needs]
     sizes = [group.max_datagram_bytes for group in needs]
     count = len(connection.map)
@@ -73,4 +75,5 @@ def _participant(
         non_blocking_send=any(group.non_blocking_send for group in needs),
         connection=connection.name,
         connections=ParticipantConnections(urls=tuple(str(url) for url in connection.urls)),
+        declared=True,
     )

@@ -101,10 +101,10 @@ def _without_udp(
     if not by or not {*by} <= _NO_UDP:
         return
     has = ", ".join(by)
-    if each.kind is EndpointKind.PUBLISHER and each.dscp is not None and each.enforce_dscp:
+    if each.dscp is not None and each.enforce_dscp:
         message = (
-            f"cannot mark publisher {each.name!r} of {node.key!r} {describe(each.dscp)}: its "
-            f"participant has {has}, and only UDP sockets can be marked"
+            f"cannot mark {each.kind.noun} {each.name!r} of {node.key!r} {describe(each.dscp)}: "
+            f"its participant has {has}, and only UDP sockets can be marked"
         )
         hint = "use 'transport: udpv4', or remove the mark"
         yield error("plan.mark-without-udp", _at(node, each), message, hint)

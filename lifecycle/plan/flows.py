@@ -63,4 +63,5 @@ def _flow(pair: tuple[str, str, str], links: Sequence[Link]) -> PlannedFlow:
         max_delay_ms=min(delays, default=None),
         linked=bool(named),
         transport=next(iter(told), FlowTransport.ANY),
+        quantities=tuple(each for link in named for each in link.quantities),
     )

@@ -21,9 +21,11 @@ from lifecycle.manifest.model import (
     FlowIdentification,
     FlowTransport,
     Machine,
+    Network,
     ParameterDeclaration,
     ParameterValue,
     Policy,
+    Quantity,
     Run,
     Timeouts,
     UniqueHow,
@@ -81,10 +83,11 @@ class ParticipantConnections:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class PlannedParticipant:
-    """An extra DDS participant that carries publishers which need their own flow.
+    """An extra DDS participant that carries endpoints which need their own flow or mark.
 
     A publisher becomes unique only in its own participant, so the planner groups publishers of one
-    class (same DSCP, same need) and gives each strictly or optionally unique one its own.
+    class (same DSCP, same need) and gives each strictly or optionally unique one its own. Marked
+    subscriptions are grouped likewise: what they acknowledge with leaves by its sockets.
 
     Attributes:
         name: base name of the hidden node that owns it, `_camera_flow_0`; its namespace is the
@@ -98,6 +101,7 @@ class PlannedParticipant:
         connection: name of the connection it stands for, unique in the node, `net`; empty for one
             that only tells a publisher's flow apart.
         connections: what `connect_to` is told.
+        declared: the manifest spells the connection out.
     """
 
     name: str
@@ -108,6 +112,7 @@ class PlannedParticipant:
     non_blocking_send: bool = False
     connection: str = ""
     connections: ParticipantConnections = ParticipantConnections()
+    declared: bool = False
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -117,6 +122,7 @@ class PlannedEndpoint:
     Attributes:
         name: as declared in the interface; the handle that code uses.
         resolved: fully qualified topic, service or action name after namespace and remap.
+        dscp: 0–63 of what it sends: a publisher's data, a subscription's acknowledgements.
         dscp_reason: where a DSCP comes from that is not written as such; empty if it is.
         five_qi_reason: why it is this 5QI, or none, where the manifest says `auto`; else empty.
         participant: base name of the PlannedParticipant that carries it; empty for the node's own.
@@ -126,7 +132,14 @@ class PlannedEndpoint:
         rate_hz: declared messages per second.
         max_message_size: largest serialized message, bytes: as declared, else the type's bound;
             None if the type has none or is not installed here.
+        max_message_size_reason: where a size comes from that is not written as such; empty if it
+            is.
         lossy: the data bear an unreliable transport; None if nobody said.
+        qos_defaults: policies of `qos` that no manifest writes: the endpoint is made with them, and
+            nobody requires them.
+        quantities: numbers of its flow need that only a measurement could prove.
+        type_hash: of the definition that is installed here (REP-2016), as `ObservedEndpoint` has
+            it; empty if the type is not installed here, or without hashes.
     """
 
     kind: EndpointKind
@@ -146,7 +159,52 @@ class PlannedEndpoint:
     loss: float | None = None
     rate_hz: float | None = None
     max_message_size: int | None = None
+    max_message_size_reason: str = ""
     lossy: bool | None = None
+    qos_defaults: tuple[str, ...] = ()
+    quantities: tuple[Quantity, ...] = ()
+    type_hash: str = ""
+    at: Position
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class PlannedFile:
+    """A path that the manifest gives a node, as it was when the plan was made.
+
+    Attributes:
+        place: where the manifest has it, below the node: `parameter_files.0`,
+            `run.working_directory`.
+        written: as written there, which is the same on every host.
+        digest: of a parameter file's contents (SHA-256, hexadecimal, 16 digits); empty of a folder
+            and of what could not be read.
+    """
+
+    place: str
+    written: str
+    digest: str = ""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class ExpectedParameter:
+    """A parameter that a node must have, and what of it must be so.
+
+    Attributes:
+        type: a word of rcl_interfaces, see ParameterDeclaration; "array" of an empty one whose type
+            is declared nowhere, which fits every array.
+        value: what it must be; None: anything of its type. Doubles that are not finite are ".nan",
+            ".inf" and "-.inf", because JSON has no others.
+        source: who says the value: "parameters", "default_value" or a parameter file; empty without
+            a value.
+        read_only: it must be so; False asks nothing.
+        optional: only a section for many nodes gives it, so that a node need not have it.
+    """
+
+    name: str
+    type: str
+    value: ParameterValue | None = None
+    source: str = ""
+    read_only: bool = False
+    optional: bool = False
     at: Position
 
 
@@ -160,6 +218,9 @@ class PlannedNode:
         namespace: absolute.
         process: name of its PlannedProcess.
         parameters: (name, value) given on top of parameter files.
+        expected_parameters: what its parameters must be once it is configured: those declared and
+            those given, see lifecycle.plan.parameters.
+        unread_parameter_files: those whose values are not known here and so not expected.
         transports: all that the node's own participant may use, "udpv4", "udpv6"; empty leaves it
             to the RMW. Nodes of one process share a participant if these and `max_datagram_bytes`
             are equal.
@@ -170,6 +231,7 @@ class PlannedNode:
         events: it tells the graph what becomes of its connections and mappings.
         membership: it tells the graph that it joins and leaves, its state and its checksum; so does
             whoever tells events.
+        files: the paths among `parameter_files` and `run` as the manifest writes them.
     """
 
     key: str
@@ -195,6 +257,9 @@ class PlannedNode:
     authority: Authority = Authority.NODES
     events: bool = False
     membership: bool = False
+    files: tuple[PlannedFile, ...] = ()
+    expected_parameters: tuple[ExpectedParameter, ...] = ()
+    unread_parameter_files: tuple[str, ...] = ()
     at: Position
 
     @property
@@ -235,6 +300,7 @@ class PlannedFlow:
         medium: what will carry it, "intraprocess", "shm", "udpm", "udpv4", "udpv6" or "tcpv4";
             empty if that is not known before the nodes' configurations are.
         medium_reason: one phrase for people, "same host", "links say so".
+        quantities: numbers of its links that only a measurement could prove.
     """
 
     topic: str
@@ -246,6 +312,7 @@ class PlannedFlow:
     transport: FlowTransport = FlowTransport.ANY
     medium: str = ""
     medium_reason: str = ""
+    quantities: tuple[Quantity, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -279,6 +346,7 @@ class Plan:
         discovery_mode: how participants find each other.
         discovery: as declared; what `discovery_mode` and `domain_id` do not say of it.
         max_datagram_bytes: UDP payload that the path carries unfragmented; None assumes Ethernet.
+        network: as declared; `flow_identification` and `max_datagram_bytes` are of it.
         server: the discovery server; None without.
         observers: (machine, how its supervisor's own participant is connected); machine is empty
             for this host. Machines without an entry leave it to the RMW.
@@ -300,6 +368,7 @@ class Plan:
     discovery_mode: DiscoveryMode = DiscoveryMode.DYNAMIC
     discovery: Discovery = Discovery()  # noqa: RUF009 - frozen
     max_datagram_bytes: int | None = None
+    network: Network = Network()  # noqa: RUF009 - frozen
     server: PlannedServer | None = None
     observers: tuple[tuple[str, ParticipantConnections], ...] = ()
 

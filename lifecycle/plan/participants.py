@@ -1,9 +1,10 @@
-"""Extra participants for publishers that need a network flow of their own.
+"""Extra participants for endpoints that need a network flow or a mark of their own.
 
-Owns: naming and describing the participants that `lifecycle.manifest.flow_needs` groups publishers
+Owns: naming and describing the participants that `lifecycle.manifest.flow_needs` groups endpoints
 into, and what one costs. On Fast DDS a publisher's
 network flow endpoints are its participant's sender sockets, so only a participant of its own makes
-it unique, and only all publishers of one participant together can carry a DSCP. Pure.
+it unique, and only all publishers of one participant together can carry a DSCP. From the same
+sockets subscriptions send their acknowledgements. Pure.
 """
 
 from __future__ import annotations
@@ -12,12 +13,11 @@ import dataclasses
 from collections.abc import Sequence
 
 from lifecycle.manifest.flow_needs import ParticipantGroup
-from lifecycle.manifest.model import EndpointKind
 from lifecycle.network.dscp import describe
 from lifecycle.plan.model import PlannedEndpoint, PlannedParticipant
 
 
-def place_publishers(
+def place_flows(
     node_name: str, endpoints: Sequence[PlannedEndpoint], groups: Sequence[ParticipantGroup]
 ) -> tuple[tuple[PlannedEndpoint, ...], tuple[PlannedParticipant, ...]]:
     """Make a participant of each group; leave all endpoints that are in none alone.
@@ -28,25 +28,25 @@ def place_publishers(
     Args:
         node_name: the node's base name.
         endpoints: all of the node's endpoints, in the interface's order.
-        groups: publishers that share, as `FlowNeeds.groups` makes them.
+        groups: endpoints that share, as `FlowNeeds.groups` makes them.
 
     Returns:
         The endpoints with `participant` filled in, and the participants by index.
     """
     names = {
-        publisher: f"_{node_name}_flow_{index}"
+        (group.kind, name): f"_{node_name}_flow_{index}"
         for index, group in enumerate(groups)
-        for publisher in group.publishers
+        for name in group.names
     }
     placed = tuple(
-        dataclasses.replace(each, participant=names[each.name])
-        if each.kind is EndpointKind.PUBLISHER and each.name in names
+        dataclasses.replace(each, participant=names[each.kind, each.name])
+        if (each.kind, each.name) in names
         else each
         for each in endpoints
     )
     participants = tuple(
         PlannedParticipant(
-            name=names[group.publishers[0]],
+            name=names[group.kind, group.names[0]],
             dscp=group.dscp,
             reason=_reason(group),
             transports=group.transports,
@@ -59,8 +59,8 @@ def place_publishers(
 
 
 def _reason(group: ParticipantGroup) -> str:
-    plural = "s" if len(group.publishers) > 1 else ""
-    facts = [f"{'unique ' if group.unique else ''}publisher{plural} {', '.join(group.publishers)}"]
+    noun = f"{group.kind.noun}{'s' if len(group.names) > 1 else ''}"
+    facts = [f"{'unique ' if group.unique else ''}{noun} {', '.join(group.names)}"]
     if group.dscp is not None:
         facts.append(f"marked {describe(group.dscp)}")
     if group.five_qi is not None:

@@ -123,7 +123,7 @@ def endpoint_of(node: PlannedNode, each: PlannedEndpoint) -> PartyEndpoint:
         fixed=carrier is not None and bool(carrier.connection),
         alone=publishes and each.unique in _OWN_FLOW,
         # Who shares a participant already may share a connection; who does not may not.
-        group=each.participant if publishes and carrier and not carrier.connection else "",
+        group=each.participant if carrier and not carrier.connection else "",
         transport=each.transport,
         lossy=each.lossy,
         size_bytes=each.max_message_size,

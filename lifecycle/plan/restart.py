@@ -1,6 +1,6 @@
 """The TCP ports and peers of nodes that are started again while others stay.
 
-Owns: `restarted` and `is_restarted_url`. Pure.
+Owns: `restarted`, `moved_observer`, `moving_nodes` and `is_restarted_url`. Pure.
 
 Fast DDS 2.14 keeps an accepted TCP connection under the listening port that its dialler names, also
 once that one is gone, and takes no other in its place: who comes again on the same port and dials
@@ -17,6 +17,7 @@ from types import MappingProxyType
 
 from lifecycle.network.connection_url import ConnectionTransport, ConnectionUrl, Peer, parse
 from lifecycle.plan.contacts import contacts_of
+from lifecycle.plan.errors import PlanError
 from lifecycle.plan.hosts import PortPool
 from lifecycle.plan.model import ParticipantConnections, Plan, PlannedNode
 from lifecycle.plan.terms import hosts_of, terms_of
@@ -25,10 +26,14 @@ RESTART_PORTS_FROM = 2000
 """How far above `first_port` the ports of restarted participants begin: out of the way of ports
 that are negotiated while a system runs, and of groups' (connection_set.GROUP_PORTS_FROM)."""
 
+OBSERVER_PORTS_FROM = 3000
+"""Likewise, of observers that a discovery server did not take to."""
+
 Heard = Mapping[str, Mapping[str, tuple[str, ...]]]
 """What nodes say that they are connected by: full node name → connection, empty for the node's own
 participant → URLs."""
 
+_LAST_PORT = 65535
 _NOTHING: Heard = MappingProxyType({})
 
 _Place = tuple[str, str]
@@ -81,6 +86,47 @@ def restarted(plan: Plan, keys: Collection[str], *, first: Plan, heard: Heard = 
     }
     return dataclasses.replace(
         plan, nodes=tuple(_moved(node, urls) if node.key in keys else node for node in plan.nodes)
+    )
+
+
+def moved_observer(
+    plan: Plan, connections: ParticipantConnections, number: int
+) -> ParticipantConnections:
+    """Return how an observer is connected on a TCP port that it never had.
+
+    Nobody but a discovery server need know that port.
+
+    Args:
+        plan: of its system.
+        connections: how it was planned.
+        number: of the try, from 0.
+
+    Raises:
+        PlanError: there is no such port.
+    """
+    port = plan.discovery.first_port + OBSERVER_PORTS_FROM + number
+    if port > _LAST_PORT:
+        raise PlanError(
+            f"cannot give the supervisor's participant port {port}: the highest is {_LAST_PORT}",
+            hint="lower 'discovery.first_port'",
+        )
+    urls = tuple(
+        str(dataclasses.replace(url, port=port))
+        if url.transport is ConnectionTransport.TCPV4 and url.port is not None
+        else str(url)
+        for url in map(parse, connections.urls)
+    )
+    return dataclasses.replace(connections, urls=urls)
+
+
+def moving_nodes(plan: Plan) -> frozenset[str]:
+    """Return the keys of the nodes that get TCP ports of their own when they are started again."""
+    places = {place for place, each in _listeners(plan).items() if place[0] and each.moves}
+    return frozenset(
+        node.key
+        for node in plan.nodes
+        if (node.process, "") in places
+        or any((node.key, each.name) in places for each in node.participants)
     )
 
 

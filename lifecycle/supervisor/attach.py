@@ -14,17 +14,21 @@ from collections.abc import Callable
 
 from lifecycle.errors import UsageError
 from lifecycle.manifest.model import EndpointPolicy
+from lifecycle.middleware.doors import peers_environment
+from lifecycle.plan.contacts import reached_hosts
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.eyes import Eyes
 from lifecycle.supervisor.gate import closes
 from lifecycle.supervisor.judge import with_findings
-from lifecycle.supervisor.options import onlooker_connections
+from lifecycle.supervisor.options import onlooker_connections, own_machines
 from lifecycle.supervisor.remote import look, running
 from lifecycle.supervisor.renegotiation import Expectation, is_negotiated
 from lifecycle.supervisor.rundir import run_name, runtime_root
 from lifecycle.supervisor.settling import Settling
 from lifecycle.verify import verify
+from lifecycle.verify.noise import tolerating_pattern
 from lifecycle.verify.observation import NodeConfiguration, Observation
+from lifecycle.verify.rules import rule
 from lifecycle.verify.verdict import Outcome, Stage, Verdict
 
 _ASK_AGAIN_S = 0.5
@@ -54,7 +58,10 @@ class Seen:
     @property
     def where(self) -> str:
         """Where it was looked if nothing at all was there, else an empty text."""
-        return "" if self.observation.nodes else where(self.plan, self.rmw)
+        tools = self.plan.policy.tolerated_nodes
+        names = (each.full_name for each in self.observation.nodes)
+        somebody = any(not tolerating_pattern(each, tools) for each in names)
+        return "" if somebody else where(self.plan, self.rmw)
 
 
 def judge_running(plan: Plan, *, timeout_s: float, strict: bool) -> Seen:
@@ -120,6 +127,8 @@ def _looking(plan: Plan) -> Eyes:
     """Open the eyes on a plan's domain; also on guests, where they are negotiated with."""
     os.environ["ROS_DOMAIN_ID"] = str(plan.domain_id)
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = plan.discovery_range.name
+    hosts = reached_hosts(plan, own_machines(plan, ""))
+    os.environ.update(peers_environment(hosts, os.environ))
     is_open = plan.policy.undeclared_nodes is EndpointPolicy.OPEN
     return Eyes.open(
         plan.domain_id,
@@ -165,7 +174,11 @@ async def _judge(plan: Plan, eyes: Eyes, timeout_s: float, *, strict: bool) -> S
 
 
 def _worth_waiting(verdict: Verdict, *, strict: bool) -> bool:
-    return closes(verdict, strict=strict) or verdict.verdict is not Outcome.OK
+    """Whether another look may change the result: what nobody measures stays so."""
+    heals = [rule(each.rule).heals for each in verdict.findings]
+    if verdict.verdict is Outcome.UNVERIFIABLE and closes(verdict, strict=strict):
+        return all(heals)
+    return any(heals)
 
 
 async def _change(eyes: Eyes, timeout_s: float) -> bool:

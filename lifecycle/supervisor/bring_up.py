@@ -1,21 +1,24 @@
 """Bring-up: start, configure, connect along the dependency DAG; after the gate, activate.
 
 Owns: the order of steps and their deadlines. Each node walks by itself and waits only for what
-its `after:` names, everything else runs in parallel; the first failure ends it all. What is judged
-when is judge.py's; activating takes the gate's permit. Must not import rclpy.
+its `after:` names, everything else runs in parallel. The first failure ends it all: no step begins
+any more, and those in progress have a moment to fail for reasons of their own, so that one run
+names them all. What is judged when is judge.py's; activating takes the gate's permit. Must not
+import rclpy.
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Iterable
-from typing import Protocol, TypeVar
+import contextlib
+from collections.abc import Awaitable, Callable, Coroutine, Iterable, Iterator
+from typing import Any, Protocol, TypeVar
 
 from lifecycle.errors import BringUpError
 from lifecycle.manifest.model import Condition, RunKind
 from lifecycle.node.control import HostSpec, Operation
 from lifecycle.plan.model import PlannedNode
-from lifecycle.supervisor.channel import ChannelClosedError, ControlChannel
+from lifecycle.supervisor.channel import ChannelClosedError, ControlChannel, HostFailedError
 from lifecycle.supervisor.driver import ControlDriver, NodeDriver, Standing
 from lifecycle.supervisor.events import Reach
 from lifecycle.supervisor.failure import (
@@ -31,7 +34,7 @@ from lifecycle.supervisor.process import ManagedProcess
 from lifecycle.supervisor.spawn import Spawner
 from lifecycle.supervisor.states import ProcessState
 from lifecycle.supervisor.system import NodeRun, System
-from lifecycle.supervisor.together import together
+from lifecycle.supervisor.together import ended
 
 T = TypeVar("T")
 
@@ -43,6 +46,10 @@ _WORDS_S = 0.1
 
 _OWN_S = 0.5
 """Our nodes keep the same limits themselves and know more: let them speak first."""
+
+ALSO_S = 0.5
+"""For steps in progress to fail, too, once one has failed; processes that start side by side and
+cannot import something fail within a tenth of a second of each other."""
 
 _ING = {
     Operation.CONFIGURE: "configuring",
@@ -96,17 +103,20 @@ class BringUp:
         self._wirer = wirer
         self._starts: dict[str, asyncio.Task[None]] = {}
         self._appearing: list[asyncio.Task[None]] = []
+        self._failures: list[StepFailedError] = []
+        self._in_progress = 0
+        self._step_over = asyncio.Event()
 
     async def connect(self, timeout_s: float, nodes: Iterable[NodeRun] | None = None) -> None:
         """Start, configure and connect every node, or some.
 
         Raises:
-            StepFailedError: the first step that failed, or what was missing after `timeout_s`.
+            StepFailedError: the steps that failed, or what was missing after `timeout_s`.
         """
         try:
             await asyncio.wait_for(self._connect_all(self._some(nodes)), timeout_s)
         except asyncio.TimeoutError:
-            raise self._late(timeout_s) from None
+            raise self._failure() or self._late(timeout_s) from None
 
     async def activate(
         self, permit: Permit, timeout_s: float, nodes: Iterable[NodeRun] | None = None
@@ -115,22 +125,24 @@ class BringUp:
 
         Raises:
             StepFailedError: as for `connect`.
+            VerificationError: something changed after the verdict, and what it is now keeps the
+                gate closed for all that were not asked yet.
         """
         managed = [node for node in self._some(nodes) if node.planned.managed]
         try:
             await asyncio.wait_for(
-                together(self._activate(node, permit) for node in managed), timeout_s
+                self._side_by_side(self._activate(node, permit) for node in managed), timeout_s
             )
         except asyncio.TimeoutError:
-            raise self._late(timeout_s) from None
+            raise self._failure() or self._late(timeout_s) from None
 
     async def deactivate(self) -> None:
         """Deactivate every active node, those first that stand on others.
 
         Raises:
-            StepFailedError: the first that failed.
+            StepFailedError: those that failed.
         """
-        await together(
+        await self._side_by_side(
             self._deactivate(node)
             for node in self._system.nodes.values()
             if node.planned.managed and node.reach is Reach.ACTIVE
@@ -152,13 +164,88 @@ class BringUp:
 
     async def _connect_all(self, nodes: Iterable[NodeRun]) -> None:
         try:
-            await together(self._walk(node) for node in nodes)
+            await self._side_by_side(self._walk(node) for node in nodes)
         finally:
             for start in self._starts.values():
                 start.cancel()
             await asyncio.gather(*self._starts.values(), return_exceptions=True)
             # A process that is started again later is another one.
             self._starts.clear()
+
+    async def _side_by_side(self, walks: Iterable[Coroutine[Any, Any, None]]) -> None:
+        """Run all of them to their end, or until one fails; then none of them goes on.
+
+        Raises:
+            StepFailedError: the first that failed, with those that did so until all had stopped.
+        """
+        self._failures = []
+        tasks = [asyncio.ensure_future(self._noting(each)) for each in walks]
+        if not tasks:
+            return
+        try:
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_EXCEPTION)
+            if any(each.exception() is not None for each in done if not each.cancelled()):
+                await self._others_over()
+        finally:
+            await ended(*tasks)
+        if (failure := self._failure()) is not None:
+            raise failure
+        for task in tasks:
+            if not task.cancelled():
+                task.result()
+
+    async def _noting(self, walk: Coroutine[Any, Any, None]) -> None:
+        try:
+            await walk
+        except StepFailedError as failure:
+            self._failures.append(failure)
+            raise
+
+    async def _others_over(self) -> None:
+        """Wait, bounded, until no step is in progress and no host reports failures any more."""
+        loop = asyncio.get_running_loop()
+        deadline = loop.time() + ALSO_S
+        while (left_s := deadline - loop.time()) > 0:
+            self._step_over.clear()
+            ends: set[asyncio.Future[Any]] = {
+                asyncio.ensure_future(asyncio.shield(each.ended))
+                for each in self._system.processes.values()
+                if each.channel is not None and each.channel.failures and not each.ended.done()
+            }
+            if not self._in_progress and not ends:
+                return
+            ends.add(asyncio.ensure_future(self._step_over.wait()))
+            try:
+                await asyncio.wait(ends, timeout=left_s, return_when=asyncio.FIRST_COMPLETED)
+            finally:
+                await ended(*ends)
+
+    def _failure(self) -> StepFailedError | None:
+        """Return the first failure with all others, also those that hosts reported since."""
+        if not self._failures:
+            return None
+        first, *others = self._failures
+        reported = [
+            _not_hosted(self._system.nodes[process.planned.nodes[0]], each)
+            for process in self._system.processes.values()
+            if process.channel is not None
+            for each in process.channel.failures
+        ]
+        return first.joined([*others, *reported])
+
+    async def _may_begin(self) -> None:
+        """Hold a step for good once another has failed: who waits for it will be cancelled."""
+        if self._failures:
+            await asyncio.get_running_loop().create_future()
+
+    @contextlib.contextmanager
+    def _progressing(self) -> Iterator[None]:
+        self._in_progress += 1
+        try:
+            yield
+        finally:
+            self._in_progress -= 1
+            self._step_over.set()
 
     async def _walk(self, node: NodeRun) -> None:
         await self._start(node)
@@ -196,6 +283,7 @@ class BringUp:
         await self._system.reached(node, Condition.CONNECTED, "connect")
         if self._wirer is not None:
             await self._wirer.ready(node)
+            await self._may_begin()
             node.doing = "being wired"
             limit_s = node.planned.timeouts.connect_s
             await self._step(node, self._wirer.wire(node), limit_s, rule=NOT_WIRED)
@@ -203,6 +291,11 @@ class BringUp:
 
     async def _activate(self, node: NodeRun, permit: Permit) -> None:
         await self._system.reached(node, Condition.ACTIVE, "activate")
+        node.doing = "waits to activate until what changed is verified"
+        # Here, too: how long it takes is not the node's to answer for.
+        # A gate that was closed fails the step itself.
+        with contextlib.suppress(BringUpError):
+            await permit.renewed()
         await self._operate(node, Operation.ACTIVATE, Reach.ACTIVE, permit)
 
     async def _deactivate(self, node: NodeRun) -> None:
@@ -221,6 +314,7 @@ class BringUp:
             Operation.ACTIVATE: node.planned.timeouts.activate_s,
             Operation.DEACTIVATE: node.planned.timeouts.deactivate_s,
         }[operation]
+        await self._may_begin()
         node.doing = _ING[operation]
         # Noted before it is sent: a request without an answer may have been carried out.
         if operation is not Operation.DEACTIVATE:
@@ -255,6 +349,7 @@ class BringUp:
         for node in nodes:
             await self._hold_start(node)
             node.doing = "starting"
+        await self._may_begin()
         channel = None
         hung = self._system.liveliness.watch_over(process, [node.name for node in nodes])
         if process.planned.run.kind is RunKind.PYTHON:
@@ -291,6 +386,12 @@ class BringUp:
         The end of the node's process ends the step: nothing else would, for a node that is
         awaited in the graph.
         """
+        with self._progressing():
+            return await self._stepping(node, doing, limit_s, rule=rule)
+
+    async def _stepping(
+        self, node: NodeRun, doing: Awaitable[T], limit_s: float, *, rule: str
+    ) -> T:
         step = asyncio.ensure_future(doing)
         waits: set[asyncio.Future[object]] = {step}  # type: ignore[arg-type]
         if node.process is not None:
@@ -309,6 +410,8 @@ class BringUp:
         except StepFailedError:
             raise
         except BringUpError as error:
+            if isinstance(error, HostFailedError):
+                raise _not_hosted(node, error) from error
             if isinstance(error, ChannelClosedError):
                 await self._death(node)
                 if node.process is not None and node.process.ended.done():
@@ -319,7 +422,7 @@ class BringUp:
                 else f"cannot start {node.name!r}: {error.message}",
                 rule=rule,
                 subject=node.name,
-                log_tail=_tail(node),
+                **_process_of(node),
             ) from error
         finally:
             if not step.done():
@@ -344,7 +447,7 @@ class BringUp:
             f"{self.unfinished()}",
             rule=DEADLINE,
             subject=culprit.name if culprit else self._system.plan.system,
-            log_tail=_tail(culprit) if culprit else (),
+            **(_process_of(culprit) if culprit else {}),
         )
 
 
@@ -357,10 +460,31 @@ def died(process: ManagedProcess, node: NodeRun | None = None) -> StepFailedErro
     holds = "" if node is None or (len(names) == 1) else f" with its process {process.name!r}"
     return StepFailedError(
         f"cannot keep {what} running{holds}: pid {process.pid} died{doing}: "
-        f"{process.ended.result()}",
+        f"{process.ended.result()}{_not_run(process)}",
         rule=PROCESS_DIED,
         subject=subject,
-        log_tail=process.log.tail,
+        process=process.name,
+        log=str(process.log.path),
+    )
+
+
+def _not_run(process: ManagedProcess) -> str:
+    """Name the program of a command where its status says, as of a shell, that it cannot be run."""
+    why = {126: "may not be run", 127: "is not there"}.get(process.ended.result().status or 0)
+    if why is None or process.planned.run.kind is not RunKind.COMMAND or not process.planned.argv:
+        return ""
+    return f", as of a program that {why}: {process.planned.argv[0]!r}"
+
+
+def _not_hosted(node: NodeRun, error: HostFailedError) -> StepFailedError:
+    """The failure of a process to host one of its nodes, which need not be `node`."""
+    name = error.node or node.name
+    message = error.message
+    return StepFailedError(
+        message if message.startswith("cannot") else f"cannot start {name!r}: {message}",
+        rule=START_FAILED,
+        subject=name,
+        **_process_of(node),
     )
 
 
@@ -369,7 +493,7 @@ def _too_late(node: NodeRun, limit_s: float) -> StepFailedError:
         f"cannot bring up {node.name!r}: it was still {node.doing} after {limit_s:g} s",
         rule=DEADLINE,
         subject=node.name,
-        log_tail=_tail(node),
+        **_process_of(node),
     )
 
 
@@ -377,5 +501,7 @@ def _is(doing: str) -> str:
     return doing if doing.startswith("waits") else f"is still {doing}"
 
 
-def _tail(node: NodeRun) -> tuple[str, ...]:
-    return () if node.process is None else node.process.log.tail
+def _process_of(node: NodeRun) -> dict[str, str]:
+    """Return what a failure says of the process of its node."""
+    process = node.process
+    return {} if process is None else {"process": process.name, "log": str(process.log.path)}

@@ -13,7 +13,7 @@ from collections.abc import Callable
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import BringUpError
-from lifecycle.middleware.busy_sign import BusySign
+from lifecycle.middleware.busy_sign import BusySign, Overdue
 from lifecycle.node.control import Command, Event, HostSpec, Operation
 from lifecycle.plan.model import ParticipantConnections
 from lifecycle.supervisor.gate import Permit
@@ -29,25 +29,41 @@ class ChannelClosedError(BringUpError):
     """The host closed its end: it is ending or has died."""
 
 
+class HostFailedError(BringUpError):
+    """The host cannot construct a node, and ends.
+
+    Attributes:
+        node: fully qualified name; empty if it could not host any.
+    """
+
+    def __init__(self, node: str, message: str) -> None:
+        super().__init__(message)
+        self.node = node
+
+
 class ControlChannel:
     """Talks to one host process over a socket whose other end the host inherits.
 
     Args:
         spec: what it hosts.
         on_state: told what it says of its nodes unasked, and of each reply with a configuration.
-        on_hang: told True when its executor hangs in a callback, False when it came back.
+        on_hang: called with why its executor is busy for too long, with None when it came back.
+
+    Attributes:
+        failures: what kept its nodes from being constructed, each cause once, the first one first.
     """
 
     def __init__(
         self,
         spec: HostSpec,
         on_state: Callable[[Event], None],
-        on_hang: Callable[[bool], None] = lambda _: None,
+        on_hang: Callable[[Overdue | None], None] = lambda _: None,
     ) -> None:
         self._spec = spec
         self._on_state = on_state
         self._on_hang = on_hang
         self._sign: BusySign | None = None
+        self.failures: list[HostFailedError] = []
         self._next = 0
         self._replies: dict[int, asyncio.Future[Event]] = {}
         self._ready: asyncio.Future[None] = asyncio.get_running_loop().create_future()
@@ -81,7 +97,7 @@ class ControlChannel:
         """Wait until every node of the process is constructed and its executor spins.
 
         Raises:
-            BringUpError: construction failed; with the host's reason.
+            HostFailedError: construction failed; with the host's reason.
             ChannelClosedError: the host ended without a word.
         """
         await asyncio.shield(self._ready)
@@ -109,11 +125,12 @@ class ControlChannel:
         Raises:
             ChannelClosedError: the host ended before it replied.
             BringUpError: an activate request without a permit that holds.
+            VerificationError: what changed since the permit's verdict does not allow it.
         """
         if operation is Operation.ACTIVATE:
             if permit is None:
                 raise BringUpError(f"cannot activate {node!r} without a permit from the gate")
-            permit.check()
+            await permit.use(node)
         if self._writer is None or self._task is None or self._task.done():
             raise ChannelClosedError(
                 f"cannot reach {node!r}: its process closed the control channel"
@@ -159,17 +176,19 @@ class ControlChannel:
             if not self._ready.done():
                 self._ready.set_result(None)
         elif event.kind == "failed":
+            failure = HostFailedError(event.node, event.error)
+            self.failures.append(failure)
             if not self._ready.done():
-                self._ready.set_exception(BringUpError(event.error))
+                self._ready.set_exception(failure)
         elif event.kind == "beat":
-            self._on_hang(False)
+            self._on_hang(None)
         elif event.kind in _UNASKED:
             self._on_state(event)
 
     def _look(self) -> None:
         """The busy sign's timer fired."""
-        if self._sign is not None and self._sign.overdue():
-            self._on_hang(True)
+        if self._sign is not None and (why := self._sign.overdue()):
+            self._on_hang(why)
 
     def _fail(self, error: ChannelClosedError) -> None:
         if not self._ready.done():

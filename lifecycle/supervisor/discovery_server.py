@@ -121,7 +121,8 @@ async def _heard(planned: PlannedServer, process: ManagedProcess | None) -> None
                 f"cannot start the discovery server at {_where(planned)}: {process.ended.result()}",
                 rule=START_FAILED,
                 subject=NAME,
-                log_tail=process.log.tail,
+                process=NAME,
+                log=str(process.log.path),
             )
         if not listening.done():
             machine = f" of machine {planned.machine!r}" if planned.machine else ""
@@ -131,7 +132,7 @@ async def _heard(planned: PlannedServer, process: ManagedProcess | None) -> None
                 f"for {START_S:g} s",
                 rule=DEADLINE,
                 subject=NAME,
-                log_tail=() if process is None else process.log.tail,
+                log="" if process is None else str(process.log.path),
             )
         listening.result()
     finally:

@@ -7,7 +7,8 @@ rclpy; the services come from middleware/ behind a Protocol.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Awaitable, Sequence
+import functools
+from collections.abc import Awaitable, Callable, Sequence
 from typing import Protocol
 
 from lifecycle.errors import BringUpError, MiddlewareError
@@ -123,8 +124,22 @@ class LifecycleServices(Protocol):
     async def get_available_transitions(self, node: str, *, timeout_s: float) -> tuple[str, ...]:
         """Return the labels of the transitions that may be asked for now."""
 
-    async def change_state(self, node: str, transition: str, *, timeout_s: float) -> bool:
-        """Ask for one transition; whether the node accepted and completed it."""
+    async def change_state(
+        self,
+        node: str,
+        transition: str,
+        *,
+        timeout_s: float,
+        before: Callable[[], Awaitable[None]] | None = None,
+    ) -> bool:
+        """Ask for one transition; whether the node accepted and completed it.
+
+        Args:
+            node: fully qualified name.
+            transition: label.
+            timeout_s: seconds, > 0.
+            before: awaited when the request is about to leave; what it raises keeps it back.
+        """
 
     async def get_configuration(self, node: str, *, timeout_s: float) -> NodeConfiguration | None:
         """Return the node's configuration; None where it has no such interface."""
@@ -200,6 +215,8 @@ class ServiceDriver:
             return _standing(state)
         wanted = _REACHED[operation]
         if state == wanted:
+            if operation is Operation.ACTIVATE and permit is not None:
+                await permit.use(self._node)
             return _standing(state)
         if operation is Operation.CONFIGURE and state == ACTIVE:
             raise BringUpError(
@@ -209,8 +226,14 @@ class ServiceDriver:
         if operation is Operation.ACTIVATE:
             if permit is None:
                 raise BringUpError(f"cannot activate {self._node!r} without a permit from the gate")
-            permit.check()
-        accepted = await self._change(operation, limit_s)
+            accepted = await self._services.change_state(
+                self._node,
+                operation.value,
+                timeout_s=limit_s,
+                before=functools.partial(permit.use, self._node),
+            )
+        else:
+            accepted = await self._change(operation, limit_s)
         state = await self._state(limit_s)
         if state != wanted:
             reason = "it stayed" if accepted else "it refused and is"

@@ -17,10 +17,13 @@ from lifecycle.errors import ExitCode
 
 ENDED_BY: dict[int, tuple[str, ExitCode]] = {
     signal.SIGINT: ("interrupted", ExitCode.INTERRUPTED),
-    signal.SIGTERM: ("terminated", ExitCode.OK),
-    signal.SIGHUP: ("the terminal was closed", ExitCode.OK),
+    signal.SIGTERM: ("terminated", ExitCode.TERMINATED),
+    signal.SIGHUP: ("the terminal was closed", ExitCode.HUNG_UP),
 }
-"""What each signal is called as the reason of an end, and the exit code of a clean one."""
+"""What each signal is called as the reason of an end, and the exit code of a run that it cut short.
+
+A run that had come as far as it was asked to, and that nothing bound to stay, was not cut short by
+SIGTERM or SIGHUP: see session.py."""
 
 
 class Ended(KeyboardInterrupt):
@@ -41,7 +44,7 @@ class Ended(KeyboardInterrupt):
 
     @property
     def exit_code(self) -> ExitCode:
-        """Of a run that ended so."""
+        """Of a run that had not begun, or not come far, when it ended so."""
         return ENDED_BY[self.number][1]
 
 

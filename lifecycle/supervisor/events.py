@@ -131,8 +131,8 @@ class NodeSilent:
     """Nothing can be expected of a node any more, though it has not left.
 
     Attributes:
-        cause: "stopped" by a signal, "hung" in a callback, "lost" from the network, or "told" by
-            its own supervisor.
+        cause: "stopped" by a signal, "hung" in a callback, "unserved" by an overloaded machine,
+            "lost" from the network, or "told" by its own supervisor.
     """
 
     kind: ClassVar[str] = "silent"
@@ -143,15 +143,18 @@ class NodeSilent:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class NodeAlive:
-    """A silent node came back.
+    """A node is not silent any more.
 
     Attributes:
         silent_s: for how long it was silent.
+        there: False for one that is not in the graph, or has not started: what made it silent is
+            over, and no more is known.
     """
 
     kind: ClassVar[str] = "alive"
     node: str
     silent_s: float
+    there: bool = True
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -178,12 +181,14 @@ class MachineConnection:
         machine: its name in the manifest.
         established: it is heard.
         lost_s: for how long it was not; 0 the first time.
+        left: its supervisor was shut down and said so; else the connection was lost.
     """
 
     kind: ClassVar[str] = "connection"
     machine: str
     established: bool
     lost_s: float = 0.0
+    left: bool = False
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -211,11 +216,16 @@ class VerdictChanged:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class GateOpened:
-    """The verdict lets the system activate."""
+    """The verdict lets the system activate.
+
+    Attributes:
+        trusted: what could not be verified and is taken on trust, in one line; empty if nothing.
+    """
 
     kind: ClassVar[str] = "gate"
     outcome: str
     nodes: tuple[str, ...]
+    trusted: str = ""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -234,19 +244,23 @@ class SystemReached:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Failure:
-    """Something that ends the run.
+    """A step that failed, or a process that ended unasked; the last verdict has it as a finding.
 
     Attributes:
         rule: id of the finding it becomes, `run.process-died`.
-        subject: node or process.
-        log_tail: the last lines its process wrote, oldest first.
+        subject: node or process, as in that finding.
+        process: name of the process concerned; empty if there is none of ours.
+        log: the file with all that its process wrote, which came as log events, too.
+        ends_run: the run ends for it; not so under --keep-going.
     """
 
     kind: ClassVar[str] = "failure"
     rule: str
     subject: str
     message: str
-    log_tail: tuple[str, ...] = ()
+    process: str = ""
+    log: str = ""
+    ends_run: bool = True
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

@@ -7,7 +7,8 @@ in this room.
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
+import os
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING
 
 from lifecycle.plan.model import ParticipantConnections, Plan, PlannedNode
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from lifecycle.middleware.clients import NodeClients
     from lifecycle.middleware.graph import GraphObserver
     from lifecycle.middleware.liveliness import AlivePublisher, AliveSubscription
+    from lifecycle.middleware.plan_notices import PlanNotices
 
 _logger = logging.getLogger(__name__)
 
@@ -75,6 +77,10 @@ class Eyes:
 
         return str(rclpy.get_rmw_implementation_identifier())
 
+    def reaches_servers(self) -> bool:
+        """Wait, bounded, until a TCP discovery server can be asked; False if it never will be."""
+        return self._graph.reaches_servers()
+
     def driver(self, node: PlannedNode) -> NodeDriver:
         """Return the driver of a managed node that is not hosted by us."""
         return ServiceDriver(self._clients, node)
@@ -87,6 +93,11 @@ class Eyes:
         """Return what is there now."""
         return await self._observer.observe(plan)
 
+    @property
+    def changes(self) -> int:
+        """Changes so far, before their bursts have passed."""
+        return self._observer.changes
+
     async def wait_change(self) -> None:
         """Wait until something changed."""
         await self._observer.wait_change()
@@ -98,6 +109,16 @@ class Eyes:
     def drop_configuration(self, node: str) -> None:
         """Forget what a node reported whose process ended."""
         self._observer.drop_configuration(node)
+
+    def participants_of(
+        self, pid: int, *, nodes: Iterable[str], reported: Iterable[str]
+    ) -> frozenset[str]:
+        """Return the GUID prefixes of the participants that discovery shows of a process."""
+        return self._graph.participants_of(pid, nodes=nodes, reported=reported)
+
+    def remove_participants(self, prefixes: Iterable[str], pids: Iterable[int]) -> None:
+        """Have everybody forget participants whose process is dead."""
+        self._graph.remove_participants(prefixes, pids)
 
     def machine_voice(self, system: str, machine: str) -> AlivePublisher:
         """Be heard as the supervisor of a machine."""
@@ -117,11 +138,17 @@ class Eyes:
 
         return self._ear(node_topic(node), to)
 
+    def plan_notices(self, on_notice: Callable[[str], None]) -> PlanNotices:
+        """Take part in the exchange of plans."""
+        from lifecycle.middleware.plan_notices import PlanNotices
+
+        return PlanNotices(self._graph.node, on_notice)
+
     def call_out(self, addresses: Iterable[str]) -> None:
-        """Make everybody announce themselves."""
+        """Make everybody announce themselves, as far as the system's discovery allows."""
         from lifecycle.middleware.healing import call_out
 
-        call_out(self._graph.domain_id, addresses)
+        call_out(self._graph.domain_id, self._graph.urls, addresses, os.environ)
 
     def send_again_soon(self) -> None:
         """Have what waits for a link to come back be sent soon when it does."""

@@ -1,18 +1,19 @@
 """A step of bring-up that failed, and the finding it becomes.
 
-Owns: `StepFailedError`, the ids of the `run.*` rules and how a failure joins a verdict, so that
-every run ends in one verdict that names what went wrong. Pure.
+Owns: `StepFailedError`, the ids of the `run.*` rules and how failures join a verdict, so that
+every run ends in one verdict that names each cause once. Pure.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable
 
 from lifecycle.errors import BringUpError, ExitCode
 from lifecycle.supervisor.events import Failure
 from lifecycle.supervisor.options import UpResult
 from lifecycle.verify.rules import rule, run
-from lifecycle.verify.verdict import Finding, Outcome, RunEnd, Verdict
+from lifecycle.verify.verdict import NOT_JUDGED, Finding, Outcome, RunEnd, Verdict
 
 PROCESS_DIED = run.PROCESS_DIED.id
 START_FAILED = run.START_FAILED.id
@@ -23,48 +24,70 @@ NOT_WIRED = run.NOT_WIRED.id
 
 
 class StepFailedError(BringUpError):
-    """A step of bring-up failed.
+    """A step of bring-up failed, or a process ended that nobody asked to end.
 
     Attributes:
         rule: one of the ids above.
         subject: fully qualified node name, or the process where no node is to blame.
-        log_tail: last lines of the process concerned, oldest first.
+        process: name of the process concerned; empty if there is none of ours.
+        log: the file with all that its process wrote; empty if there is none.
+        others: what else had failed by then for causes of its own, each named once.
     """
 
     def __init__(
-        self, message: str, *, rule: str, subject: str, log_tail: tuple[str, ...] = ()
+        self, message: str, *, rule: str, subject: str, process: str = "", log: str = ""
     ) -> None:
         super().__init__(message)
         self.rule = rule
         self.subject = subject
-        self.log_tail = log_tail
+        self.process = process
+        self.log = log
+        self.others: tuple[StepFailedError, ...] = ()
+
+    @property
+    def every(self) -> tuple[StepFailedError, ...]:
+        """This one and the others."""
+        return (self, *self.others)
 
     @property
     def reason(self) -> str:
-        """What failed, in words that stand alone: with the subject, if the message has it not."""
-        named = self.subject in self.message
-        return self.message if named else f"{self.subject}: {self.message}"
+        """What failed, in one line that names each cause; the findings say the rest."""
+        return f"failed: {', '.join(f'{each.subject} ({each.rule})' for each in self.every)}"
 
-    def event(self) -> Failure:
-        """Return the failure as listeners hear of it."""
+    def joined(self, others: Iterable[StepFailedError]) -> StepFailedError:
+        """Return this one with more that failed, but for what it names already."""
+        for each in others:
+            named = {(one.rule, one.subject) for one in self.every}
+            processes = {one.process for one in self.every if one.process}
+            # A process that says why it cannot go on, and then ends, has failed once.
+            again = each.rule == PROCESS_DIED and each.process in processes
+            if (each.rule, each.subject) not in named and not again:
+                self.others = (*self.others, each)
+        return self
+
+    def event(self, *, ends_run: bool = True) -> Failure:
+        """Return the failure as listeners get it."""
         return Failure(
-            rule=self.rule, subject=self.subject, message=self.message, log_tail=self.log_tail
+            rule=self.rule,
+            subject=self.subject,
+            message=self.message,
+            process=self.process,
+            log=self.log,
+            ends_run=ends_run,
         )
-
-
-NOT_JUDGED = Verdict(verdict=Outcome.UNVERIFIABLE, blocking=True, findings=(), flows=())
-"""The verdict of a system that never came as far as being judged."""
 
 
 def finding_of(failure: StepFailedError) -> Finding:
     """Return the finding that a failure is."""
-    return rule(failure.rule).finding(
+    kind = rule(failure.rule)
+    return kind.finding(
         Outcome.VIOLATED,
         subject=failure.subject,
         expected="",
         observed="",
         message=failure.message,
         node=failure.subject if failure.subject.startswith("/") else "",
+        hint=f"{kind.fix}: {failure.log}" if failure.log and "log" in kind.fix else "",
     )
 
 
@@ -81,10 +104,10 @@ def never_connected(verdict: Verdict, reason: str, exit_code: ExitCode) -> Verdi
 
 
 def with_failure(verdict: Verdict, failure: StepFailedError) -> Verdict:
-    """Return `verdict`, violated, with the failure as its first finding."""
+    """Return `verdict`, violated, with all that failed as its first findings, each once."""
+    findings = tuple(finding_of(each) for each in failure.every)
+    named = {(each.rule, each.subject) for each in findings}
+    rest = (each for each in verdict.findings if (each.rule, each.subject) not in named)
     return dataclasses.replace(
-        verdict,
-        verdict=Outcome.VIOLATED,
-        blocking=True,
-        findings=(finding_of(failure), *verdict.findings),
+        verdict, verdict=Outcome.VIOLATED, blocking=True, findings=(*findings, *rest)
     )

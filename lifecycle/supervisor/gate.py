@@ -2,10 +2,14 @@
 
 Owns: `Gate` and `Permit`. The drivers ask a permit at the very place where the bytes of an
 activate request go out, so a mistake elsewhere is a refused request, not an active system. A
-permit dies with the gate: once anything goes wrong, nodes not yet activated stay inactive. Pure.
+permit belongs to one verdict: whatever changed since is judged again before another request leaves.
+It dies with the gate: once anything goes wrong, nodes not yet activated stay inactive. Pure.
 """
 
 from __future__ import annotations
+
+import asyncio
+from typing import Protocol
 
 from lifecycle.errors import BringUpError, ExitCode, LifecycleError
 from lifecycle.verify.verdict import Outcome, Verdict
@@ -16,15 +20,20 @@ class VerificationError(LifecycleError):
 
     Attributes:
         verdict: why.
+        again: the gate was open, and what changed since had it judged again.
     """
 
-    def __init__(self, verdict: Verdict) -> None:
+    def __init__(self, verdict: Verdict, *, again: bool = False) -> None:
         self.verdict = verdict
+        self.again = again
         self.exit_code = (
             ExitCode.VIOLATED if verdict.verdict is Outcome.VIOLATED else ExitCode.UNVERIFIABLE
         )
         named = "\n".join(f"  {finding.rule}: {finding.message}" for finding in verdict.findings)
-        super().__init__(f"cannot activate: the verdict is {verdict.verdict.value}\n{named}")
+        is_now = "the verdict is"
+        if again:
+            is_now = "the system changed before every node was activated, and its verdict now is"
+        super().__init__(f"cannot activate: {is_now} {verdict.verdict.value}\n{named}")
 
 
 def closes(verdict: Verdict, *, strict: bool) -> bool:
@@ -34,36 +43,107 @@ def closes(verdict: Verdict, *, strict: bool) -> bool:
     return strict and verdict.verdict is Outcome.UNVERIFIABLE
 
 
+class Judging(Protocol):
+    """What a permit asks about the verdict that it came from, see judge.Judge."""
+
+    def is_current(self, verdict: Verdict) -> bool:
+        """Whether nothing changed since the look that `verdict` came from."""
+
+    async def again(self, ahead: frozenset[str]) -> Verdict:
+        """Judge the system as it is now, in which the nodes `ahead` may be active; bounded."""
+
+
 class Permit:
-    """The right to send activate requests. Only `Gate.judge` makes one."""
+    """The right to send activate requests. Only `Gate.judge` makes one.
+
+    Attributes:
+        verdict: the one that it stands on; a newer one, once it was renewed.
+    """
 
     def __init__(self, gate: Gate, verdict: Verdict) -> None:
         if gate.permit is not None or closes(verdict, strict=gate.strict):
             raise BringUpError("cannot make a permit without an open gate; ask Gate.judge for one")
         self._gate = gate
+        self._sent: set[str] = set()
+        self._refused: Verdict | None = None
+        self._renewal: asyncio.Future[None] | None = None
         self.verdict = verdict
 
     def check(self) -> None:
-        """Confirm that the right still holds.
+        """Confirm that the right still holds, whatever may have changed.
 
         Raises:
+            VerificationError: what changed since does not allow it.
             BringUpError: the gate was closed after this permit was given.
         """
+        if self._refused is not None:
+            raise VerificationError(self._refused, again=True)
         if self._gate.permit is not self:
             raise BringUpError("cannot activate: the gate was closed again before this request")
+
+    async def use(self, node: str) -> None:
+        """Confirm that `node` may be sent its activate request now; nothing is awaited after it.
+
+        Raises:
+            VerificationError: as for `check`.
+            BringUpError: likewise.
+        """
+        await self.renewed()
+        self._sent.add(node)
+
+    async def renewed(self) -> None:
+        """Return once the verdict is that of the present moment.
+
+        Everybody who waits for it shares one judgement. It does not wait where nothing changed.
+
+        Raises:
+            VerificationError: as for `check`; the gate is closed for all that were not sent.
+            BringUpError: likewise.
+        """
+        self.check()
+        while not self._gate.is_current(self.verdict):
+            if self._renewal is None or self._renewal.done():
+                self._renewal = asyncio.ensure_future(self._renew())
+                # Whoever waited for it may be gone.
+                self._renewal.add_done_callback(lambda done: done.cancelled() or done.exception())
+            renewal = self._renewal
+            await asyncio.wait({renewal})
+            self.check()
+            renewal.result()
+
+    async def _renew(self) -> None:
+        verdict = await self._gate.judged_again(frozenset(self._sent))
+        if self._gate.permit is not self:
+            return
+        if closes(verdict, strict=self._gate.strict):
+            self._refused = verdict
+            self._gate.close()
+        else:
+            self.verdict = verdict
+
+    def end(self) -> None:
+        """Stop judging again: the gate is closed."""
+        # Not from inside of it: it ends by itself.
+        if self._renewal is not None and self._refused is None:
+            self._renewal.cancel()
 
 
 class Gate:
     """Holds a system back until it is verified.
+
+    Args:
+        strict: see below.
+        judging: has what changed judged again; without it a verdict stays true.
 
     Attributes:
         strict: refuse an unverifiable verdict even where the manifest's policy lets it pass.
         permit: the one that holds at this moment; None while the gate is closed.
     """
 
-    def __init__(self, *, strict: bool) -> None:
+    def __init__(self, *, strict: bool, judging: Judging | None = None) -> None:
         self.strict = strict
         self.permit: Permit | None = None
+        self._judging = judging
 
     def judge(self, verdict: Verdict) -> Permit:
         """Open on a verdict that allows it.
@@ -79,4 +159,15 @@ class Gate:
 
     def close(self) -> None:
         """End the permit: no activate request is sent from now on."""
-        self.permit = None
+        permit, self.permit = self.permit, None
+        if permit is not None:
+            permit.end()
+
+    def is_current(self, verdict: Verdict) -> bool:
+        """Whether nothing changed since the look that `verdict` came from."""
+        return self._judging is None or self._judging.is_current(verdict)
+
+    async def judged_again(self, ahead: frozenset[str]) -> Verdict:
+        """Judge the system as it is now, in which the nodes `ahead` may be active."""
+        assert self._judging is not None
+        return await self._judging.again(ahead)

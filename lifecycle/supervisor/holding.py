@@ -7,6 +7,7 @@ answered. What an order does is regulate.py's.
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 from collections.abc import Awaitable, Callable
 from typing import Any
 
@@ -17,6 +18,7 @@ from lifecycle.supervisor.gate import VerificationError
 from lifecycle.supervisor.judge import Changes, Judge
 from lifecycle.supervisor.orders import HELD, PAUSED, Done, Mailbox, Order, Pending, check_order
 from lifecycle.supervisor.regulate import Regulator
+from lifecycle.supervisor.revision import Revisions
 from lifecycle.supervisor.system import System
 from lifecycle.supervisor.together import ended
 from lifecycle.supervisor.vigil import Vigil
@@ -32,6 +34,7 @@ class Holding:
         judge: judges it at every change.
         changes: what it waits for.
         regulator: carries out orders, and knows the phase.
+        revisions: knows which manifest runs.
         vigil: over the processes.
         emit: where events go.
         note_segments: called when processes may be new.
@@ -45,6 +48,7 @@ class Holding:
         judge: Judge,
         changes: Changes,
         regulator: Regulator,
+        revisions: Revisions,
         vigil: Vigil,
         emit: Emitter,
         note_segments: Callable[[], Awaitable[None]],
@@ -54,11 +58,13 @@ class Holding:
         self._judge = judge
         self._changes = changes
         self._regulator = regulator
+        self._revisions = revisions
         self._vigil = vigil
         self._emit = emit
         self._note_segments = note_segments
         self._keep_going = keep_going
         self._mailbox = Mailbox()
+        self._violated = ""
 
     async def hold(self, stage: Stage, hold_s: float | None) -> str:
         """Keep the system as it is, or as it is ordered; return what was violated, else nothing.
@@ -74,7 +80,6 @@ class Holding:
         """
         await self._note_segments()
         deadline = None if hold_s is None else asyncio.get_running_loop().time() + hold_s
-        violated = ""
         while True:
             watch = Watch(self._judge, self._changes, stage)
             watching = asyncio.ensure_future(watch.run())
@@ -83,19 +88,23 @@ class Holding:
             finally:
                 await ended(watching)
             if stage is Stage.ACTIVE:
-                violated = violated or watch.violated
+                self._violated = self._violated or watch.violated
             if pending is None:
-                return violated
+                return self._violated
             await self._carry_out(pending)
             stage = self._regulator.stage
 
     async def ordered(self, order: Order) -> Done:
         """Take an order from outside, if it fits what the system is doing; return its outcome."""
         try:
-            check_order(order, self._system, self._regulator.phase)
+            self._check(order)
         except UsageError as error:
             return Done(exit_code=error.exit_code, error=str(error))
         return await self._mailbox.place(order)
+
+    def _check(self, order: Order) -> None:
+        check_order(order, self._system, self._regulator.phase)
+        self._revisions.check(order)
 
     def close(self, reason: str) -> None:
         """Answer every order that is still open, and those to come, with `reason`."""
@@ -105,7 +114,13 @@ class Holding:
         """Carry an order out and tell who gave it; what ends the run is raised."""
         try:
             # Another order may have come first.
-            check_order(pending.order, self._system, self._regulator.phase)
+            self._check(pending.order)
+            if self._revisions.takes(pending.order):
+                assert pending.order.plan is not None
+                for line in self._revisions.differences(pending.order.plan):
+                    self._emit(Notice(message=f"takes the changed manifest: {line}"))
+            else:
+                pending.order = dataclasses.replace(pending.order, plan=None, reload=False)
             await self._regulator.carry_out(pending.order)
             await self._note_segments()
         except (UsageError, VerificationError, StepFailedError) as error:
@@ -139,7 +154,8 @@ class Holding:
                 failure = death.result()
                 if not self._keep_going:
                     raise failure
-                self._emit(failure.event())
+                self._emit(failure.event(ends_run=False))
+                self._violated = self._violated or failure.reason
                 self._system.touched.set()
             finally:
                 await ended(death, order)

@@ -15,6 +15,8 @@ from typing import Protocol
 from lifecycle.graph.waiting import set_within
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor import discovery_server
+from lifecycle.supervisor.activation_guard import ActivationGuard
+from lifecycle.supervisor.agreement import Agreement
 from lifecycle.supervisor.events import Emitter, VerdictChanged
 from lifecycle.supervisor.gate import closes
 from lifecycle.supervisor.liveliness import Presence
@@ -23,6 +25,7 @@ from lifecycle.supervisor.system import GraphObserver, System
 from lifecycle.supervisor.together import ended
 from lifecycle.verify import verify
 from lifecycle.verify.observation import Observation
+from lifecycle.verify.rules import rule
 from lifecycle.verify.verdict import Finding, Outcome, Stage, Verdict
 
 QUIET_S = 0.005
@@ -37,6 +40,9 @@ SETTLED_S = 0.5
 UNVERIFIABLE_S = 3.5
 """What cannot be verified may be unseen yet; Fast DDS announces a late participant every 3 s."""
 
+AGAIN_S = 5.0
+"""For what changed behind an open gate to be judged clear; Fast DDS announces every 3 s."""
+
 ASK_AGAIN_S = 0.02
 """Two other participants match without our graph changing, so while only that is missing the nodes
 are asked again: after this long, then twice as long each time, ..."""
@@ -50,12 +56,18 @@ HEALING = (
     "graph.unattributed-",
     "graph.unseen-",
     "connection.",
+    "flow.unverifiable",
     "flow.wrong-medium",
     "state.",
     "config.",
+    "param.missing",
     "run.silent-",
+    "run.plan-unknown",
 )
 """Beginnings of the ids of rules that a system on its way up breaks for a moment."""
+
+_UNPROVEN = "flow.unverifiable"
+"""A requirement that only a node's report could prove."""
 
 
 class Changes:
@@ -65,6 +77,7 @@ class Changes:
         self._system = system
         self._observer = observer
         self._count = 0
+        self._touches = 0
         self._event = asyncio.Event()
         self._tasks = (
             asyncio.ensure_future(self._follow_graph()),
@@ -75,6 +88,14 @@ class Changes:
     def count(self) -> int:
         """Changes so far."""
         return self._count
+
+    @property
+    def mark(self) -> tuple[int, int]:
+        """A moment, as far as anything has changed: equal to a later one if nothing did since.
+
+        It knows of a change as soon as it is noticed, where `count` lets a burst pass.
+        """
+        return self._observer.changes, self._touches + self._system.touched.is_set()
 
     async def beyond(self, count: int, timeout_s: float | None) -> bool:
         """Wait for a change after `count`; False if none came within `timeout_s`."""
@@ -99,6 +120,7 @@ class Changes:
         while True:
             await self._system.touched.wait()
             self._system.touched.clear()
+            self._touches += 1
             self._note()
 
     def _note(self) -> None:
@@ -136,6 +158,8 @@ class Judge:
         strict: bool,
         verify_: Callable[..., Verdict] = verify,
         looker: Looker | None = None,
+        agreement: Agreement | None = None,
+        guard: ActivationGuard | None = None,
     ) -> None:
         self._system = system
         self._observer = observer
@@ -144,7 +168,10 @@ class Judge:
         self._strict = strict
         self._verify = verify_
         self._looker = looker
+        self._agreement = agreement
+        self._guard = guard
         self.latest: Verdict | None = None
+        self._mark: tuple[int, int] | None = None
         self.seen = Observation()
         self._presence = Presence(emit)
         self._settling = Settling()
@@ -152,9 +179,29 @@ class Judge:
 
     async def once(self, stage: Stage) -> Verdict:
         """Look and judge now."""
+        mark = self._changes.mark
         verdict = await self._look(stage)
         self._stands(stage, verdict)
+        self._mark = mark
         return verdict
+
+    def is_current(self, verdict: Verdict) -> bool:
+        """Whether nothing changed since the look that `verdict`, the latest one, came from."""
+        return verdict is self.latest and self._mark == self._changes.mark
+
+    async def again(self, ahead: frozenset[str]) -> Verdict:
+        """Judge a system behind an open gate again because it changed.
+
+        Args:
+            ahead: names of the nodes that were asked to activate since the gate opened.
+
+        Returns:
+            The latest verdict; whether it keeps the gate open is the gate's to say.
+        """
+        self.ahead |= ahead
+        await self.until_clear(Stage.CONNECTED, AGAIN_S)
+        assert self.latest is not None
+        return self.latest
 
     async def settled(self, stage: Stage) -> tuple[Verdict, float | None]:
         """Look and judge now, and give what may pass by itself a moment to do so (settling.py).
@@ -180,8 +227,11 @@ class Judge:
         observation = without(await self._observer.observe(asked), self._system.dead())
         self.seen = observation
         self._presence.see(observation)
+        self._system.present = self._presence.present
         if self._looker is not None:
             self._looker.look(observation)
+        if self._guard is not None:
+            self._guard.look(observation)
         verdict = self._verify(
             self._system.expected,
             observation,
@@ -191,11 +241,24 @@ class Judge:
         )
         if self._looker is not None:
             verdict = with_findings(verdict, self._looker.findings())
+        if self._guard is not None:
+            verdict = with_findings(verdict, self._guard.findings())
         verdict = with_findings(verdict, self._system.liveliness.findings())
+        if self._agreement is not None:
+            verdict = self._agreement.explained(verdict)
+            verdict = with_findings(verdict, self._agreement.findings(observation))
         return with_findings(verdict, discovery_server.findings(self._system))
 
-    async def until_clear(self, stage: Stage, timeout_s: float) -> Verdict:
+    async def until_clear(
+        self, stage: Stage, timeout_s: float, *, unchanged_s: float | None = None
+    ) -> Verdict:
         """Judge until the gate may open, a finding that cannot heal stands, or time is up.
+
+        Args:
+            stage: what the system has come to.
+            timeout_s: seconds, for all of it.
+            unchanged_s: seconds after which findings stand that have not changed, even if they
+                could heal; None waits for these until time is up.
 
         Returns:
             The last verdict; whether it opens the gate is the gate's to say.
@@ -215,6 +278,8 @@ class Judge:
             if found != standing:
                 standing, since = found, now
             patience = _patience(verdict)
+            if unchanged_s is not None:
+                patience = unchanged_s if patience is None else min(patience, unchanged_s)
             until = deadline if patience is None else min(deadline, since + patience)
             if now >= until:
                 return verdict
@@ -230,7 +295,7 @@ class Judge:
         return any(
             each.outcome is Outcome.VIOLATED
             and each.rule.startswith("graph.unmatched-")
-            and telling.isdisjoint(_who_tells(each))
+            and telling.isdisjoint(each.nodes)
             for each in verdict.findings
         )
 
@@ -251,13 +316,14 @@ class Judge:
 
 
 def with_findings(verdict: Verdict, findings: tuple[Finding, ...]) -> Verdict:
-    """Return `verdict` with violations that the supervisor itself found."""
+    """Return `verdict` with what the supervisor itself found."""
     if not findings:
         return verdict
+    outcomes = [each.outcome for each in findings]
     return dataclasses.replace(
         verdict,
-        verdict=Outcome.VIOLATED,
-        blocking=True,
+        verdict=Outcome.worst((verdict.verdict, *outcomes)),
+        blocking=verdict.blocking or Outcome.VIOLATED in outcomes,
         findings=(*findings, *verdict.findings),
     )
 
@@ -278,6 +344,7 @@ def without(observation: Observation, dead: frozenset[str]) -> Observation:
         ),
         endpoints=tuple(each for each in observation.endpoints if each.node not in gone),
         configurations=tuple(each for each in observation.configurations if each.name not in gone),
+        parameters=tuple(each for each in observation.parameters if each.node not in gone),
     )
 
 
@@ -294,14 +361,11 @@ def _patience(verdict: Verdict) -> float | None:
     violated = [each for each in verdict.findings if each.outcome is Outcome.VIOLATED]
     if any(not _may_heal(each) for each in violated):
         return SETTLED_S
-    return None if violated else UNVERIFIABLE_S
-
-
-def _who_tells(finding: Finding) -> tuple[str, ...]:
-    """Return the nodes that know of a match that is missing: both ends; of a server its client."""
-    if finding.node:
-        return (finding.node,)
-    return tuple(finding.subject.rpartition(": ")[2].split(" → "))
+    if all(each.rule == _UNPROVEN for each in violated):
+        # A foreign node may report yet, or never will: that is not worth the whole time.
+        lasting = not violated and any(not rule(each.rule).heals for each in verdict.findings)
+        return SETTLED_S if lasting else UNVERIFIABLE_S
+    return None
 
 
 def _may_heal(finding: Finding) -> bool:

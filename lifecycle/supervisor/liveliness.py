@@ -13,6 +13,7 @@ import enum
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING
 
+from lifecycle.middleware.busy_sign import Overdue
 from lifecycle.supervisor.events import (
     Emitter,
     NodeAlive,
@@ -21,6 +22,7 @@ from lifecycle.supervisor.events import (
     NodeSilent,
 )
 from lifecycle.verify.hidden import is_hidden_node
+from lifecycle.verify.noise import is_noise_node
 from lifecycle.verify.observation import Observation
 from lifecycle.verify.rules import run
 from lifecycle.verify.verdict import Finding, Outcome
@@ -34,6 +36,7 @@ class Cause(enum.Enum):
 
     STOPPED = "stopped"
     HUNG = "hung"
+    UNSERVED = "unserved"
     LOST = "lost"
     TOLD = "told"
 
@@ -50,10 +53,17 @@ class Liveliness:
     Args:
         emit: where events go.
         changed: called whenever a node fell silent or came back: time to judge again.
+        is_there: whether a node has started, and is in the graph as far as that is known.
     """
 
-    def __init__(self, emit: Emitter, changed: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        emit: Emitter,
+        changed: Callable[[], None],
+        is_there: Callable[[str], bool] = lambda _: True,
+    ) -> None:
         self._emit = emit
+        self._is_there = is_there
         self._listeners = [changed]
         self._silent: dict[str, _Silence] = {}
 
@@ -100,7 +110,9 @@ class Liveliness:
             news = True
             if not silence.causes:
                 del self._silent[name]
-                self._emit(NodeAlive(node=name, silent_s=self._emit.elapsed_s - silence.since_s))
+                silent_s = self._emit.elapsed_s - silence.since_s
+                there = self._is_there(name)
+                self._emit(NodeAlive(node=name, silent_s=silent_s, there=there))
         if news:
             self._tell()
 
@@ -109,11 +121,13 @@ class Liveliness:
         for name in nodes:
             self._silent.pop(name, None)
 
-    def watch_over(self, process: ManagedProcess, nodes: Iterable[str]) -> Callable[[bool], None]:
+    def watch_over(
+        self, process: ManagedProcess, nodes: Iterable[str]
+    ) -> Callable[[Overdue | None], None]:
         """Follow a process that is about to be spawned.
 
         Returns:
-            What its control channel tells that its executor hangs (True), or came back (False).
+            What its control channel calls when its executor is busy for too long, or came back.
         """
         names = tuple(nodes)
 
@@ -124,17 +138,20 @@ class Liveliness:
             else:
                 self.came_back(names, Cause.STOPPED)
 
-        def hung(is_hung: bool) -> None:
-            if is_hung:
-                assert process.channel is not None
-                self.fell_silent(
-                    names,
-                    Cause.HUNG,
-                    f"a callback in its process {process.name!r} (pid {process.pid}) has been "
-                    f"running for {process.channel.silent_s:g} s",
-                )
-            else:
+        def hung(why: Overdue | None) -> None:
+            assert process.channel is not None
+            where = f"its process {process.name!r} (pid {process.pid})"
+            if why is Overdue.HANGS:
+                limit_s = process.channel.silent_s
+                detail = f"a callback in {where} has been running for {limit_s:g} s"
+                self.fell_silent(names, Cause.HUNG, detail)
+            elif why is Overdue.UNSERVED:
+                detail = f"{where} gets no processor for its callback: the machine is overloaded"
+                self.fell_silent(names, Cause.UNSERVED, detail)
+            if why is not Overdue.HANGS:
                 self.came_back(names, Cause.HUNG)
+            if why is not Overdue.UNSERVED:
+                self.came_back(names, Cause.UNSERVED)
 
         process.on_stop = stopped
         process.ended.add_done_callback(lambda _: self.forget(names))
@@ -166,18 +183,25 @@ class Liveliness:
 class Presence:
     """Tells which nodes joined and left the graph between two observations.
 
-    Hidden nodes, whose names begin with an underscore, are left out: they are participants of nodes
-    that are told of anyway, or tools.
+    Hidden nodes, whose names begin with an underscore, are left out, as are tools: the one are
+    participants of nodes that are told of anyway, of the other a verdict tells.
     """
 
     def __init__(self, emit: Emitter) -> None:
         self._emit = emit
         self._present: frozenset[str] = frozenset()
 
+    @property
+    def present(self) -> frozenset[str]:
+        """Names of the nodes that were in the graph when it was last looked at."""
+        return self._present
+
     def see(self, observation: Observation) -> None:
         """Compare with what was seen before."""
         names = (each.full_name for each in observation.nodes)
-        present = frozenset(each for each in names if not is_hidden_node(each))
+        present = frozenset(
+            each for each in names if not is_hidden_node(each) and not is_noise_node(each)
+        )
         for name in sorted(present - self._present):
             self._emit(NodeJoined(node=name))
         for name in sorted(self._present - present):

@@ -108,7 +108,9 @@ class Neighbours:
         self._air = air
         self._loop = asyncio.get_running_loop()
         self._closed = False
+        self._machines: list[_Neighbour] = []
         self._ears: list[Ear] = []
+        self._attached: tuple[str, ...] = ()
         self._voices: list[Voice] = []
         self._said: Mapping[str, str] = {}
         self._missing: dict[str, _Neighbour] = {}
@@ -124,16 +126,41 @@ class Neighbours:
         for machine, nodes in remote.items():
             if machine:
                 what = f"the supervisor of machine {machine!r}"
-                listener = self._listener(_Neighbour(what, machine, tuple(nodes)))
+                self._machines.append(_Neighbour(what, machine, tuple(nodes)))
+                listener = self._listener(self._machines[-1])
                 self._ears.append(self._air.machine_ear(plan.system, machine, listener))
-        for node in self._system.nodes.values():
-            if node.planned.run.kind is RunKind.ATTACH:
-                listener = self._listener(_Neighbour(repr(node.name), "", (node.name,)))
-                self._ears.append(self._air.node_ear(node.name, listener))
+        self._attached = self._attached_nodes()
+        for name in self._attached:
+            listener = self._listener(_Neighbour(repr(name), "", (name,)))
+            self._ears.append(self._air.node_ear(name, listener))
         if remote:
             own = dict.fromkeys(node.planned.machine for node in self._system.nodes.values())
             self._voices = [self._air.machine_voice(plan.system, each) for each in own if each]
             self._system.liveliness.listen(self._tell)
+
+    def renew(self) -> None:
+        """Follow the attached nodes of the plan as it is now, where they are others."""
+        if self._attached == self._attached_nodes():
+            return
+        for each in (*self._ears, *self._voices):
+            each.destroy()
+        self._ears.clear()
+        self._voices.clear()
+        self._machines.clear()
+        self._missing.clear()
+        self.open()
+
+    def _attached_nodes(self) -> tuple[str, ...]:
+        return tuple(
+            node.name
+            for node in self._system.nodes.values()
+            if node.planned.run.kind is RunKind.ATTACH
+        )
+
+    @property
+    def machines(self) -> frozenset[str]:
+        """Machines whose supervisor is connected now."""
+        return frozenset(each.machine for each in self._machines if each.heard)
 
     async def close(self) -> None:
         """Leave, and hear no more."""
@@ -197,7 +224,9 @@ class Neighbours:
             return
         neighbour.heard = False
         if neighbour.machine:
-            self._system.emit(MachineConnection(machine=neighbour.machine, established=False))
+            self._system.emit(
+                MachineConnection(machine=neighbour.machine, established=False, left=True)
+            )
         self._system.liveliness.came_back(neighbour.nodes, Cause.TOLD)
 
     def _told(self, neighbour: _Neighbour, silent: Mapping[str, str]) -> None:
@@ -212,7 +241,8 @@ class Neighbours:
     def _tell(self) -> None:
         """Our own nodes fell silent or came back: say so."""
         liveliness = self._system.liveliness
-        said = {**liveliness.causes(Cause.HUNG), **liveliness.causes(Cause.STOPPED)}
+        causes = (Cause.UNSERVED, Cause.HUNG, Cause.STOPPED)
+        said = {name: why for cause in causes for name, why in liveliness.causes(cause).items()}
         if said != self._said and not self._closed:
             self._said = said
             self._start(self._say(said))

@@ -8,7 +8,7 @@ need it, so it loads on first use. Must not import rclpy.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,7 +21,12 @@ from lifecycle.supervisor.rundir import LEDGER_NAME, RunDirectory
 from lifecycle.verify.verdict import Verdict
 
 if TYPE_CHECKING:
+    from lifecycle.supervisor.programming import TargetOptions
     from lifecycle.supervisor.programming.keeper import Keeper, Programs
+
+
+_SWEEP_S = 10.0
+"""For servers to remove what dead runs left; what is not removed then stays listed."""
 
 
 class Networks:
@@ -48,18 +53,23 @@ class Networks:
             self._keeper = Keeper(programmer, self._tell)
             emit.listen(self._hear)
 
-    async def begin(self, verdict: Verdict) -> None:
-        """Program what was verified, before the first message of an active system leaves.
+    async def begin(self, verdict: Verdict, timeout_s: float | None = None) -> None:
+        """Program what was verified, before the first message of what is to be activated leaves.
 
-        From now on every verdict is followed.
+        Called for every gate that opens, a restart's and a resume's too. From now on every verdict
+        is followed.
+
+        Args:
+            verdict: has the flows.
+            timeout_s: what is left for it; None for the patience with each request.
 
         Raises:
-            StepFailedError: a network could not be programmed.
+            StepFailedError: a network could not be programmed, or not in time.
         """
         if self._keeper is None:
             return
         try:
-            await self._keeper.begin(verdict.flows)
+            await self._keeper.begin(verdict.flows, timeout_s)
         except LifecycleError as error:
             raise StepFailedError(
                 f"cannot program networks for {self._system!r}: {error}",
@@ -68,17 +78,20 @@ class Networks:
             ) from error
         self._begun = True
 
-    async def close(self) -> None:
-        """Remove everything of the system from networks; failures are told."""
+    async def close(self, hurry: asyncio.Event | None = None) -> None:
+        """Remove everything of the system from networks, bounded; failures become notices.
+
+        Args:
+            hurry: once set, no server is waited for any more.
+        """
         self._begun = False
         if self._keeper is not None:
-            await self._keeper.close()
+            await self._keeper.close(hurry)
         elif (self._directory / LEDGER_NAME).is_file():
-            try:
-                for text in await asyncio.to_thread(remove_programmed, self._directory):
-                    self._tell(text)
-            except LifecycleError as error:
-                self._tell(str(error))
+            from lifecycle.supervisor.programming.keeper import remove
+            from lifecycle.supervisor.programming.orphans import Removal
+
+            await remove(Removal(self._directory), self._tell, hurry)
 
     def _hear(self, event: Event) -> None:
         if self._begun and self._keeper is not None and isinstance(event, VerdictChanged):
@@ -86,6 +99,25 @@ class Networks:
 
     def _tell(self, text: str) -> None:
         self._emit(Notice(message=text))
+
+
+def token_variables(program: Iterable[TargetOptions]) -> frozenset[str]:
+    """Return the environment variables that hold tokens, which no node has any use for.
+
+    Args:
+        program: what a run programs.
+
+    Raises:
+        SettingsError: a settings file cannot be used.
+    """
+    paths = {each.settings for each in program if each.settings}
+    if not paths:
+        return frozenset()
+    from lifecycle.supervisor.programming.settings import load_settings
+
+    found = [load_settings(each) for each in paths]
+    tokens = [each.token for file in found for each in (file.nef, file.camara) if each is not None]
+    return frozenset(each.env for each in tokens if each is not None and each.env)
 
 
 def open_networks(
@@ -100,6 +132,7 @@ def open_networks(
 
     Raises:
         UsageError: the options of a network cannot be used.
+        KeyboardInterrupt: while a server was asked to remove what is left of a dead run.
     """
     path = directory.path
     if not options.program:
@@ -114,7 +147,7 @@ def open_networks(
         owned=True,
         treatment=options.treatment,
     )
-    swept = sweep_orphans(path.parent, own=path.name)
+    swept = sweep_orphans(path.parent, own=path.name, within_s=_SWEEP_S)
     for each in swept.removed:
         if each.changes:
             emit(Notice(message=f"left by a killed supervisor: {each.render(done=True)}"))
@@ -123,8 +156,12 @@ def open_networks(
     return Networks(plan.system, path, emit, programmer)
 
 
-def remove_programmed(directory: Path) -> tuple[str, ...]:
+def remove_programmed(directory: Path, within_s: float | None = None) -> tuple[str, ...]:
     """Remove everything that a run has in networks, whoever applied it; say what was done.
+
+    Args:
+        directory: of the run.
+        within_s: for all that servers are asked; None for the patience with each request.
 
     Raises:
         ProgrammingError: something could not be removed; it stays listed.
@@ -133,4 +170,5 @@ def remove_programmed(directory: Path) -> tuple[str, ...]:
         return ()
     from lifecycle.supervisor.programming import remove_run
 
-    return tuple(each.render(done=True) for each in remove_run(directory) if each.changes)
+    done = remove_run(directory, within_s=within_s)
+    return tuple(each.render(done=True) for each in done if each.changes)

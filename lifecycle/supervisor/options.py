@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import psutil
 
 from lifecycle.errors import ExitCode, UsageError
-from lifecycle.manifest.model import Machine
+from lifecycle.manifest.model import Machine, Manifest
 from lifecycle.network.connection_url import ConnectionTransport, Peer, parse
 from lifecycle.plan.model import ParticipantConnections, Plan, PlannedProcess
 from lifecycle.plan.terms import urls_of
@@ -69,12 +69,12 @@ class UpResult:
     verdict: Verdict
 
 
-def own_machines(plan: Plan, machine: str) -> frozenset[str]:
+def own_machines(plan: Plan | Manifest, machine: str) -> frozenset[str]:
     """Return the names of the machines whose supervisor this is; empty for nodes that name none.
 
     Args:
-        plan: the whole system.
-        machine: a machine of the plan; empty for every machine whose address is this host's.
+        plan: the whole system, planned or as its manifest says.
+        machine: a machine of it; empty for every machine whose address is this host's.
 
     Raises:
         UsageError: the plan has no such machine.

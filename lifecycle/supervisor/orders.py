@@ -11,6 +11,7 @@ import dataclasses
 import enum
 
 from lifecycle.errors import ExitCode, UsageError
+from lifecycle.plan.model import Plan
 from lifecycle.supervisor.states import ProcessState
 from lifecycle.supervisor.system import NodeRun, System
 
@@ -34,10 +35,14 @@ class Order:
 
     Attributes:
         node: for RESTART, manifest key or fully qualified name; empty for the whole system.
+        plan: what the manifest that the order names comes to now; None if it names none.
+        reload: for RESTART, `plan` is to run from now on.
     """
 
     kind: OrderKind
     node: str = ""
+    plan: Plan | None = None
+    reload: bool = False
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,7 +1,10 @@
 """Ending processes that escaped: what our children left, and what a killed supervisor left.
 
-Owns: finding them without guessing, and ending them bounded. A process is ours if it descends from
-us, or if its environment carries a run's id; a pid alone never proves it. Must not import rclpy.
+Owns: finding them without guessing, and ending them bounded. A process belongs to a run if it
+descends from the run's zygote, which adopts all that its descendants leave behind, or if its
+environment carries the run's id. Other children of this process do not: it may have become the
+supervisor by exec of a shell with background jobs. A pid alone never proves it. Must not import
+rclpy.
 """
 
 from __future__ import annotations
@@ -12,12 +15,12 @@ import select
 import signal
 import threading
 import time
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 
 import psutil
 
-from lifecycle.middleware.shm import port_files_of, sweep
+from lifecycle.middleware.shm import segments_of
 from lifecycle.supervisor.rundir import RUN_VARIABLE, RunRecord, boot_id, start_ticks
 
 GRACE_S = 3.0
@@ -25,6 +28,9 @@ GRACE_S = 3.0
 
 KILL_S = 5.0
 """How long the kernel may take to end a killed process, before it is reported."""
+
+_ROUNDS = 3
+"""How often what was started while others were ended is looked for."""
 
 OWN_CHILD = threading.Lock()
 """Held by whoever runs a program and waits for it himself. If it were buried as an orphan first,
@@ -43,17 +49,27 @@ class _Orphan:
             signal.pidfd_send_signal(self.pidfd, number)
 
 
-def end_descendants(spare: Iterable[int], grace_s: float = 0.5) -> tuple[int, ...]:
-    """End everything that descends from this process, but for `spare` and this process's threads.
+def end_strays(zygote_pid: int, run_id: str, grace_s: float = 0.5) -> tuple[int, ...]:
+    """End everything that still belongs to this process's run, but for the zygote itself.
+
+    Args:
+        zygote_pid: it may have ended; then only the run's id finds what it left.
+        run_id: of this run.
+        grace_s: seconds between SIGTERM and SIGKILL.
 
     Returns:
         The pids that had to be ended.
     """
-    spared = set(spare)
-    pids = [each.pid for each in psutil.Process().children(recursive=True)]
-    ended = _end((pid for pid in pids if pid not in spared), grace_s)
-    reap_adopted(spared)
-    return ended
+    ended: list[int] = []
+    # Again for what they started meanwhile.
+    for _ in range(_ROUNDS):
+        strays = {*descendants(zygote_pid), *_carrying(run_id)} - {zygote_pid, os.getpid()}
+        found = _end(strays, grace_s)
+        if not found:
+            break
+        ended += found
+    reap_adopted((zygote_pid,))
+    return tuple(sorted(ended))
 
 
 def reap_adopted(spare: Iterable[int]) -> None:
@@ -73,30 +89,31 @@ def reap_adopted(spare: Iterable[int]) -> None:
         OWN_CHILD.release()
 
 
-def end_run(record: RunRecord) -> tuple[int, ...]:
+def end_run(record: RunRecord) -> tuple[tuple[int, ...], frozenset[str]]:
     """End what is left of a run whose supervisor was killed.
 
     Returns:
-        The pids that were ended.
+        The pids that were ended, and the shared memory files that the run was seen to own.
     """
+    recorded = frozenset(record.segments)
     if record.boot_id != boot_id():
+        return (), recorded
+    pids = {child.pid for child in record.children if start_ticks(child.pid) == child.start_ticks}
+    pids |= _carrying(record.run_id)
+    for pid in tuple(pids):
+        pids.update(descendants(pid))
+    pids.discard(os.getpid())
+    # What they own now may be newer than the record.
+    owned = segments_of(pids)
+    return _end(pids, GRACE_S), recorded | owned
+
+
+def descendants(pid: int) -> tuple[int, ...]:
+    """Return the pids of everything that descends from a process; nothing once it has ended."""
+    try:
+        return tuple(each.pid for each in psutil.Process(pid).children(recursive=True))
+    except psutil.NoSuchProcess:
         return ()
-    known = {child.pid for child in record.children if start_ticks(child.pid) == child.start_ticks}
-    return _end(known | _carrying(record.run_id), GRACE_S)
-
-
-def sweep_of(began_s: float, segments: Collection[str], domain_id: int | None) -> tuple[str, ...]:
-    """Remove a run's shared memory that nobody uses any more; return the names.
-
-    Args:
-        began_s: seconds since the epoch; what is newer and abandoned is ours, or nobody's.
-        segments: what its processes were seen to use.
-        domain_id: of the run: a port's file may be older than the run, left by somebody killed,
-            and the process that used it again may have died before it was seen. None: not known.
-    """
-    newer = sweep(created_after_s=began_s)
-    older = {*segments, *(() if domain_id is None else port_files_of(domain_id))}
-    return newer + (sweep(only=older) if older else ())
 
 
 def _carrying(run_id: str) -> set[int]:

@@ -38,6 +38,14 @@ STUCK_ESCALATION: Escalation = (
 )
 """For a host with a callback in progress: asked politely, it would first have to finish it."""
 
+STARTING_ESCALATION: Escalation = (
+    (signal.SIGTERM, 1.5),
+    (signal.SIGKILL, 5.0),
+)
+"""For a process whose nodes are not there yet: nothing to undo, and nothing to wait for.
+
+Not SIGINT: Python answers that with a traceback from the middle of an import."""
+
 COMMAND_ESCALATION: Escalation = ESCALATION[1:]
 """For foreign commands: rclpy and rclcpp end on SIGINT."""
 
@@ -51,6 +59,7 @@ class ManagedProcess:
         channel: to our host; None for a foreign command.
         child: None before it was spawned.
         ended: resolves with how it ended.
+        asked_to_end: `end` was called while it lived.
         on_stop: told True when a signal stopped it, False when it continues; set before `spawn`.
     """
 
@@ -68,6 +77,7 @@ class ManagedProcess:
         self.channel: ControlChannel | None = None
         self.child: Child | None = None
         self.ended: asyncio.Future[ProcessExit] = asyncio.get_running_loop().create_future()
+        self.asked_to_end = False
         self.on_stop: Callable[[bool], None] = lambda _: None
         self.log = ProcessLog(logs, planned.name)
         self._emit = emit
@@ -137,10 +147,11 @@ class ManagedProcess:
         Returns:
             The name of the signal that was needed beyond the first step; empty if none was.
         """
-        if self.child is None:
+        if self.child is None or self.ended.done():
             await self._release()
             return ""
         if self.state in (ProcessState.STARTING, ProcessState.RUNNING):
+            self.asked_to_end = True
             self._change(ProcessState.STOPPING)
         if self.channel is not None:
             await self.channel.close()
@@ -167,6 +178,11 @@ class ManagedProcess:
             for each in waits:
                 each.cancel()
         return self.ended.done()
+
+    @property
+    def died(self) -> bool:
+        """Whether it ended although it was not asked to."""
+        return self.state is ProcessState.EXITED and not self.asked_to_end
 
     def _exited(self, exited: asyncio.Future[ProcessExit]) -> None:
         self._change(ProcessState.EXITED, detail=str(exited.result()))

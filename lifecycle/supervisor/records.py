@@ -1,15 +1,18 @@
-"""What a run leaves word of: its processes and the shared memory they were seen to use.
+"""Records what a run owns: its processes and the shared memory that they were seen to own.
 
-Owns: `Records`, which keeps the run directory true, for whoever has to clean up after a supervisor
-that was killed.
+Owns: `Records`, which keeps the run directory true, for the next `up` or `down` that has to clean
+up after a supervisor that was killed.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
+from collections.abc import Iterator
 
-from lifecycle.middleware.shm import segments_of
+from lifecycle.middleware.shm import Creations, segments_of
+from lifecycle.supervisor.orphans import descendants
 from lifecycle.supervisor.rundir import ChildRecord, RunDirectory, start_ticks
 from lifecycle.supervisor.system import System
 
@@ -18,7 +21,7 @@ class Records:
     """The records of one run.
 
     Attributes:
-        segments: shared memory files that our processes were seen to use.
+        segments: shared memory files that our processes were seen to own.
     """
 
     def __init__(self, directory: RunDirectory, system: System, zygote_pid: int) -> None:
@@ -41,8 +44,50 @@ class Records:
         )
 
     async def note_segments(self) -> None:
-        """Remember the shared memory of our processes: one that is killed cannot remove its own."""
-        pids = [os.getpid(), *(each.pid for each in self._system.living)]
+        """Note the shared memory of our processes: one that is killed cannot remove its own."""
         loop = asyncio.get_running_loop()
-        self.segments |= await loop.run_in_executor(None, segments_of, pids)
-        self.write()
+        found = await loop.run_in_executor(None, self._owned)
+        if not found <= self.segments:
+            self.segments |= found
+            self.write()
+
+    def _owned(self) -> frozenset[str]:
+        """Return what is owned now, also by what our processes started: `ros2 run` does."""
+        return segments_of((os.getpid(), *descendants(self._zygote_pid)))
+
+    async def note_each(self, created: asyncio.Event) -> None:
+        """Note the shared memory of our processes each time that the event is set, for ever."""
+        while True:
+            await created.wait()
+            created.clear()
+            await self.note_segments()
+
+
+@contextlib.contextmanager
+def noting(directory: RunDirectory, system: System, zygote_pid: int) -> Iterator[Records]:
+    """Keep records that note shared memory once it is made: its owner may be killed at any time.
+
+    Where the kernel does not announce it, it is noted when `note_segments` is called.
+    """
+    records = Records(directory, system, zygote_pid)
+    records.write()
+    try:
+        creations = Creations()
+    except OSError:
+        yield records
+        return
+    loop = asyncio.get_running_loop()
+    created = asyncio.Event()
+
+    def take() -> None:
+        if creations.take():
+            created.set()
+
+    loop.add_reader(creations.descriptor, take)
+    noted = asyncio.ensure_future(records.note_each(created))
+    try:
+        yield records
+    finally:
+        loop.remove_reader(creations.descriptor)
+        creations.close()
+        noted.cancel()

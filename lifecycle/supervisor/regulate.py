@@ -10,17 +10,20 @@ import asyncio
 from collections.abc import Callable, Coroutine, Iterable
 from typing import Any
 
-from lifecycle.plan import PlanError, restarted
+from lifecycle.plan import Plan, PlanError, moving_nodes, restarted
 from lifecycle.supervisor.bring_up import BringUp
-from lifecycle.supervisor.events import Emitter, GateOpened, Reach, SystemReached
+from lifecycle.supervisor.events import Emitter, GateOpened, Notice, Reach, SystemReached
 from lifecycle.supervisor.failure import START_FAILED, StepFailedError
-from lifecycle.supervisor.gate import Gate, VerificationError
+from lifecycle.supervisor.first_contact import TRIES, UNCHANGED_S, undiscovered
+from lifecycle.supervisor.gate import Gate, Permit, VerificationError, closes
 from lifecycle.supervisor.judge import Judge
 from lifecycle.supervisor.orders import ACTIVE, HELD, PAUSED, Order, OrderKind, node_of
 from lifecycle.supervisor.shutdown import TakeDown
+from lifecycle.supervisor.states import ProcessState
 from lifecycle.supervisor.system import NodeRun, System
 from lifecycle.supervisor.together import together
-from lifecycle.verify.verdict import Stage
+from lifecycle.verify import not_ok
+from lifecycle.verify.verdict import Stage, Verdict
 
 Alive = Callable[[Coroutine[Any, Any, object]], Coroutine[Any, Any, None]]
 """Runs a step; the unexpected end of any process ends it."""
@@ -36,6 +39,7 @@ class Regulator:
         forget: drops what a node reported before it was restarted.
         vanishes: waits, bounded, until the graph shows no node of this name.
         replanned: told the names of nodes that the plan connects otherwise from now on.
+        program: programs networks with the flows of a verdict within seconds, done when it returns.
         timeout_s: for bringing up again what an order took down.
 
     Attributes:
@@ -56,6 +60,7 @@ class Regulator:
         forget: Callable[[str], None],
         vanishes: Callable[[str], Coroutine[Any, Any, None]],
         replanned: Callable[[Iterable[str]], None],
+        program: Callable[[Verdict, float], Coroutine[Any, Any, None]],
         hurry: asyncio.Event,
         timeout_s: float,
     ) -> None:
@@ -70,6 +75,7 @@ class Regulator:
         self._forget = forget
         self._vanishes = vanishes
         self._replanned = replanned
+        self._program = program
         self._hurry = hurry
         self._timeout_s = timeout_s
         self.phase = "connecting"
@@ -85,7 +91,7 @@ class Regulator:
         Raises:
             VerificationError: the gate stays closed. In phase PAUSED or HELD the system stays as
                 it is and can be asked again; in any other the run is over.
-            StepFailedError: a step failed; the run is over.
+            StepFailedError: a step failed, or a network could not be programmed; the run is over.
         """
         if order.kind is OrderKind.PAUSE:
             await self._pause()
@@ -106,29 +112,114 @@ class Regulator:
         was_paused = self.phase == PAUSED
         nodes = tuple(self._system.nodes.values())
         if order.node:
-            process = node_of(order, self._system).process
-            nodes = tuple(each for each in nodes if each.process is process)
-        names = {each.process.name for each in nodes if each.process is not None}
+            nodes = self._with_process_of(node_of(order, self._system))
         self._gate.close()
         self.phase = "restarting"
-        self._leaves(names)
-        await TakeDown(self._system, self._emit, self._hurry, nodes=nodes).run()
-        self._replan(nodes)
-        self._system.renew(nodes)
-        for node in nodes:
-            self._forget(node.name)
-        self._comes_back(names)
-        # A participant that was killed haunts the graph; who comes back would be taken for two.
-        gone = [each.name for each in nodes if each.process is not None]
-        await self._alive(together(self._vanishes(name) for name in gone))
-        self.phase = "connecting"
-        self._judge.ahead = self._active()
-        await self._alive(self._bring_up.connect(self._timeout_s, nodes))
+        await self._again(nodes, self._timeout_s, order.plan if order.reload else None)
         self._emit(SystemReached(reached="connected", elapsed_s=self._emit.elapsed_s))
         if was_paused:
             self._reached(PAUSED)
         else:
             await self._through_the_gate()
+
+    async def until_clear(self, timeout_s: float) -> None:
+        """Judge a connected system until its gate may open, or stays closed; activate nothing.
+
+        Nodes that were not discovered over TCP are started again on fresh ports, a few times.
+
+        Args:
+            timeout_s: seconds, for all of it.
+
+        Raises:
+            StepFailedError: a step of starting again failed.
+        """
+        loop = asyncio.get_running_loop()
+        deadline = loop.time() + timeout_s
+        tries: dict[str, int] = {}
+        phase = self.phase
+        while True:
+            restartable = self._restartable() if sum(tries.values()) < TRIES else frozenset()
+            unchanged_s = UNCHANGED_S if restartable else None
+            left_s = deadline - loop.time()
+            await self._alive(
+                self._judge.until_clear(Stage.CONNECTED, left_s, unchanged_s=unchanged_s)
+            )
+            verdict = self._judge.latest
+            assert verdict is not None
+            if not restartable or not closes(verdict, strict=self._gate.strict):
+                return
+            name = undiscovered(verdict, restartable, tries)
+            left_s = deadline - loop.time()
+            if name is None and left_s > 0:
+                # What keeps the gate closed may still heal by itself.
+                await self._alive(self._judge.until_clear(Stage.CONNECTED, left_s))
+            if name is None or left_s <= UNCHANGED_S:
+                return
+            tries[name] = tries.get(name, 0) + 1
+            self._emit(
+                Notice(
+                    message=f"{name!r} is started again on a fresh port: not discovered over TCP "
+                    f"for {UNCHANGED_S:g} s ({not_ok(verdict)}); "
+                    f"try {sum(tries.values())} of {TRIES}"
+                )
+            )
+            node = self._system.node_named(name)
+            assert node is not None
+            await self._again(self._with_process_of(node), left_s)
+            self.phase = phase
+
+    def _restartable(self) -> frozenset[str]:
+        """Return the names of nodes that could be started again on fresh ports before the gate."""
+        moving = moving_nodes(self._system.plan)
+        active = {
+            each.process for each in self._system.nodes.values() if each.reach is Reach.ACTIVE
+        }
+        return frozenset(
+            each.name
+            for key, each in self._system.nodes.items()
+            if key in moving
+            and each.process is not None
+            and each.process.state is ProcessState.RUNNING
+            and each.process not in active
+        )
+
+    def _with_process_of(self, node: NodeRun) -> tuple[NodeRun, ...]:
+        return tuple(each for each in self._system.nodes.values() if each.process is node.process)
+
+    async def _again(
+        self, nodes: tuple[NodeRun, ...], timeout_s: float, plan: Plan | None = None
+    ) -> None:
+        """Take nodes down with all of their processes, and bring them up as far as connected.
+
+        Args:
+            nodes: with all of their processes.
+            timeout_s: seconds, for bringing them up.
+            plan: another manifest's, to be taken meanwhile; None to keep this one.
+        """
+        names = {each.process.name for each in nodes if each.process is not None}
+        self._leaves(names)
+        await TakeDown(self._system, self._emit, self._hurry, nodes=nodes).run()
+        # A participant that was killed haunts the graph; who comes back would be taken for two.
+        gone = [each.name for each in nodes if each.process is not None]
+        for node in nodes:
+            self._forget(node.name)
+        if plan is not None:
+            nodes = self._reload(plan, nodes)
+        else:
+            self._replan(nodes)
+            self._system.renew(nodes)
+        self._comes_back(names)
+        await self._alive(together(self._vanishes(name) for name in gone))
+        self.phase = "connecting"
+        self._judge.ahead = self._active()
+        await self._alive(self._bring_up.connect(timeout_s, nodes))
+
+    def _reload(self, plan: Plan, nodes: tuple[NodeRun, ...]) -> tuple[NodeRun, ...]:
+        """Take another manifest's plan for nodes that are down; return those to bring up."""
+        names = {each.name for each in nodes}
+        fresh = self._system.reload(plan, plan.processes, nodes)
+        self._replanned(names | {each.name for each in fresh})
+        return fresh
 
     def _replan(self, nodes: Iterable[NodeRun]) -> None:
         """Connect nodes that come again so that those who stay find them."""
@@ -156,7 +247,7 @@ class Regulator:
         self._gate.close()
         self.phase = "verifying"
         self._judge.ahead = self._active()
-        await self._alive(self._judge.until_clear(Stage.CONNECTED, self._timeout_s))
+        await self.until_clear(self._timeout_s)
         assert self._judge.latest is not None
         try:
             permit = self._gate.judge(self._judge.latest)
@@ -170,6 +261,12 @@ class Regulator:
             for each in self._system.nodes.values()
             if each.planned.managed and each.reach is not Reach.ACTIVE
         )
+        try:
+            # What comes again sends from other ports: their rules come before its first message.
+            await self._alive(self.program(permit, deadline - loop.time()))
+        except VerificationError:
+            self.phase = before
+            raise
         self.phase = "activating"
         self._emit(
             GateOpened(
@@ -182,6 +279,26 @@ class Regulator:
         # The same question as at the gate: what became active must be what was verified.
         self._gate.judge(self._judge.latest)
         self._reached(ACTIVE)
+
+    async def program(self, permit: Permit, timeout_s: float) -> None:
+        """Program networks with the flows of the verdict that nodes are activated on.
+
+        Args:
+            permit: to activate them.
+            timeout_s: seconds, for all of it.
+
+        Raises:
+            StepFailedError: a network could not be programmed.
+            VerificationError: what changed meanwhile closed the gate.
+        """
+        loop = asyncio.get_running_loop()
+        deadline = loop.time() + timeout_s
+        programmed = None
+        while permit.verdict.flows != programmed:
+            programmed = permit.verdict.flows
+            await self._program(permit.verdict, deadline - loop.time())
+            # A network may take seconds: what changed meanwhile is judged before the gate opens.
+            await permit.renewed()
 
     def _active(self) -> frozenset[str]:
         return frozenset(

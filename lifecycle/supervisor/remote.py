@@ -1,6 +1,6 @@
 """Talking to a supervisor that runs: which one a word means, its status, its end.
 
-Owns: `find_run`, `status`, `look`, `order`, `down`. Must not import rclpy.
+Owns: `find_run`, `status`, `look`, `differences`, `order`, `down`. Must not import rclpy.
 """
 
 from __future__ import annotations
@@ -9,10 +9,12 @@ import time
 from pathlib import Path
 
 from lifecycle.errors import ExitCode, UsageError
+from lifecycle.middleware.shm import sweep
+from lifecycle.plan.model import Plan
 from lifecycle.supervisor.networks import remove_programmed
-from lifecycle.supervisor.orphans import end_run, sweep_of
+from lifecycle.supervisor.orphans import end_run
 from lifecycle.supervisor.rundir import RunDirectory, is_held, new_run_id, read_record
-from lifecycle.supervisor.server import Answer, Ask, Look, ask
+from lifecycle.supervisor.server import Answer, Ask, Look, Question, ask
 from lifecycle.supervisor.status import SystemStatus
 
 STATUS_S = 5.0
@@ -61,7 +63,7 @@ def status(path: Path) -> SystemStatus:
         UsageError: it runs no more.
         TimeoutError: it does not answer.
     """
-    answer = _asked(path, Ask.STATUS, STATUS_S)
+    answer = _asked(path, Question(ask=Ask.STATUS), STATUS_S)
     if answer is None or answer.status is None:
         raise _killed(path)
     return answer.status
@@ -74,13 +76,27 @@ def look(path: Path) -> Look:
         UsageError: it runs no more.
         TimeoutError: it does not answer.
     """
-    answer = _asked(path, Ask.LOOK, STATUS_S)
+    answer = _asked(path, Question(ask=Ask.LOOK), STATUS_S)
     if answer is None or answer.look is None:
         raise _killed(path)
     return answer.look
 
 
-def order(path: Path, what: Ask, timeout_s: float, *, node: str = "") -> Answer:
+def differences(path: Path, plan: Plan) -> tuple[str, ...]:
+    """Ask a supervisor how `plan` differs from what it runs, one line each.
+
+    Returns:
+        Nothing where they do not differ, or nobody answers in time: a notice is not worth a wait.
+    """
+    question = Question(ask=Ask.DIFFERENCES, plan=plan)
+    try:
+        answer = _asked(path, question, STATUS_S)
+    except TimeoutError:
+        return ()
+    return () if answer is None else answer.differences
+
+
+def order(path: Path, question: Question, timeout_s: float) -> Answer:
     """Have a supervisor pause, resume or restart its system, or one node of it.
 
     Returns:
@@ -90,16 +106,16 @@ def order(path: Path, what: Ask, timeout_s: float, *, node: str = "") -> Answer:
         UsageError: it runs no more.
         TimeoutError: it is not done after `timeout_s`; it goes on all the same.
     """
-    answer = _asked(path, what, timeout_s, node=node)
+    answer = _asked(path, question, timeout_s)
     if answer is None or answer.exit_code is None:
         raise _killed(path)
     return answer
 
 
-def _asked(path: Path, what: Ask, timeout_s: float, *, node: str = "") -> Answer | None:
+def _asked(path: Path, question: Question, timeout_s: float) -> Answer | None:
     """Return the answer of a supervisor; None if it is not there any more."""
     try:
-        return ask(path / "control", what, timeout_s, node=node)
+        return ask(path / "control", question, timeout_s)
     except (FileNotFoundError, ConnectionRefusedError):
         return None
 
@@ -122,16 +138,15 @@ def down(path: Path, timeout_s: float) -> ExitCode:
         ProgrammingError: nothing runs, but something of it could not be removed from a network.
     """
     deadline = time.monotonic() + timeout_s
-    answer = _asked(path, Ask.DOWN, timeout_s)
+    answer = _asked(path, Question(ask=Ask.DOWN), timeout_s)
     if answer is not None and _released(path, deadline):
         return ExitCode.OK
     directory = RunDirectory.acquire(path.parent, path.name, new_run_id())
     try:
         if directory.previous is not None:
-            end_run(directory.previous)
-            previous = directory.previous
-            sweep_of(previous.began_s, previous.segments, previous.domain_id)
-        remove_programmed(path)
+            _, segments = end_run(directory.previous)
+            sweep(segments)
+        remove_programmed(path, max(1.0, deadline - time.monotonic()))
     finally:
         directory.release()
     return ExitCode.OK

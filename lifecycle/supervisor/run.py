@@ -9,20 +9,24 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
-from collections.abc import Awaitable, Callable, Iterable, Mapping
+from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
 
 from lifecycle.errors import ExitCode, LifecycleError
 from lifecycle.manifest.model import Authority, DataLayerSource, EndpointPolicy, RunKind
+from lifecycle.middleware.doors import discovery_peers, peers_environment
 from lifecycle.middleware.process import adopt_orphans, exit_after
 from lifecycle.middleware.profiles import discovery_environment
+from lifecycle.middleware.shm import sweep
+from lifecycle.plan import moved_observer
+from lifecycle.plan.contacts import reached_hosts
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor import discovery_server
 from lifecycle.supervisor.ending import Ending
 from lifecycle.supervisor.events import Emitter, Listener, Notice, RunStarted
 from lifecycle.supervisor.eyes import Eyes
-from lifecycle.supervisor.failure import NOT_JUDGED, StepFailedError, never_connected, with_failure
+from lifecycle.supervisor.failure import StepFailedError, never_connected, with_failure
 from lifecycle.supervisor.logs import log_directory
-from lifecycle.supervisor.networks import open_networks
+from lifecycle.supervisor.networks import open_networks, token_variables
 from lifecycle.supervisor.options import (
     UpOptions,
     UpResult,
@@ -30,7 +34,8 @@ from lifecycle.supervisor.options import (
     observer_connections,
     own_machines,
 )
-from lifecycle.supervisor.orphans import end_run, sweep_of
+from lifecycle.supervisor.orphans import end_run
+from lifecycle.supervisor.records import Records, noting
 from lifecycle.supervisor.rundir import (
     RUN_VARIABLE,
     RunDirectory,
@@ -43,22 +48,31 @@ from lifecycle.supervisor.session import Session
 from lifecycle.supervisor.status import SystemStatus
 from lifecycle.supervisor.system import System
 from lifecycle.supervisor.zygote import Zygote, ZygoteProcess
+from lifecycle.verify.verdict import NOT_JUDGED
 
 LEAVE_S = 10.0
 """A participant leaves within 0.2 s, over connections that nobody answers within 4 s."""
 
 
+OBSERVER_TRIES = 4
+
+
 class Forerunner:
     """A zygote that is started before the manifest is read, to import while we do.
+
+    Args:
+        preload: see ZygoteProcess.
+        without: variables of our environment that nothing it starts shall have.
 
     Attributes:
         run_id: of the run that it is for.
     """
 
-    def __init__(self, *, preload: bool = True) -> None:
+    def __init__(self, *, preload: bool = True, without: Collection[str] = ()) -> None:
         self.run_id = new_run_id()
+        environment = {name: text for name, text in os.environ.items() if name not in without}
         self.process = ZygoteProcess(
-            preload=preload, environment={**os.environ, RUN_VARIABLE: self.run_id}
+            preload=preload, environment={**environment, RUN_VARIABLE: self.run_id}
         )
 
     def close(self) -> None:
@@ -121,7 +135,7 @@ def _up(
     for listener in listeners:
         emit.listen(listener)
     python = any(each.run.kind is RunKind.PYTHON for each in processes)
-    forerunner = forerunner or Forerunner(preload=python)
+    forerunner = forerunner or Forerunner(preload=python, without=token_variables(options.program))
     try:
         directory = RunDirectory.acquire(
             runtime_root(os.environ),
@@ -132,16 +146,18 @@ def _up(
     except LifecycleError:
         forerunner.close()
         raise
-    session: Session | None = None
+    records: Records | None = None
     try:
         if directory.previous is not None:
             _clean_up_after(directory.previous, emit)
-        networks = open_networks(plan, options, directory, emit, environment=os.environ)
+        # Servers may be asked to remove what dead runs left: that must not outlast a signal.
+        with ending.raised() if options.program else contextlib.nullcontext():
+            networks = open_networks(plan, options, directory, emit, environment=os.environ)
         adopt_orphans()
-        _enter_graph(plan, directory)
+        _enter_graph(plan, options, directory)
 
         async def run(leaving: contextlib.ExitStack) -> UpResult:
-            nonlocal session
+            nonlocal records
             logs = log_directory(os.environ, plan.system)
             system = System(
                 plan,
@@ -151,17 +167,20 @@ def _up(
                 variables=_graph_variables(os.environ),
             )
             zygote = Zygote(forerunner.process)
+            records = leaving.enter_context(noting(directory, system, zygote.pid))
             try:
                 # Before any participant: who asks a server that is not there waits to ask again.
                 with ending.raised():
                     await discovery_server.begin(system, zygote, ours=_serves(plan, options))
-                eyes = _eyes(plan, options)
+                eyes = _eyes(plan, options, emit)
                 leaving.callback(eyes.destroy)
+                await records.note_segments()
                 emit(_started(system, eyes, str(logs)))
                 session = Session(
                     system,
                     options,
                     directory=directory,
+                    records=records,
                     zygote=zygote,
                     eyes=eyes,
                     networks=networks,
@@ -184,8 +203,7 @@ def _up(
         result = asyncio.run(_leaving_last(run))
     finally:
         forerunner.close()
-        segments = session.segments if session else ()
-        swept = sweep_of(directory.began_s, segments, plan.domain_id)
+        swept = sweep(records.segments) if records else ()
         directory.release()
     if swept and result.exit_code == ExitCode.OK:
         emit(Notice(message=f"removed shared memory left in /dev/shm: {', '.join(swept)}"))
@@ -211,16 +229,35 @@ def _serves(plan: Plan, options: UpOptions) -> bool:
     return server is not None and server.machine in own_machines(plan, options.machine)
 
 
-def _eyes(plan: Plan, options: UpOptions) -> Eyes:
+def _eyes(plan: Plan, options: UpOptions, emit: Emitter) -> Eyes:
+    """Make the supervisor's participant; on another port if a discovery server is not reached.
+
+    Fast DDS may never use the first connection to it (middleware/dead_connections.py).
+    """
     layer = plan.data_layer
     dynamic = layer.source is DataLayerSource.DYNAMIC
     wires = layer.authority is Authority.SUPERVISOR
-    return Eyes.open(
-        plan.domain_id,
-        observer_connections(plan, options.machine),
-        guests=wires and dynamic and plan.policy.undeclared_nodes is EndpointPolicy.OPEN,
-        events=wires and (dynamic or layer.events),
-    )
+    planned = connections = observer_connections(plan, options.machine)
+    for number in range(OBSERVER_TRIES):
+        eyes = Eyes.open(
+            plan.domain_id,
+            connections,
+            guests=wires and dynamic and plan.policy.undeclared_nodes is EndpointPolicy.OPEN,
+            events=wires and (dynamic or layer.events),
+        )
+        if number + 1 == OBSERVER_TRIES or eyes.reaches_servers():
+            break
+        eyes.prepare_to_leave()
+        eyes.destroy()
+        connections = moved_observer(plan, planned, number)
+        emit(
+            Notice(
+                message="the supervisor's own participant is made again on a fresh port: the "
+                "discovery server did not take its connection; "
+                f"try {number + 1} of {OBSERVER_TRIES - 1}"
+            )
+        )
+    return eyes
 
 
 def _started(system: System, eyes: Eyes, logs: str) -> RunStarted:
@@ -238,15 +275,19 @@ def _started(system: System, eyes: Eyes, logs: str) -> RunStarted:
 _GRAPH_VARIABLES = (
     "ROS_DOMAIN_ID",
     "ROS_AUTOMATIC_DISCOVERY_RANGE",
+    "ROS_STATIC_PEERS",
     "FASTRTPS_DEFAULT_PROFILES_FILE",
 )
 
 
-def _enter_graph(plan: Plan, directory: RunDirectory) -> None:
+def _enter_graph(plan: Plan, options: UpOptions, directory: RunDirectory) -> None:
     """Place this process where the plan's nodes will be, and have participants found quickly."""
     os.environ["ROS_DOMAIN_ID"] = str(plan.domain_id)
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = plan.discovery_range.name
-    os.environ.update(discovery_environment(directory.path))
+    hosts = reached_hosts(plan, own_machines(plan, options.machine))
+    os.environ.update(peers_environment(hosts, os.environ))
+    peers = discovery_peers(plan.domain_id, hosts, os.environ)
+    os.environ.update(discovery_environment(directory.path, peers=peers))
 
 
 def _graph_variables(environment: Mapping[str, str]) -> tuple[tuple[str, str], ...]:
@@ -256,8 +297,8 @@ def _graph_variables(environment: Mapping[str, str]) -> tuple[tuple[str, str], .
 
 def _clean_up_after(record: RunRecord, emit: Emitter) -> None:
     """Sweep what a supervisor left that had no chance to do it itself."""
-    ended = end_run(record)
-    swept = sweep_of(record.began_s, record.segments, record.domain_id)
+    ended, segments = end_run(record)
+    swept = sweep(segments)
     if ended or swept:
         emit(
             Notice(

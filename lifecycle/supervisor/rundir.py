@@ -26,6 +26,8 @@ from lifecycle.plan.model import Plan
 RUN_VARIABLE = "LIFECYCLE_RUN"
 """Set in every process of a run, with the run's id: what proves that a process is ours."""
 
+_OURS = os.O_CLOEXEC | os.O_NOFOLLOW
+
 LEDGER_NAME = "programmed.json"
 """File in a run directory that lists what is ours in networks, see programming/ledger.py."""
 
@@ -75,11 +77,20 @@ class AlreadyRunningError(UsageError):
 
 
 def runtime_root(environment: Mapping[str, str]) -> Path:
-    """Return where run directories are: $XDG_RUNTIME_DIR/lifecycle, else /tmp/lifecycle-UID."""
+    """Return where run directories are: $XDG_RUNTIME_DIR/lifecycle, else /tmp/lifecycle-UID.
+
+    Raises:
+        UsageError: another user can put things there, or it is no directory.
+    """
     base = environment.get("XDG_RUNTIME_DIR")
     if base and Path(base).is_dir():
-        return Path(base) / "lifecycle"
-    return Path(tempfile.gettempdir()) / f"lifecycle-{os.getuid()}"
+        root = Path(base) / "lifecycle"
+    else:
+        root = Path(tempfile.gettempdir()) / f"lifecycle-{os.getuid()}"
+    _refuse_unsafe_parents(root)
+    if os.path.lexists(root):
+        _refuse_unless_private(root)
+    return root
 
 
 def run_name(plan: Plan, machine: str = "") -> str:
@@ -128,26 +139,58 @@ class RunDirectory:
 
         Raises:
             AlreadyRunningError: another supervisor has it.
-            UsageError: the directory belongs to somebody else, or is writable by others.
+            UsageError: the directory belongs to another user, is writable by others, or cannot be
+                made or written.
         """
-        _private_directory(root)
         directory = cls(root / name, run_id, domain_id)
-        _private_directory(directory.path)
-        lock = os.open(directory.path / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            directory._take()
+            directory.previous = read_record(directory.path)
+            directory.record(())
         except BlockingIOError:
-            os.close(lock)
             record = read_record(directory.path)
             pid = f" (pid {record.supervisor.pid})" if record else ""
             raise AlreadyRunningError(
                 f"cannot bring up {name!r}: another supervisor{pid} runs it already",
                 hint=f"end it first: lifecycle down {name}",
             ) from None
-        directory._lock = lock
-        directory.previous = read_record(directory.path)
-        directory.record(())
+        except OSError as error:
+            directory._let_go()
+            raise _unusable(error.filename or directory.path, str(error.strerror)) from error
         return directory
+
+    def _take(self) -> None:
+        """Make the directory and lock it, also where its last supervisor just removes it.
+
+        Raises:
+            BlockingIOError: another supervisor has it.
+            OSError: it cannot be made.
+            UsageError: it is not ours alone.
+        """
+        _refuse_unsafe_parents(self.path.parent)
+        path = self.path / "lock"
+        while True:
+            _private_directory(self.path.parent)
+            _private_directory(self.path)
+            try:
+                lock = os.open(path, os.O_RDWR | os.O_CREAT | _OURS, 0o600)
+            except FileNotFoundError:
+                continue
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                if path.exists() and os.path.samestat(os.fstat(lock), path.lstat()):
+                    self._lock = lock
+                    return
+            except FileNotFoundError:
+                pass
+            finally:
+                if self._lock is None:
+                    os.close(lock)
+
+    def _let_go(self) -> None:
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
 
     @property
     def socket_path(self) -> Path:
@@ -168,31 +211,45 @@ class RunDirectory:
             domain_id=self.domain_id,
         )
         part = self.path / ".record.json"
-        part.write_bytes(to_json(record))
+        part.unlink(missing_ok=True)
+        new = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _OURS, 0o600)
+        with os.fdopen(new, "wb") as file:
+            file.write(to_json(record))
         part.replace(self.path / "record.json")
 
     def release(self) -> None:
-        """Remove what is in the directory and give up the lock; nothing of ours may run."""
-        for name in ("record.json", "control"):
-            (self.path / name).unlink(missing_ok=True)
-        if self._lock is not None:
-            os.close(self._lock)
-            self._lock = None
+        """Remove the directory and give up the lock; nothing of ours may run.
+
+        A list of what is still programmed in networks stays, and with it the directory.
+        """
+        if self._lock is None:
+            return
+        with contextlib.suppress(FileNotFoundError):
+            for each in tuple(self.path.iterdir()):
+                # The lock last: who takes it must not find what is being removed.
+                if each.name not in (LEDGER_NAME, "lock"):
+                    with contextlib.suppress(IsADirectoryError):
+                        each.unlink(missing_ok=True)
+            (self.path / "lock").unlink(missing_ok=True)
+            # Another supervisor may have it by now, or it is not empty.
+            with contextlib.suppress(OSError):
+                self.path.rmdir()
+        self._let_go()
 
 
 def read_record(path: Path) -> RunRecord | None:
     """Return the record in a run directory; None if there is none that can be read."""
     try:
         return from_json((path / "record.json").read_bytes(), RunRecord)
-    except (FileNotFoundError, ValueError):
+    except (FileNotFoundError, NotADirectoryError, ValueError):
         return None
 
 
 def is_held(path: Path) -> bool:
-    """Whether a supervisor holds this run directory now."""
+    """Whether a supervisor holds this run directory now; what is not ours is none."""
     try:
-        lock = os.open(path / "lock", os.O_RDWR | os.O_CLOEXEC)
-    except FileNotFoundError:
+        lock = os.open(path / "lock", os.O_RDWR | _OURS)
+    except OSError:
         return False
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -231,16 +288,72 @@ def connect(path: Path) -> socket.socket:
 
 
 def _private_directory(path: Path) -> None:
-    """Make `path` if need be, and insist that nobody else can put things into it."""
-    path.mkdir(mode=0o700, parents=True, exist_ok=True)
-    status = path.lstat()
-    if (
-        not stat.S_ISDIR(status.st_mode)
-        or status.st_uid != os.getuid()
-        or status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
-    ):
-        raise UsageError(
-            f"cannot use {str(path)!r} as run directory: it must be a directory of this user that "
-            "others cannot write",
-            hint="remove it, or set XDG_RUNTIME_DIR",
-        )
+    """Make `path` if need be, and insist that no other user can put things into it.
+
+    Raises:
+        UsageError: another user can, or something else is in its place.
+    """
+    with contextlib.suppress(FileExistsError):
+        path.mkdir(mode=0o700, parents=True)
+    _refuse_unless_private(path)
+
+
+def _refuse_unless_private(path: Path) -> None:
+    try:
+        status = path.lstat()
+    except FileNotFoundError:
+        return  # just removed by the run that had it
+    what = ""
+    if stat.S_ISLNK(status.st_mode):
+        what = "it is a symbolic link"
+    elif not stat.S_ISDIR(status.st_mode):
+        what = "it is not a directory"
+    elif status.st_uid != os.getuid():
+        what = f"it belongs to user {status.st_uid}, and this is user {os.getuid()}"
+    elif status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        what = "others can write it"
+    if what:
+        raise _unusable(path, what)
+
+
+def _refuse_unsafe_parents(root: Path) -> None:
+    """Insist that no other user can put another directory into the place of `root`.
+
+    Each directory above it must belong to this user or to root, and be writable by all only with
+    the sticky bit, as /tmp is.
+
+    Raises:
+        UsageError: another user can.
+    """
+    trusted = {os.getuid(), 0, _unmapped_uid()}
+    # Where links lead to: they lie in the directories above, which are looked at as well.
+    for path in {*root.absolute().parents, *Path(os.path.realpath(root.parent) + "/x").parents}:
+        try:
+            status = path.stat()
+        except FileNotFoundError:
+            continue
+        except OSError as error:
+            raise _unusable(path, str(error.strerror)) from error
+        if status.st_uid not in trusted:
+            raise _unusable(
+                root,
+                f"{str(path)!r} belongs to user {status.st_uid}, and this is user {os.getuid()}",
+            )
+        if status.st_mode & stat.S_IWOTH and not status.st_mode & stat.S_ISVTX:
+            raise _unusable(root, f"everybody can write {str(path)!r}")
+
+
+def _unmapped_uid() -> int:
+    """Return as whom the owner of / is seen in a user namespace without root's uid; else 0."""
+    uids = Path("/proc/self/uid_map").read_text(encoding="ascii").split()
+    if int(uids[1]) == 0 and int(uids[0]) == 0:
+        return 0
+    return int(Path("/proc/sys/kernel/overflowuid").read_text(encoding="ascii"))
+
+
+def _unusable(path: Path | str, what: str) -> UsageError:
+    return UsageError(
+        f"cannot use {str(path)!r} as run directory: {what}; it must be a directory of this user "
+        "that others cannot write",
+        hint="remove it, or set XDG_RUNTIME_DIR to such a directory",
+    )

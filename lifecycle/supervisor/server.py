@@ -22,6 +22,8 @@ from lifecycle.verify.observation import Observation
 from lifecycle.verify.verdict import Verdict
 
 _BURST_S = 0.05
+_LARGEST_QUESTION = 64 * 2**20
+"""Bytes of a line; a question may hold a whole plan."""
 _ORDERS = {each.value: each for each in OrderKind}
 
 
@@ -35,6 +37,7 @@ class Ask(enum.Enum):
     PAUSE = "pause"
     RESUME = "resume"
     RESTART = "restart"
+    DIFFERENCES = "differences"
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,10 +46,15 @@ class Question:
 
     Attributes:
         node: for RESTART, manifest key or fully qualified name; empty for the whole system.
+        plan: for DIFFERENCES and orders, what the manifest that the client was given comes to now;
+            None if it was given none.
+        reload: for RESTART, `plan` is to run from now on.
     """
 
     ask: Ask
     node: str = ""
+    plan: Plan | None = None
+    reload: bool = False
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,12 +82,14 @@ class Answer:
             an order, what came of it.
         error: why an order was not carried out; empty if it was.
         look: for LOOK; for FOLLOW one at once and one after each change.
+        differences: for DIFFERENCES, how the plan of the question differs from what runs.
     """
 
     status: SystemStatus | None = None
     exit_code: int | None = None
     error: str = ""
     look: Look | None = None
+    differences: tuple[str, ...] = ()
 
 
 class ControlServer:
@@ -91,6 +101,7 @@ class ControlServer:
         down: for DOWN.
         look: for LOOK and FOLLOW.
         order: carries out an order.
+        differences: says how a plan differs from what runs.
     """
 
     def __init__(
@@ -101,12 +112,14 @@ class ControlServer:
         *,
         look: Callable[[], Look] | None = None,
         order: Callable[[Order], Awaitable[Done]] | None = None,
+        differences: Callable[[Plan], tuple[str, ...]] = lambda _: (),
     ) -> None:
         self._path = path
         self._status = status
         self._down = down
         self._look = look
         self._order = order
+        self._differences = differences
         self._changed = asyncio.Event()
         self._server: asyncio.AbstractServer | None = None
         self._open: set[asyncio.StreamWriter] = set()
@@ -122,7 +135,9 @@ class ControlServer:
         sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         with short_path(self._path) as name:
             sock.bind(name)
-        self._server = await asyncio.start_unix_server(self._serve, sock=sock)
+        self._server = await asyncio.start_unix_server(
+            self._serve, sock=sock, limit=_LARGEST_QUESTION
+        )
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self._open.add(writer)
@@ -153,9 +168,16 @@ class ControlServer:
         if question.ask is Ask.LOOK and self._look is not None:
             return Answer(look=self._look())
         if self._order is not None and question.ask.value in _ORDERS:
-            order = Order(kind=_ORDERS[question.ask.value], node=question.node)
+            order = Order(
+                kind=_ORDERS[question.ask.value],
+                node=question.node,
+                plan=question.plan,
+                reload=question.reload,
+            )
             done = await self._order(order)
             return Answer(exit_code=done.exit_code, error=done.error)
+        if question.ask is Ask.DIFFERENCES and question.plan is not None:
+            return Answer(differences=self._differences(question.plan))
         return Answer(status=self._status())
 
     async def _follow(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -194,7 +216,7 @@ async def _say(writer: asyncio.StreamWriter, answer: Answer) -> None:
     await writer.drain()
 
 
-def ask(path: Path, question: Ask, timeout_s: float, *, node: str = "") -> Answer | None:
+def ask(path: Path, question: Question, timeout_s: float) -> Answer | None:
     """Ask the supervisor that listens at `path`.
 
     Returns:
@@ -206,7 +228,7 @@ def ask(path: Path, question: Ask, timeout_s: float, *, node: str = "") -> Answe
     """
     with connect(path) as sock:
         sock.settimeout(timeout_s)
-        sock.sendall(to_json(Question(ask=question, node=node)) + b"\n")
+        sock.sendall(to_json(question) + b"\n")
         with sock.makefile("rb") as stream:
             line = stream.readline()
     return from_json(line, Answer) if line else None

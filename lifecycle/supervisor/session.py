@@ -16,6 +16,8 @@ from typing import Any
 
 from lifecycle.errors import ExitCode
 from lifecycle.supervisor import discovery_server
+from lifecycle.supervisor.activation_guard import ActivationGuard
+from lifecycle.supervisor.agreement import Agreement
 from lifecycle.supervisor.bring_up import BringUp
 from lifecycle.supervisor.elsewhere import Elsewhere
 from lifecycle.supervisor.ending import ENDED_BY, Ending
@@ -29,40 +31,62 @@ from lifecycle.supervisor.events import (
     SystemReached,
 )
 from lifecycle.supervisor.eyes import Eyes
-from lifecycle.supervisor.failure import NOT_JUDGED, StepFailedError, with_failure
-from lifecycle.supervisor.gate import Gate, VerificationError
+from lifecycle.supervisor.failure import StepFailedError, with_failure
+from lifecycle.supervisor.gate import Gate, VerificationError, closes
 from lifecycle.supervisor.holding import Holding
 from lifecycle.supervisor.judge import Changes, Judge
 from lifecycle.supervisor.neighbours import Neighbours
 from lifecycle.supervisor.networks import Networks
 from lifecycle.supervisor.options import Until, UpOptions, UpResult
-from lifecycle.supervisor.orphans import end_descendants, reap_adopted
+from lifecycle.supervisor.orders import ACTIVE, HELD, PAUSED
+from lifecycle.supervisor.orphans import end_strays, reap_adopted
 from lifecycle.supervisor.records import Records
 from lifecycle.supervisor.regulate import Regulator
+from lifecycle.supervisor.revision import Revisions
 from lifecycle.supervisor.rundir import RunDirectory
 from lifecycle.supervisor.server import ControlServer, Look
 from lifecycle.supervisor.shutdown import TakeDown
 from lifecycle.supervisor.sightings import Sightings
+from lifecycle.supervisor.stale import StaleNodes
 from lifecycle.supervisor.status import SystemStatus, system_status
 from lifecycle.supervisor.system import System
 from lifecycle.supervisor.together import ended
 from lifecycle.supervisor.vigil import Vigil
 from lifecycle.supervisor.wiring import authority_of
 from lifecycle.supervisor.zygote import Zygote
-from lifecycle.verify.missing import missing, not_ok
-from lifecycle.verify.verdict import Outcome, RunEnd, Stage, Verdict
+from lifecycle.verify.missing import missing, not_ok, taken_on_trust
+from lifecycle.verify.verdict import NOT_JUDGED, Outcome, RunEnd, Stage, Verdict
 
 _GLANCE_S = 1.0
 """How long `--until connected` looks for a verdict to report; it gates nothing."""
 
 
-class _Stop(Exception):  # noqa: N818 - not an error: somebody asked
-    """Somebody asked the run to end."""
+_STOPPING = "stopping"
+_KEPT = (ACTIVE, PAUSED, "pausing")
+"""Phases of a system that was verified and is what was asked for; in any other it is on its way."""
+
+
+class _Stop(Exception):  # noqa: N818 - not an error: it was asked for
+    """The run was asked to end.
+
+    Attributes:
+        reason: in words.
+        exit_code: of a run that was cut short by it.
+    """
 
     def __init__(self, reason: str, exit_code: ExitCode) -> None:
         super().__init__(reason)
         self.reason = reason
         self.exit_code = exit_code
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class _End:
+    """What a run comes to, beside its reason: nothing to add, if it is as it was asked for."""
+
+    exit_code: ExitCode = ExitCode.OK
+    why: str = ""
+    verdict: Verdict | None = None
 
 
 class Session:
@@ -72,6 +96,7 @@ class Session:
         system: the plan and the part of it that this supervisor is responsible for.
         options: what the person asked for.
         directory: acquired for this run.
+        records: of this run.
         zygote: forks the processes.
         eyes: see the graph; made before any process.
         networks: programmed while the system is active.
@@ -85,6 +110,7 @@ class Session:
         options: UpOptions,
         *,
         directory: RunDirectory,
+        records: Records,
         zygote: Zygote,
         eyes: Eyes,
         networks: Networks,
@@ -100,12 +126,16 @@ class Session:
         self._emit = emit
         self._ending = ending
         self._furthest: str | None = None
-        self._violated = ""
+        self._held = False
+        self._trusted = ""
+        self._ends = ""
         self._hurry = asyncio.Event()
         self._stop: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._gate = Gate(strict=options.strict)
         self._changes = Changes(system, eyes)
         self._authority = authority_of(system, emit, eyes)
+        self._neighbours = Neighbours(system, eyes)
+        self._agreement = Agreement(system, eyes, self._neighbours)
+        self._guard = ActivationGuard(system)
         self._judge = Judge(
             system,
             eyes,
@@ -113,9 +143,14 @@ class Session:
             emit,
             strict=options.strict,
             looker=self._authority,
+            agreement=self._agreement,
+            guard=self._guard,
         )
-        sightings = Sightings(system.plan, eyes, self._changes)
-        self._records = Records(directory, system, zygote.pid)
+        self._gate = Gate(strict=options.strict, judging=self._judge)
+        sightings = Sightings(system, eyes, self._changes)
+        self._stale = StaleNodes(system, eyes)
+        emit.listen(self._stale.on_event)
+        self._records = records
         self._vigil = Vigil(system)
         self._bring_up = BringUp(
             system,
@@ -126,7 +161,6 @@ class Session:
             wirer=self._authority,
         )
         self._elsewhere = Elsewhere(system.plan, system.awaited(), eyes, self._changes)
-        self._neighbours = Neighbours(system, eyes)
         self._regulator = Regulator(
             system,
             bring_up=self._bring_up,
@@ -139,24 +173,22 @@ class Session:
             forget=eyes.drop_configuration,
             vanishes=sightings.vanishes,
             replanned=self._replanned,
+            program=networks.begin,
             hurry=self._hurry,
             timeout_s=options.timeout_s,
         )
+        self._revisions = Revisions(system, options)
         self._holding = Holding(
             system,
             judge=self._judge,
             changes=self._changes,
             regulator=self._regulator,
+            revisions=self._revisions,
             vigil=self._vigil,
             emit=emit,
             note_segments=self._records.note_segments,
             keep_going=options.keep_going,
         )
-
-    @property
-    def segments(self) -> frozenset[str]:
-        """Shared memory files that our processes were seen to use."""
-        return self._records.segments
 
     def status(self) -> SystemStatus:
         """Return what is known now."""
@@ -178,8 +210,13 @@ class Session:
         )
 
     def stop(self, reason: str, exit_code: ExitCode) -> None:
-        """Ask the run to end; a second time, ask it to hurry."""
-        if self._stop.done():
+        """Ask the run to end; once it ends, an interrupt asks it to hurry.
+
+        Args:
+            reason: in words.
+            exit_code: of the run, if this cuts it short.
+        """
+        if self._stop.done() or self._regulator.phase == _STOPPING:
             if exit_code is ExitCode.INTERRUPTED:
                 self._hurry.set()
             return
@@ -190,12 +227,14 @@ class Session:
         server = ControlServer(
             self._directory.socket_path,
             self.status,
-            lambda: self.stop("lifecycle down", ExitCode.OK),
+            lambda: self.stop("lifecycle down", ExitCode.BRING_UP_FAILED),
             look=self.look,
             order=self._holding.ordered,
+            differences=self._revisions.differences,
         )
         await server.open()
         self._neighbours.open()
+        self._agreement.open()
         self._emit.listen(lambda event: None if isinstance(event, LogLine) else server.changed())
         result = UpResult(exit_code=ExitCode.INTERNAL, verdict=NOT_JUDGED)
         try:
@@ -204,8 +243,12 @@ class Session:
                     result = await self._until_over()
                 finally:
                     await self._take_down()
+                if self._hurry.is_set() and result.exit_code == ExitCode.OK:
+                    result = _hurried(result)
         finally:
+            self._stale.close()
             self._eyes.prepare_to_leave()
+            self._agreement.close()
             await self._neighbours.close()
             await self._changes.close()
             self._emit(Stopped(exit_code=result.exit_code, elapsed_s=self._emit.elapsed_s))
@@ -215,31 +258,96 @@ class Session:
     async def _until_over(self) -> UpResult:
         """Run the phases; whatever ends them becomes an exit code and a verdict."""
         reason = stopping = "done"
-        verdict: Verdict | None = None
+        end = _End()
         try:
-            exit_code = await self._unless_stopped(self._phases())
-            if self._violated:
-                reason = f"done, and violated; {self._violated}"
+            end = await self._unless_stopped(self._phases())
         except _Stop as stop:
             reason = stopping = stop.reason
-            exit_code = stop.exit_code
-            if waits := self._waits():
-                reason = f"{reason}; {waits}"
+            end = self._cut_short(stop.exit_code)
         except StepFailedError as failure:
-            self._emit(failure.event())
-            reason, stopping, exit_code = failure.reason, "rolling back", failure.exit_code
-            verdict = with_failure(self._judge.latest or _empty(), failure)
+            for each in failure.every:
+                self._emit(each.event())
+            reason, stopping = failure.reason, "rolling back"
+            verdict = with_failure(self._judge.latest or NOT_JUDGED, failure)
+            end = _End(exit_code=failure.exit_code, verdict=verdict)
         except VerificationError as error:
-            stopping, exit_code = "the verdict keeps the gate closed", error.exit_code
-            if self._regulator.phase == "activating":
+            stopping, end = "the verdict keeps the gate closed", _End(exit_code=error.exit_code)
+            if error.again:
+                stopping = "the system changed before every node was activated"
+            elif self._regulator.phase == "activating":
                 stopping = "what became active is not what was verified"
             reason = f"{stopping}; {not_ok(error.verdict) or error.verdict.verdict.value}"
         self._gate.close()
-        self._regulator.phase = "stopping"
+        self._regulator.phase = _STOPPING
         self._emit(Stopping(reason=stopping))
-        run = RunEnd(reason=reason, reached=self._furthest, exit_code=exit_code)
-        verdict = dataclasses.replace(verdict or self._judge.latest or NOT_JUDGED, run=run)
-        return UpResult(exit_code=exit_code, verdict=verdict)
+        self._ends = stopping
+        if end.why:
+            reason = f"{reason}, but {end.why}" if reason == "done" else f"{reason}; {end.why}"
+        run = RunEnd(
+            reason=reason,
+            reached=self._furthest,
+            exit_code=end.exit_code,
+            trusted=self._trusted,
+        )
+        verdict = dataclasses.replace(end.verdict or self._judge.latest or NOT_JUDGED, run=run)
+        return UpResult(exit_code=end.exit_code, verdict=verdict)
+
+    def _cut_short(self, exit_code: ExitCode) -> _End:
+        """Return what a run comes to that is asked to end.
+
+        It is a success only if the system was verified, is what was asked for, and nothing bound
+        it to stay; an interrupt (Ctrl-C) never is. That other machines of the system were shut down
+        before is how a system of several hosts ends, and no failure of this one.
+
+        Args:
+            exit_code: of a run that is cut short.
+        """
+        if not self._held:
+            return _End(exit_code=exit_code, why=self._waits())
+        end = self._outcome()
+        if exit_code is ExitCode.INTERRUPTED:
+            return dataclasses.replace(end, exit_code=exit_code)
+        if end.exit_code == ExitCode.VIOLATED and self._hosts_left():
+            end = _End()
+        if end.exit_code != ExitCode.OK:
+            return end
+        if self._options.stop_after_s is not None:
+            why = f"it did not hold for the {self._options.stop_after_s:g} s of --stop-after"
+            return _End(exit_code=exit_code, why=why)
+        if self._options.until is Until.ACTIVE and self._regulator.phase not in _KEPT:
+            why = f"the system was {self._regulator.phase}, not active"
+            return _End(exit_code=exit_code, why=why)
+        return end
+
+    def _hosts_left(self) -> bool:
+        """Whether nothing is violated but that other machines of the system were shut down."""
+        latest = self._judge.latest
+        return latest is not None and self._agreement.follows_from_shut_down(latest)
+
+    def _outcome(self, meanwhile: str = "") -> _End:
+        """Return what the run of a system comes to that was held until now.
+
+        Args:
+            meanwhile: what was violated while it was held; empty if nothing was.
+        """
+        deaths = self._vigil.deaths()
+        if deaths:
+            failure = deaths[0].joined(deaths[1:])
+            verdict = with_failure(self._judge.latest or NOT_JUDGED, failure)
+            return _End(exit_code=failure.exit_code, why=failure.reason, verdict=verdict)
+        latest = self._judge.latest
+        end = _End()
+        if self._options.until is Until.CONNECTED or latest is None:
+            pass
+        elif latest.verdict is Outcome.VIOLATED:
+            end = _End(exit_code=ExitCode.VIOLATED, why=f"violated; {not_ok(latest)}")
+        elif meanwhile:
+            end = _End(exit_code=ExitCode.VIOLATED, why=f"violated meanwhile, {meanwhile}")
+        elif closes(latest, strict=self._options.strict):
+            end = _End(exit_code=ExitCode.UNVERIFIABLE, why=f"unverifiable; {not_ok(latest)}")
+        elif self._regulator.phase == HELD:
+            end = _End(exit_code=ExitCode.VIOLATED, why="held at the gate, and not active")
+        return end
 
     def _waits(self) -> str:
         """Say what a run still waits for that is asked to end before its system is up."""
@@ -247,7 +355,7 @@ class Session:
         verifies = self._regulator.phase == "verifying" and latest is not None
         return self._bring_up.unfinished() or (missing(latest) if verifies and latest else "")
 
-    async def _phases(self) -> ExitCode:
+    async def _phases(self) -> _End:
         loop = asyncio.get_running_loop()
         deadline = loop.time() + self._options.timeout_s
         async with self._following():
@@ -257,17 +365,20 @@ class Session:
             await self._vigil.during(self._judge.until_clear(Stage.CONNECTED, _GLANCE_S))
             return await self._hold(Stage.CONNECTED)
         self._regulator.phase = "verifying"
-        await self._vigil.during(self._judge.until_clear(Stage.CONNECTED, deadline - loop.time()))
+        await self._regulator.until_clear(deadline - loop.time())
         verdict = self._judge.latest
         assert verdict is not None
         permit = self._gate.judge(verdict)
+        self._trusted = taken_on_trust(verdict)
         self._reached("verified")
         if self._options.until is Until.VERIFIED:
             return await self._hold(Stage.CONNECTED)
+        await self._vigil.during(self._regulator.program(permit, deadline - loop.time()))
+        verdict = permit.verdict
+        self._trusted = taken_on_trust(verdict)
         self._regulator.phase = "activating"
         managed = tuple(each.name for each in self._system.nodes.values() if each.planned.managed)
-        self._emit(GateOpened(outcome=verdict.verdict.value, nodes=managed))
-        await self._vigil.during(self._networks.begin(verdict))
+        self._emit(GateOpened(outcome=verdict.verdict.value, nodes=managed, trusted=self._trusted))
         async with self._following():
             await self._vigil.during(self._bring_up.activate(permit, deadline - loop.time()))
         await self._vigil.during(self._judge.until_clear(Stage.ACTIVE, deadline - loop.time()))
@@ -279,33 +390,28 @@ class Session:
 
     @contextlib.asynccontextmanager
     async def _following(self) -> AsyncIterator[None]:
-        """Keep looking at the nodes of others that ours wait for."""
-        following = asyncio.ensure_future(self._elsewhere.follow())
+        """Keep looking at the nodes of others, and at ours that others may drive, too."""
+        followers = (
+            asyncio.ensure_future(self._elsewhere.follow()),
+            asyncio.ensure_future(self._guard.follow(self._eyes, self._changes)),
+        )
         try:
             yield
         finally:
-            if following.done():
-                following.result()
-            await ended(following)
+            for each in followers:
+                if each.done():
+                    each.result()
+            await ended(*followers)
 
-    async def _hold(self, stage: Stage) -> ExitCode:
+    async def _hold(self, stage: Stage) -> _End:
         """Keep the system for as long as was asked; return what the run comes to."""
+        self._held = True
         hold_s = self._options.stop_after_s
         if hold_s is None and self._options.until is not Until.ACTIVE:
             hold_s = 0.0
-        meanwhile = await self._holding.hold(stage, hold_s)
-        if self._options.until is Until.CONNECTED:
-            return ExitCode.OK
-        verdict = self._judge.latest
-        if verdict is not None and verdict.verdict is Outcome.VIOLATED:
-            self._violated = not_ok(verdict)
-        elif meanwhile:
-            self._violated = f"meanwhile, {meanwhile}"
-        else:
-            return ExitCode.OK
-        return ExitCode.VIOLATED
+        return self._outcome(await self._holding.hold(stage, hold_s))
 
-    async def _unless_stopped(self, phases: Coroutine[Any, Any, ExitCode]) -> ExitCode:
+    async def _unless_stopped(self, phases: Coroutine[Any, Any, _End]) -> _End:
         running = asyncio.ensure_future(phases)
         try:
             waits: set[asyncio.Future[Any]] = {running, self._stop}
@@ -318,9 +424,11 @@ class Session:
 
     async def _take_down(self) -> None:
         """End everything, also what our processes left behind."""
-        self._regulator.phase = "stopping"
+        self._regulator.phase = _STOPPING
+        self._agreement.leave(self._ends)
         self._eyes.prepare_to_leave()
         self._holding.close(f"cannot go on: {self._system.plan.system!r} is being taken down")
+        await self._guard.close()
         await self._bring_up.close()
         await self._records.note_segments()
         if self._authority is not None:
@@ -329,10 +437,12 @@ class Session:
             await TakeDown(self._system, self._emit, self._hurry).run()
         finally:
             # After the last message has left, and before what runs below us is ended.
-            await self._networks.close()
+            await self._networks.close(self._hurry)
             await discovery_server.end(self._system, self._hurry)
         loop = asyncio.get_running_loop()
-        left = await loop.run_in_executor(None, end_descendants, (self._zygote.pid,))
+        left = await loop.run_in_executor(
+            None, end_strays, self._zygote.pid, self._directory.run_id
+        )
         if left:
             self._emit(Notice(message=f"ended processes that were left behind: {_listed(left)}"))
         if not self._stop.done():
@@ -362,14 +472,22 @@ class Session:
     def _replanned(self, nodes: Iterable[str]) -> None:
         if self._authority is not None:
             self._authority.replan(self._system.plan, frozenset(nodes))
+        self._neighbours.renew()
+        self._agreement.announce(self._system.first)
 
     def _reached(self, reached: str) -> None:
         self._furthest = reached
         self._emit(SystemReached(reached=reached, elapsed_s=self._emit.elapsed_s))
 
 
-def _empty() -> Verdict:
-    return Verdict(verdict=Outcome.OK, blocking=False, findings=(), flows=())
+def _hurried(result: UpResult) -> UpResult:
+    """Return what a run comes to that was interrupted while it was taken down: not cleanly."""
+    run = result.verdict.run
+    assert run is not None
+    reason = f"{run.reason}; interrupted while it was taken down"
+    run = dataclasses.replace(run, reason=reason, exit_code=ExitCode.INTERRUPTED)
+    verdict = dataclasses.replace(result.verdict, run=run)
+    return UpResult(exit_code=ExitCode.INTERRUPTED, verdict=verdict)
 
 
 def _listed(pids: tuple[int, ...]) -> str:

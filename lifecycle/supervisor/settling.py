@@ -11,14 +11,14 @@ from collections.abc import Iterator
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.plan.model import Plan
 from lifecycle.verify.rules.clients import SERVER_OF
-from lifecycle.verify.rules.endpoints import UNATTRIBUTED_ENDPOINT
+from lifecycle.verify.rules.outsiders import UNATTRIBUTED_ENDPOINT
 from lifecycle.verify.verdict import Finding, Verdict
 
 PASSING_S = 1.0
 """Discovery shows a newcomer's endpoints before its name, measured 0.02–0.45 s earlier; what nodes
 have only just been told, or have just made in code, is seen 0.01–0.1 s later."""
 
-_Key = tuple[str, str, str]
+_Key = tuple[str, str, str, EndpointKind | None]
 _Place = tuple[object, ...]
 
 
@@ -88,7 +88,7 @@ class Settling:
 
 
 def _key(finding: Finding) -> _Key:
-    return finding.rule, finding.subject, finding.node
+    return finding.rule, finding.subject, finding.node, finding.endpoint
 
 
 def _demands(plan: Plan) -> Iterator[tuple[_Place, str]]:

@@ -19,6 +19,7 @@ from lifecycle.supervisor.instructions import Step
 from lifecycle.supervisor.process import (
     COMMAND_ESCALATION,
     ESCALATION,
+    STARTING_ESCALATION,
     STUCK_ESCALATION,
     ManagedProcess,
 )
@@ -166,7 +167,9 @@ class TakeDown:
 
     async def _end(self, process: ManagedProcess) -> None:
         escalation = ESCALATION
-        if process.planned.run.kind is RunKind.COMMAND:
+        if process.state is ProcessState.STARTING:
+            escalation = STARTING_ESCALATION
+        elif process.planned.run.kind is RunKind.COMMAND:
             escalation = COMMAND_ESCALATION
         elif any(self._system.nodes[key].stuck for key in process.planned.nodes):
             escalation = STUCK_ESCALATION

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import asyncio
 
-from lifecycle.plan.model import Plan
 from lifecycle.supervisor.eyes import Eyes
 from lifecycle.supervisor.judge import Changes
+from lifecycle.supervisor.system import System
 
 _LEASE_S = 21.0
 """Fast DDS forgets a participant that left without a word after 20 s, by default."""
@@ -18,8 +18,8 @@ _LEASE_S = 21.0
 class Sightings:
     """Who is in the graph of one system, as an event to wait for."""
 
-    def __init__(self, plan: Plan, eyes: Eyes, changes: Changes) -> None:
-        self._plan = plan
+    def __init__(self, system: System, eyes: Eyes, changes: Changes) -> None:
+        self._system = system
         self._eyes = eyes
         self._changes = changes
 
@@ -42,5 +42,5 @@ class Sightings:
             await self._changes.beyond(count, left_s)
 
     async def _is_there(self, name: str) -> bool:
-        observation = await self._eyes.observe(self._plan)
+        observation = await self._eyes.observe(self._system.plan)
         return any(each.full_name == name for each in observation.nodes)

@@ -33,6 +33,8 @@ class NodeStatus:
         flows: flows from or to it.
         findings: findings of the last verdict that concern it.
         silent: why nothing can be expected of it; empty while it is alive.
+        died: how its process ended unasked; empty while it runs. It then has no state, and no
+            matches.
         connections: as it reports them, its own participant left out.
     """
 
@@ -50,6 +52,7 @@ class NodeStatus:
     flows: int
     findings: int
     silent: str = ""
+    died: str = ""
     connections: tuple[ConnectionReport, ...] = ()
 
 
@@ -77,7 +80,9 @@ class SystemStatus:
 
 def node_status(node: NodeRun, verdict: Verdict | None, silent: str = "") -> NodeStatus:
     """Return what is known of one node."""
-    reports = () if node.configuration is None else node.configuration.endpoints
+    died = _died(node)
+    configuration = None if died else node.configuration
+    reports = () if configuration is None else configuration.endpoints
     flows = [
         flow
         for flow in (() if verdict is None else verdict.flows)
@@ -91,7 +96,7 @@ def node_status(node: NodeRun, verdict: Verdict | None, silent: str = "") -> Nod
         pid=0 if node.process is None else node.process.pid,
         managed=node.planned.managed,
         reach=node.reach,
-        state=node.state,
+        state="" if died else node.state,
         doing=node.doing,
         matched=sum(each.kind.is_topic and bool(each.matched) for each in reports),
         endpoints=sum(each.kind.is_topic for each in node.planned.endpoints),
@@ -102,12 +107,21 @@ def node_status(node: NodeRun, verdict: Verdict | None, silent: str = "") -> Nod
             for finding in (() if verdict is None else verdict.findings)
         ),
         silent=silent,
+        died=died,
         connections=tuple(
             each
-            for each in (() if node.configuration is None else node.configuration.connections)
+            for each in (() if configuration is None else configuration.connections)
             if each.name
         ),
     )
+
+
+def _died(node: NodeRun) -> str:
+    """Say how a node's process ended that nobody asked to end; empty if it has not."""
+    process = node.process
+    if process is None or not process.died or not process.ended.done():
+        return ""
+    return f"pid {process.pid} died: {process.ended.result()}"
 
 
 def system_status(

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import functools
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Protocol
 
@@ -44,6 +44,10 @@ class GraphObserver(Protocol):
 
     async def observe(self, plan: Plan) -> Observation:
         """Return what the graph holds now, with the configurations put here and read there."""
+
+    @property
+    def changes(self) -> int:
+        """Changes of the graph so far, each counted as soon as it is noticed."""
 
     async def wait_change(self) -> None:
         """Wait until the graph may have changed since the last `observe`."""
@@ -137,8 +141,11 @@ class NodeRun:
 
         Raises:
             BringUpError: the node refused, failed or cannot be reached.
+            VerificationError: what changed since the permit's verdict does not allow it.
         """
         assert self.driver is not None
+        if permit is not None:
+            await permit.renewed()
         self._emit(RequestSent(node=self.name, operation=operation))
         return await self.driver.perform(operation, permit)
 
@@ -171,6 +178,7 @@ class System:
         remote: the plan's other nodes, which another supervisor brings up.
         touched: set whenever a node told something of itself: time to judge again.
         liveliness: which nodes are silent.
+        present: names of the nodes that are in the graph; None before it was first looked at.
         first: the plan as the run began with it.
         server: the discovery server, where this supervisor runs one.
         expected: the plan as it must be seen now; where the data layer is negotiated while the
@@ -208,7 +216,15 @@ class System:
         self.machines = frozenset(each.machine for each in own) if self.remote else None
         self._by_name = {node.name: node for node in self.nodes.values()}
         self.touched = asyncio.Event()
-        self.liveliness = Liveliness(emit, self.touched.set)
+        self.present: frozenset[str] | None = None
+        self.liveliness = Liveliness(emit, self.touched.set, self._is_there)
+
+    def _is_there(self, name: str) -> bool:
+        """Whether a node has started, and is in the graph as far as that is known."""
+        node = self._by_name.get(name)
+        if node is not None and node.reach in (Reach.WAITING, Reach.STOPPED):
+            return False
+        return self.present is None or name in self.present
 
     def node_named(self, name: str) -> NodeRun | None:
         """Return the node with this fully qualified name."""
@@ -219,6 +235,41 @@ class System:
         self.plan = self.expected = plan
         for key, node in self.nodes.items():
             node.planned = plan.node(key)
+
+    def reload(
+        self, plan: Plan, processes: Iterable[PlannedProcess], nodes: Collection[NodeRun]
+    ) -> tuple[NodeRun, ...]:
+        """Take another manifest's plan; only nodes that were taken down may differ in it.
+
+        Args:
+            plan: of which all nodes are this supervisor's.
+            processes: of that plan.
+            nodes: those that were taken down, with all of their processes.
+
+        Returns:
+            The nodes to bring up in their place.
+        """
+        self.first = self.plan = self.expected = plan
+        down = {each.planned.key: each for each in nodes}
+        stay = {key: each for key, each in self.nodes.items() if key not in down}
+        kept = {each.process.name: each.process for each in stay.values() if each.process}
+        self.nodes, self.processes = {}, {}
+        for process in processes:
+            managed = kept.get(process.name)
+            if managed is None and process.run.kind is not RunKind.ATTACH:
+                managed = self._process(process)
+            if managed is not None:
+                self.processes[process.name] = managed
+            for key in process.nodes:
+                if key in stay:
+                    self.nodes[key] = stay[key]
+                    stay[key].planned = plan.node(key)
+                    continue
+                node = self.nodes[key] = NodeRun(plan.node(key), self.emit)
+                node.process = managed
+                node.advance(Reach.WAITING)
+        self._by_name = {node.name: node for node in self.nodes.values()}
+        return tuple(each for key, each in self.nodes.items() if key not in stay)
 
     def renew(self, nodes: Iterable[NodeRun]) -> None:
         """Let nodes that were taken down, with all of their processes, be brought up again."""

@@ -9,14 +9,14 @@ import asyncio
 from collections.abc import Coroutine
 from typing import Any
 
-from lifecycle.supervisor.bring_up import died
+from lifecycle.supervisor.bring_up import ALSO_S, died
 from lifecycle.supervisor.failure import StepFailedError
 from lifecycle.supervisor.process import ManagedProcess
 from lifecycle.supervisor.system import System
 from lifecycle.supervisor.together import ended
 from lifecycle.supervisor.watch import first_death
 
-_SPEAK_S = 0.7
+_SPEAK_S = 0.7 + ALSO_S
 """A step notices its node's death itself within this, and knows what the node was doing."""
 
 
@@ -50,8 +50,17 @@ class Vigil:
                 running.result()
             if death.done():
                 raise death.result()
+        except StepFailedError as failure:
+            failure.joined(self.deaths())
+            raise
         finally:
             await ended(running, death)
+
+    def deaths(self) -> tuple[StepFailedError, ...]:
+        """Return the failure of every process that has ended although it was to run."""
+        server = self._system.server
+        every = (*self._system.processes.values(), *(() if server is None else (server,)))
+        return tuple(self._failure(each) for each in every if each.died)
 
     async def next_death(self) -> StepFailedError:
         """Wait for the next process that ends unasked; return the failure that this is."""

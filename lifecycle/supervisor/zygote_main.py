@@ -3,7 +3,9 @@
 Owns: what runs in `python -m lifecycle.supervisor.zygote_main SOCKET_FD [--preload]`. It stays
 single-threaded and never calls rclpy.init, so that forking is safe and every child is a
 participant of its own; with `--preload` a forked host skips ~130 ms of imports. Each child leads a
-session of its own. If the supervisor vanishes the zygote ends what is left of them, bounded.
+session of its own. It adopts what its children leave behind (PR_SET_CHILD_SUBREAPER), so as long as
+it lives, what descends from it is what the run started. If the supervisor vanishes the zygote ends
+what is left of its children, bounded.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ import warnings
 from typing import NoReturn
 
 from lifecycle.codec import from_json, to_json
-from lifecycle.middleware.process import die_with_parent
+from lifecycle.middleware.process import adopt_orphans, die_with_parent
 from lifecycle.supervisor.zygote_protocol import (
     LARGEST_MESSAGE,
     MSG_CMSG_CLOEXEC,
@@ -34,6 +36,7 @@ GRACE_S = 4.0
 """How long orphans get to end by themselves once the supervisor is gone."""
 
 _CHILD_SIGNAL = -1
+_ENDED = os.WEXITED | os.WNOWAIT | os.WNOHANG
 _STOPS = os.WSTOPPED | os.WCONTINUED | os.WNOHANG
 _PIPE_BYTES = 65536
 
@@ -56,6 +59,7 @@ class _Zygote:
             for key, _ in self._selector.select():
                 if key.data == _CHILD_SIGNAL:
                     self._note_stops()
+                    self._bury_adopted()
                 elif key.data is not None:
                     self._reap(key.data)
                 elif not self._request():
@@ -97,6 +101,8 @@ class _Zygote:
         self._tell(Report(id=request, pid=pid), pidfd)
 
     def _reap(self, pid: int) -> None:
+        if pid not in self._children:
+            return  # on the way to an adopted one
         request, pidfd = self._children.pop(pid)
         self._selector.unregister(pidfd)
         os.close(pidfd)
@@ -113,6 +119,15 @@ class _Zygote:
                     request, _ = self._children[found.si_pid]
                     stopped = found.si_code != os.CLD_CONTINUED
                     self._tell(Report(id=request, pid=found.si_pid, stopped=stopped))
+
+    def _bury_adopted(self) -> None:
+        """Reap orphans that have ended, and children where one of them is in between."""
+        with contextlib.suppress(ChildProcessError):
+            while (found := os.waitid(os.P_ALL, 0, _ENDED)) is not None:
+                if found.si_pid in self._children:
+                    self._reap(found.si_pid)
+                else:
+                    os.waitpid(found.si_pid, 0)
 
     def _tell(self, report: Report, *descriptors: int) -> None:
         # A supervisor that is gone is noticed by the next read.
@@ -150,7 +165,9 @@ class _Zygote:
             self._sock.close()
             for _, pidfd in self._children.values():
                 os.close(pidfd)
-            signal.signal(signal.SIGINT, signal.default_int_handler)
+            # A host takes them itself, once there is something to shut down; until then it ends
+            # at once, and without a KeyboardInterrupt in the middle of somebody's import.
+            signal.signal(signal.SIGINT, signal.SIG_DFL)
             signal.signal(signal.SIGTERM, signal.SIG_DFL)
             _take_streams(descriptors[0], descriptors[1])
             os.environ.update(dict(request.environment))
@@ -199,7 +216,6 @@ def _run(argv: tuple[str, ...], control: int | None) -> int:
         argv = tuple(word.replace("{control}", str(control)) for word in argv)
     else:
         die_with_parent(signal.SIGTERM)
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
     try:
         os.execvp(argv[0], argv)  # noqa: S606 - what a spawner is for
     except OSError as error:
@@ -223,6 +239,7 @@ def main() -> int:
     # Ctrl-C is the supervisor's to handle, and its end is what ends us.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    adopt_orphans()
     if options.preload:
         from lifecycle.node import host
 

@@ -20,9 +20,18 @@ from lifecycle.verify.observation import (
 )
 from lifecycle.verify.report import render_text, to_json, to_junit, to_sarif
 from lifecycle.verify.rules import RULES, Rule
-from lifecycle.verify.verdict import Finding, FlowReport, Outcome, RunEnd, Stage, Verdict
+from lifecycle.verify.verdict import (
+    NOT_JUDGED,
+    Finding,
+    FlowReport,
+    Outcome,
+    RunEnd,
+    Stage,
+    Verdict,
+)
 
 __all__ = [
+    "NOT_JUDGED",
     "RULES",
     "EndpointReport",
     "Finding",

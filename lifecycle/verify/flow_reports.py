@@ -77,6 +77,7 @@ def _report(
         destination=_used(destination, carrier),
         unique=None if None in ends else _HOW[ends.count(True)],
         dscp=_dscp(flow.publishers, carrier),
+        reader_dscp=_dscp(flow.subscriptions, carrier),
         requirement=flow.requirement,
         demanded=flow.planned.unique,
         transport=_transport(view, flow, source, destination),
@@ -100,14 +101,14 @@ def _used(nfes: tuple[NetworkFlowEndpoint, ...], carrier: str) -> tuple[NetworkF
     return tuple(each for each in nfes if each.transport_protocol is not other)
 
 
-def _dscp(publishers: Sequence[Actual], carrier: str) -> int | None:
-    """The DSCP that was read back; None if none was, or several publishers differ.
+def _dscp(ends: Sequence[Actual], carrier: str) -> int | None:
+    """The DSCP that was read back; None if none was, or several endpoints differ.
 
     Only UDP sockets are marked and read: of a connection that has both, TCP does not carry it.
     """
     if _OTHER_PROTOCOL.get(carrier) is TransportProtocol.UDP:
         return None
-    read = {end.report.dscp if end.report else None for end in publishers}
+    read = {end.report.dscp if end.report else None for end in ends}
     return read.pop() if len(read) == 1 else None
 
 

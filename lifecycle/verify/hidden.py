@@ -6,10 +6,12 @@ the name, and what a hidden node is. Pure.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
+from lifecycle.manifest.model import TOLERATED_NODES
 from lifecycle.plan.model import PlannedNode
 from lifecycle.plan.participants import owner_of
+from lifecycle.verify.noise import tolerating_pattern
 from lifecycle.verify.observation import NodeConfiguration
 
 
@@ -19,9 +21,17 @@ class Owners:
     Args:
         nodes: of the plan.
         reported: what nodes say of themselves; only planned ones count.
+        tolerated: patterns of names of tools, whose nodes belong to nobody by name alone.
     """
 
-    def __init__(self, nodes: Iterable[PlannedNode], reported: Iterable[NodeConfiguration]) -> None:
+    def __init__(
+        self,
+        nodes: Iterable[PlannedNode],
+        reported: Iterable[NodeConfiguration],
+        tolerated: Collection[str] = TOLERATED_NODES,
+    ) -> None:
+        # A pattern that is not of hidden nodes, like `*`, says nothing of these.
+        self._tools = [each for each in tolerated if each.rpartition("/")[2].startswith("_")]
         self._owners: dict[str, str] = {}
         self._planned: set[str] = set()
         for node in nodes:
@@ -47,6 +57,8 @@ class Owners:
         What is connected while the system runs is in the graph before its node's report says so.
         """
         namespace, _, base = hidden.rpartition("/")
+        if tolerating_pattern(hidden, self._tools):
+            return ""  # `_ros2cli_4711` is no participant of a node `ros2cli`
         return max(
             (
                 name

@@ -11,9 +11,18 @@ from lifecycle.manifest.model import EndpointPolicy
 from lifecycle.plan.model import Plan
 from lifecycle.verify.flow_reports import flow_reports
 from lifecycle.verify.layout import lay_out
+from lifecycle.verify.noise import OUR_NODES
 from lifecycle.verify.observation import Observation
 from lifecycle.verify.rules import CHECKS, rule
-from lifecycle.verify.verdict import Finding, OpenEndpoint, Outcome, Stage, Verdict
+from lifecycle.verify.verdict import (
+    Finding,
+    OpenEndpoint,
+    Outcome,
+    Stage,
+    ToleratedNode,
+    Verdict,
+)
+from lifecycle.verify.view import View
 
 
 def verify(
@@ -50,6 +59,32 @@ def verify(
             for each in view.undeclared
             if view.planned[each.node].endpoint_policy is EndpointPolicy.OPEN
         ),
+        tolerated=_tolerated(view),
+    )
+
+
+def _tolerated(view: View) -> tuple[ToleratedNode, ...]:
+    """List the undeclared nodes that the policy lets be there, sorted by name."""
+    because = {name: f"tolerated_nodes: {pattern}" for name, pattern in view.tools.items()}
+    endpoints = list(view.of_tools)
+    if view.plan.policy.undeclared_nodes is EndpointPolicy.OPEN:
+        others = (*view.foreign, *view.unattributed)
+        undeclared = {name for name in view.observed if name not in view.planned}
+        undeclared |= {each.node for each in others}
+        because |= dict.fromkeys(undeclared, "undeclared_nodes: open")
+        endpoints += others
+    has = {
+        name: tuple(
+            OpenEndpoint(kind=each.kind, node=name, name=each.name, type=each.type)
+            for each in endpoints
+            if each.node == name
+        )
+        for name in because
+    }
+    return tuple(
+        ToleratedNode(node=name, because=because[name], endpoints=has[name])
+        for name in sorted(because)
+        if has[name] or view.tools.get(name) != OUR_NODES
     )
 
 

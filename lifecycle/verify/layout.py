@@ -7,17 +7,18 @@ over. All rules read the result, so that they agree on what is the same thing. P
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedFlow, PlannedNode
 from lifecycle.verify.hidden import Owners
 from lifecycle.verify.noise import (
+    DeclaredNames,
     action_part,
     fold_actions,
     is_noise_endpoint,
-    is_noise_node,
     known_node,
+    tolerating_pattern,
 )
 from lifecycle.verify.observation import (
     EndpointReport,
@@ -40,6 +41,9 @@ from lifecycle.verify.view import (
 _Pools = dict[tuple[EndpointKind, str], list[ObservedEndpoint]]
 """One node's endpoints by kind and name."""
 
+_PREFIX_DIGITS = 24
+"""A GUID begins with its participant's prefix of 12 bytes (DDSI-RTPS §9.3.1)."""
+
 
 def lay_out(
     plan: Plan,
@@ -54,8 +58,11 @@ def lay_out(
     reported = _by_identity(observation)
     configurations = {each.name: each for each in reversed(reported)}
     duplicated = {each.full_name for each in observation.nodes if each.count > 1}
-    owners = Owners(planned.values(), reported)
-    endpoints = _attributed(observation, planned, configurations, owners)
+    owners = Owners(planned.values(), reported, plan.policy.tolerated_nodes)
+    names = DeclaredNames.of(plan)
+    everything = _attributed(observation, planned, configurations, owners, names)
+    tools = _tools(observation, everything, planned, owners, plan.policy.tolerated_nodes)
+    endpoints = tuple(each for each in everything if each.node not in tools)
     places: dict[str, _Pools] = {}
     for endpoint in endpoints:
         pools = places.setdefault(endpoint.node, {})
@@ -85,22 +92,21 @@ def lay_out(
         machines=machines,
         ahead=ahead,
         planned=planned,
-        observed=_graph_nodes(observation.nodes, planned, owners),
+        names=names,
+        observed=_graph_nodes(observation.nodes, planned, owners, tools),
         reported=reported,
         configurations=configurations,
+        parameters={each.node: each for each in observation.parameters},
         actual=actual,
         actual_by_node=by_node,
         undeclared=_sorted(undeclared),
         unattributed=tuple(each for each in endpoints if not each.node),
-        foreign=tuple(
-            each
-            for each in endpoints
-            if each.node and each.node not in planned and not is_noise_node(each.node)
-        ),
+        foreign=tuple(each for each in endpoints if each.node and each.node not in planned),
+        tools=tools,
+        of_tools=tuple(each for each in everything if each.node in tools),
         seen=_seen(
             (*endpoints, *(each.observed for each in actual if each.unseen and each.observed)),
             actual,
-            planned,
         ),
         flows=tuple(_flow(each, plan, by_node) for each in plan.flows),
     )
@@ -117,10 +123,13 @@ def _attributed(
     planned: dict[str, PlannedNode],
     configurations: dict[str, NodeConfiguration],
     owners: Owners,
+    names: DeclaredNames,
 ) -> tuple[ObservedEndpoint, ...]:
     """Give each endpoint to its node: by hidden participant, or by the GID that a node reported.
 
-    What client libraries bring along is left out here, unless it is declared.
+    Services have no GID of their own in reports: one whose node is not known is that of the node on
+    its participant that declares it. What client libraries bring along is left out here, unless it
+    is declared; under a declared name, unless it is a declared node's.
     """
     declared = {
         (name, each.kind, each.resolved)
@@ -133,6 +142,9 @@ def _attributed(
         for report in configuration.endpoints
         if report.gid
     }
+    by_participant: dict[str, dict[str, None]] = {}
+    for gid, name in by_gid.items():
+        by_participant.setdefault(gid[:_PREFIX_DIGITS], {})[name] = None
     found: list[ObservedEndpoint] = []
     for endpoint in observation.endpoints:
         node = known_node(endpoint.node)
@@ -140,18 +152,55 @@ def _attributed(
             node = owners.of(node) or node
         if not node:
             node = by_gid.get(endpoint.gid, "")
-        if (node, endpoint.kind, endpoint.name) not in declared and is_noise_endpoint(
-            endpoint.kind,
-            known_node(endpoint.node),
-            endpoint.name,
-            endpoint.type,
-            ours=node in configurations,
+        if not node and not endpoint.kind.is_topic:
+            node = next(
+                (
+                    each
+                    for each in by_participant.get(endpoint.gid[:_PREFIX_DIGITS], ())
+                    if (each, *(action_part(endpoint.kind, endpoint.name) or _place(endpoint)))
+                    in declared
+                ),
+                "",
+            )
+        feeds = node not in planned and names.fed_by(endpoint.kind, endpoint.name)
+        if (
+            not feeds
+            and (node, endpoint.kind, endpoint.name) not in declared
+            and is_noise_endpoint(
+                endpoint.kind,
+                known_node(endpoint.node),
+                endpoint.name,
+                endpoint.type,
+                ours=node in configurations,
+            )
         ):
             continue
-        found.append(
-            endpoint if node == endpoint.node else dataclasses.replace(endpoint, node=node)
-        )
+        if node != endpoint.node:
+            gid = endpoint.gid if endpoint.kind.is_topic or not node else ""
+            endpoint = dataclasses.replace(endpoint, node=node, gid=gid)  # noqa: PLW2901
+        found.append(endpoint)
     return _sorted(fold_actions(_sorted(found)))
+
+
+def _place(endpoint: ObservedEndpoint) -> tuple[EndpointKind, str]:
+    return endpoint.kind, endpoint.name
+
+
+def _tools(
+    observation: Observation,
+    endpoints: Iterable[ObservedEndpoint],
+    planned: dict[str, PlannedNode],
+    owners: Owners,
+    patterns: Sequence[str],
+) -> dict[str, str]:
+    """Return the undeclared nodes that are tolerated by their name, and the pattern, sorted."""
+    seen = {each.full_name for each in observation.nodes} | {each.node for each in endpoints}
+    found = {
+        name: tolerating_pattern(name, patterns)
+        for name in sorted(seen)
+        if known_node(name) and name not in planned and not owners.of(name)
+    }
+    return {name: pattern for name, pattern in found.items() if pattern}
 
 
 def _match_node(
@@ -264,6 +313,7 @@ def _as_observed(node: PlannedNode, report: EndpointReport, name: str) -> Observ
         type=report.type,
         qos=report.qos,
         gid=report.gid,
+        type_hash=report.type_hash,
     )
 
 
@@ -274,7 +324,10 @@ def _is_part_of(endpoint: ObservedEndpoint, actions: set[tuple[str, EndpointKind
 
 
 def _graph_nodes(
-    nodes: Iterable[ObservedNode], planned: dict[str, PlannedNode], owners: Owners
+    nodes: Iterable[ObservedNode],
+    planned: dict[str, PlannedNode],
+    owners: Owners,
+    tools: Collection[str],
 ) -> dict[str, ObservedNode]:
     """Nodes that count: tools and hidden participants of declared nodes left out."""
     merged: dict[str, ObservedNode] = {}
@@ -282,7 +335,7 @@ def _graph_nodes(
         name = node.full_name
         if not known_node(name):
             continue  # its endpoints are judged; it is no name that could be declared or not
-        if name not in planned and (is_noise_node(name) or owners.of(name)):
+        if name not in planned and (name in tools or owners.of(name)):
             continue
         known = merged.get(name)
         merged[name] = (
@@ -294,9 +347,8 @@ def _graph_nodes(
 def _seen(
     endpoints: Iterable[ObservedEndpoint],
     actual: Sequence[Actual],
-    planned: dict[str, PlannedNode],
 ) -> tuple[Seen, ...]:
-    """Collect publishers and subscriptions with all that is known of them, tools left out."""
+    """Collect publishers and subscriptions with all that is known of them."""
     known = {id(each.observed): each for each in actual if each.observed is not None}
     # Nobody here can see those, but who hears them counts them.
     found = [
@@ -315,8 +367,6 @@ def _seen(
     for endpoint in endpoints:
         if not endpoint.kind.is_topic:
             continue
-        if endpoint.node not in planned and is_noise_node(endpoint.node):
-            continue
         match = known.get(id(endpoint))
         report = match.report if match else None
         found.append(
@@ -328,9 +378,17 @@ def _seen(
                 qos=actual_qos(endpoint.qos, report.qos if report else None),
                 report=report,
                 planned=match.planned if match else None,
+                type_hash=_type_hash(endpoint, report),
             )
         )
     return tuple(found)
+
+
+def _type_hash(endpoint: ObservedEndpoint, report: EndpointReport | None) -> str | None:
+    """Discovery wins where it knows a hash; with static discovery only the node itself does."""
+    if endpoint.type_hash or report is None or report.type_hash is None:
+        return endpoint.type_hash
+    return report.type_hash
 
 
 def _flow(planned: PlannedFlow, plan: Plan, by_node: dict[str, tuple[Actual, ...]]) -> FlowView:

@@ -1,4 +1,7 @@
-"""What a verdict still waits for, in one line. Owns: `missing`, `not_ok`. Pure."""
+"""What a verdict still waits for, or takes on trust, in one line.
+
+Owns: `missing`, `not_ok`, `taken_on_trust`. Pure.
+"""
 
 from __future__ import annotations
 
@@ -16,30 +19,35 @@ def missing(verdict: Verdict) -> str:
     findings = [each for each in verdict.findings if each.outcome is Outcome.VIOLATED]
     if not findings and verdict.blocking:
         findings = list(verdict.findings)
-    absent: dict[str, None] = {}
-    wrong: dict[str, None] = {}
-    unknown: dict[str, None] = {}
+    absent: list[str] = []
+    wrong: list[str] = []
+    unknown: list[str] = []
     comes = any(each.rule == _NODE for each in findings)
+    reports = any(each.rule == _REPORT for each in findings)
     for finding in findings:
         phrase = _ABSENT.get(finding.rule)
         named = f"{finding.subject} ({finding.rule})"
         if phrase is not None and finding.outcome is Outcome.VIOLATED:
-            absent[f"{finding.subject} ({_what(finding, phrase)})"] = None
+            absent.append(f"{finding.subject} ({_what(finding, phrase)})")
         elif finding.rule == _UNATTRIBUTED:
             # Discovery tells of an endpoint before it tells of its node: most likely that one's.
             if not comes:
-                unknown[named] = None
+                unknown.append(named)
+        elif finding.rule == _UNPROVEN:
+            # Of a node whose report is missing, the report is what is waited for.
+            if not reports:
+                unknown.append(named)
         elif finding.outcome is Outcome.UNVERIFIABLE:
-            unknown[named] = None
+            unknown.append(named)
         else:
-            wrong[named] = None
+            wrong.append(named)
     parts = []
     if absent:
-        parts.append("missing: " + ", ".join(absent))
+        parts.append("missing: " + ", ".join(dict.fromkeys(absent)))
     if wrong:
-        parts.append("wrong: " + ", ".join(wrong))
+        parts.append("wrong: " + ", ".join(dict.fromkeys(wrong)))
     if unknown:
-        parts.append("unknown: " + ", ".join(unknown))
+        parts.append("unknown: " + ", ".join(dict.fromkeys(unknown)))
     return "; ".join(parts)
 
 
@@ -54,7 +62,40 @@ def not_ok(verdict: Verdict) -> str:
     return missing(verdict) or (f"unknown: {', '.join(subjects)}" if subjects else "")
 
 
+_NAMED_EACH = 2
+_NAMED_RULES = 4
+_LONGEST = 500
+
+
+def taken_on_trust(verdict: Verdict) -> str:
+    """Summarise what is unverifiable in one bounded line, for a gate that opens in spite of it.
+
+    Returns:
+        `max_delay_ms 5 of /robot/video: /camera → /viewer, rate_hz 15 of /robot/video and 3 more
+        (flow.not-measured); /camera (graph.qos-unverifiable)`: by rule, at most two of each; empty
+        if nothing is.
+    """
+    by_rule: dict[str, list[str]] = {}
+    for finding in verdict.findings:
+        if finding.outcome is Outcome.UNVERIFIABLE:
+            number = f"{finding.expected} of " if finding.rule == _NOT_MEASURED else ""
+            by_rule.setdefault(finding.rule, []).append(f"{number}{finding.subject}")
+    parts = []
+    for rule, found in list(by_rule.items())[:_NAMED_RULES]:
+        subjects = list(dict.fromkeys(found))
+        more = len(subjects) - _NAMED_EACH
+        named = ", ".join(subjects[:_NAMED_EACH])
+        parts.append(named + (f" and {more} more" if more > 0 else "") + f" ({rule})")
+    if len(by_rule) > _NAMED_RULES:
+        parts.append(f"and {len(by_rule) - _NAMED_RULES} more rules")
+    line = "; ".join(parts)
+    return line if len(line) <= _LONGEST else f"{line[: _LONGEST - 1]}…"
+
+
+_NOT_MEASURED = "flow.not-measured"
 _NODE = "graph.missing-node"
+_REPORT = "config.missing-report"
+_UNPROVEN = "flow.unverifiable"
 _UNATTRIBUTED = "graph.unattributed-endpoint"
 
 _ABSENT = {
@@ -63,7 +104,7 @@ _ABSENT = {
     "graph.unmatched-link": "match",
     "graph.unmatched-flow": "match",
     "graph.unmatched-client": "match",
-    "config.missing-report": "report",
+    _REPORT: "report",
     "config.incomplete-report": "{kind} in the report of {node}",
 }
 """Rules that say that something is not there (yet), and how to call it."""

@@ -1,8 +1,8 @@
 """What every ROS 2 graph holds that no manifest declares.
 
-Owns: the list of nodes and endpoints that tools and client libraries bring along, and the folding
-of an action's hidden topics and services into action endpoints. Data and predicates only: who
-observes a graph may use them, `verify` always does. Pure.
+Owns: which nodes are tools, the endpoints that client libraries bring along, and the folding of an
+action's hidden topics and services into action endpoints; which names a plan declares, so that
+nobody's own housekeeping is taken for harmless under one of them. Data and predicates only. Pure.
 
 Sources: rcl (parameter, type description and logger services, rosout), rcl_lifecycle, the actions
 article (https://design.ros2.org/articles/actions.html), names of nodes as the tools choose them.
@@ -10,23 +10,21 @@ article (https://design.ros2.org/articles/actions.html), names of nodes as the t
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import dataclasses
+import re
+from collections.abc import Collection, Iterable, Mapping
 
-from lifecycle.manifest.model import EndpointKind
+from lifecycle.manifest.model import TOLERATED_NODES, EndpointKind
+from lifecycle.manifest.type_hash import join
+from lifecycle.plan.model import Plan
 from lifecycle.verify.observation import ObservedEndpoint
 
-NOISE_NODE_PREFIXES = (
-    "_ros2cli_",
-    "_lifecycle_",
-    "launch_ros_",
-    "rqt_",
-    "rviz_",
-    "transform_listener_impl_",
-)
-"""Base names of nodes that tools make start so; in whichever namespace. `_lifecycle_` is ours."""
+OUR_NODES = "_lifecycle_*"
+"""Observers: every supervisor and every `lifecycle verify` has one. They are tolerated as tools,
+whatever the policy: a name proves nothing, so they may do no more than those."""
 
-NOISE_NODE_NAMES = frozenset({"rviz", "rviz2", "rosbag2_recorder", "rosbag2_player"})
-"""Base names of tools that always use the same one."""
+_OUR_TOPICS = "/_lifecycle/"
+"""Where the supervisors of several machines notice each other."""
 
 PLACEHOLDER_NAMES = frozenset({"_NODE_NAME_UNKNOWN_", "_CREATED_BY_BARE_DDS_APP_"})
 """What rmw_dds_common calls the node of an endpoint whose node it does not know (yet)."""
@@ -108,20 +106,102 @@ _ACTION_SIDES = (
 _SEND_GOAL_TYPE_SUFFIX = "_SendGoal"
 
 
-def is_noise_node(full_name: str) -> bool:
-    """Tell whether a node belongs to a tool and not to a system.
+def tolerating_pattern(full_name: str, patterns: Collection[str] = TOLERATED_NODES) -> str:
+    """Return the pattern by which a node may be there undeclared; empty if there is none.
 
     Args:
         full_name: fully qualified, `/launch_ros_4711`. A manifest may declare a node of such a
             name; whoever filters must keep declared names.
+        patterns: as in `policy.tolerated_nodes`; our own observers are always tolerated.
     """
     base = full_name.rpartition("/")[2]
-    return base in NOISE_NODE_NAMES or base.startswith(NOISE_NODE_PREFIXES)
+    for pattern in (OUR_NODES, *patterns):
+        if _matches(full_name if "/" in pattern else base, pattern):
+            return pattern
+    return ""
+
+
+def is_noise_node(full_name: str) -> bool:
+    """Tell whether a node is named as a tool that everybody may be expected to use."""
+    return bool(tolerating_pattern(full_name))
+
+
+def _matches(name: str, pattern: str) -> bool:
+    spelled = re.escape(pattern).replace(r"\*", ".*").replace(r"\?", ".")
+    return re.fullmatch(spelled, name) is not None
+
+
+_NAMESPACES: Mapping[EndpointKind, EndpointKind] = {
+    EndpointKind.PUBLISHER: EndpointKind.PUBLISHER,
+    EndpointKind.SUBSCRIPTION: EndpointKind.PUBLISHER,
+    EndpointKind.SERVICE_SERVER: EndpointKind.SERVICE_SERVER,
+    EndpointKind.SERVICE_CLIENT: EndpointKind.SERVICE_SERVER,
+    EndpointKind.ACTION_SERVER: EndpointKind.ACTION_SERVER,
+    EndpointKind.ACTION_CLIENT: EndpointKind.ACTION_SERVER,
+}
+"""Kinds that meet under one name, by the one that offers."""
+
+OFFERS = frozenset(_NAMESPACES.values())
+"""Kinds of endpoint that feed or serve others; the rest only listens, or asks."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class DeclaredNames:
+    """The topics, services and actions that a plan declares.
+
+    Attributes:
+        names: by the kind that offers, fully qualified, those that endpoints declare.
+        own: likewise, those that every declared node has under its own name: its lifecycle and
+            parameter services, `~/transition_event` and the like.
+    """
+
+    names: frozenset[tuple[EndpointKind, str]] = frozenset()
+    own: frozenset[tuple[EndpointKind, str]] = frozenset()
+
+    @classmethod
+    def of(cls, plan: Plan) -> DeclaredNames:
+        """Collect those of a plan."""
+        services = (*NODE_SERVICES, *OUR_SERVICES)
+        return cls(
+            names=frozenset(
+                (_NAMESPACES[each.kind], each.resolved)
+                for node in plan.nodes
+                for each in node.endpoints
+            ),
+            own=frozenset(
+                (kind, f"{node.full_name}/{name}")
+                for node in plan.nodes
+                for kind, names in (
+                    (EndpointKind.SERVICE_SERVER, services),
+                    (EndpointKind.PUBLISHER, NODE_TOPICS),
+                )
+                for name in names
+            ),
+        )
+
+    def of_kind(self, kind: EndpointKind) -> tuple[str, ...]:
+        """Return the declared names under which endpoints of a kind meet, sorted."""
+        return tuple(sorted(name for each, name in self.names if each is _NAMESPACES[kind]))
+
+    def has(self, kind: EndpointKind, name: str) -> bool:
+        """Tell whether an endpoint meets declared ones; a part of an action, that action's."""
+        part = action_part(kind, name)
+        return (_NAMESPACES[kind], name) in self.names or (part is not None and self.has(*part))
+
+    def fed_by(self, kind: EndpointKind, name: str) -> bool:
+        """Tell whether an endpoint that is not a declared node's would feed or serve the system."""
+        if kind not in OFFERS or (kind, name) in NOISE_TOPICS:
+            return False
+        return self.has(kind, name) or (kind, name) in self.own
 
 
 def known_node(full_name: str) -> str:
     """Return a node's name, or an empty one where it only stands for "not known"."""
     return "" if full_name.rpartition("/")[2] in PLACEHOLDER_NAMES else full_name
+
+
+NO_NAMES = DeclaredNames()
+"""Nothing is looked for."""
 
 
 def is_noise_endpoint(kind: EndpointKind, node: str, name: str, type_: str, *, ours: bool) -> bool:
@@ -142,7 +222,8 @@ def is_noise_endpoint(kind: EndpointKind, node: str, name: str, type_: str, *, o
     """
     if not node:
         return False
-    if (kind, name) in NOISE_TOPICS:
+    of_observers = name.startswith(_OUR_TOPICS) and bool(tolerating_pattern(node, ()))
+    if of_observers or (kind, name) in NOISE_TOPICS:
         return True
     owner, _, base = name.rpartition("/")
     offers = kind in (EndpointKind.SERVICE_SERVER, EndpointKind.PUBLISHER)
@@ -174,14 +255,22 @@ def our_nodes(endpoints: Iterable[ObservedEndpoint]) -> frozenset[str]:
     return frozenset(node for node, bases in offered.items() if bases >= OURS_BY)
 
 
-def without_noise(endpoints: Iterable[ObservedEndpoint]) -> tuple[ObservedEndpoint, ...]:
-    """Return what somebody wrote on purpose, in order; the input must be complete per node."""
+def without_noise(
+    endpoints: Iterable[ObservedEndpoint], *, but: DeclaredNames = NO_NAMES
+) -> tuple[ObservedEndpoint, ...]:
+    """Return what somebody wrote on purpose, in order; the input must be complete per node.
+
+    Args:
+        endpoints: to choose from.
+        but: names that are looked for: whoever offers them is kept, whatever it looks like.
+    """
     found = tuple(endpoints)
     ours = our_nodes(found)
     return tuple(
         each
         for each in found
-        if not is_noise_endpoint(each.kind, each.node, each.name, each.type, ours=each.node in ours)
+        if but.fed_by(each.kind, each.name)
+        or not is_noise_endpoint(each.kind, each.node, each.name, each.type, ours=each.node in ours)
     )
 
 
@@ -230,7 +319,26 @@ def fold_actions(endpoints: Iterable[ObservedEndpoint]) -> tuple[ObservedEndpoin
                 for part in parts
                 if part.name.endswith("/send_goal")
             )
-            kept.append(ObservedEndpoint(kind=side, node=node, name=name, type=type_))
+            kept.append(
+                ObservedEndpoint(
+                    kind=side,
+                    node=node,
+                    name=name,
+                    type=type_,
+                    # Of nobody known these are all that tells whose it is.
+                    gid="" if node else parts[0].gid,
+                    address=parts[0].address,
+                    type_hash=_action_hash(parts),
+                )
+            )
         else:
             kept.extend(parts)
     return tuple(kept)
+
+
+def _action_hash(parts: Iterable[ObservedEndpoint]) -> str | None:
+    """Return the type hash of an action from those of its parts; None while one is not seen."""
+    hashes = {part.name.rpartition("/")[2]: part.type_hash for part in parts}
+    told = [hashes[part] for part in ("send_goal", "get_result", "feedback")]
+    known = [each for each in told if each is not None]
+    return join(known) if len(known) == len(told) else None

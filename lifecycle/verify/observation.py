@@ -7,10 +7,25 @@ Owns: the observation types and the node configuration (schema: schemas/node_con
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import ipaddress
+import re
+from collections.abc import Iterable
 
-from lifecycle.manifest.model import EndpointKind
+from lifecycle import codec
+from lifecycle.manifest.model import EndpointKind, ParameterValue
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.network.nfe import NetworkFlowEndpoint, UniqueRequirement
+from lifecycle.plan.parameters import portable
+
+LONGEST_CONFIGURATION = 1 << 22
+"""Characters of a node configuration as JSON; one of 1,000 endpoints takes about 600,000."""
+
+_GID = re.compile(r"[0-9a-f]{32}")
+_LARGEST = 2**63 - 1
+
+LONGEST_VALUE = 4096
+"""Bytes of JSON; of a longer parameter value only the digest is passed on."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,6 +75,8 @@ class EndpointReport:
         nfes: this endpoint's own network flow endpoints; None where the RMW cannot tell.
         participant: base name of the hidden node that carries it; empty for the node's own.
         matched: number of matched remote endpoints; None where unknown.
+        peers: GIDs, hex, of those matched endpoints that the node's discovery knows, sorted; None
+            where the RMW cannot tell them apart. Fewer than `matched`: some are not known to it.
         server_matched: of a service or action client that exists: a server of its name is matched
             with it both ways; None for everything else and where the RMW cannot tell.
         dscp: DSCP read back from the sender sockets with getsockopt, 0–63; None if not read.
@@ -70,6 +87,8 @@ class EndpointReport:
         aliases: fully qualified further names that it was given while running.
         lossy: the node's hint: its data bear an unreliable transport; None without one.
         size_bytes: the node's hint: its largest serialized message; None without one.
+        type_hash: of the definition that it was made with (REP-2016), of publishers and
+            subscriptions that exist; empty where the RMW knows none, None where nobody looked.
     """
 
     kind: EndpointKind
@@ -82,6 +101,7 @@ class EndpointReport:
     nfes: tuple[NetworkFlowEndpoint, ...] | None = None
     participant: str = ""
     matched: int | None = None
+    peers: tuple[str, ...] | None = None
     server_matched: bool | None = None
     dscp: int | None = None
     error: str = ""
@@ -90,6 +110,52 @@ class EndpointReport:
     aliases: tuple[str, ...] = ()
     lossy: bool | None = None
     size_bytes: int | None = None
+    type_hash: str | None = None
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class ParameterReport:
+    """What a node says of one of its parameters.
+
+    Attributes:
+        type: a word of rcl_interfaces, "double_array"; empty for one that may have any type and is
+            not set.
+        value: None if it is not set, or too long to be passed on. Doubles that are not finite are
+            ".nan", ".inf" and "-.inf", because JSON has no others.
+        digest: of a value that is too long; else empty.
+        read_only: it cannot be set once it is declared.
+    """
+
+    name: str
+    type: str
+    value: ParameterValue | None = None
+    digest: str = ""
+    read_only: bool = False
+
+    @classmethod
+    def of(
+        cls, name: str, type_: str, value: ParameterValue | None, *, read_only: bool
+    ) -> ParameterReport:
+        """Return the report of a parameter; `value` is None if it is not set."""
+        spelled = None if value is None else portable(value)
+        digest = "" if spelled is None else digest_of(spelled)
+        return cls(
+            name=name,
+            type=type_,
+            value=None if digest else spelled,
+            digest=digest,
+            read_only=read_only,
+        )
+
+
+def digest_of(value: ParameterValue) -> str:
+    """Return what stands for a value that is too long to be passed on; empty for every other.
+
+    Args:
+        value: as `portable` spells it.
+    """
+    document = codec.to_json(value)
+    return hashlib.sha256(document).hexdigest() if len(document) > LONGEST_VALUE else ""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,6 +172,7 @@ class NodeConfiguration:
         connections: every connection that exists or was asked for.
         checksum: of everything but state, matches, whether connections are established, and itself;
             changes exactly when a reader must read again. Hex SHA-256, 16 digits.
+        parameters: all that are declared, sorted by name; None where the node does not say.
     """
 
     identity: Identity
@@ -119,6 +186,96 @@ class NodeConfiguration:
     endpoints: tuple[EndpointReport, ...]
     checksum: str = ""
     connections: tuple[ConnectionReport, ...] = ()
+    parameters: tuple[ParameterReport, ...] | None = None
+
+
+class ConfigurationError(ValueError):
+    """A text that is no node configuration, or not that of the node that gave it."""
+
+
+def decode_configuration(text: str | bytes, node: str) -> NodeConfiguration:
+    """Return the node configuration that a node answered with.
+
+    Args:
+        text: JSON, from whoever has a service of that name.
+        node: fully qualified name of the node that was asked.
+
+    Raises:
+        ConfigurationError: it is too long, not what the schema says, another node's, or has values
+            that no endpoint can have; the message says which.
+    """
+    try:
+        found = codec.from_json(text, NodeConfiguration, longest=LONGEST_CONFIGURATION)
+    except ValueError as error:
+        raise ConfigurationError(str(error)) from error
+    if found.name != node:
+        raise ConfigurationError(f"it is that of node {found.name[:_SHOWN]!r}")
+    for what, value, allowed in _wrong(found):
+        raise ConfigurationError(f"{what} is {str(value)[:_SHOWN]!r}; allowed: {allowed}")
+    return found
+
+
+_SHOWN = 100
+"""Characters of a wrong value that a message quotes."""
+
+
+def _wrong(found: NodeConfiguration) -> Iterable[tuple[str, object, str]]:
+    """Yield what the types of a configuration allow and its meaning does not."""
+    yield from _outside("identity.process_id", found.identity.process_id, 0, _LARGEST)
+    for index, each in enumerate(found.endpoints):
+        at = f"endpoints[{index}]"
+        yield from _outside(f"{at}.matched", each.matched, 0, _LARGEST)
+        yield from _outside(f"{at}.size_bytes", each.size_bytes, 0, _LARGEST)
+        yield from _outside(f"{at}.dscp", each.dscp, 0, 63)
+        for gid in (*((each.gid,) if each.gid else ()), *(each.peers or ())):
+            if not _GID.fullmatch(gid):
+                yield f"{at}.gid or .peers", gid, "32 hex digits"
+        if each.qos is not None:
+            for field in ("depth", "deadline_ns", "lifespan_ns", "liveliness_lease_duration_ns"):
+                yield from _outside(f"{at}.qos.{field}", getattr(each.qos, field), 0, _LARGEST)
+        for nfe in each.nfes or ():
+            yield from _outside(f"{at}.nfes.transport_port", nfe.transport_port, 0, 0xFFFF)
+            yield from _outside(f"{at}.nfes.flow_label", nfe.flow_label, 0, 0xFFFFF)
+            yield from _outside(f"{at}.nfes.dscp", nfe.dscp, 0, 63)
+            if nfe.internet_address and not _is_address(nfe.internet_address):
+                yield f"{at}.nfes.internet_address", nfe.internet_address, "an IP address"
+    for parameter in found.parameters or ():
+        values = parameter.value if isinstance(parameter.value, tuple) else (parameter.value,)
+        for value in values:
+            if isinstance(value, int):
+                yield from _outside(
+                    f"parameters.{parameter.name[:_SHOWN]}", value, -_LARGEST - 1, _LARGEST
+                )
+
+
+def _outside(
+    what: str, value: int | None, least: int, most: int
+) -> Iterable[tuple[str, object, str]]:
+    if value is not None and not least <= value <= most:
+        yield what, value, f"{least}–{most}"
+
+
+def _is_address(text: str) -> bool:
+    try:
+        ipaddress.ip_address(text)
+    except ValueError:
+        return False
+    return True
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class NodeParameters:
+    """What a node's parameter services said of the parameters that its plan names.
+
+    Attributes:
+        node: fully qualified name.
+        parameters: those that it has; None if that could not be learnt.
+        error: why it could not, to follow "it "; else empty.
+    """
+
+    node: str
+    parameters: tuple[ParameterReport, ...] | None = None
+    error: str = ""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -144,7 +301,11 @@ class ObservedEndpoint:
     Attributes:
         node: fully qualified node name; empty while discovery does not know it.
         qos: history and depth are UNKNOWN/0 over Fast DDS; None for services and actions.
-        gid: hex; empty for services and actions.
+        type_hash: of the definition that it was made with, as discovery tells (REP-2016,
+            `RIHS01_df66…`; those of several messages of a service or an action in the order of
+            `manifest.type_hash.join`); empty if it announces none, None if that was not seen.
+        gid: hex; empty for services and actions of a known node.
+        address: IP address of its participant, where its node is not known and discovery tells.
     """
 
     kind: EndpointKind
@@ -153,12 +314,19 @@ class ObservedEndpoint:
     type: str
     qos: QosProfile | None = None
     gid: str = ""
+    type_hash: str | None = None
+    address: str = ""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Observation:
-    """Everything seen of a system at one moment, noise of tools already taken out."""
+    """Everything seen of a system at one moment, tools and what they use included.
+
+    Attributes:
+        parameters: of nodes that do not report them in their configuration.
+    """
 
     nodes: tuple[ObservedNode, ...] = ()
     endpoints: tuple[ObservedEndpoint, ...] = ()
     configurations: tuple[NodeConfiguration, ...] = ()
+    parameters: tuple[NodeParameters, ...] = ()

@@ -12,9 +12,9 @@ unicast: both count as multicast.
 
 from __future__ import annotations
 
-import ipaddress
 from collections.abc import Sequence
 
+from lifecycle.network.address import is_multicast
 from lifecycle.network.connection_url import ConnectionTransport, ConnectionUrlError, parse
 from lifecycle.network.nfe import (
     InternetProtocol,
@@ -33,6 +33,9 @@ UNKNOWN = "unknown"
 
 NETWORK = frozenset({"udpv4", "udpv6", "tcpv4", "tcpv6", MULTICAST})
 """Transports whose packets a network sees."""
+
+_ANY_PORT = 0
+"""Of the NFE that stands for a URL: no port tells one transport from another."""
 
 _FAMILIES = {InternetProtocol.IPV4: "v4", InternetProtocol.IPV6: "v6"}
 
@@ -86,14 +89,14 @@ def _as_nfe(text: str) -> NetworkFlowEndpoint | None:
         return NetworkFlowEndpoint(
             transport_protocol=TransportProtocol.UNKNOWN,
             internet_protocol=InternetProtocol.UNKNOWN,
-            transport_port=0,
+            transport_port=_ANY_PORT,
         )
     tcp = url.transport is ConnectionTransport.TCPV4
     ipv6 = url.transport is ConnectionTransport.UDPV6 or ":" in url.address
     return NetworkFlowEndpoint(
         transport_protocol=TransportProtocol.TCP if tcp else TransportProtocol.UDP,
         internet_protocol=InternetProtocol.IPV6 if ipv6 else InternetProtocol.IPV4,
-        transport_port=url.port or 0,
+        transport_port=_ANY_PORT,
         internet_address=url.address or ("::" if ipv6 else "0.0.0.0"),  # noqa: S104 - any address
     )
 
@@ -137,16 +140,11 @@ def carrier(
 
 def spell_transport(nfe: NetworkFlowEndpoint) -> str:
     """Return the word for an IP NFE's transport, `udpv4`."""
-    return nfe.transport_protocol.value + _FAMILIES.get(nfe.internet_protocol, "")
+    return nfe.transport_protocol.value + _FAMILIES[nfe.internet_protocol]
 
 
 def _is_group(nfe: NetworkFlowEndpoint) -> bool:
-    if nfe.transport_protocol is not TransportProtocol.UDP:
-        return False
-    try:
-        return ipaddress.ip_address(nfe.internet_address).is_multicast
-    except ValueError:
-        return False  # no address in numbers: it is compared as text elsewhere
+    return nfe.transport_protocol is TransportProtocol.UDP and is_multicast(nfe.internet_address)
 
 
 def _has_shared_memory(nfes: Sequence[NetworkFlowEndpoint]) -> bool:

@@ -68,7 +68,7 @@ class Uniqueness:
         # NFEs with another port or protocol are dissimilar whatever else they hold, so only those
         # of one bucket are ever compared: judging grows with the endpoints, not with their square.
         self._buckets: dict[_Bucket, list[tuple[_Entry, LocatedNfe]]] = {}
-        self._unknown: dict[tuple[EndpointKind, tuple[str, int]], int] = {}
+        self._unknown: set[tuple[EndpointKind, tuple[str, int]]] = set()
         self._answers: dict[int, bool | None] = {}
         for configuration in configurations:
             for report in configuration.endpoints:
@@ -90,8 +90,7 @@ class Uniqueness:
         )
         self._entries[id(report)] = entry
         if entry.judged is None:
-            place = (report.kind, entry.process)
-            self._unknown[place] = self._unknown.get(place, 0) + 1
+            self._unknown.add((report.kind, entry.process))
             return
         for each in entry.judged:
             if is_ip(each):
@@ -99,12 +98,9 @@ class Uniqueness:
 
     def nfes(self, ends: Sequence[Actual]) -> tuple[NetworkFlowEndpoint, ...]:
         """Return the NFEs of endpoints, each once, with the DSCP that was read back."""
-        found: dict[NetworkFlowEndpoint, None] = {}
-        for end in ends:
-            entry = self._entries.get(id(end.report))
-            for each in (entry.nfes if entry else None) or ():
-                found[each.nfe] = None
-        return tuple(found)
+        entries = (self._entries.get(id(end.report)) for end in ends)
+        found = (each.nfe for entry in entries if entry for each in entry.nfes or ())
+        return tuple(dict.fromkeys(found))
 
     def is_unique(self, end: Actual) -> bool | None:
         """Return whether an endpoint is unique; None when its NFEs are not known."""
@@ -134,7 +130,7 @@ class Uniqueness:
             for owner, other in self._buckets[_bucket(kind, own)]
             if owner is not entry
         ]
-        if self._unknown.get((kind, entry.process)):
+        if (kind, entry.process) in self._unknown:
             others.append(None)
         return is_unique_endpoint(entry.judged, others)
 

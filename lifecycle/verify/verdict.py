@@ -60,6 +60,13 @@ class Finding:
     endpoint: EndpointKind | None = None
     hint: str = ""
 
+    @property
+    def nodes(self) -> tuple[str, ...]:
+        """Fully qualified names of the nodes it concerns: of a flow or a connection both ends."""
+        if self.node:
+            return (self.node,)
+        return tuple(self.subject.rpartition(": ")[2].split(" → "))
+
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class FlowReport:
@@ -72,6 +79,8 @@ class FlowReport:
         destination: the subscription's NFEs; empty when unknown.
         unique: how unique the flow is; None when it cannot be told.
         dscp: read back from the sender's UDP sockets; None when not read, or where TCP carries it.
+        reader_dscp: likewise of what the subscription sends, its acknowledgements; None also where
+            it sends from its node's own participant, which nobody marks.
         requirement: the publisher's and the subscription's requirement.
         demanded: what a link demands.
         max_delay_ms: what a link demands, declared and not measured here; None if not asked for.
@@ -100,6 +109,7 @@ class FlowReport:
     five_qi: int | None = None
     five_qi_reason: str = ""
     effective_transport: str = "unknown"
+    reader_dscp: int | None = None
     tuples: tuple[FlowTuple, ...] = dataclasses.field(init=False)
 
     def __post_init__(self) -> None:
@@ -121,6 +131,27 @@ class OpenEndpoint:
     type: str
 
 
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class ToleratedNode:
+    """A node that no manifest declares and that the policy lets be there.
+
+    Attributes:
+        node: fully qualified node name; empty for endpoints whose node nobody knows.
+        because: what tolerates it: `tolerated_nodes: rviz_*` or `undeclared_nodes: open`.
+        endpoints: what it has, without the housekeeping of client libraries.
+    """
+
+    node: str
+    because: str
+    endpoints: tuple[OpenEndpoint, ...] = ()
+
+    def describe(self) -> str:
+        """Return it in a few words, `/rviz2 (subscription of /map)`."""
+        named = dict.fromkeys(f"{each.kind.noun} of {each.name}" for each in self.endpoints)
+        name = self.node or "an unknown node"
+        return f"{name} ({', '.join(named)})" if named else name
+
+
 _ENDED = {
     None: "before it was connected",
     "connected": "when connected, before it was verified",
@@ -138,15 +169,19 @@ class RunEnd:
             was asked for.
         reached: how far the system came: "connected", "verified" or "active"; None before.
         exit_code: of the command that ran it.
+        trusted: what its gate could not verify and took on trust, in one line; empty if nothing, or
+            if the gate did not open.
     """
 
     reason: str
     reached: str | None
     exit_code: int
+    trusted: str = ""
 
     def describe(self) -> str:
         """Return it in one line."""
-        return f"ended {_ENDED[self.reached]}, exit code {self.exit_code}: {self.reason}"
+        trusted = f"; taken on trust: {self.trusted}" if self.trusted else ""
+        return f"ended {_ENDED[self.reached]}, exit code {self.exit_code}: {self.reason}{trusted}"
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -157,6 +192,10 @@ class Verdict:
         verdict: VIOLATED if any finding is; else UNVERIFIABLE if any finding is; else OK.
         blocking: the gate stays closed: VIOLATED, or UNVERIFIABLE where the policy says so.
         open_endpoints: what nodes made in code and may make; no finding, but nothing is hidden.
+        tolerated: undeclared nodes that the policy lets be there; no finding either. Observers of
+            this project are not listed while they do nothing but observe.
+        judged: a system was looked at and every rule applied. If not, a rule without a finding
+            says nothing, and the findings are what kept it from being judged.
         run: how the run ended that this is the last verdict of; None of a system that is running.
     """
 
@@ -165,4 +204,12 @@ class Verdict:
     findings: tuple[Finding, ...]
     flows: tuple[FlowReport, ...]
     open_endpoints: tuple[OpenEndpoint, ...] = ()
+    tolerated: tuple[ToleratedNode, ...] = ()
+    judged: bool = True
     run: RunEnd | None = None
+
+
+NOT_JUDGED = Verdict(
+    verdict=Outcome.UNVERIFIABLE, blocking=True, findings=(), flows=(), judged=False
+)
+"""The verdict of a system that never came as far as being judged."""

@@ -21,10 +21,12 @@ from lifecycle.plan.model import (
     PlannedFlow,
     PlannedNode,
 )
+from lifecycle.verify.noise import DeclaredNames
 from lifecycle.verify.observation import (
     EndpointReport,
     Identity,
     NodeConfiguration,
+    NodeParameters,
     ObservedEndpoint,
     ObservedNode,
 )
@@ -75,6 +77,7 @@ class Seen:
         node: fully qualified name of the node it belongs to, hidden participants resolved to
             their node; empty while unknown.
         planned: its declaration; None if there is none.
+        type_hash: as `ObservedEndpoint` has it.
     """
 
     kind: EndpointKind
@@ -84,6 +87,7 @@ class Seen:
     qos: QosProfile | None
     report: EndpointReport | None
     planned: PlannedEndpoint | None
+    type_hash: str | None = None
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -138,11 +142,15 @@ class View:
         observed: nodes of the graph by full name, tools and hidden participants left out, sorted.
         reported: every report, sorted by name.
         configurations: reports by full node name; the first of several.
+        parameters: what parameter services said, by full node name.
         actual: every declared endpoint, in plan order.
         actual_by_node: the same by full node name.
         undeclared: endpoints of declared nodes that no declaration covers, sorted.
         unattributed: endpoints whose node is not known, sorted.
-        foreign: endpoints of nodes that are not in the plan, sorted.
+        foreign: endpoints of nodes that are not in the plan and no tools, sorted.
+        names: what the plan declares, by name.
+        tools: undeclared nodes that the policy tolerates, and the pattern that says so, sorted.
+        of_tools: their endpoints, housekeeping left out, sorted.
         seen: every publisher and subscription of the graph, tools left out, sorted.
         flows: every planned flow, in plan order.
     """
@@ -152,16 +160,37 @@ class View:
     machines: frozenset[str] | None = None
     ahead: frozenset[str] = frozenset()
     planned: dict[str, PlannedNode]
+    names: DeclaredNames
     observed: dict[str, ObservedNode]
     reported: tuple[NodeConfiguration, ...]
     configurations: dict[str, NodeConfiguration]
+    parameters: dict[str, NodeParameters]
     actual: tuple[Actual, ...]
     actual_by_node: dict[str, tuple[Actual, ...]]
     undeclared: tuple[ObservedEndpoint, ...]
     unattributed: tuple[ObservedEndpoint, ...]
     foreign: tuple[ObservedEndpoint, ...]
+    tools: dict[str, str]
+    of_tools: tuple[ObservedEndpoint, ...]
     seen: tuple[Seen, ...]
     flows: tuple[FlowView, ...]
+
+    @property
+    def seen_of_tools(self) -> tuple[Seen, ...]:
+        """Publishers and subscriptions of tools, which others may be matched with too."""
+        return tuple(
+            Seen(
+                kind=each.kind,
+                node=each.node,
+                name=each.name,
+                type=each.type,
+                qos=each.qos,
+                report=None,
+                planned=None,
+            )
+            for each in self.of_tools
+            if each.kind.is_topic
+        )
 
     def is_absent(self, node: PlannedNode) -> bool:
         """Tell whether nothing at all is seen of a node: then one finding says it all."""

@@ -12,6 +12,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -26,6 +27,9 @@ from tests.ros.supervisor.running import ROOT, Event, Up
 
 DOMAIN = 7
 """Nobody else is in a network of our own."""
+
+CUT_S = 3.0
+"""Long enough to be noticed and for everything that is sent meanwhile; the lease is 20 s."""
 
 _MANIFESTS = ROOT / "manifests"
 _SUFFIX = ".lifecycle.yaml"
@@ -99,6 +103,26 @@ class System:
         """Ask something over shared memory, see tests.net.asking; return the lines."""
         asking = ("-m", "tests.net.asking", str(DOMAIN), "shm://", *words)
         return self.hosts[machine].run(*self._python(machine), *asking).splitlines()
+
+    def cut(self, seconds: float = CUT_S) -> None:
+        """Take the cable out for so long; both sides must notice, and be well again afterwards."""
+        since = {name: up.catch_up() for name, up in self.ups.items()}
+        others = dict(zip(self.ups, reversed(self.ups), strict=True))
+        for name, other in others.items():
+            self.ups[name].met("connection", machine=other, established=True)
+        began = time.monotonic()
+        self.hosts["left"].ip("link", "set", "e0", "down")
+        for name, other in others.items():
+            lost = {"machine": other, "established": False}
+            self.ups[name].met("connection", since=since[name], **lost)
+        time.sleep(max(0.0, seconds - (time.monotonic() - began)))  # the outage itself
+        self.hosts["left"].ip("link", "set", "e0", "up")
+        for name, other in others.items():
+            found = {"machine": other, "established": True}
+            self.ups[name].met("connection", since=since[name], **found)
+        for up in self.ups.values():
+            while up.of_kind("verdict")[-1]["verdict"]["verdict"] != "ok":
+                up.until("verdict")
 
     def finish(self) -> None:
         """End all supervisors; each must end well, with its gate held and nothing left."""

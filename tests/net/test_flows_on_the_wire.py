@@ -20,6 +20,7 @@ from tests.ros.supervisor.running import Event
 
 _EF = 46
 _AF41 = 34
+_CS6 = 48
 
 _MARKED: Mapping[str, Any] = {
     "nodes/n1/flows": {
@@ -28,6 +29,8 @@ _MARKED: Mapping[str, Any] = {
             "battery": {},
         }
     },
+    # A DataReader's TRANSPORT_PRIORITY, as-is: TOS 0xC0 is CS6.
+    "nodes/n2/flows": {"subscriptions": {"battery": {"transport_priority": 0xC0}}},
 }
 _TWO_MARKS: Mapping[str, Any] = {
     "nodes/n1/flows": {"publishers": {"video": {"dscp": "EF"}, "battery": {"dscp": "AF41"}}},
@@ -41,12 +44,14 @@ class Seen:
     Attributes:
         video: packets with messages of /video, as they left host A.
         battery: likewise.
+        acknowledgements: packets in which the reader of /battery acknowledges, as they reached A.
         packets: everything that left or reached A.
         flows: the last verdict's, by topic.
     """
 
     video: list[Packet]
     battery: list[Packet]
+    acknowledgements: list[Packet]
     packets: list[Packet]
     flows: dict[str, Event]
 
@@ -63,6 +68,8 @@ def _observe(
     directory = tmp_path_factory.mktemp("wire")
     with Hosts() as hosts:
         left, right = hosts.bridged("A", "B")
+        # Else the kernel would give a label to packets whose socket has none, ip-sysctl.
+        left.run("sh", "-c", "echo 0 > /proc/sys/net/ipv6/auto_flowlabels")
         manifest = article(directory, left.ipv4, right.ipv4, edit=edit)
         # The capture is there before any process: nothing that is sent escapes it.
         with (
@@ -72,6 +79,7 @@ def _observe(
             for up in ups:
                 up.until("system", reached="active")
             video, battery = (capture.wait_data(topic, 20) for topic in ("/video", "/battery"))
+            capture.wait(lambda: capture.acknowledgements("/battery", outgoing=False))
             flows = ups[0].of_kind("verdict")[-1]["verdict"]["flows"]
             for up in ups:
                 up.signal(signal.SIGTERM)
@@ -79,6 +87,7 @@ def _observe(
             return Seen(
                 video=video,
                 battery=battery,
+                acknowledgements=capture.acknowledgements("/battery", outgoing=False),
                 packets=capture.packets(),
                 flows={each["topic"]: each for each in flows},
             )
@@ -183,6 +192,39 @@ def test_discovery_of_a_marked_participant_carries_the_mark_as_well(marked: Seen
     assert announced[-1].dscp == _EF
     (other,) = {each.participant for each in marked.battery}
     assert {each.dscp for each in marked.sent_by(other)} == {0}
+
+
+def test_a_marked_subscription_acknowledges_with_its_dscp_and_the_data_carry_the_publishers(
+    plain: Seen, marked: Seen
+) -> None:
+    assert {each.dscp for each in plain.acknowledgements} == {0}
+    assert {(each.dscp, each.ecn) for each in marked.acknowledgements} == {(_CS6, 0)}
+    assert {each.dscp for each in marked.battery} == {0}
+    assert {topic: each["reader_dscp"] for topic, each in marked.flows.items()} == {
+        "/video": None,
+        "/battery": _CS6,
+    }
+
+
+def test_the_participant_of_a_marked_subscription_is_shared_with_no_other_reader(
+    marked: Seen,
+) -> None:
+    (participant,) = {each.participant for each in marked.acknowledgements}
+    others = {each.dscp for each in marked.packets if not each.outgoing} - {_CS6}
+    assert others == {0}
+    (reader,) = {
+        guid
+        for each in marked.acknowledgements
+        for guid in each.acknowledges
+        if guid[15] & 0xC0 == 0
+    }
+    assert reader[:12] == participant
+
+
+def test_ipv6_flows_whose_label_is_shown_as_unset_have_none_on_the_wire(marked_ipv6: Seen) -> None:
+    for topic, packets in (("/video", marked_ipv6.video), ("/battery", marked_ipv6.battery)):
+        shown = {each["flow_label"] for each in marked_ipv6.flows[topic]["tuples"]}
+        assert {each.flow_label for each in packets} == shown == {0}
 
 
 def test_ipv6_flows_carry_one_dscp_per_publisher(marked_ipv6: Seen) -> None:

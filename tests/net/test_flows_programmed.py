@@ -70,6 +70,13 @@ class Bench:
         )
         return done.returncode, done.stdout + done.stderr
 
+    def ledger(self) -> list[str]:
+        """The kinds of networks in which something of the system is listed."""
+        files = list((self.directory / "a").rglob("programmed.json"))
+        return [
+            each["target"] for file in files for each in json.loads(file.read_text())["targets"]
+        ]
+
     def up(self) -> Iterator[tuple[Up, Up]]:
         """Bring both hosts up until active; end them in order afterwards."""
         with up_on_both(self.one, self.other, self.manifest, runtime=self.directory) as ups:
@@ -155,9 +162,23 @@ def test_flows_are_marked_by_the_rule_and_again_after_a_restart_and_no_more_afte
         assert bench.one.run("nft", "list", "tables") == ""
 
 
-def test_flows_have_their_queue_by_their_5qi(bench: Bench) -> None:
+def test_flows_have_their_queue_by_their_5qi_unless_another_is_in_the_way(bench: Bench) -> None:
     tc = ("--target", "tc", "--device", "e0", "--rate", "20mbit")
+    nft = ("--target", "nft", "--dscp-from-5qi", str(bench.mapping))
     for _ in bench.up():
+        bench.one.run("tc", "qdisc", "add", "dev", "e0", "root", "handle", "7:", "htb")
+        code, text = bench.flows("apply", *nft, *tc)
+        assert code == ExitCode.BRING_UP_FAILED, text
+        assert "cannot make 1 of 2 changes to targets:\n  cannot use tc on e0: " in text
+        assert "\ndone all the same:\nnft table inet flowqos_article: 1 created, 0 unc" in text
+        removal = f"\ntake back what was done: lifecycle flows remove {bench.manifest}\n"
+        assert text.endswith(removal), text
+        assert bench.ledger() == ["nft"]
+        code, text = bench.flows("remove")
+        assert (code, "1 deleted" in text) == (ExitCode.OK, True), text
+        assert bench.ledger() == []
+        bench.one.run("tc", "qdisc", "del", "dev", "e0", "root")
+
         code, text = bench.flows("apply", *tc)
         assert code == ExitCode.OK, text
         assert "tc on e0: 1 created, 0 unchanged" in text

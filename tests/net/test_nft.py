@@ -231,5 +231,7 @@ def test_without_privilege_a_dry_run_is_checked_all_the_same_and_an_apply_says_w
     assert unchecked is not allowed
     assert str(caught.value) == (
         "cannot read nft table inet flowqos_robot: 'nft list table inet flowqos_robot' needs "
-        "CAP_NET_ADMIN in this network namespace; run this command as root"
+        "CAP_NET_ADMIN in this network namespace; run this command as root, or give it that "
+        "capability: in a container --cap-add NET_ADMIN, in a systemd unit "
+        "AmbientCapabilities=CAP_NET_ADMIN"
     )

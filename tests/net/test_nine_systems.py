@@ -13,20 +13,35 @@ from pathlib import Path
 import psutil
 
 from tests.net.hosts import Hosts
-from tests.net.nine_systems import System, edited, on_one_host, on_two_hosts, on_two_hosts_by_tcp
+from tests.net.nine_systems import (
+    DOMAIN,
+    System,
+    edited,
+    on_one_host,
+    on_two_hosts,
+    on_two_hosts_by_tcp,
+)
 from tests.ros.supervisor.running import BOUND_S
 
 _ROS_DISCOVERY_INFO = range(7000, 7010)
 """rmw_fastrtps takes the first free one for it per participant, and lets nobody say otherwise."""
+_DEFAULT_PORTS = range(7400 + 250 * DOMAIN, 7400 + 250 * (DOMAIN + 1))
+"""DDSI-RTPS 9.6.2.3."""
 _GRAPH = "/lifecycle/graph"
 _SPDP = bytes.fromhex("000100c2")  # DDSI-RTPS Table 9.1
 _SEDP = frozenset(bytes.fromhex(each) for each in ("000003c2", "000004c2"))
 
 
 def _no_multicast(system: System) -> None:
+    """Nothing went to a group, nor to where participants listen that nobody gave a port."""
     assert [each for each in system.left_the_hosts() if each.multicast] == []
     for wire in system.inside.values():
         assert [each for each in wire.packets() if each.multicast] == []
+    everywhere = [
+        *system.left_the_hosts(),
+        *(w for i in system.inside.values() for w in i.packets()),
+    ]
+    assert [each for each in everywhere if each.destination_port in _DEFAULT_PORTS] == []
 
 
 def test_statically_configured_nodes(hosts: Hosts, tmp_path: Path) -> None:
@@ -39,6 +54,7 @@ def test_statically_configured_nodes(hosts: Hosts, tmp_path: Path) -> None:
             for where in (("left", "talker"), ("right", "listener"))
         )
         left, right = (system.hosts[each].ipv4 for each in ("left", "right"))
+        system.cut()
         system.finish()
     # Known before anything ran: these are the manifest's numbers.
     assert {each.flow for each in system.hellos()} == {(left, 8002, right, 8011)}
@@ -69,6 +85,7 @@ def test_statically_configured_nodes_with_static_endpoint_discovery(
         system.until_active()
         system.until_says("right", "listener", "heard hello")
         system.until_said()
+        system.cut()
         system.finish()
     flows = {each.flow for each in system.hellos()}
     assert len(flows) == 1
@@ -79,6 +96,12 @@ def test_statically_configured_nodes_with_static_endpoint_discovery(
     kinds = {writer[12:] for each in data for writer in each.writers}
     assert _SPDP in kinds
     assert kinds & _SEDP == set()
+    for packet in (each for each in system.left_the_hosts() if each.source_port):
+        for port in (packet.source_port, packet.destination_port):
+            assert 8200 <= port < 8212 or port in _ROS_DISCOVERY_INFO, packet
+    # Nodes and supervisors see each other, and announce what is for that; no topic of the manifest.
+    assert system.outside["left"].writers("/rosout") != set()
+    assert system.outside["left"].writers("/chatter") == set()
 
 
 def test_statically_configured_graph(hosts: Hosts, tmp_path: Path) -> None:
@@ -118,6 +141,7 @@ def _nothing_open_until_told(system: System, directory: Path) -> None:
 def test_dynamically_configured_graph_with_static_discovery(hosts: Hosts, tmp_path: Path) -> None:
     with on_two_hosts(hosts, "dynamically_configured_graph", tmp_path) as system:
         _endpoints_made_while_running_are_connected(system)
+        system.cut()
         system.finish()
     assert system.outside["left"].writers(_GRAPH) == set()
     _no_multicast(system)
@@ -164,6 +188,7 @@ def test_dynamically_configured_graph_with_events_and_static_discovery(
 ) -> None:
     with on_two_hosts(hosts, "dynamically_configured_graph_with_events", tmp_path) as system:
         _endpoints_made_while_running_are_connected(system)
+        system.cut()
         system.finish()
     assert len(system.outside["left"].writers(_GRAPH)) == 2
     _no_multicast(system)
@@ -223,6 +248,7 @@ def test_client_server_master_with_point_to_point_tcp_data_only(
             and each.pid in system.hosts["left"].pids()
         ]
         assert servers != []
+        system.cut()
         system.finish()
         assert [each for each in servers if each.is_running()] == []
     assert {each.protocol for each in system.hellos()} == {"tcp"}
@@ -242,6 +268,7 @@ def test_distributed_system_with_intelligent_multicast(hosts: Hosts, tmp_path: P
             system.until_says(machine, process, "heard hello")
         count = len(system.hellos())
         system.outside["left"].wait(lambda: len(system.hellos()) >= count + 40)
+        system.cut()
         system.finish()
     local = [each for each in system.inside["left"].packets() if b"hello " in each.payload]
     sent = [each for each in local if each.outgoing]
@@ -250,7 +277,8 @@ def test_distributed_system_with_intelligent_multicast(hosts: Hosts, tmp_path: P
     said = [_said(each.payload) for each in sent]
     assert len(said) == len(set(said))
     over_the_cable = system.outside["left"].packets()
-    assert [each for each in over_the_cable if each.protocol == "udp"] == []
+    for wire in system.outside.values():
+        assert [each for each in wire.packets() if each.protocol == "udp"] == []
     assert any(b"hello " in each.payload for each in over_the_cable)
 
 

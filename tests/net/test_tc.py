@@ -6,7 +6,7 @@ import dataclasses
 import re
 import shutil
 import socket
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -23,7 +23,7 @@ from lifecycle.supervisor.programming.errors import (
 )
 from lifecycle.supervisor.programming.ledger import Ledger
 from lifecycle.supervisor.programming.tc import TcTarget, probe_features
-from lifecycle.supervisor.programming.tool import HostTool
+from lifecycle.supervisor.programming.tool import HostTool, Output
 from tests.net.hosts import Host, Hosts, lacking
 from tests.unit.supervisor.programming.samples import ledger_in, rule
 
@@ -292,10 +292,20 @@ def test_without_a_rate_prio_is_needed_and_its_absence_is_said(bench: Bench) -> 
         target.apply([bench.rule()])
 
 
-def test_without_privilege_one_line_says_what_is_needed(bench: Bench) -> None:
-    nobody = ("setpriv", "--reuid=65534", "--regid=65534", "--clear-groups", "--")
+@pytest.mark.parametrize(
+    "without",
+    [
+        ("--reuid=65534", "--regid=65534", "--clear-groups"),
+        # Root, as in a container that was not given it.
+        ("--bounding-set=-net_admin", "--inh-caps=-net_admin"),
+    ],
+)
+def test_without_privilege_one_line_says_what_is_needed(
+    bench: Bench, without: tuple[str, ...]
+) -> None:
     settings = TcSettings(device="e0", link_kbit=20_000)
-    target = TcTarget("robot", settings, bench.ledger, HostTool(bench.one.command(*nobody)))
+    tool = HostTool(bench.one.command("setpriv", *without, "--"))
+    target = TcTarget("robot", settings, bench.ledger, tool)
 
     # Looking needs no privilege.
     assert kinds(target.plan([bench.rule()])) == ["create"]
@@ -304,5 +314,86 @@ def test_without_privilege_one_line_says_what_is_needed(bench: Bench) -> None:
 
     assert str(caught.value) == (
         "cannot program tc on e0: 'tc -batch -' needs CAP_NET_ADMIN in this network namespace; "
-        "run this command as root"
+        "run this command as root, or give it that capability: in a container --cap-add "
+        "NET_ADMIN, in a systemd unit AmbientCapabilities=CAP_NET_ADMIN"
     )
+    # Nothing was made, and nothing is listed that would have to be removed.
+    assert bench.ledger.read().targets == ()
+
+
+def test_each_class_has_a_queue_of_its_own_that_is_short(bench: Bench) -> None:
+    bench.target(queue_ms=40).apply([bench.rule()])
+
+    listed = bench.one.run("tc", "qdisc", "show", "dev", "e0")
+    queues = re.findall(r"qdisc bfifo (\w+:) parent 1f10:(\w+) limit (\w+)", listed)
+
+    # 40 ms of 20 Mbit/s: a bound on what waits, whatever the device's txqueuelen is.
+    assert sorted(queues) == [("212e:", EF, "100000b"), ("2fff:", REST, "100000b")]
+    assert kinds(bench.target(queue_ms=40).apply([bench.rule()])) == ["keep"]
+
+
+def test_another_length_of_the_queues_is_a_change(bench: Bench) -> None:
+    bench.target().apply([bench.rule()])
+    assert "limit 125000b" in bench.one.run("tc", "qdisc", "show", "dev", "e0")
+
+    changes = bench.target(queue_ms=100).apply([bench.rule()])
+
+    assert [each.detail for each in changes.changes] == ["the classes change"]
+    assert bench.one.run("tc", "qdisc", "show", "dev", "e0").count("limit 250000b") == 2
+
+
+def test_a_queue_that_others_made_longer_is_made_anew(bench: Bench) -> None:
+    bench.target().apply([bench.rule()])
+    bench.one.run(
+        *("tc", "qdisc", "replace", "dev", "e0", "parent", "1f10:fff"),
+        *("handle", "2fff:", "bfifo", "limit", "9999999"),
+    )
+
+    (change,) = bench.target().apply([bench.rule()]).changes
+
+    assert change.detail == "it was changed by others"
+    assert "9999999" not in bench.one.run("tc", "qdisc", "show", "dev", "e0")
+
+
+class StopsAt:
+    """Runs the programs of a host, but for batches, which stop at a line as tc would."""
+
+    def __init__(self, host: Host, line: str) -> None:
+        self._tool = HostTool(host.command())
+        self._line = line
+
+    def run(self, argv: Sequence[str], *, stdin: str = "") -> Output:
+        probing = argv[0] == "unshare"
+        broken = stdin if probing else stdin.replace(self._line, f"{self._line} nonsense", 1)
+        return self._tool.run(argv, stdin=broken)
+
+
+def test_a_batch_that_stops_half_way_is_taken_back_and_leaves_no_entry(bench: Bench) -> None:
+    settings = TcSettings(device="e0", link_kbit=20_000)
+    before = everything(bench.one)
+    tool = StopsAt(bench.one, "parent 1f10:1 classid 1f10:fff htb")
+
+    with pytest.raises(ProgrammingError, match="cannot program tc on e0"):
+        TcTarget("robot", settings, bench.ledger, tool).apply([bench.rule()])
+
+    assert everything(bench.one) == before
+    assert bench.ledger.read().targets == ()
+
+
+def test_a_change_that_stops_half_way_says_what_it_left_and_is_made_anew(bench: Bench) -> None:
+    settings = TcSettings(device="e0", link_kbit=20_000)
+    bench.target().apply([bench.rule()])
+    tool = StopsAt(bench.one, "parent 1f10:1 classid 1f10:10a htb")
+    rules = [bench.rule(), bench.rule("/lidar", 17901, dscp=10)]
+
+    with pytest.raises(ProgrammingError) as caught:
+        TcTarget("robot", settings, bench.ledger, tool).apply(rules)
+
+    assert str(caught.value).endswith(
+        "; the qdisc 1f10: on e0 is left half-changed, and made anew the next time"
+    )
+    (record,) = bench.ledger.read().targets
+    assert (record.target, record.scope, record.seen) == ("tc", "e0", "")
+    changes = bench.target().apply(rules)
+    assert {each.detail for each in changes.changes} == {"an earlier attempt did not finish"}
+    assert bench.classes() == ["1", AF11, EF, REST]

@@ -15,6 +15,10 @@ from tests.net.hosts import Host, Hosts
 from tests.net.running import UNIQUE, article, run_directory, up_on, up_on_both
 from tests.ros.supervisor.running import BOUND_S, Up
 
+_TOPICS = [
+    {"name": "video", "type": "std_msgs/msg/String", "qos": "sensor_data"},
+    {"name": "battery", "type": "std_msgs/msg/String"},
+]
 _NODE_OF = {"a": "/n1", "b": "/n2"}
 
 
@@ -172,3 +176,28 @@ def test_hosts_leave_nothing_behind(tmp_path: Path) -> None:
     assert sleeping.wait(BOUND_S) == -signal.SIGKILL
     alive = [int(each.name) for each in Path("/proc").iterdir() if each.name.isdigit()]
     assert network not in {Host._network(pid) for pid in alive}
+
+
+def test_hosts_beyond_a_router_find_each_other_by_their_addresses(
+    hosts: Hosts, tmp_path: Path
+) -> None:
+    left, _, right = hosts.routed("A", "B")
+    # Each in a process of its own: more participants than rmw looks for by itself.
+    more = {
+        f"nodes/{name}{number}": {
+            "run": {"python": f"tests.net.systems:{kind}"},
+            "machine": machine,
+            "interface": {"publishers" if kind == "Source" else "subscriptions": _TOPICS},
+        }
+        for number in range(3, 8)
+        for name, kind, machine in (("out", "Source", "a"), ("in", "Sink", "b"))
+    }
+    link = {"topic": "/video", "from": "out7", "to": "in7"}
+    manifest = article(tmp_path, left.ipv4, right.ipv4, edit={**more, "links": [link]})
+    with up_on_both(left, right, manifest, "--timeout", "60", runtime=tmp_path) as ups:
+        for up in ups:
+            up.until("system", reached="active")
+        ups[1].met("log", process="in7", line="heard both")
+        for up in ups:
+            up.signal(signal.SIGTERM)
+        assert [up.finish() for up in ups] == [ExitCode.OK, ExitCode.OK]

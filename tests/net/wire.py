@@ -37,6 +37,8 @@ _SOL_PACKET, _STATISTICS = 263, 6  # linux/socket.h, linux/if_packet.h
 _END_S = 5.0
 
 _DATA, _DATA_FRAG, _INFO_DST, _PAD, _INFO_TS = 0x15, 0x16, 0x0E, 0x01, 0x09
+_ACKNACK = 0x06
+_SUBSCRIPTIONS_WRITER = bytes.fromhex("000004c2")
 _PUBLICATIONS_WRITER = bytes.fromhex("000003c2")  # DDSI-RTPS Table 9.1
 _PARTICIPANT_WRITER = bytes.fromhex("000100c2")
 _BUILTIN = 0xC0  # the two highest bits of an entity kind, DDSI-RTPS §9.3.1.2
@@ -60,6 +62,7 @@ class Packet:
         participant: GUID prefix of the RTPS message; empty if it is none.
         discovers: it announces the participant itself (SPDP).
         writers: GUIDs whose DATA it carries, discovery's among them.
+        acknowledges: GUIDs of readers whose ACKNACK it carries, discovery's among them.
         payload: what UDP or TCP carries; empty for later fragments.
     """
 
@@ -80,6 +83,7 @@ class Packet:
     participant: bytes = b""
     discovers: bool = False
     writers: tuple[bytes, ...] = ()
+    acknowledges: tuple[bytes, ...] = ()
     payload: bytes = dataclasses.field(default=b"", repr=False)
 
     @property
@@ -119,6 +123,7 @@ class Capture:
         self._over, self._close = socket.socketpair()
         self._packets: list[Packet] = []
         self._topics: dict[bytes, str] = {}
+        self._read_topics: dict[bytes, str] = {}  # by GUID of the reader
         self._fragments = Fragments()
         self._more = threading.Condition()
         self._thread = threading.Thread(target=self._read, daemon=True)
@@ -150,6 +155,15 @@ class Capture:
             for packet in self.packets()
             if outgoing in (None, packet.outgoing)
             and any(self.topic(writer) == topic for writer in packet.writers)
+        ]
+
+    def acknowledgements(self, topic: str, *, outgoing: bool) -> list[Packet]:
+        """Return the packets in which a reader of a ROS topic acknowledges."""
+        return [
+            packet
+            for packet in self.packets()
+            if packet.outgoing is outgoing
+            and any(self._read_topics.get(each) == topic for each in packet.acknowledges)
         ]
 
     def wait(self, holds: Callable[[], object], *, timeout_s: float = BOUND_S) -> None:
@@ -236,16 +250,19 @@ class Capture:
         message = self._fragments.add(octets)[_UDP_HEADER:]
         if message[:4] == b"RTPS":
             self._learn_all(message)
-        writers = []
+        writers: list[bytes] = []
+        readers: list[bytes] = []
         for message in _messages(packet):
             prefix = message[8:20]
             writers += [prefix + writer for writer, _ in _data(message)]
+            readers += [prefix + reader for reader in _acknowledging(message)]
             self._learn_all(message)
             packet = dataclasses.replace(
                 packet,
                 participant=prefix,
                 discovers=any(each[12:] == _PARTICIPANT_WRITER for each in writers),
                 writers=tuple(writers),
+                acknowledges=tuple(readers),
             )
         with self._more:
             self._packets.append(packet)
@@ -254,12 +271,14 @@ class Capture:
     def _learn_all(self, message: bytes) -> None:
         for writer, data in _data(message):
             if writer == _PUBLICATIONS_WRITER:
-                self._learn(data)
+                self._learn(data, self._topics)
+            elif writer == _SUBSCRIPTIONS_WRITER:
+                self._learn(data, self._read_topics)
 
-    def _learn(self, data: bytes) -> None:
+    def _learn(self, data: bytes, topics: dict[bytes, str]) -> None:
         guid, topic = _announced(data)
         if guid and topic.startswith(_MINE):
-            self._topics[guid] = "/" + topic[len(_MINE) :].decode()
+            topics[guid] = "/" + topic[len(_MINE) :].decode()
 
 
 def _messages(packet: Packet) -> Iterator[bytes]:
@@ -362,6 +381,20 @@ def _packet(
 
 def _data(message: bytes) -> Iterator[tuple[bytes, bytes]]:
     """Yield (writer entity id, serialized payload) of each DATA and DATA_FRAG."""
+    for kind, submessage, order in _submessages(message):
+        if kind in (_DATA, _DATA_FRAG) and len(submessage) >= 16:
+            yield submessage[12:16], _payload(submessage, order)
+
+
+def _acknowledging(message: bytes) -> Iterator[bytes]:
+    """Yield the reader entity id of each ACKNACK."""
+    for kind, submessage, _ in _submessages(message):
+        if kind == _ACKNACK and len(submessage) >= 8:
+            yield submessage[4:8]
+
+
+def _submessages(message: bytes) -> Iterator[tuple[int, bytes, str]]:
+    """Yield (kind, octets with their header, byte order) of each submessage."""
     at = 20
     while at + 4 <= len(message):
         kind, flags = message[at], message[at + 1]
@@ -370,8 +403,7 @@ def _data(message: bytes) -> Iterator[tuple[bytes, bytes]]:
         end = at + 4 + length
         if length == 0 and kind not in (_PAD, _INFO_TS):
             end = len(message)  # the last submessage may leave its length out
-        if kind in (_DATA, _DATA_FRAG) and at + 16 <= len(message):
-            yield message[at + 12 : at + 16], _payload(message[at:end], order)
+        yield kind, message[at:end], order
         at = end
 
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from lifecycle.export.picture.graph import Edge, edges, framed, node_words
-from lifecycle.export.picture.look import LINES, STATES, printable
+from lifecycle.export.picture.look import LINES, STATES
 from lifecycle.export.picture.model import LineKind, Picture, PicturedNode, Presence
+from lifecycle.printable import one_line
 
 _STYLES = {
     Presence.PRESENT: "solid",
@@ -67,4 +68,4 @@ def _quoted(*words: str) -> str:
 
 
 def _escape(word: str) -> str:
-    return printable(" ".join(word.replace("\\", "\\\\").replace('"', '\\"').split()))
+    return one_line(" ".join(word.replace("\\", "\\\\").replace('"', '\\"').split()))

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from html import escape
 
-from lifecycle.export.picture.look import OUTCOMES, PRESENCE_WORDS, STATES, printable, remark
+from lifecycle.export.picture.look import OUTCOMES, PRESENCE_WORDS, STATES, remark
 from lifecycle.export.picture.matrix import place
 from lifecycle.export.picture.model import (
     Picture,
@@ -21,6 +21,7 @@ from lifecycle.export.picture.model import (
 from lifecycle.export.picture.page import CSS, SCRIPT
 from lifecycle.export.picture.svg import HEADINGS, figure_svg, legend_svg, style
 from lifecycle.export.picture.views import computational, data_layer
+from lifecycle.printable import one_line
 from lifecycle.verify.verdict import Outcome
 
 _VERDICTS = {
@@ -255,4 +256,4 @@ def _links(findings: Iterable[int]) -> str:
 
 
 def _text(words: str) -> str:
-    return escape(printable(words))
+    return escape(one_line(words))

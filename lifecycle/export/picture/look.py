@@ -67,11 +67,6 @@ OUTCOMES = {
 }
 
 
-def printable(words: str) -> str:
-    """Return words of which nothing is a command to a terminal, or cannot be spelt in XML 1.0."""
-    return "".join(each if each.isprintable() else "\N{REPLACEMENT CHARACTER}" for each in words)
-
-
 def remark(presence: Presence) -> tuple[str, ...]:
     """What is said of something beside its name: nothing if it is as declared."""
     return () if presence.as_declared else (PRESENCE_WORDS[presence],)

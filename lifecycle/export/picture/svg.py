@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from xml.sax.saxutils import escape, quoteattr
 
-from lifecycle.export.picture.look import DASHES, LINES, OUTCOMES, PRESENCE_WORDS, STATES, printable
+from lifecycle.export.picture.look import DASHES, LINES, OUTCOMES, PRESENCE_WORDS, STATES
 from lifecycle.export.picture.matrix import (
     LINE,
     MARGIN,
@@ -19,6 +19,7 @@ from lifecycle.export.picture.matrix import (
 )
 from lifecycle.export.picture.model import NodeState, Picture, Presence
 from lifecycle.export.picture.views import computational, data_layer
+from lifecycle.printable import one_line
 from lifecycle.verify.verdict import Outcome
 
 _INK, _QUIET = "#1b2733", "#4d5a66"
@@ -295,8 +296,8 @@ def _text(x: int, y: int, words: str, class_: str, *, anchor: str = "") -> str:
 
 
 def _attribute(words: str) -> str:
-    return quoteattr(printable(words))
+    return quoteattr(one_line(words))
 
 
 def _escape(words: str) -> str:
-    return escape(printable(words))
+    return escape(one_line(words))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
-from lifecycle.export.picture.look import OUTCOMES, STATES, numbers, printable, remark
+from lifecycle.export.picture.look import OUTCOMES, STATES, numbers, remark
 from lifecycle.export.picture.model import (
     Picture,
     PicturedArrow,
@@ -14,6 +14,7 @@ from lifecycle.export.picture.model import (
     Presence,
 )
 from lifecycle.export.picture.views import edge_label, end_words
+from lifecycle.printable import one_line
 from lifecycle.verify.verdict import Outcome
 
 _ARROWS = {
@@ -30,7 +31,7 @@ def picture_to_text(picture: Picture) -> str:
 
 
 def _document(picture: Picture) -> Iterator[str]:
-    yield picture.title
+    yield one_line(picture.title)
     yield ""
     yield "computational graph"
     names = {node.id: node.name for node in picture.nodes()}
@@ -41,7 +42,7 @@ def _document(picture: Picture) -> Iterator[str]:
     yield ""
     yield "data layer graph"
     for machine in picture.machines:
-        yield f"  {machine.title}"
+        yield one_line(f"  {machine.title}")
         for process in machine.processes:
             for node in process.nodes:
                 yield from _participants(node, process.title)
@@ -53,11 +54,11 @@ def _document(picture: Picture) -> Iterator[str]:
         yield "findings"
     for finding in picture.findings:
         symbol = OUTCOMES[finding.outcome].symbol
-        yield f"  ⚠{finding.number} {symbol} {finding.outcome.value} {finding.rule}: " + printable(
+        yield f"  ⚠{finding.number} {symbol} {finding.outcome.value} {finding.rule}: " + one_line(
             finding.message
         )
         if finding.hint:
-            yield f"      {printable(finding.hint)}"
+            yield f"      {one_line(finding.hint)}"
 
 
 def _node(node: PicturedNode) -> tuple[str, ...]:
@@ -65,15 +66,15 @@ def _node(node: PicturedNode) -> tuple[str, ...]:
     where = remark(node.presence)
     notes = [*where, *(each for each in node.notes if not where or each != "not declared")]
     return (
-        f"{STATES[node.state].symbol} {printable(node.name)}",
+        f"{STATES[node.state].symbol} {one_line(node.name)}",
         node.state.value,
         pid,
-        " ".join(filter(None, [printable(", ".join(notes)), numbers(node.findings)])),
+        " ".join(filter(None, [one_line(", ".join(notes)), numbers(node.findings)])),
     )
 
 
 def _line(line: PicturedLine, names: dict[str, str]) -> Iterator[str]:
-    yield f"  {line.kind.value} {printable(line.name)}  {printable(' ≠ '.join(line.types))}"
+    yield f"  {line.kind.value} {one_line(line.name)}  {one_line(' ≠ '.join(line.types))}"
     for arrow in line.arrows:
         yield f"    {_arrow(arrow, names)}"
     alone = line.alone
@@ -83,21 +84,21 @@ def _line(line: PicturedLine, names: dict[str, str]) -> Iterator[str]:
     ):
         for end in ends:
             words = end_words(end)
-            said = f"  ({printable(', '.join(words))})" if words else ""
+            said = f"  ({one_line(', '.join(words))})" if words else ""
             if end in alone:
-                yield f"    {before}{printable(names[end.node])}{after}{said}"
+                yield f"    {before}{one_line(names[end.node])}{after}{said}"
             elif said:
-                yield f"      {printable(names[end.node])}{said}"
+                yield f"      {one_line(names[end.node])}{said}"
 
 
 def _arrow(arrow: PicturedArrow, names: dict[str, str]) -> str:
     words = [*arrow.notes, *remark(arrow.presence)]
     if arrow.outcome not in (Outcome.OK, None):
         words.append(arrow.outcome.value)
-    said = f"  ({', '.join(words)})" if words else ""
+    said = one_line(f"  ({', '.join(words)})") if words else ""
     return (
-        f"{printable(names[arrow.source])} {_ARROWS[arrow.presence]} "
-        f"{printable(names[arrow.target])}{said}"
+        f"{one_line(names[arrow.source])} {_ARROWS[arrow.presence]} "
+        f"{one_line(names[arrow.target])}{said}"
     )
 
 
@@ -105,20 +106,20 @@ def _participants(node: PicturedNode, process: str) -> Iterator[str]:
     where = [process or (f"process {node.process}" if node.process else "")]
     where += [f"pid {node.pid}"] if node.pid else []
     said = f"  {', '.join(filter(None, where))}" if any(where) else ""
-    yield f"    {printable(node.name)}{printable(said)}"
+    yield f"    {one_line(node.name)}{one_line(said)}"
     for each in node.participants:
         words = [*remark(each.presence), *each.notes]
         if len(node.participants) > 1 or words:
             gap = "  " if words else ""
-            yield f"      {printable(each.name)}{gap}{printable(', '.join(words))}"
+            yield f"      {one_line(each.name)}{gap}{one_line(', '.join(words))}"
 
 
 def _flow(flow: PicturedFlow) -> tuple[str, ...]:
     judged = flow.outcome if flow.presence is not Presence.UNDECLARED else None
     outcome = judged.value if judged else ""
     return (
-        printable(flow.topic),
-        f"{printable(flow.names[0])} {_ARROWS[flow.presence]} {printable(flow.names[1])}",
+        one_line(flow.topic),
+        f"{one_line(flow.names[0])} {_ARROWS[flow.presence]} {one_line(flow.names[1])}",
         edge_label(flow),
         ", ".join(flow.tuples),
         ", ".join(flow.demands),

@@ -7,7 +7,7 @@ check.connection-flow. Their addresses and ports are `connection_urls`'. Pure.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.document import error, warning
@@ -144,10 +144,19 @@ def _flows(node: Node, connection: ConnectionDeclaration, needs: FlowNeeds) -> I
     ]
     for kind, each in found:
         yield from _carrier(connection, kind, each, transports)
-    publishers = [name for kind, name in connection.map if kind is EndpointKind.PUBLISHER]
+    publisher = EndpointKind.PUBLISHER
+    publishers = [name for kind, name in connection.map if kind is publisher]
     for kind, each in found:
-        if kind is EndpointKind.PUBLISHER:
+        if kind is publisher:
             yield from _apart(node, connection, each, publishers, needs)
+        elif each.dscp is not None:
+            sharing = [(name, needs.of(node.key, publisher, name)) for name in publishers]
+            sharing += [
+                (one.need.name, one)
+                for other, one in found
+                if other is kind and one.dscp is not None and one is not each
+            ]
+            yield from _marked_apart(connection, each, sharing)
 
 
 def _what(kind: EndpointKind, each: ResolvedNeed) -> str:
@@ -204,21 +213,36 @@ def _apart(
             "sockets"
         )
         yield error(rule, each.need.at, message, "give it a connection of its own")
+    if each.dscp is not None:
+        sharing = [(name, needs.of(node.key, each.need.kind, name)) for name in others]
+        yield from _marked_apart(connection, each, sharing)
+
+
+def _marked_apart(
+    connection: ConnectionDeclaration,
+    each: ResolvedNeed,
+    sharing: Sequence[tuple[str, ResolvedNeed | None]],
+) -> Iterator[Diagnostic]:
+    """Judge whether the sockets of the connection may carry the mark of one endpoint.
+
+    `sharing` has the name and need of those that send from them too.
+    """
+    assert each.dscp is not None
+    rule, noun, name = "check.connection-flow", each.need.kind.noun, each.need.name
     marks = {url.dscp for url in connection.urls if url.dscp is not None}
     for mark in sorted(marks - {each.dscp}):
-        if each.dscp is not None:
-            message = (
-                f"cannot mark publisher {name!r} {describe(each.dscp)}: a URL of connection "
-                f"{connection.name!r} says {describe(mark)}"
-            )
-            yield error(rule, each.need.at, message, "say it once")
-    for other in others:
-        resolved = needs.of(node.key, EndpointKind.PUBLISHER, other)
+        message = (
+            f"cannot mark {noun} {name!r} {describe(each.dscp)}: a URL of connection "
+            f"{connection.name!r} says {describe(mark)}"
+        )
+        yield error(rule, each.need.at, message, "say it once")
+    for other, resolved in sharing:
         theirs = resolved.dscp if resolved else None
-        if each.dscp is not None and theirs != each.dscp:
-            has = describe(theirs) if theirs is not None else "no DSCP"
-            message = (
-                f"cannot mark publisher {name!r} {describe(each.dscp)} on connection "
-                f"{connection.name!r}: {other!r} shares its sockets and has {has}"
-            )
-            yield error(rule, each.need.at, message, "give it a connection of its own")
+        if theirs == each.dscp:
+            continue
+        has = describe(theirs) if theirs is not None else "no DSCP"
+        message = (
+            f"cannot mark {noun} {name!r} {describe(each.dscp)} on connection "
+            f"{connection.name!r}: {other!r} shares its sockets and has {has}"
+        )
+        yield error(rule, each.need.at, message, "give it a connection of its own")

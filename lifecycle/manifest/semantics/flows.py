@@ -12,6 +12,7 @@ from lifecycle.manifest.diagnostics import Diagnostic
 from lifecycle.manifest.document import error, warning
 from lifecycle.manifest.flow_needs import OWN_FLOW, FlowNeeds, ResolvedNeed
 from lifecycle.manifest.model import EndpointKind, FlowNeed, Node, RunKind
+from lifecycle.manifest.qos import Reliability
 from lifecycle.manifest.semantics.system import System
 from lifecycle.manifest.wording import did_you_mean
 from lifecycle.network.dscp import MAX_DSCP, describe
@@ -37,7 +38,7 @@ def check(system: System, needs: FlowNeeds) -> Iterator[Diagnostic]:
     """Yield findings about flow needs, but for `endpoints`."""
     for node in system.manifest.nodes:
         for each in needs.of_node(node):
-            yield from _marking(each)
+            yield from _marking(node, each)
             yield from _class(each)
             if node.run.kind is not RunKind.PYTHON:
                 yield from _foreign(node, each)
@@ -65,21 +66,24 @@ def _endpoint(node: Node, need: FlowNeed) -> Iterator[Diagnostic]:
     yield error("check.flow-unknown-endpoint", need.at, message, hint)
 
 
-def _marking(each: ResolvedNeed) -> Iterator[Diagnostic]:
+def _marking(node: Node, each: ResolvedNeed) -> Iterator[Diagnostic]:
     need = each.need
     given = [
         word
         for word, value in (("a DSCP", need.dscp), ("a priority", need.transport_priority))
         if value is not None
     ]
-    if given and need.kind is not EndpointKind.PUBLISHER:
-        message = f"cannot mark {need.kind.noun} {need.name!r} with {given[0]}: only senders mark"
-        yield error("check.flow-dscp", need.at, message, "give it to the publishers of the topic")
-        return
+    if given and need.kind is EndpointKind.SUBSCRIPTION and _is_best_effort(node, need):
+        message = (
+            f"cannot mark anything that subscription {need.name!r} sends with {given[0]}: it is "
+            f"BEST_EFFORT and acknowledges nothing"
+        )
+        hint = "make it RELIABLE, or mark the publishers of the topic"
+        yield warning("check.flow-dscp", need.at, message, hint)
     if len(given) > 1:
         message = (
-            f"cannot give publisher {need.name!r} both dscp and transport_priority: each is the "
-            f"whole mark"
+            f"cannot give {need.kind.noun} {need.name!r} both dscp and transport_priority: each is "
+            f"the whole mark"
         )
         yield error("check.flow-dscp", need.at, message, f"keep one; {_both(need)}")
         return
@@ -93,6 +97,19 @@ def _marking(each: ResolvedNeed) -> Iterator[Diagnostic]:
         rule = "check.five-qi-class" if need.transport_priority is None else ""
         message, _, hint = note.partition("; ")
         yield warning(rule or "check.transport-priority", need.at, message, hint)
+
+
+def _is_best_effort(node: Node, need: FlowNeed) -> bool:
+    """Whether a reader sends no ACKNACK: a BEST_EFFORT one never does (DDSI-RTPS §8.4.11)."""
+    qos = next(
+        (
+            each.qos
+            for each in node.interface.endpoints
+            if (each.kind, each.name) == (need.kind, need.name)
+        ),
+        None,
+    )
+    return qos is not None and qos.reliability is Reliability.BEST_EFFORT
 
 
 def _both(need: FlowNeed) -> str:

@@ -24,8 +24,8 @@ _OWN = "give it another DSCP, or none: then it gets one that nobody has"
 def check(system: System, needs: FlowNeeds) -> Iterator[Diagnostic]:
     """Yield findings about publishers that their DSCP tells apart.
 
-    All nodes are counted. The article counts subscriptions too; a subscription sends no data and so
-    has no DSCP, and is told apart by its port.
+    All nodes are counted. The article counts subscriptions too; here they are told apart by their
+    ports, and a DSCP that one acknowledges with must only not be an identifier of another's.
     """
     if system.manifest.network.flow_identification is FlowIdentification.DSCP:
         yield from _repurposed(system, needs)
@@ -40,11 +40,21 @@ def _publishers(system: System, needs: FlowNeeds) -> Iterator[tuple[Resolved, Re
             yield each, need
 
 
+def _subscriptions(system: System, needs: FlowNeeds) -> Iterator[tuple[Resolved, ResolvedNeed]]:
+    for each in system.endpoints:
+        need = needs.of(each.node.key, each.endpoint.kind, each.endpoint.name)
+        if need is not None and each.endpoint.kind is EndpointKind.SUBSCRIPTION:
+            yield each, need
+
+
 def _repurposed(system: System, needs: FlowNeeds) -> Iterator[Diagnostic]:
     publishers = list(_publishers(system, needs))
     relying = {id(need) for _, need in _relying(system, needs)}
     asking = [each for each in publishers if each[1].unique or id(each[1]) in relying]
-    others = [each for each in publishers if not (each[1].unique or id(each[1]) in relying)]
+    others = [
+        *(each for each in publishers if not (each[1].unique or id(each[1]) in relying)),
+        *_subscriptions(system, needs),
+    ]
     for _, need in asking:
         message, hint = need.marking.problem
         if message and need.need.transport_priority is None:
@@ -57,8 +67,9 @@ def _repurposed(system: System, needs: FlowNeeds) -> Iterator[Diagnostic]:
         other = None if need.dscp is None else holders.get(need.dscp)
         if need.dscp is not None and other is not None and other is not each:
             message = (
-                f"cannot give publisher {each.name!r} of {each.node.key!r} {describe(need.dscp)}: "
-                f"it identifies {other.name!r} of {other.node.key!r} ({spell(other.at)})"
+                f"cannot give {each.endpoint.kind.noun} {each.name!r} of {each.node.key!r} "
+                f"{describe(need.dscp)}: it identifies {other.name!r} of {other.node.key!r} "
+                f"({spell(other.at)})"
             )
             yield error("check.dscp-not-unique", need.need.at, message, _OWN)
     at = system.manifest.network.at

@@ -76,8 +76,13 @@ def _uniqueness(link: Link, ends: list[Resolved], needs: FlowNeeds) -> Iterator[
         for each in silent:
             message = f"{_flow(link)}: {_end_name(each)} does not ask to be unique"
             yield error("check.link-not-unique", link.at, message, _remedy(each))
-    # A DSCP of its own makes an NFE unique as well; `flows` judges whether it is its own.
-    marked = any(_dscp(each, needs) is not None for each in ends)
+    # A DSCP of its own makes an NFE unique as well; `flows` judges whether it is its own. That of
+    # a subscription is of its acknowledgements and tells no data apart.
+    marked = any(
+        _dscp(each, needs) is not None
+        for each in ends
+        if each.endpoint.kind is EndpointKind.PUBLISHER
+    )
     if link.unique is UniqueHow.WEAKLY and len(silent) == len(ends) and not marked:
         names = " nor ".join(_end_name(each) for each in ends)
         message = f"{_flow(link)}: neither {names} asks to be unique"

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 from lifecycle.manifest.diagnostics import Diagnostic
 from lifecycle.manifest.document import error, warning
-from lifecycle.manifest.model import EndpointKind
+from lifecycle.manifest.model import EndpointKind, RunKind
 from lifecycle.manifest.qos import Certainty, Incompatibility, incompatibilities
 from lifecycle.manifest.semantics.system import Resolved, System
 
@@ -41,7 +41,10 @@ def _judge(
         return  # types that differ are `types`'s finding
     other = requesting if at is offering else offering
     doubtful = []
+    unknown = _left_open(offering) | _left_open(requesting)
     for each in incompatibilities(offered, requested):
+        if each.policy in unknown:
+            continue
         values = f"{each.policy} is offered {each.offered} and requested {each.requested}{what}"
         if each.severity is Certainty.CERTAIN:
             message = f"cannot match {other} on {at.name!r}: {values}"
@@ -52,6 +55,16 @@ def _judge(
         message = f"cannot tell whether this matches {other} on {at.name!r}: {', '.join(doubtful)}"
         hint = "write the values at both ends"
         yield warning("check.qos-doubtful", at.at, message, hint)
+
+
+def _left_open(end: Resolved) -> set[str]:
+    """Return the policies that only a node's own code knows: it is not ours, and nobody wrote them.
+
+    Whether they fit is judged when it runs (graph.qos-incompatible).
+    """
+    if end.node.run.kind is RunKind.PYTHON:
+        return set()
+    return {policy.removesuffix("_ns") for policy in end.endpoint.qos_defaults}
 
 
 def _is_settled(each: Incompatibility) -> bool:

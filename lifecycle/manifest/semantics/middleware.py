@@ -40,7 +40,7 @@ def check(system: System, needs: FlowNeeds, environment: Mapping[str, str]) -> I
             if each.dscp is not None:
                 cell = capabilities(rmw).dscp
                 must = each.need.enforce
-                what = f"publisher {each.need.name!r} of {node.key!r}"
+                what = f"{each.need.kind.noun} {each.need.name!r} of {node.key!r}"
                 yield from _judge(each, what, dscp_feasibility(rmw), cell, must=must)
 
 

@@ -18,6 +18,7 @@ from lifecycle.manifest.nodl import nearest_file
 from lifecycle.manifest.semantics.parameter_sections import Section, read_sections
 from lifecycle.manifest.semantics.parameter_types import is_implicit, misfit, suggestion
 from lifecycle.manifest.semantics.system import System, full_name
+from lifecycle.manifest.source import is_outside
 from lifecycle.manifest.wording import did_you_mean
 
 
@@ -37,19 +38,19 @@ def check(system: System) -> Iterator[Diagnostic]:
     for node in system.manifest.nodes:
         for index, path in enumerate(node.parameter_files):
             if path not in files:
-                files[path] = _File(shown=_shown(path, system.manifest.path))
+                files[path] = _File(shown=shown_path(path, system.manifest.path))
                 yield from _read(path, files[path], node, index)
             files[path].readers.append(node)
     for path, file in files.items():
         for node in file.readers:
             if file.readable:
-                yield from _unmatched_node(path, file, node)
+                yield from _unmatched_node(path, file, node, system.manifest.path)
                 yield from _values(file, node)
         yield from _unmatched_sections(file, system)
         yield from _unknown_to_all(file)
 
 
-def _shown(path: str, manifest: str) -> str:
+def shown_path(path: str, manifest: str) -> str:
     """Return a file's path as the user would write it beside the manifest's."""
     folder = Path(manifest).parent
     # relpath, not relative_to: a file may well lie beside the manifest's folder.
@@ -68,13 +69,15 @@ def _read(path: str, file: _File, node: Node, index: int) -> Iterator[Diagnostic
     yield from found
 
 
-def _unmatched_node(path: str, file: _File, node: Node) -> Iterator[Diagnostic]:
+def _unmatched_node(path: str, file: _File, node: Node, manifest: str) -> Iterator[Diagnostic]:
     name = full_name(node)
     if any(section.matches(name) for section in file.sections):
         return
     at = node.where(f"parameter_files.{node.parameter_files.index(path)}")
     patterns = [section.pattern for section in file.sections]
     listed = ", ".join(repr(each) for each in patterns) or "no node"
+    if is_outside(path, manifest, os.environ):
+        listed = "others" if patterns else "no node"
     message = f"cannot find node {name!r} in {file.shown!r}: it is for {listed}"
     hint = f"name the section {name}, or /** for every node"
     yield warning("check.parameter-file-unmatched", at, message, hint)

@@ -41,7 +41,7 @@ def _given(node: Node) -> Iterator[Diagnostic]:
 
 
 def _no_effect(node: Node) -> Iterator[Diagnostic]:
-    """Warn of what a node that somebody else starts will never be given."""
+    """Warn of what a node that somebody else starts will never be given, only judged by."""
     if node.run.kind is not RunKind.ATTACH:
         return
     places = [(f"parameters.{name}", "parameters") for name, _ in node.parameters[:1]]
@@ -49,6 +49,6 @@ def _no_effect(node: Node) -> Iterator[Diagnostic]:
         (f"parameter_files.{i}", "parameter files") for i in range(len(node.parameter_files))
     ]
     for place, what in places[:1]:
-        message = f"cannot give {what} to {node.key!r}: somebody else starts it"
-        hint = "remove them, or give them where it is started"
+        message = f"cannot give {what} to {node.key!r}, which is attached: they are only verified"
+        hint = "give them where it is started"
         yield warning("check.parameter-unused", node.where(place), message, hint)

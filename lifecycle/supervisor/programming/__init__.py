@@ -24,7 +24,7 @@ from lifecycle.supervisor.programming.programmer import (
     open_programmer,
 )
 from lifecycle.supervisor.programming.targets import KINDS, TargetOptions
-from lifecycle.supervisor.programming.tc import parse_rate
+from lifecycle.supervisor.programming.tc import parse_queue, parse_rate
 
 __all__ = [
     "KINDS",
@@ -45,6 +45,7 @@ __all__ = [
     "TargetOptions",
     "Treatment",
     "open_programmer",
+    "parse_queue",
     "parse_rate",
     "remove_run",
     "sweep_orphans",

@@ -7,14 +7,12 @@ are `export.camara`.
 from __future__ import annotations
 
 import datetime as dt
-import math
 from collections.abc import Sequence
-from typing import Any
 
 from lifecycle.export.camara import camara_sessions
 from lifecycle.export.rules import FlowRule
 from lifecycle.supervisor.programming.errors import HttpError
-from lifecycle.supervisor.programming.http import Api, as_segment
+from lifecycle.supervisor.programming.http import Api, Fields, as_segment, show, text_of
 from lifecycle.supervisor.programming.ledger import Entry
 from lifecycle.supervisor.programming.remote import Ask, Body, Made, asks_of
 from lifecycle.supervisor.programming.settings import CamaraTargetSettings
@@ -30,6 +28,12 @@ _MARGIN_S = (5.0, 300.0)
 """… but at least and at most so many seconds before it expires."""
 
 _POLL_S = 0.25
+
+_STATUSES = ("REQUESTED", "AVAILABLE", "UNAVAILABLE")
+"""QosStatus of QualityOnDemand 1.1.0."""
+
+_LONGEST_S = 2**31 - 1
+"""Largest `duration`, an int32."""
 
 
 class CamaraService:
@@ -63,36 +67,41 @@ class CamaraService:
         """
         reply = self._api.request("POST", "/sessions", body)
         session = reply.object()
-        id_ = _id_of(session)
+        id_ = session.identifier("sessionId")
         if not id_:
             raise HttpError(
                 f"cannot tell what {self._api.url}/sessions has made: its answer has no sessionId",
                 status=reply.status,
                 uncertain=True,
             )
-        session = self._settled(id_, session)
-        if session.get("qosStatus") == "UNAVAILABLE":
+        try:
+            session = self._settled(id_, session)
+            if _status(session) != "UNAVAILABLE":
+                return self._made(id_, session, body)
+            why = _why(session)
             self.delete(id_)
-            raise HttpError(
-                f"cannot get this QoS: the network made session {id_} unavailable "
-                f"({session.get('statusInfo', 'no reason given')})",
-                status=reply.status,
-            )
-        return self._made(session, body)
+        except HttpError as error:
+            error.uncertain = True  # it was made, whatever became of asking for its state
+            raise
+        raise HttpError(
+            f"cannot get this QoS: the network made session {id_} unavailable ({why})",
+            status=reply.status,
+        )
 
     def find(self, body: Body) -> Made | None:
         """Look through the device's sessions for one that asks for the same."""
         asked = {"device": body["device"]} if "device" in body else {}
         reply = self._api.request("POST", "/retrieve-sessions", asked, may_be_gone=True)
-        for each in reply.body if isinstance(reply.body, list) else ():
-            if isinstance(each, dict) and _id_of(each) and not _differs(body, each, missing=True):
-                return self._made(each, body)
+        for each in reply.objects():
+            id_ = each.identifier("sessionId")
+            if id_ and not _differs(body, each, missing=True):
+                return self._made(id_, each, body)
         return None
 
     def see(self, id_: str, body: Body) -> Made | None:
         """GET it; one that has ended counts as different, for it has to be deleted first."""
         reply = self._api.request("GET", _path(id_), may_be_gone=True)
-        return None if reply.gone else self._made(reply.object(), body)
+        return None if reply.gone else self._made(id_, reply.object(), body)
 
     def update(self, id_: str, before: Body, body: Body) -> Made:  # noqa: ARG002 - Service
         """Delete and create: a session cannot be changed, and two for one flow are a conflict."""
@@ -121,7 +130,7 @@ class CamaraService:
                 raise
         else:
             if not reply.gone:
-                made = self._made(reply.object(), body)
+                made = self._made(entry.id, reply.object(), body)
                 if made.expires_s is not None and made.expires_s > (entry.expires_s or 0.0) + 1:
                     return made
         return self.update(entry.id, body, body)
@@ -134,60 +143,63 @@ class CamaraService:
         margin_s = min(max(_MARGIN * self._settings.duration_s, least), most)
         return entry.expires_s - margin_s - self._api.clock.now_s()
 
-    def _settled(self, id_: str, session: dict[str, Any]) -> dict[str, Any]:
+    def _settled(self, id_: str, session: Fields) -> Fields:
         """Ask until the session is more than requested, for `wait_s`."""
         wait_s = _POLL_S
         deadline_s = self._api.clock.now_s() + self._settings.wait_s
-        while session.get("qosStatus") == "REQUESTED":
+        while _status(session) == "REQUESTED":
             left_s = deadline_s - self._api.clock.now_s()
             if left_s <= 0:
                 break
-            self._api.clock.sleep(min(wait_s, left_s))
+            self._api.pause(min(wait_s, left_s))
             wait_s *= 2
             session = self._api.request("GET", _path(id_)).object()
         return session
 
-    def _made(self, session: dict[str, Any], body: Body) -> Made:
-        status = session.get("qosStatus")
+    def _made(self, id_: str, session: Fields, body: Body) -> Made:
+        status = _status(session)
         if status == "UNAVAILABLE":
-            ended = f"it ended: {session.get('statusInfo', 'no reason given')}"
-            return Made(id=_id_of(session), differs=ended)
-        granted = session.get("duration")
+            return Made(id=id_, differs=f"it ended: {_why(session)}")
+        granted = session.whole("duration", 1, _LONGEST_S)
         detail = "requested, not yet available" if status == "REQUESTED" else ""
-        if isinstance(granted, int) and granted < self._settings.duration_s:
+        if granted is not None and granted < self._settings.duration_s:
             detail = f"granted for {granted} s instead of {self._settings.duration_s} s"
         return Made(
-            id=_id_of(session),
-            expires_s=self._expires_s(session),
+            id=id_,
+            expires_s=self._expires_s(session, granted),
             detail=detail,
             differs=_differs(body, session),
         )
 
-    def _expires_s(self, session: dict[str, Any]) -> float | None:
-        """When a session ends, seconds since the epoch; the latest it can, if nobody says."""
-        told = session.get("expiresAt")
-        if isinstance(told, str) and (when := _parse_time(told)) is not None:
+    def _expires_s(self, session: Fields, granted_s: int | None) -> float | None:
+        """When a session ends, seconds since the epoch; the latest it can, if nothing says when."""
+        text = session.text("expiresAt")
+        if text:
+            when = _parse_time(text)
+            if when is None:
+                session.refuse("expiresAt", "a date and time with a time zone (RFC 3339)", text)
             return when
-        granted = session.get("duration")
-        if isinstance(granted, int | float) and math.isfinite(granted):
-            return self._api.clock.now_s() + granted
-        return None
+        return None if granted_s is None else self._api.clock.now_s() + granted_s
 
 
 def _path(id_: str) -> str:
     return f"/sessions/{as_segment(id_)}"
 
 
-def _id_of(session: dict[str, Any]) -> str:
-    found = session.get("sessionId")
-    return found if isinstance(found, str) else ""
+def _status(session: Fields) -> str:
+    return session.one_of("qosStatus", _STATUSES)
 
 
-def _differs(asked: Body, seen: dict[str, Any], *, missing: bool = False) -> str:
+def _why(session: Fields) -> str:
+    return text_of(session.text("statusInfo")) or "no reason given"
+
+
+def _differs(asked: Body, seen: Fields, *, missing: bool = False) -> str:
     """Why what the server shows is not what was asked for; empty if it is."""
     for key in _COMPARED:
-        if (key in seen or missing) and seen.get(key) != asked.get(key):
-            return f"the server has {key} {seen.get(key)!r}"
+        found = seen.values.get(key)
+        if (key in seen.values or missing) and found != asked.get(key):
+            return f"the server has {key} {show(found)}"
     return ""
 
 
@@ -196,9 +208,9 @@ def _parse_time(text: str) -> float | None:
     try:
         # Python 3.10 reads neither Z nor fractions of other than 3 or 6 digits.
         when = dt.datetime.fromisoformat(_plain_fraction(text.upper().replace("Z", "+00:00")))
-    except ValueError:
+        return None if when.tzinfo is None else when.timestamp()
+    except (ValueError, OverflowError):
         return None
-    return None if when.tzinfo is None else when.timestamp()
 
 
 def _plain_fraction(text: str) -> str:

@@ -54,15 +54,27 @@ class HttpError(ProgrammingError):
 
 
 class PartlyError(ProgrammingError):
-    """Some flows could not be programmed; the others are.
+    """Some flows or targets could not be programmed; the others are.
 
     Attributes:
-        errors: one per flow.
+        errors: one per flow or target.
+        done: what was done all the same and is there now, as text for people, one per target.
     """
 
     def __init__(
-        self, target: str, total: int, errors: Sequence[tuple[str, LifecycleError]]
+        self,
+        target: str,
+        total: int,
+        errors: Sequence[tuple[str, LifecycleError]],
+        *,
+        done: Sequence[str] = (),
     ) -> None:
         lines = "".join(f"\n  {key}{': ' if key else ''}{error}" for key, error in errors)
-        super().__init__(f"cannot make {len(errors)} of {total} changes to {target}:{lines}")
+        made = "\n".join(("\ndone all the same:", *done)) if done else ""
+        super().__init__(f"cannot make {len(errors)} of {total} changes to {target}:{lines}{made}")
         self.errors = tuple(errors)
+        self.done = tuple(done)
+
+    def __str__(self) -> str:
+        """The message ends with lists, so a hint has a line of its own."""
+        return f"{self.message}\n{self.hint}" if self.hint else self.message

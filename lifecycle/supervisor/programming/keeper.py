@@ -8,13 +8,17 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import time
 from collections.abc import Callable, Coroutine, Iterator, Sequence
 from typing import Any, Protocol, TypeVar
 
 from lifecycle.errors import LifecycleError
 from lifecycle.graph.waiting import set_within
 from lifecycle.supervisor.programming.changes import Changes
+from lifecycle.supervisor.together import ended
 from lifecycle.verify.verdict import FlowReport
+
+_T = TypeVar("_T")
 
 _AGAIN_S = (2.0, 60.0)
 """First and longest pause after a failure."""
@@ -22,20 +26,42 @@ _AGAIN_S = (2.0, 60.0)
 _SOON_S = 1.0
 """Nothing is renewed more often than so."""
 
+CLOSE_S = 10.0
+"""For servers to delete in the end what was made; as much as one request may take by default."""
 
-class Programs(Protocol):
+_HURRIED_S = 1.0
+"""The same for who was asked to hurry before: a server that is well answers in less."""
+
+_STILL_THERE = "what is left is listed, and removed by the next 'lifecycle down' or 'flows remove'"
+
+
+class Removes(Protocol):
+    """What removes everything of one run from networks."""
+
+    def close(self, *, within_s: float | None) -> tuple[Changes, ...]:
+        """Remove everything."""
+        ...
+
+    def cancel(self) -> None:
+        """From another thread: let what is under way fail at once."""
+        ...
+
+
+class Programs(Removes, Protocol):
     """What a Programmer does for its keeper."""
 
-    def update(self, flows: Sequence[FlowReport], *, hold: bool) -> tuple[Changes, ...]:
+    def update(
+        self, flows: Sequence[FlowReport], *, hold: bool, within_s: float | None
+    ) -> tuple[Changes, ...]:
         """Bring networks up to date."""
         ...
 
-    def renew(self) -> float | None:
+    def renew(self, *, within_s: float | None) -> float | None:
         """Prolong what would expire; return seconds until the next time."""
         ...
 
-    def close(self) -> tuple[Changes, ...]:
-        """Remove everything."""
+    def resume(self) -> None:
+        """Work again after a `cancel`."""
         ...
 
 
@@ -53,17 +79,23 @@ class Keeper:
         self._flows: tuple[FlowReport, ...] | None = None
         self._changed = asyncio.Event()
         self._task: asyncio.Task[None] | None = None
+        self._one_at_a_time = asyncio.Lock()  # the programmer is of one thread
 
-    async def begin(self, flows: Sequence[FlowReport]) -> None:
-        """Program for the first time, and be done when this returns.
+    async def begin(self, flows: Sequence[FlowReport], within_s: float | None = None) -> None:
+        """Program these flows, and be done when this returns; again whenever a gate opens.
+
+        Cancelled, it is over as soon as what is under way has been cut off.
+
+        Args:
+            flows: verified.
+            within_s: for all that servers are asked.
 
         Raises:
             LifecycleError: it failed; what was made all the same is removed by `close`.
         """
+        await self._stop()  # what follows verdicts may wait for servers far longer than this may
         self._flows = tuple(flows)
-        texts, _ = await _whole(asyncio.to_thread(self._once))
-        for text in texts:
-            self._tell(text)
+        await self._program(within_s)
         self.take(flows)  # from now on renewed in time
 
     def take(self, flows: Sequence[FlowReport]) -> None:
@@ -73,19 +105,22 @@ class Keeper:
         if self._task is None:
             self._task = asyncio.ensure_future(self._run())
 
-    async def close(self) -> None:
-        """Stop, and remove from networks everything that is ours; failures are told."""
-        task, self._task = self._task, None
+    async def close(self, hurry: asyncio.Event | None = None) -> None:
+        """Stop, and remove from networks everything that is ours; failures become notices.
+
+        Args:
+            hurry: once set, no server is waited for any more.
+        """
         try:
-            if task is not None:
-                task.cancel()
-                with contextlib.suppress(asyncio.CancelledError):
-                    await task
+            await self._stop()
         finally:
-            with self._telling():
-                for each in await asyncio.to_thread(self._programmer.close):
-                    if each.changes:
-                        self._tell(each.render(done=True))
+            await remove(self._programmer, self._tell, hurry)
+
+    async def _stop(self) -> None:
+        """Follow no verdicts until `take`."""
+        task, self._task = self._task, None
+        if task is not None:
+            await ended(task)
 
     async def _run(self) -> None:
         pause_s: float | None = None
@@ -96,18 +131,42 @@ class Keeper:
             failed = True
             due_s = None
             with self._telling():
-                texts, due_s = await _whole(asyncio.to_thread(self._once))
-                for text in texts:
-                    self._tell(text)
+                due_s = await self._program()
                 failed = False
             again_s = min(again_s * 2, _AGAIN_S[1]) if failed else _AGAIN_S[0]
             pause_s = again_s if failed else due_s if due_s is None else max(due_s, _SOON_S)
 
-    def _once(self) -> tuple[list[str], float | None]:
+    async def _program(self, within_s: float | None = None) -> float | None:
+        """Program the latest flows and say what was done; return when it must be done again."""
+        loop = asyncio.get_running_loop()
+
+        def say(text: str) -> None:
+            # At once: whoever is cancelled meanwhile has changed the networks all the same.
+            loop.call_soon_threadsafe(self._tell, text)
+
+        async with self._one_at_a_time:
+            return await self._whole(asyncio.to_thread(self._once, within_s, say))
+
+    def _once(self, within_s: float | None, say: Callable[[str], None]) -> float | None:
         assert self._flows is not None
-        done = self._programmer.update(self._flows, hold=True)
-        texts = [each.render(done=True) for each in done if each.pending]
-        return texts, self._programmer.renew()
+        until_s = None if within_s is None else time.monotonic() + within_s
+        done = self._programmer.update(self._flows, hold=True, within_s=within_s)
+        for each in done:
+            if each.pending:
+                say(each.render(done=True))
+        left_s = None if until_s is None else until_s - time.monotonic()
+        return self._programmer.renew(within_s=left_s)
+
+    async def _whole(self, work: Coroutine[Any, Any, _T]) -> _T:
+        """Wait for work in a thread to its end; cancelled, have it end at once."""
+        task = asyncio.ensure_future(work)
+        try:
+            return await asyncio.shield(task)
+        except asyncio.CancelledError:
+            self._programmer.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+            self._programmer.resume()
+            raise
 
     @contextlib.contextmanager
     def _telling(self) -> Iterator[None]:
@@ -117,14 +176,31 @@ class Keeper:
             self._tell(str(error))
 
 
-_T = TypeVar("_T")
+async def remove(
+    removes: Removes, tell: Callable[[str], None], hurry: asyncio.Event | None = None
+) -> None:
+    """Remove everything of one run, in a thread and within CLOSE_S for all servers together.
 
-
-async def _whole(work: Coroutine[Any, Any, _T]) -> _T:
-    """Wait for work in a thread to its end even when cancelled: it cannot be stopped half-way."""
-    task = asyncio.ensure_future(work)
+    Args:
+        removes: see Removes.
+        tell: takes what was done or failed, as text for people.
+        hurry: once set, no server is waited for any more.
+    """
+    hurry = hurry or asyncio.Event()
+    is_late = hurry.is_set()
+    within_s = _HURRIED_S if is_late else CLOSE_S
+    removing = asyncio.ensure_future(asyncio.to_thread(removes.close, within_s=within_s))
+    if not is_late:
+        hurried = asyncio.ensure_future(hurry.wait())
+        await asyncio.wait({removing, hurried}, return_when=asyncio.FIRST_COMPLETED)
+        await ended(hurried)
+        if not removing.done():
+            removes.cancel()
     try:
-        return await asyncio.shield(task)
-    except asyncio.CancelledError:
-        await asyncio.gather(task, return_exceptions=True)
-        raise
+        done = await removing
+    except LifecycleError as error:
+        tell(f"{error}\n{_STILL_THERE}")
+        return
+    for each in done:
+        if each.changes:
+            tell(each.render(done=True))

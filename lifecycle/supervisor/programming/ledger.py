@@ -177,6 +177,10 @@ class Ledger:
         """Nothing of ours is left in one network."""
         self._write(self._others(target, scope), None)
 
+    def restore(self, target: str, scope: str, record: TargetRecord | None) -> None:
+        """Write down what was of ours in one network before; None if nothing was."""
+        self._write(self._others(target, scope), record)
+
     def _others(self, target: str, scope: str) -> tuple[TargetRecord, ...]:
         return tuple(
             each for each in self.read().targets if (each.target, each.scope) != (target, scope)

@@ -6,7 +6,7 @@ server's view of a subscription is compared with ours. Bodies are `export.nef`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from lifecycle.export.nef import nef_subscriptions
@@ -16,9 +16,10 @@ from lifecycle.supervisor.programming.errors import HttpError
 from lifecycle.supervisor.programming.http import (
     MERGE_PATCH,
     Api,
-    Reply,
+    Fields,
     as_segment,
-    last_segment,
+    show,
+    text_of,
 )
 from lifecycle.supervisor.programming.ledger import Entry
 from lifecycle.supervisor.programming.remote import Ask, Body, Made, asks_of
@@ -71,7 +72,8 @@ class NefService:
             HttpError: refused, or the answer does not say what was made.
         """
         reply = self._api.request("POST", "/subscriptions", body)
-        made = last_segment(reply.location) or _id_of(reply.object())
+        subscription = reply.object(may_be_empty=True)
+        made = reply.created() or subscription.link("self")
         if not made:
             raise HttpError(
                 f"cannot tell what {self._api.url}/subscriptions has made: its answer has neither "
@@ -79,14 +81,15 @@ class NefService:
                 status=reply.status,
                 uncertain=True,
             )
-        return Made(id=made, detail=_refused(reply.object()))
+        return Made(id=made, detail=_refused(subscription))
 
     def find(self, body: Body) -> Made | None:
         """Look through our subscriptions for one that asks for the same."""
         reply = self._api.request("GET", "/subscriptions", may_be_gone=True)
-        for each in reply.body if isinstance(reply.body, list) else ():
-            if isinstance(each, dict) and _id_of(each) and not _differs(body, each, missing=True):
-                return Made(id=_id_of(each))
+        for each in reply.objects():
+            id_ = each.link("self")
+            if id_ and not _differs(body, each, missing=True):
+                return Made(id=id_)
         return None
 
     def see(self, id_: str, body: Body) -> Made | None:
@@ -104,16 +107,14 @@ class NefService:
             return self.create(body)
         patch = {key: body[key] for key in _PATCHABLE if key in body}
         try:
-            reply: Reply | None = self._api.request(
-                "PATCH", _path(id_), patch, content_type=MERGE_PATCH
-            )
+            reply = self._api.request("PATCH", _path(id_), patch, content_type=MERGE_PATCH)
         except HttpError as error:
             if error.status not in _NO_PATCH:
                 raise
             reply = self._api.request("PUT", _path(id_), body, may_be_gone=True)
-        if reply is None or reply.gone:
+        if reply.gone:
             return self.create(body)
-        return Made(id=id_, detail=_refused(reply.object()))
+        return Made(id=id_, detail=_refused(reply.object(may_be_empty=True)))
 
     def delete(self, id_: str) -> None:
         """DELETE it; 204, and 200 as some servers answer."""
@@ -132,47 +133,61 @@ def _path(id_: str) -> str:
     return f"/subscriptions/{as_segment(id_)}"
 
 
-def _id_of(subscription: dict[str, Any]) -> str:
-    link = subscription.get("self")
-    return last_segment(link) if isinstance(link, str) else ""
-
-
-def _refused(subscription: dict[str, Any]) -> str:
+def _refused(subscription: Fields) -> str:
     """Say so if the server granted another reference than was asked for."""
-    granted = subscription.get("appliedQosRef")
-    return f"granted as {granted}" if isinstance(granted, str) and granted else ""
+    granted = text_of(subscription.text("appliedQosRef"))
+    return f"granted as {granted}" if granted else ""
 
 
-def _differs(asked: Body, seen: dict[str, Any], *, missing: bool = False) -> str:
+def _differs(asked: Body, seen: Fields, *, missing: bool = False) -> str:
     """Why what the server shows is not what was asked for; empty if it is.
 
     Args:
         asked: our body.
         seen: the server's; it may add to it.
         missing: something that the server does not show differs too.
+
+    Raises:
+        HttpError: a field is not what the interface has there.
     """
     for key in _COMPARED:
-        if (key in seen or missing) and seen.get(key) != asked.get(key):
-            return f"the server has {key} {seen.get(key)!r}"
-    if ("flowInfo" in seen or missing) and _filters(seen) != _filters(asked):
+        found = seen.text(key)
+        if (key in seen.values or missing) and found != asked.get(key, ""):
+            return f"the server has {key} {show(found)}"
+    if ("flowInfo" in seen.values or missing) and _shown_filters(seen) != _filters(asked):
         return "the server has other filters"
     return ""
 
 
-def _filters(subscription: Body) -> list[str]:
+def _shown_filters(seen: Fields) -> list[str]:
+    """The filters that a server shows.
+
+    Raises:
+        HttpError: they are no list of objects that hold lists of strings.
+    """
+    flows = seen.values.get("flowInfo")
+    if flows is None:
+        return []
+    if not isinstance(flows, list):
+        seen.refuse("flowInfo", "a JSON array", flows)
+    for index, flow in enumerate(flows):
+        if not isinstance(flow, dict):
+            seen.refuse(f"flowInfo[{index}]", "a JSON object", flow)
+        texts = flow.get("flowDescriptions", [])
+        if not isinstance(texts, list) or not all(isinstance(each, str) for each in texts):
+            key = f"flowInfo[{index}].flowDescriptions"
+            seen.refuse(key, "a JSON array of strings", texts if texts is not None else "null")
+    return _filters(seen.values)
+
+
+def _filters(subscription: Mapping[str, Any]) -> list[str]:
     """The filters in one spelling: servers write `17` and `udp`, and other spaces."""
-    flows = subscription.get("flowInfo")
-    texts = [
-        text
-        for flow in (flows if isinstance(flows, list) else [])
-        if isinstance(flow, dict)
-        for text in flow.get("flowDescriptions", [])
-    ]
-    return sorted(map(_spelled, texts))
+    flows = subscription.get("flowInfo", [])
+    return sorted(_spelled(text) for flow in flows for text in flow.get("flowDescriptions", []))
 
 
-def _spelled(text: object) -> str:
+def _spelled(text: str) -> str:
     try:
-        return parse_filter(" ".join(str(text).split())).text()
+        return parse_filter(" ".join(text.split())).text()
     except ValueError:
-        return str(text)
+        return text

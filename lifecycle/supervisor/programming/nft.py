@@ -29,6 +29,7 @@ from lifecycle.supervisor.programming.errors import (
     MissingFeatureError,
     NotOursError,
     PrivilegeError,
+    ProgrammingError,
 )
 from lifecycle.supervisor.programming.ledger import Entry, Ledger, TargetRecord, digest_of
 from lifecycle.supervisor.programming.tool import HostTool, Tool, demand, failure
@@ -86,9 +87,15 @@ class NftTarget:
         if not planned.pending:
             return planned
         text = self._text(marking)
+        before = self._ledger.record(KIND, self._table)
         # Written first: a crash in between leaves an entry without a table, which is harmless.
         self._ledger.put(self._record(marking, seen=""))
-        self._write(text)
+        try:
+            self._write(text)
+        except ProgrammingError:
+            # nft takes a ruleset whole or not at all, so all is as it was.
+            self._ledger.restore(KIND, self._table, before)
+            raise
         self._ledger.put(self._record(marking, seen=digest_of(_steady(self._listing()))))
         return planned
 

@@ -16,6 +16,7 @@ from lifecycle.export.rules import FlowRule, LeftOut, RuleSet, SourceAddress, fl
 from lifecycle.network.five_qi_dscp import DscpMapping
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.programming.changes import Changes, Target
+from lifecycle.supervisor.programming.deadline import Deadline
 from lifecycle.supervisor.programming.errors import PartlyError
 from lifecycle.supervisor.programming.ledger import Ledger
 from lifecycle.supervisor.programming.sources import RouteSources
@@ -46,7 +47,7 @@ class Programmer:
         ledger: of the system, which the targets write to.
         source_address: observes where publishers send from; None believes the manifest only.
         treatment: what flows get beyond what the manifest says.
-        made_by: what to close in the end.
+        made_by: what to close in the end, and holds the deadline.
     """
 
     def __init__(
@@ -65,6 +66,7 @@ class Programmer:
         self._source_address = source_address
         self._treatment = treatment or Treatment()
         self._made_by = made_by
+        self._deadline = made_by.deadline if made_by is not None else Deadline()
         self._applied: tuple[FlowRule, ...] | None = None
         self.left_out: tuple[LeftOut, ...] = ()
 
@@ -89,7 +91,13 @@ class Programmer:
         rules = self._take(flows)
         return "\n".join(each.dry_run(rules) for each in self._targets)
 
-    def update(self, flows: Iterable[FlowReport], *, hold: bool = False) -> tuple[Changes, ...]:
+    def update(
+        self,
+        flows: Iterable[FlowReport],
+        *,
+        hold: bool = False,
+        within_s: float | None = None,
+    ) -> tuple[Changes, ...]:
         """Bring every target up to date with these flows.
 
         Args:
@@ -97,6 +105,7 @@ class Programmer:
             hold: a flow that was programmed and is not verified at this moment keeps its rule
                 until it is verified again or is no longer declared: while a node restarts, its old
                 rule harms nobody, and a session of a mobile network is costly to make again.
+            within_s: for all that servers are asked; None for the patience with each request.
 
         Returns:
             What was done, per target; nothing if the rules are the same as last time.
@@ -112,23 +121,38 @@ class Programmer:
             return ()
         # Forgotten first: if a target fails, the next call must not take it for done.
         self._applied = None
-        with self._ledger.locked():
+        with self._deadline.within(within_s), self._ledger.locked():
             done = _each(self._targets, lambda target: target.apply(rules))
         self._applied = rules
         return done
 
-    def renew(self) -> float | None:
+    def renew(self, *, within_s: float | None = None) -> float | None:
         """Prolong what would expire; return seconds until the next time, None if never."""
-        with self._ledger.locked():
+        with self._deadline.within(within_s), self._ledger.locked():
             due = [each.renew() for each in self._targets]
         return min((each for each in due if each is not None), default=None)
 
-    def close(self) -> tuple[Changes, ...]:
-        """Remove everything that the ledger lists, by whichever target it was made."""
+    def close(self, *, within_s: float | None = None) -> tuple[Changes, ...]:
+        """Remove everything that the ledger lists, by whichever target it was made.
+
+        Args:
+            within_s: for all that servers are asked; None for the patience with each request.
+
+        Raises:
+            PartlyError: something could not be removed, or not in time; it stays listed.
+        """
         try:
-            return remove_all(self._ledger, self._made_by)
+            return remove_all(self._ledger, self._made_by, within_s=within_s)
         finally:
             self.release()
+
+    def cancel(self) -> None:
+        """From another thread: have what servers are asked fail at once, until `resume`."""
+        self._deadline.cancel()
+
+    def resume(self) -> None:
+        """Ask servers again after a `cancel`."""
+        self._deadline.renew()
 
     def release(self) -> None:
         """Close connections and leave in the networks what was made."""
@@ -189,15 +213,22 @@ def open_programmer(
     )
 
 
-def remove_all(ledger: Ledger, targets: Targets | None = None) -> tuple[Changes, ...]:
+def remove_all(
+    ledger: Ledger, targets: Targets | None = None, *, within_s: float | None = None
+) -> tuple[Changes, ...]:
     """Remove everything that a ledger lists.
+
+    Args:
+        ledger: says what there is.
+        targets: make what removes; None for new ones.
+        within_s: for all that servers are asked; None for the patience with each request.
 
     Raises:
         PartlyError: something could not be removed; it stays listed.
     """
     own = targets or Targets(ledger)
     try:
-        with ledger.locked():
+        with own.deadline.within(within_s), ledger.locked():
             records = ledger.read().targets
             return _each(records, lambda record: own.restore(record).remove())
     finally:
@@ -235,8 +266,13 @@ def _each(things: Iterable[_T], do: Callable[[_T], Changes]) -> tuple[Changes, .
             done.append(do(each))
         except LifecycleError as error:  # noqa: PERF203 - the other targets go on
             errors.append(error)
-    if len(errors) == 1:
+    if len(errors) == len(every) == 1:
         raise errors[0]
     if errors:
-        raise PartlyError("targets", len(every), [("", error) for error in errors])
+        raise PartlyError(
+            "targets",
+            len(every),
+            [("", error) for error in errors],
+            done=[each.render(done=True) for each in done if each.changes],
+        )
     return tuple(done)

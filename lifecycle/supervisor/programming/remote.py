@@ -166,8 +166,16 @@ class RemoteTarget:
             else:
                 done.append(dataclasses.replace(change, detail=detail or change.detail))
         if errors:
-            raise PartlyError(self.name, len(planned.changes), errors)
+            raise self._partly(len(planned.changes), errors, done)
         return dataclasses.replace(planned, changes=tuple(done))
+
+    def _partly(
+        self, total: int, errors: Sequence[tuple[str, LifecycleError]], done: Sequence[Change]
+    ) -> PartlyError:
+        made = Changes(target=self.name, changes=tuple(done))
+        return PartlyError(
+            self.name, total, errors, done=[made.render(done=True)] if made.pending else ()
+        )
 
     def dry_run(self, rules: Sequence[FlowRule]) -> str:
         """Return the bodies as JSON, one per flow; asks no server."""
@@ -193,7 +201,7 @@ class RemoteTarget:
             else:
                 done.append(change)
         if errors:
-            raise PartlyError(self.name, len(entries), errors)
+            raise self._partly(len(entries), errors, done)
         return Changes(target=self.name, changes=tuple(done))
 
     def renew(self) -> float | None:

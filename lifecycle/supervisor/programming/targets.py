@@ -11,9 +11,10 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from lifecycle.errors import UsageError
-from lifecycle.export.tc_settings import TcMatch, TcSettings
+from lifecycle.export.tc_settings import DEFAULT_QUEUE_MS, TcMatch, TcSettings
 from lifecycle.supervisor.programming import camara, nef, nft, tc
 from lifecycle.supervisor.programming.changes import Target
+from lifecycle.supervisor.programming.deadline import Deadline
 from lifecycle.supervisor.programming.errors import SettingsError
 from lifecycle.supervisor.programming.http import Api, Clock, Patience
 from lifecycle.supervisor.programming.ledger import Ledger, TargetRecord
@@ -39,6 +40,8 @@ class TargetOptions:
         link_kbit: rate of the link behind it, kbit/s; None for strict priority without rates.
         guaranteed_kbit: rates by class name, kbit/s; tc with a rate only.
         match: what tc's filters look at.
+        queue_ms: how long the queue of each class may become, milliseconds at the link's rate;
+            None for tc_settings.DEFAULT_QUEUE_MS.
         settings: path of the settings file; nef and camara only.
     """
 
@@ -47,6 +50,7 @@ class TargetOptions:
     link_kbit: int | None = None
     guaranteed_kbit: Mapping[str, int] = dataclasses.field(default_factory=dict)
     match: TcMatch = TcMatch.FLOW
+    queue_ms: float | None = None
     settings: str = ""
 
     def __post_init__(self) -> None:
@@ -75,6 +79,7 @@ class TargetOptions:
                 link_kbit=self.link_kbit,
                 guaranteed_kbit=self.guaranteed_kbit,
                 match=self.match,
+                queue_ms=DEFAULT_QUEUE_MS if self.queue_ms is None else self.queue_ms,
             )
         except ValueError as error:
             raise UsageError(str(error)) from error
@@ -88,6 +93,9 @@ class Targets:
         tool: runs nft and tc; None for this host.
         patience: with servers.
         clock: for servers.
+
+    Attributes:
+        deadline: of everything that the targets ask of servers.
     """
 
     def __init__(
@@ -99,6 +107,7 @@ class Targets:
         clock: Clock | None = None,
     ) -> None:
         self.ledger = ledger
+        self.deadline = Deadline()
         self._tool = tool
         self._patience = patience
         self._clock = clock
@@ -174,6 +183,7 @@ class Targets:
             ca_file=ca_file,
             patience=self._patience,
             clock=self._clock,
+            deadline=self.deadline,
         )
         self._open.append(api)
         return api

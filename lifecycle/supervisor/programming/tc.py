@@ -38,15 +38,20 @@ from lifecycle.supervisor.programming.errors import (
     ProgrammingError,
 )
 from lifecycle.supervisor.programming.ledger import Entry, Ledger, TargetRecord, digest_of
-from lifecycle.supervisor.programming.tool import HostTool, Tool, demand, failure
+from lifecycle.supervisor.programming.tool import HostTool, Tool, demand, failure, refused
 
 KIND = "tc"
 
 _BATCH = ("tc", "-batch", "-")
+_HARMLESS = "qdisc add dev lo root handle 1: pfifo\n"
+"""Every kernel with traffic control has pfifo (net/sched/sch_fifo.c), so only privilege fails."""
+
 _NO_DEVICE = re.compile(r"cannot find device", re.IGNORECASE)
 _NEW_CLASS = re.compile(rf" classid ({re.escape(OWNED_HANDLE)}[0-9a-f]+) ")
 _CLASS_ID = re.compile(rf"^class htb ({re.escape(OWNED_HANDLE)}[0-9a-f]+) ", re.MULTILINE)
 _RATE = re.compile(r"([0-9]{1,9})(bit|kbit|mbit|gbit)")
+_DURATION = re.compile(r"([0-9]{1,6}(?:\.[0-9]{1,3})?)(us|ms|s)")
+_MS = {"us": 0.001, "ms": 1.0, "s": 1000.0}
 _KBIT = {"bit": 0.001, "kbit": 1, "mbit": 1000, "gbit": 1_000_000}
 
 
@@ -63,6 +68,19 @@ def parse_rate(text: str) -> int:
     return kbit
 
 
+def parse_queue(text: str) -> float:
+    """Return the milliseconds of a time as tc(8) spells it, `50ms`.
+
+    Raises:
+        ValueError: not such a time, or zero.
+    """
+    match = _DURATION.fullmatch(text.strip().lower())
+    queue_ms = float(match[1]) * _MS[match[2]] if match else 0.0
+    if queue_ms <= 0:
+        raise ValueError(f"cannot use queue {text!r}; use a number and us, ms or s: 50ms")
+    return queue_ms
+
+
 def probe_features(tool: Tool) -> TcFeatures | None:
     """Ask the kernel what it has, in a network namespace that is thrown away.
 
@@ -70,11 +88,14 @@ def probe_features(tool: Tool) -> TcFeatures | None:
         What it has; None where this user may not make a namespace, so that only trying tells.
     """
     for unshare in (("unshare", "-n"), ("unshare", "-Urn")):
+        # Root whose CAP_NET_ADMIN was taken away makes a namespace that it may change nothing in:
+        # what fails there would say nothing of the kernel.
         try:
-            if tool.run([*unshare, "true"]).returncode == 0:
-                break
+            tried = tool.run([*unshare, *_BATCH], stdin=_HARMLESS)
         except MissingFeatureError:
             return None
+        if tried.returncode == 0 or not refused(tried, by="unshare"):
+            break
     else:
         return None
 
@@ -210,20 +231,57 @@ class TcTarget:
         self._ledger.put(dataclasses.replace(made, entries=(*_without(stale, entries), *entries)))
         if root and (root != wanted.qdisc or self._altered(record)):
             # What is there cannot be changed into what is wanted, or is not known: start again.
-            self._batch([render_tc_removal(self._settings.device).strip()])
+            self._start_again(record)
             root = ""
-        self._batch(
-            [
-                *(wanted.there if root else wanted.fresh),
-                *wanted.anchors,
-                *(each.line for each, _ in wanted.filters),
-            ]
-        )
-        if root:
-            self._delete(stale)
-            self._delete_classes(wanted)
+        try:
+            self._batch(
+                [
+                    *(wanted.there if root else wanted.fresh),
+                    *wanted.anchors,
+                    *(each.line for each, _ in wanted.filters),
+                ]
+            )
+            if root:
+                self._delete(stale)
+                self._delete_classes(wanted)
+        except ProgrammingError as error:
+            raise self._stopped_half_way(error, root) from error
         self._ledger.put(dataclasses.replace(made, entries=entries, seen=self._seen()))
         return planned
+
+    def _start_again(self, record: TargetRecord) -> None:
+        """Delete our qdisc, to make it anew."""
+        try:
+            self._batch([render_tc_removal(self._settings.device).strip()])
+        except ProgrammingError:
+            self._ledger.put(record)  # as it was
+            raise
+
+    def _stopped_half_way(self, error: ProgrammingError, root: str) -> ProgrammingError:
+        """Take back what a batch began, and return the error that says what is left.
+
+        `tc -batch` is not atomic: it stops at the line that fails, and what came before stays.
+
+        Args:
+            error: why it stopped.
+            root: the kind of our qdisc that was there before; empty where there was none.
+        """
+        device = self._settings.device
+        if root:
+            message = (
+                f"{error.message}; the qdisc {OWNED_HANDLE} on {device} is left half-changed, and "
+                "made anew the next time"
+            )
+            return type(error)(message, hint=error.hint)
+        try:
+            found = self._root()
+            if found is not None and found[1] == OWNED_HANDLE:
+                self._batch([render_tc_removal(device).strip()])
+        except ProgrammingError as left:
+            message = f"{error.message}; the qdisc {OWNED_HANDLE} on {device} is left: {left}"
+            return type(error)(message, hint=error.hint)
+        self._ledger.drop(KIND, device)
+        return error
 
     def dry_run(self, rules: Sequence[FlowRule]) -> str:
         """Return the lines for `tc -batch`; tc itself has no dry run to check them."""
@@ -353,12 +411,14 @@ class TcTarget:
         return "it was changed by others" if record.seen != self._seen() else ""
 
     def _seen(self) -> str:
-        """A digest of our classes and filters, as tc shows them without counters."""
+        """A digest of our classes, queues and filters, as tc shows them without counters."""
         device = self._settings.device
+        qdiscs = self._read(["tc", "qdisc", "show", "dev", device]).splitlines()
+        queues = [each for each in qdiscs if f" parent {OWNED_HANDLE}" in each]
         classes = self._read(["tc", "class", "show", "dev", device])
         filters = self._read(["tc", "filter", "show", "dev", device, "parent", OWNED_HANDLE])
         # The kernel lists classes in the order of a hash table.
-        return digest_of(*sorted(classes.splitlines()), filters)
+        return digest_of(*sorted(queues), *sorted(classes.splitlines()), filters)
 
     def _delete(self, entries: Iterable[Entry]) -> None:
         lines = [each.body for each in entries]

@@ -26,6 +26,12 @@ _TIMEOUT_S = 10.0
 
 _PACKAGES = {"nft": "nftables", "tc": "iproute2", "ip": "iproute2", "unshare": "util-linux"}
 
+HOW_PRIVILEGED = (
+    "run this command as root, or give it that capability: in a container --cap-add NET_ADMIN, in "
+    "a systemd unit AmbientCapabilities=CAP_NET_ADMIN"
+)
+"""Root is not enough where the capability was taken away: capabilities(7)."""
+
 _NO_PRIVILEGE = re.compile(r"operation not permitted|permission denied|must be root", re.IGNORECASE)
 _NO_FEATURE = re.compile(
     r"qdisc kind is unknown|classifier not found|unknown qdisc|"
@@ -115,6 +121,11 @@ def demand(tool: Tool, argv: Sequence[str], *, doing: str, stdin: str = "") -> s
     raise failure(output, argv, doing=doing)
 
 
+def refused(output: Output, *, by: str) -> bool:
+    """Whether a program failed for want of a privilege, or the program `by` that starts it did."""
+    return bool(_NO_PRIVILEGE.search(output.stderr)) or output.stderr.startswith(f"{by}:")
+
+
 def failure(output: Output, argv: Sequence[str], *, doing: str) -> ProgrammingError:
     """Return the error that a failed program means."""
     command = shlex.join(argv)
@@ -122,7 +133,7 @@ def failure(output: Output, argv: Sequence[str], *, doing: str) -> ProgrammingEr
     if _NO_PRIVILEGE.search(output.stderr):
         return PrivilegeError(
             f"cannot {doing}: {command!r} needs CAP_NET_ADMIN in this network namespace",
-            hint="run this command as root",
+            hint=HOW_PRIVILEGED,
         )
     if _NO_FEATURE.search(output.stderr):
         return MissingFeatureError(f"cannot {doing}: {command!r} says {said!r}")

@@ -5,26 +5,36 @@ from __future__ import annotations
 import json
 
 from lifecycle import codec
+from lifecycle.printable import json_text
 from lifecycle.verify.verdict import Verdict
 
 
 def to_json(verdict: Verdict, *, indent: int | None = None) -> str:
-    """Write `{"verdict": …, "findings": [...], "flows": [...]}`, and `open_endpoints` if any.
+    """Write `{"verdict": …, "findings": [...], "flows": [...]}`.
 
-    The last verdict of a run has `run`, too: why it ended, how far it came and its exit code.
+    There are `open_endpoints` and `tolerated`, too, where there are any. The last verdict of a run
+    has `run`: why it ended, how far it came, its exit code, and what its gate took on trust, if
+    anything. Where no system was judged it has `"judged": false`, and its findings are why.
 
     Args:
         verdict: what to write.
         indent: spaces per level; None for one line.
     """
-    document = {
+    document: dict[str, object] = {
         "verdict": verdict.verdict.value,
         "findings": codec.to_plain(verdict.findings),
         "flows": codec.to_plain(verdict.flows),
     }
+    if not verdict.judged:
+        document["judged"] = False
     if verdict.open_endpoints:
         document["open_endpoints"] = codec.to_plain(verdict.open_endpoints)
+    if verdict.tolerated:
+        document["tolerated"] = codec.to_plain(verdict.tolerated)
     if verdict.run is not None:
-        document["run"] = codec.to_plain(verdict.run)
+        run = codec.to_plain(verdict.run)
+        assert isinstance(run, dict)
+        document["run"] = {name: value for name, value in run.items() if value or name != "trusted"}
     separators = (",", ":") if indent is None else None
-    return json.dumps(document, ensure_ascii=False, indent=indent, separators=separators)
+    text = json.dumps(document, ensure_ascii=False, indent=indent, separators=separators)
+    return json_text(text)

@@ -1,7 +1,8 @@
 """The verdict as SARIF 2.1.0, for editors and code scanning. Pure.
 
 Source of the format: OASIS SARIF 2.1.0. Violated is an error, unverifiable a warning; a finding
-points at the declaration in the manifest.
+points at the declaration in the manifest. A run that was no success has at least one error; its
+rule is `run.end` where no finding is to blame, so that an unjudged system does not look good.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import json
 from urllib.parse import quote
 
+from lifecycle.printable import json_text
 from lifecycle.verify.rules import RULES
 from lifecycle.verify.verdict import Finding, Outcome, RunEnd, Verdict
 
@@ -37,13 +39,16 @@ def to_sarif(verdict: Verdict) -> str:
             {
                 "tool": {"driver": {"name": "lifecycle", "rules": rules}},
                 "columnKind": "unicodeCodePoints",
-                "results": [_result(each, index[each.rule]) for each in verdict.findings],
+                "results": [
+                    *(_result(each, index.get(each.rule)) for each in verdict.findings),
+                    *_end_result(verdict),
+                ],
                 "properties": {"verdict": verdict.verdict.value},
                 **_invocations(verdict.run),
             }
         ],
     }
-    return json.dumps(log, ensure_ascii=False, indent=2) + "\n"
+    return json_text(json.dumps(log, ensure_ascii=False, indent=2)) + "\n"
 
 
 def _invocations(run: RunEnd | None) -> _Json:
@@ -57,7 +62,17 @@ def _invocations(run: RunEnd | None) -> _Json:
     return {"invocations": [ended]}
 
 
-def _result(finding: Finding, rule_index: int) -> _Json:
+def _end_result(verdict: Verdict) -> list[_Json]:
+    """Return what a log without an error has to say of a run that was no success."""
+    run = verdict.run
+    if run is None or run.exit_code == 0:
+        return []
+    if any(each.outcome is Outcome.VIOLATED for each in verdict.findings):
+        return []
+    return [{"ruleId": "run.end", "level": "error", "message": {"text": run.describe()}}]
+
+
+def _result(finding: Finding, rule_index: int | None) -> _Json:
     location: _Json = {
         "logicalLocations": [{"fullyQualifiedName": finding.subject, "kind": "resource"}]
     }
@@ -69,7 +84,7 @@ def _result(finding: Finding, rule_index: int) -> _Json:
         }
     return {
         "ruleId": finding.rule,
-        "ruleIndex": rule_index,
+        **({} if rule_index is None else {"ruleIndex": rule_index}),
         "level": _LEVELS[finding.outcome],
         "message": {
             "text": f"{finding.message}; {finding.hint}" if finding.hint else finding.message

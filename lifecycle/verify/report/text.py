@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 from lifecycle.manifest.model import UniqueHow
 from lifecycle.network.dscp import describe
+from lifecycle.printable import one_line
 from lifecycle.verify.transport import NETWORK
 from lifecycle.verify.verdict import Finding, FlowReport, Outcome, Verdict
 
@@ -45,9 +46,12 @@ def render_text(
     if verdict.open_endpoints:
         lines += ["", "endpoints that `endpoints: open` allows"]
         lines += [
-            f"  {each.kind.noun} of {each.name} in {each.node}, {each.type}"
+            one_line(f"  {each.kind.noun} of {each.name} in {each.node}, {each.type}")
             for each in verdict.open_endpoints
         ]
+    if verdict.tolerated:
+        named = ", ".join(each.describe() for each in verdict.tolerated)
+        lines += ["", *_wrap(named, max(width, 40), first="tolerated: ")]
     if flows and verdict.flows:
         lines += ["", "flows", *_flows(verdict.flows, colour=colour)]
     if verdict.run is not None:
@@ -69,7 +73,7 @@ def _headline(verdict: Verdict) -> str:
 
 def _finding(finding: Finding, *, colour: bool, width: int) -> list[str]:
     head = _paint(finding.outcome.value, finding.outcome, colour=colour)
-    lines = [f"{head} {finding.rule}: {finding.subject}"]
+    lines = [f"{head} {finding.rule}: {one_line(finding.subject)}"]
     rows = [
         ("", finding.message),
         ("expected", finding.expected),
@@ -87,7 +91,7 @@ def _finding(finding: Finding, *, colour: bool, width: int) -> list[str]:
 def _wrap(text: str, width: int, *, first: str = "") -> list[str]:
     """Wrap between words only: names and addresses stay whole. `first` starts the first line."""
     return textwrap.wrap(
-        text,
+        one_line(text),
         width,
         initial_indent=first,
         subsequent_indent=" " * len(first),
@@ -99,8 +103,8 @@ def _wrap(text: str, width: int, *, first: str = "") -> list[str]:
 def _flows(flows: Sequence[FlowReport], *, colour: bool) -> list[str]:
     rows = [
         (
-            flow.topic,
-            f"{flow.publisher} → {flow.subscription}",
+            one_line(flow.topic),
+            one_line(f"{flow.publisher} → {flow.subscription}"),
             _UNIQUE[flow.unique],
             "" if flow.dscp is None else describe(flow.dscp),
             flow.effective_transport,
@@ -114,7 +118,7 @@ def _flows(flows: Sequence[FlowReport], *, colour: bool) -> list[str]:
         outcome = _paint(flow.outcome.value, flow.outcome, colour=colour)
         lines.append("  " + "  ".join([*cells, outcome]))
         if flow.effective_transport in NETWORK:
-            lines += [f"    {each.describe()}" for each in flow.tuples]
+            lines += [one_line(f"    {each.describe()}") for each in flow.tuples]
     return lines
 
 

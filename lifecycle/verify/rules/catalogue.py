@@ -23,6 +23,7 @@ class Rule:
         concerns_flow: a finding on an endpoint also spoils the flows of that endpoint.
         may_block: False for a rule whose unverifiable findings never close the gate, because the
             manifest waived the requirement itself.
+        heals: False for a rule whose findings no second look can take back.
     """
 
     id: str
@@ -31,6 +32,7 @@ class Rule:
     fix: str
     concerns_flow: bool = False
     may_block: bool = True
+    heals: bool = True
 
     def finding(
         self,

@@ -37,7 +37,9 @@ def check(view: View) -> Iterator[Finding]:
     for actual in view.actual:
         if actual.observed is not None:
             servers.setdefault(_place(actual.observed), []).append(actual.node.full_name)
-    others = Counter(map(_place, (*view.undeclared, *view.foreign, *view.unattributed)))
+    others = Counter(
+        map(_place, (*view.undeclared, *view.foreign, *view.of_tools, *view.unattributed))
+    )
     for client in view.actual:
         kind = SERVER_OF.get(client.planned.kind)
         if kind is None or client.observed is None:

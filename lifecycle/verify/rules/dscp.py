@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from lifecycle.manifest.model import EndpointKind
 from lifecycle.network.dscp import describe
 from lifecycle.verify.rules.catalogue import Rule
 from lifecycle.verify.verdict import Finding, Outcome
@@ -16,7 +15,7 @@ from lifecycle.verify.view import View
 
 DSCP_NOT_APPLIED = Rule(
     id="flow.dscp-not-applied",
-    meaning="a publisher's sockets do not carry the declared DSCP",
+    meaning="the sockets that an endpoint sends from do not carry the declared DSCP",
     outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
     fix="see the node's log for the refused socket option; `enforce: false` makes it a warning",
     concerns_flow=True,
@@ -24,7 +23,7 @@ DSCP_NOT_APPLIED = Rule(
 )
 DSCP_UNVERIFIABLE = Rule(
     id="flow.dscp-unverifiable",
-    meaning="nobody read back the DSCP of a publisher that declares one",
+    meaning="nobody read back the DSCP of an endpoint that declares one",
     outcomes=(Outcome.UNVERIFIABLE,),
     fix="only nodes in our host mark and read back; mark a foreign node's flow in the network",
     concerns_flow=True,
@@ -33,15 +32,18 @@ RULES = (DSCP_NOT_APPLIED, DSCP_UNVERIFIABLE)
 
 
 def check(view: View) -> Iterator[Finding]:
-    """Judge every publisher that declares a DSCP and is there."""
+    """Judge every endpoint that declares a DSCP and is there.
+
+    A subscription's is that of its acknowledgements.
+    """
     for actual in view.actual:
         planned, node, report = actual.planned, actual.node, actual.report
         wanted = planned.dscp
-        if planned.kind is not EndpointKind.PUBLISHER or wanted is None:
+        if wanted is None:
             continue
         if actual.observed is None and report is None:
             continue
-        where = f"the publisher of {planned.resolved} in {node.full_name}"
+        where = f"the {planned.kind.noun} of {planned.resolved} in {node.full_name}"
         read = report.dscp if report else None
         if read is None:
             yield DSCP_UNVERIFIABLE.on_endpoint(

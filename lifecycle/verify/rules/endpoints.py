@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from lifecycle.manifest.model import EndpointKind, EndpointPolicy
+from lifecycle.verify.noise import OFFERS
 from lifecycle.verify.observation import ObservedEndpoint
 from lifecycle.verify.rules.catalogue import Rule
-from lifecycle.verify.verdict import Finding, Outcome, Stage
+from lifecycle.verify.verdict import Finding, Outcome
 from lifecycle.verify.view import Actual, Seen, View
 
 MISSING_ENDPOINT = Rule(
@@ -38,14 +39,7 @@ UNSEEN_ENDPOINT = Rule(
     fix="verify it where it can be seen: on its own host, or with its connection's peers",
     concerns_flow=True,
 )
-UNATTRIBUTED_ENDPOINT = Rule(
-    id="graph.unattributed-endpoint",
-    meaning="the graph has an endpoint whose node is not known",
-    outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
-    fix="wait for discovery; a plain DDS program never tells a node name: give it another domain",
-)
-
-_MEETS = {
+MEETS = {
     EndpointKind.PUBLISHER: "topic",
     EndpointKind.SUBSCRIPTION: "topic",
     EndpointKind.SERVICE_SERVER: "service",
@@ -56,15 +50,12 @@ _MEETS = {
 """Kinds that meet under one name: topics, services and actions do not see each other."""
 
 
-def _article(word: str) -> str:
-    return "an" if word.startswith("a") else "a"
-
-
 UNDECLARED = {
     kind: Rule(
         id=f"graph.undeclared-{kind.noun.replace(' ', '-')}",
-        meaning=f"a declared node has {_article(kind.noun)} {kind.noun} that the manifest does "
-        "not declare",
+        meaning=f"a declared node has {'an' if kind.noun.startswith('a') else 'a'} {kind.noun}"
+        " that the manifest does not declare"
+        + (", or a tool has one under a declared name" if kind in OFFERS else ""),
         outcomes=(Outcome.VIOLATED,),
         fix="declare it in the node's interface, remove it, or set `endpoints: open` on the node",
     )
@@ -81,7 +72,6 @@ RULES = (
     *UNDECLARED.values(),
     TYPE_MISMATCH,
     ENDPOINT_ERROR,
-    UNATTRIBUTED_ENDPOINT,
 )
 
 
@@ -95,8 +85,6 @@ def check(view: View) -> Iterator[Finding]:
                 yield from _unseen(view, actual)
     yield from _undeclared(view)
     yield from _conflicts(view)
-    if view.plan.policy.undeclared_nodes is EndpointPolicy.DECLARED:
-        yield from _unattributed(view)
 
 
 def _declared(actual: Actual, *, absent: bool) -> Iterator[Finding]:
@@ -135,7 +123,7 @@ def _declared(actual: Actual, *, absent: bool) -> Iterator[Finding]:
 def _remapped(actual: Actual) -> str:
     """Say which other name its node has the endpoint under; empty if it has none."""
     planned, report = actual.planned, actual.report
-    if report is None or not report.name or report.resolved == planned.resolved:
+    if report is None or report.resolved == planned.resolved:
         return ""
     return (
         f"{report.kind.value}/{report.name} is {report.resolved} now: is a remap wrong, or did "
@@ -161,7 +149,7 @@ def _unseen(view: View, actual: Actual) -> Iterator[Finding]:
     else:
         known = sum(
             seen.name == planned.resolved and seen.kind is _OTHER[planned.kind]
-            for seen in view.seen
+            for seen in (*view.seen, *view.seen_of_tools)
         )
         more = report.matched - known
         if more <= 0 or view.plan.policy.undeclared_nodes is EndpointPolicy.OPEN:
@@ -227,7 +215,7 @@ def _conflicts(view: View) -> Iterator[Finding]:
     """A topic, service or action of ours that somebody undeclared uses with another type."""
     types: dict[tuple[str, str], dict[str, None]] = {}
     for actual in view.actual:
-        place = (_MEETS[actual.planned.kind], actual.planned.resolved)
+        place = (MEETS[actual.planned.kind], actual.planned.resolved)
         types.setdefault(place, {})[actual.planned.type] = None
     others = (*view.undeclared, *view.foreign, *view.unattributed)
     undeclared: tuple[Seen | ObservedEndpoint, ...] = (
@@ -235,7 +223,7 @@ def _conflicts(view: View) -> Iterator[Finding]:
         *(each for each in others if not each.kind.is_topic),
     )
     for seen in undeclared:
-        what = _MEETS[seen.kind]
+        what = MEETS[seen.kind]
         declared = types.get((what, seen.name))
         if declared is None or seen.type in declared:
             continue
@@ -246,24 +234,9 @@ def _conflicts(view: View) -> Iterator[Finding]:
             subject=seen.name,
             expected=" or ".join(declared),
             observed=seen.type or "no type",
-            message=f"cannot match the {word} of {seen.name} in {who}: it is {seen.type},"
-            f" the manifest declares the {what} as {' or '.join(declared)}",
+            message=f"cannot match the {word} of {seen.name} in {who}: it is"
+            f" {seen.type or 'of unknown type'}, the manifest declares the {what} as"
+            f" {' or '.join(declared)}",
             node=seen.node,
             endpoint=seen.kind,
-        )
-
-
-def _unattributed(view: View) -> Iterator[Finding]:
-    """Closed world: before the gate, every endpoint must be known to be somebody's."""
-    outcome = Outcome.VIOLATED if view.stage is Stage.CONNECTED else Outcome.UNVERIFIABLE
-    for endpoint in view.unattributed:
-        word = endpoint.kind.noun
-        yield UNATTRIBUTED_ENDPOINT.finding(
-            outcome,
-            subject=endpoint.name,
-            expected=f"{word} of a declared node",
-            observed=f"{word} of an unknown node",
-            message=f"cannot tell whose {word} of {endpoint.name} this is"
-            + (f" (GID {endpoint.gid})" if endpoint.gid else ""),
-            endpoint=endpoint.kind,
         )

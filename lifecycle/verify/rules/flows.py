@@ -1,6 +1,7 @@
 """Rules about the uniqueness of network flows. Pure.
 
-An optionally required endpoint never violates: the requirement is met by trying. `system_default`
+What is strictly required, or demanded by a link, must be proven: what cannot be is violated. An
+optionally required endpoint never violates: the requirement is met by trying. `system_default`
 demands nothing either; the flow report says what came of it.
 """
 
@@ -8,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from lifecycle.manifest.model import EndpointKind, UniqueHow
+from lifecycle.manifest.model import EndpointKind, Quantity, UniqueHow
 from lifecycle.network.nfe import (
     FlowUniqueness,
     NetworkFlowEndpoint,
@@ -31,9 +32,10 @@ NOT_UNIQUE = Rule(
 )
 UNVERIFIABLE = Rule(
     id="flow.unverifiable",
-    meaning="a unique network flow is needed and nobody tells the network flow endpoints",
-    outcomes=(Outcome.UNVERIFIABLE,),
-    fix="run the node in our host under an RMW that tells them (rmw_fastrtps_cpp)",
+    meaning="a unique network flow is strictly required or demanded and cannot be proven",
+    outcomes=(Outcome.VIOLATED,),
+    fix="run the node with `run: python` under rmw_fastrtps_cpp, which reports network flow"
+    " endpoints; or ask for `unique: optionally_required`, or drop the link's `unique`",
     concerns_flow=True,
 )
 BROKEN_ENDPOINT = Rule(
@@ -44,11 +46,19 @@ BROKEN_ENDPOINT = Rule(
     " no interface",
     concerns_flow=True,
 )
-RULES = (NOT_UNIQUE, UNVERIFIABLE, BROKEN_ENDPOINT)
+NOT_MEASURED = Rule(
+    id="flow.not-measured",
+    meaning="a number that the manifest declares of a flow has not been measured",
+    outcomes=(Outcome.UNVERIFIABLE,),
+    fix="nothing here measures it: measure it where the data are used, or leave it out of the"
+    " manifest; `--strict` refuses it, and so does `policy.unverifiable: block`",
+    heals=False,
+)
+RULES = (NOT_UNIQUE, UNVERIFIABLE, BROKEN_ENDPOINT, NOT_MEASURED)
 
 
 def check(view: View) -> Iterator[Finding]:
-    """Judge every endpoint that strictly requires a unique flow, then every link's demand."""
+    """Judge every strict endpoint, then every link's demand, then name what nobody measures."""
     uniqueness = Uniqueness(view.reported, view.addresses)
     for actual in view.actual:
         yield from _broken(actual)
@@ -57,6 +67,47 @@ def check(view: View) -> Iterator[Finding]:
     for flow in view.flows:
         if flow.planned.unique is not UniqueHow.NOT:
             yield from _demanded(flow, uniqueness)
+    yield from _not_measured(view)
+
+
+def _not_measured(view: View) -> Iterator[Finding]:
+    """One finding per number: whoever declares it is told that nobody has compared it."""
+    for actual in view.actual:
+        planned, node = actual.planned, actual.node.full_name
+        if actual.observed is None and actual.report is None:
+            continue  # it is missing, and that is said
+        for each in planned.quantities:
+            where = f"the {planned.kind.noun} of {planned.resolved} in {node}"
+            yield _unmeasured(
+                each, where, subject=planned.resolved, node=node, endpoint=planned.kind
+            )
+    for flow in view.flows:
+        ends = (*flow.publishers, *flow.subscriptions)
+        if any(end.observed is None and end.report is None for end in ends):
+            continue
+        for each in flow.planned.quantities:
+            where = f"the flow {flow.publisher} → {flow.subscription} on {flow.planned.topic}"
+            yield _unmeasured(each, where, subject=flow.subject)
+
+
+def _unmeasured(
+    quantity: Quantity,
+    where: str,
+    *,
+    subject: str,
+    node: str = "",
+    endpoint: EndpointKind | None = None,
+) -> Finding:
+    return NOT_MEASURED.finding(
+        Outcome.UNVERIFIABLE,
+        subject=subject,
+        expected=str(quantity),
+        observed="not measured",
+        message=f"cannot verify {quantity} of {where}: nothing measures it",
+        at=quantity.at,
+        node=node,
+        endpoint=endpoint,
+    )
 
 
 def _broken(actual: Actual) -> Iterator[Finding]:
@@ -85,12 +136,12 @@ def _strict(actual: Actual, uniqueness: Uniqueness) -> Iterator[Finding]:
     unique = uniqueness.is_unique(actual)
     if unique is None:
         yield UNVERIFIABLE.on_endpoint(
-            Outcome.UNVERIFIABLE,
+            Outcome.VIOLATED,
             actual,
             expected=f"unique {word}",
             observed="network flow endpoints not reported",
-            message=f"cannot verify that {where} has a unique network flow: nobody tells its"
-            " network flow endpoints",
+            message=f"cannot accept {where}: it strictly requires a unique network flow, which"
+            f" cannot be proven: {_why_unproven(actual)}",
         )
     elif unique is False:
         shared = spell_nfes(uniqueness.nfes((actual,)))
@@ -119,17 +170,26 @@ def _demanded(flow: FlowView, uniqueness: Uniqueness) -> Iterator[Finding]:
     if met:
         return
     observed = f"publisher {_answer(publisher)}, subscription {_answer(subscription)}"
+    unproven = ", which cannot be proven" if met is None else ""
     rule = UNVERIFIABLE if met is None else NOT_UNIQUE
-    verb = "cannot verify" if met is None else "cannot accept"
     yield rule.finding(
-        Outcome.UNVERIFIABLE if met is None else Outcome.VIOLATED,
+        Outcome.VIOLATED,
         subject=flow.subject,
         expected=f"{how} unique flow",
         observed=observed,
-        message=f"{verb} the flow {flow.publisher} → {flow.subscription} on {flow.planned.topic}:"
-        f" its link demands a {how} unique flow; {observed}",
+        message=f"cannot accept the flow {flow.publisher} → {flow.subscription} on"
+        f" {flow.planned.topic}: its link demands a {how} unique flow{unproven}; {observed}",
         at=flow.at,
     )
+
+
+def _why_unproven(actual: Actual) -> str:
+    """Say why the network flow endpoints of an endpoint, or of its neighbours, are not known."""
+    if actual.report is None:
+        return f"{actual.node.full_name} does not report its network flow endpoints"
+    if actual.report.nfes is None:
+        return "its RMW does not report network flow endpoints"
+    return "its process has endpoints whose network flow endpoints are not reported"
 
 
 def _answer(unique: bool | None) -> str:

@@ -1,13 +1,16 @@
 """Rules about declared pairs that do not match. Pure.
 
-A pair is proven to match when one of its ends reports at least as many matched endpoints as the
-graph has for it. Where neither end reports a count, discovery has to do: both ends are there, of
-one type, and compatible, which is DDS's own condition for a match (DDS 1.4 §2.2.2.5, §2.2.3).
+Judged pair by pair: each end that reports names the peers that it is matched with, and both must
+name each other. Where an end's RMW only counts its peers, the count must be that of all endpoints
+of the graph that can match it, tools' included: a count that is lower or higher proves nothing
+about this pair. Where neither end reports, discovery has to do: both ends are there, of one type,
+and compatible, which is DDS's own condition for a match (DDS 1.4 §2.2.2.5, §2.2.3) but for the
+partition, which nobody announces upward; that is not enough for a declared link.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import Certainty, QosProfile, incompatibilities
@@ -18,43 +21,49 @@ from lifecycle.verify.view import UNKNOWN_QOS, Actual, FlowView, Seen, View, act
 UNMATCHED_LINK = Rule(
     id="graph.unmatched-link",
     meaning="the two ends of a declared link are not matched",
-    outcomes=(Outcome.VIOLATED,),
+    outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
     fix="see the other findings on its ends; if there are none, look at the network between them",
     concerns_flow=True,
 )
 UNMATCHED_FLOW = Rule(
     id="graph.unmatched-flow",
     meaning="a declared publisher and a declared subscription of its topic are not matched",
-    outcomes=(Outcome.VIOLATED,),
+    outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
     fix="look at the network between the two: discovery range, multicast, firewall, peers",
     concerns_flow=True,
 )
 RULES = (UNMATCHED_LINK, UNMATCHED_FLOW)
 
 
+_Answer = tuple[Outcome, str]
+"""What is known of a pair, and why it is not ok."""
+
+_OK: _Answer = (Outcome.OK, "")
+
+
 def check(view: View) -> Iterator[Finding]:
     """Judge every planned flow."""
     topics: dict[tuple[str, EndpointKind], list[Seen]] = {}
-    for seen in view.seen:
+    for seen in (*view.seen, *view.seen_of_tools):
         topics.setdefault((seen.name, seen.kind), []).append(seen)
     for flow in view.flows:
         cause = _cause(flow)
-        reason = cause or _shortfall(
-            flow,
-            topics.get((flow.planned.topic, EndpointKind.PUBLISHER), []),
-            topics.get((flow.planned.topic, EndpointKind.SUBSCRIPTION), []),
-        )
-        # Without a link the cause has its own finding already.
-        if not reason or (cause and not flow.planned.linked):
+        if cause and not flow.planned.linked:
+            continue  # the cause has its own finding already
+        outcome, reason = (Outcome.VIOLATED, cause) if cause else _judge(flow, topics)
+        if outcome is Outcome.OK:
             continue
         rule = UNMATCHED_LINK if flow.planned.linked else UNMATCHED_FLOW
+        violated = outcome is Outcome.VIOLATED
+        pair = f"{flow.publisher} → {flow.subscription}"
         yield rule.finding(
-            Outcome.VIOLATED,
+            outcome,
             subject=flow.subject,
             expected="matched",
             observed=reason,
-            message=f"cannot see {flow.publisher} → {flow.subscription} matched on"
-            f" {flow.planned.topic}: {reason}",
+            message=f"cannot see {pair} matched on {flow.planned.topic}: {reason}"
+            if violated
+            else f"cannot verify that {pair} are matched on {flow.planned.topic}: {reason}",
             at=flow.at,
         )
 
@@ -78,41 +87,99 @@ def _cause(flow: FlowView) -> str:
     return ""
 
 
-def _shortfall(flow: FlowView, publishers: Iterable[Seen], subscriptions: Iterable[Seen]) -> str:
-    """Return how many matches are missing; empty if the match is proven as far as can be."""
-    for publisher in flow.publishers:
-        at_publisher = _count(publisher, subscriptions, publishes=True)
-        for subscription in flow.subscriptions:
-            at_subscription = _count(subscription, publishers, publishes=False)
-            known = [each for each in (at_publisher, at_subscription) if each]
-            if not known or any(matched >= expected for matched, expected in known):
-                continue
-            parts = []
-            if at_publisher:
-                parts.append(f"the publisher matched {at_publisher[0]} of {at_publisher[1]}")
-            if at_subscription:
-                parts.append(
-                    f"the subscription matched {at_subscription[0]} of {at_subscription[1]}"
-                )
-            return ", ".join(parts)
-    return ""
+def _judge(flow: FlowView, topics: Mapping[tuple[str, EndpointKind], Sequence[Seen]]) -> _Answer:
+    """Return the worst that is known of any of the flow's pairs."""
+    answers = [
+        _pair(
+            publisher,
+            subscription,
+            topics.get((flow.planned.topic, EndpointKind.PUBLISHER), ()),
+            topics.get((flow.planned.topic, EndpointKind.SUBSCRIPTION), ()),
+        )
+        for publisher in flow.publishers
+        for subscription in flow.subscriptions
+    ]
+    if flow.planned.linked and None in answers:
+        return Outcome.UNVERIFIABLE, "neither end reports whom it is matched with"
+    return _worst(each for each in answers if each is not None)
 
 
-def _count(end: Actual, others: Iterable[Seen], *, publishes: bool) -> tuple[int, int] | None:
-    """Return (matched, expected) at one end; None if it does not report a count."""
-    if end.report is None or end.report.matched is None:
+def _pair(
+    publisher: Actual,
+    subscription: Actual,
+    publishers: Sequence[Seen],
+    subscriptions: Sequence[Seen],
+) -> _Answer | None:
+    """Return what the two ends say of each other; None if neither reports its matches."""
+    told = [
+        answer
+        for answer in (
+            _of_one_end(publisher, subscription, subscriptions),
+            _of_one_end(subscription, publisher, publishers),
+        )
+        if answer is not None
+    ]
+    return _worst(told) if told else None
+
+
+def _worst(answers: Iterable[_Answer]) -> _Answer:
+    """Return the worst outcome with every reason for it."""
+    found = list(answers)
+    outcome = Outcome.worst(each for each, _ in found)
+    reasons = dict.fromkeys(reason for each, reason in found if each is outcome)
+    return outcome, ", ".join(reasons)
+
+
+def _of_one_end(end: Actual, other: Actual, others: Sequence[Seen]) -> _Answer | None:
+    """Return what one end says of the other; None if it does not report its matches."""
+    report = end.report
+    if report is None or report.matched is None:
         return None
+    word = f"the {end.planned.kind.noun}"
+    gid = _gid(other)
+    if report.peers is None or not gid:
+        return _by_count(word, report.matched, end, others)
+    if gid in report.peers:
+        return _OK
+    unknown = report.matched - len(report.peers)
+    if unknown > 0:
+        return (
+            Outcome.UNVERIFIABLE,
+            f"{word} matched {report.matched}, of which {unknown} are not known to its node",
+        )
+    if report.matched == 0:
+        return Outcome.VIOLATED, f"{word} matched nobody"
+    return Outcome.VIOLATED, f"{word} matched {report.matched} others, not this one"
+
+
+def _by_count(word: str, matched: int, end: Actual, others: Sequence[Seen]) -> _Answer:
+    """Conclude from a number alone: it proves the pair only if it is that of all who can match."""
+    publishes = end.planned.kind is EndpointKind.PUBLISHER
     own = _qos(end)
-    expected = sum(
-        other.type == _type(end)
+    possible = [
+        other
+        for other in others
+        if other.type == _type(end)
         and (
             _compatible(own, other.qos or UNKNOWN_QOS)
             if publishes
             else _compatible(other.qos or UNKNOWN_QOS, own)
         )
-        for other in others
-    )
-    return end.report.matched, expected
+    ]
+    reason = f"{word} matched {matched} of {len(possible)}"
+    if matched == len(possible):
+        return _OK
+    if matched < len(possible) and (
+        matched == 0 or all(each.planned is not None for each in possible)
+    ):
+        return Outcome.VIOLATED, reason
+    return Outcome.UNVERIFIABLE, f"{reason}, and does not tell which"
+
+
+def _gid(end: Actual) -> str:
+    """Return the GID of an end: as discovery shows it, else as its node says; empty if unknown."""
+    shown = end.observed.gid if end.observed is not None else ""
+    return shown or (end.report.gid if end.report is not None else "")
 
 
 def _compatible(offered: QosProfile, requested: QosProfile) -> bool:

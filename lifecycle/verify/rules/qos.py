@@ -9,12 +9,14 @@ from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import (
     BEST_AVAILABLE_NS,
     INFINITE_NS,
+    POLICIES,
     Certainty,
     History,
     Incompatibility,
     QosProfile,
     incompatibilities,
 )
+from lifecycle.plan.model import PlannedEndpoint, PlannedNode
 from lifecycle.verify.rules.catalogue import Rule
 from lifecycle.verify.verdict import Finding, Outcome
 from lifecycle.verify.view import UNKNOWN_QOS, Actual, Seen, View, actual_qos
@@ -28,10 +30,10 @@ QOS_DIFFERS = Rule(
 )
 QOS_UNVERIFIABLE = Rule(
     id="graph.qos-unverifiable",
-    meaning="a declared QoS policy can be read neither from discovery nor from the node",
+    meaning="declared QoS policies can be read neither from discovery nor from the node",
     outcomes=(Outcome.UNVERIFIABLE,),
     fix="Fast DDS does not announce history and depth: only a node that reports its"
-    " configuration can prove them",
+    " configuration can prove them; a policy that is not written is not required",
 )
 QOS_INCOMPATIBLE = Rule(
     id="graph.qos-incompatible",
@@ -45,27 +47,24 @@ RULES = (QOS_DIFFERS, QOS_UNVERIFIABLE, QOS_INCOMPATIBLE)
 _FREE = frozenset({"SYSTEM_DEFAULT", "BEST_AVAILABLE", "UNKNOWN"})
 """Declared values that leave the choice to the middleware, or mark a gap: nothing to compare."""
 
-_COMPARED = (
-    "history",
-    "depth",
-    "reliability",
-    "durability",
-    "deadline_ns",
-    "lifespan_ns",
-    "liveliness",
-    "liveliness_lease_duration_ns",
-)
+_Unknown = list[tuple[Actual, list[tuple[str, str]]]]
+"""Endpoints of a node with the policies that are declared and not known, each with its value."""
 
 
 def check(view: View) -> Iterator[Finding]:
-    """Judge the QoS of every declared endpoint, then of every pair."""
-    for actual in view.actual:
-        if actual.observed is not None or actual.report is not None:
-            yield from _against_declaration(actual)
+    """Judge the QoS of every declared endpoint as far as it is written, then of every pair."""
+    for name, node in view.planned.items():
+        unknown: _Unknown = []
+        for actual in view.actual_by_node[name]:
+            if actual.observed is not None or actual.report is not None:
+                yield from _against_declaration(actual, unknown)
+        if unknown:
+            yield _unverifiable(node, unknown)
     yield from _pairs(view)
 
 
-def _against_declaration(actual: Actual) -> Iterator[Finding]:
+def _against_declaration(actual: Actual, unknown: _Unknown) -> Iterator[Finding]:
+    """Judge what is written of one endpoint; what is written and not known goes to `unknown`."""
     planned, node = actual.planned, actual.node
     if planned.qos is None or _leaves_all(planned.qos):
         return
@@ -74,12 +73,12 @@ def _against_declaration(actual: Actual) -> Iterator[Finding]:
         actual.report.qos if actual.report else None,
     )
     differing: list[tuple[str, str, str]] = []
-    unknown: list[tuple[str, str]] = []
-    for policy in _comparable(planned.kind, planned.qos):
+    hidden: list[tuple[str, str]] = []
+    for policy in _comparable(planned, planned.qos):
         want = spell(planned.qos, policy)
         have = spell(known or UNKNOWN_QOS, policy)
         if known is None or have == "UNKNOWN":
-            unknown.append((policy, want))
+            hidden.append((policy, want))
         elif have != want:
             differing.append((policy, want, have))
     word = planned.kind.noun
@@ -92,15 +91,32 @@ def _against_declaration(actual: Actual) -> Iterator[Finding]:
             observed=f"{policy} {have}",
             message=f"cannot accept {where}: {policy} is declared {want} and is {have}",
         )
-    if unknown:
-        names = ", ".join(policy for policy, _ in unknown)
-        yield QOS_UNVERIFIABLE.on_endpoint(
-            Outcome.UNVERIFIABLE,
-            actual,
-            expected=", ".join(f"{policy} {want}" for policy, want in unknown),
-            observed="not announced",
-            message=f"cannot verify {names} of {where}: nothing tells the actual value",
-        )
+    if hidden:
+        unknown.append((actual, hidden))
+
+
+def _unverifiable(node: PlannedNode, unknown: _Unknown) -> Finding:
+    """One finding for a node: what is not announced is the same for all of its endpoints."""
+    policies = ", ".join(dict.fromkeys(policy for _, hidden in unknown for policy, _ in hidden))
+    listed = ", ".join(_spell_end(each) for each, _ in unknown)
+    of = listed if len(unknown) == 1 else f"{len(unknown)} endpoints: {listed}"
+    return QOS_UNVERIFIABLE.finding(
+        Outcome.UNVERIFIABLE,
+        subject=node.full_name,
+        expected="; ".join(
+            f"{_spell_end(each)}: " + ", ".join(f"{policy} {want}" for policy, want in hidden)
+            for each, hidden in unknown
+        ),
+        observed="not announced",
+        message=f"cannot verify {policies} of {node.full_name} on {of}: neither discovery nor the"
+        " node reports the actual value",
+        at=unknown[0][0].planned.at,
+        node=node.full_name,
+    )
+
+
+def _spell_end(end: Actual) -> str:
+    return f"{end.planned.resolved} ({end.planned.kind.noun})"
 
 
 def _leaves_all(declared: QosProfile) -> bool:
@@ -114,14 +130,16 @@ def _leaves_all(declared: QosProfile) -> bool:
     return all(each.value == "SYSTEM_DEFAULT" for each in policies) and not any(durations)
 
 
-def _comparable(kind: EndpointKind, declared: QosProfile) -> Iterator[str]:
-    """Policies of a declared profile that mean something definite on this kind of endpoint."""
-    for policy in _COMPARED:
+def _comparable(planned: PlannedEndpoint, declared: QosProfile) -> Iterator[str]:
+    """Policies that are written and mean something definite on this kind of endpoint."""
+    for policy in POLICIES:
+        if policy in planned.qos_defaults:
+            continue
         value = getattr(declared, policy)
         if policy == "depth" and declared.history is not History.KEEP_LAST:
             continue
         # A DataReader has no lifespan (DDS 1.4 §2.2.3.16).
-        if policy == "lifespan_ns" and kind is EndpointKind.SUBSCRIPTION:
+        if policy == "lifespan_ns" and planned.kind is EndpointKind.SUBSCRIPTION:
             continue
         if value == BEST_AVAILABLE_NS and policy.endswith("_ns"):
             continue

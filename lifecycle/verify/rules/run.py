@@ -54,6 +54,18 @@ SILENT_NODE = Rule(
     outcomes=(Outcome.VIOLATED,),
     fix="the message says which; a callback that may take long needs a larger `timeouts.silent_s`",
 )
+PLANS_DIFFER = Rule(
+    id="run.plans-differ",
+    meaning="the supervisor of another machine planned another system than this one",
+    outcomes=(Outcome.VIOLATED,),
+    fix="give both supervisors the same manifest and arguments, and start them again",
+)
+PLAN_UNKNOWN = Rule(
+    id="run.plan-unknown",
+    meaning="the supervisor of another machine does not say what it planned",
+    outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
+    fix="run the same version of lifecycle on every machine of the system",
+)
 RULES = (
     PROCESS_DIED,
     START_FAILED,
@@ -62,6 +74,8 @@ RULES = (
     NOT_PROGRAMMED,
     NOT_WIRED,
     SILENT_NODE,
+    PLANS_DIFFER,
+    PLAN_UNKNOWN,
 )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 
 from lifecycle.errors import ExitCode
-from tests.ros.faults.system import NODES, Fault, foreign
+from tests.ros.faults.system import BARE_DDS, NODES, Fault, foreign
 
 TALKER = "nodes/talker"
 LISTENER = "nodes/listener"
@@ -122,7 +122,7 @@ START = (
     Fault(
         name="the module cannot be imported",
         edits=_run("talker", "tests.ros.faults.no_such_module:Talker"),
-        exit_code=ExitCode.BRING_UP_FAILED,
+        exit_code=ExitCode.MANIFEST_INVALID,
         subject="talker",
         message="tests.ros.faults.no_such_module",
     ),
@@ -136,14 +136,14 @@ START = (
     Fault(
         name="the module has no such class",
         edits=_run("talker", "Talkre"),
-        exit_code=ExitCode.BRING_UP_FAILED,
+        exit_code=ExitCode.MANIFEST_INVALID,
         subject="talker",
         message="Talkre",
     ),
     Fault(
         name="the class is no LifecycleNode",
         edits=_run("talker", "NotALifecycleNode"),
-        exit_code=ExitCode.BRING_UP_FAILED,
+        exit_code=ExitCode.MANIFEST_INVALID,
         subject="talker",
         message="NotALifecycleNode",
     ),
@@ -171,7 +171,7 @@ START = (
     Fault(
         name="the command does not exist",
         edits={**_command("talker"), f"{TALKER}/run": {"command": ["/no/such/program"]}},
-        exit_code=ExitCode.BRING_UP_FAILED,
+        exit_code=ExitCode.MANIFEST_INVALID,
         subject="talker",
         message="/no/such/program",
     ),
@@ -194,15 +194,15 @@ TRANSITIONS = (
     Fault(
         name="a declared subscription has no handler",
         edits=_run("listener", "WithoutHandler"),
-        exit_code=ExitCode.BRING_UP_FAILED,
-        subject="/listener",
+        exit_code=ExitCode.MANIFEST_INVALID,
+        subject="listener",
         message="@on_message('chatter')",
     ),
     Fault(
         name="a handler names no declared subscription",
         edits=_run("listener", "WithMisspeltHandler"),
-        exit_code=ExitCode.BRING_UP_FAILED,
-        subject="/listener",
+        exit_code=ExitCode.MANIFEST_INVALID,
+        subject="listener",
         message="@on_message('chater')",
     ),
     *(
@@ -382,6 +382,52 @@ GRAPH = (
     ),
 )
 
+DEFINITIONS = (
+    Fault(
+        name="a publisher was built from another definition of its type",
+        edits=_command(
+            *("talker", "--publish", "/chatter:std_msgs/msg/String:RELIABLE"),
+            *("--redefine", "std_msgs/msg/String"),
+        ),
+        exit_code=ExitCode.VIOLATED,
+        rule="graph.type-definition-differs",
+        subject="/chatter",
+        message="its std_msgs/msg/String is not that of the definition installed here",
+    ),
+    Fault(
+        name="a client was built from another definition of its service",
+        edits={
+            "nodes/asker": {
+                "run": {
+                    "command": foreign(
+                        *("asker", "--call", "/listener/ping:std_srvs/srv/Trigger"),
+                        *("--redefine", "std_srvs/srv/Trigger"),
+                    )
+                },
+                "managed": False,
+                "interface": {
+                    "service_clients": [{"name": "/listener/ping", "type": "std_srvs/srv/Trigger"}]
+                },
+            }
+        },
+        exit_code=ExitCode.VIOLATED,
+        rule="graph.type-definition-differs",
+        subject="/listener/ping",
+        message="service client of /listener/ping in /asker",
+    ),
+    Fault(
+        name="an action server was built from another definition of its action",
+        edits=_docked(
+            *("--serve", "/dock:test_msgs/action/Fibonacci"),
+            *("--redefine", "test_msgs/action/Fibonacci"),
+        ),
+        exit_code=ExitCode.VIOLATED,
+        rule="graph.type-definition-differs",
+        subject="/dock",
+        message="action server of /dock in /dock",
+    ),
+)
+
 FLOWS = (
     Fault(
         name="a strictly unique subscription on a transport without network flows",
@@ -400,12 +446,41 @@ FLOWS = (
         name="a foreign node does not tell its queue depth and the manifest insists",
         edits={
             **_command("talker", "--publish", "/chatter:std_msgs/msg/String:RELIABLE"),
+            f"{TALKER}/interface/publishers/0/qos": {"depth": 10},
             "policy/unverifiable": "block",
         },
         exit_code=ExitCode.UNVERIFIABLE,
         rule="graph.qos-unverifiable",
-        subject="/chatter",
+        subject="/talker",
         message="depth",
+    ),
+    Fault(
+        name="a foreign subscription cannot prove the unique flow that it strictly requires",
+        edits={
+            f"{LISTENER}/run": {
+                "command": foreign(
+                    *("listener", "--subscribe", "/chatter:std_msgs/msg/String:RELIABLE")
+                )
+            },
+            f"{LISTENER}/managed": False,
+            f"{LISTENER}/interface": {
+                "subscriptions": [{"name": "/chatter", "type": "std_msgs/msg/String"}]
+            },
+            f"{LISTENER}/flows": {"subscriptions": {"/chatter": {"unique": "strictly_required"}}},
+        },
+        exit_code=ExitCode.VIOLATED,
+        rule="flow.unverifiable",
+        subject="/chatter",
+        message="cannot be proven: /listener does not report",
+    ),
+    Fault(
+        name="nobody measures the rate that the manifest declares and the gate is strict",
+        edits={f"{TALKER}/flows": {"publishers": {"chatter": {"rate_hz": 500}}}},
+        exit_code=ExitCode.UNVERIFIABLE,
+        rule="flow.not-measured",
+        subject="/chatter",
+        message="rate_hz 500",
+        options=("--strict",),
     ),
 )
 
@@ -430,4 +505,110 @@ ACTIVE = (
     ),
 )
 
-FAULTS = STATIC + START + TRANSITIONS + GRAPH + FLOWS + ACTIVE
+CHATTER = "/chatter:std_msgs/msg/String:RELIABLE"
+_ELSEWHERE = {
+    f"{LISTENER}/run": {
+        "command": foreign("listener", "--subscribe", CHATTER),
+        "environment": {
+            "FASTRTPS_DEFAULT_PROFILES_FILE": "$(env FAULT_FOREIGN_PARTITION)",
+            "RMW_FASTRTPS_USE_QOS_FROM_XML": "1",
+        },
+    },
+    f"{LISTENER}/managed": False,
+    f"{LISTENER}/interface": {
+        "subscriptions": [{"name": "/chatter", "type": "std_msgs/msg/String"}]
+    },
+    "policy/unpublished": "ignore",
+}
+"""Edits that make the listener a foreign command whose subscription is in another partition."""
+
+OUTSIDERS = (
+    Fault(
+        name="the listener is in a foreign partition",
+        edits=_ELSEWHERE,
+        exit_code=ExitCode.VIOLATED,
+        rule="graph.unmatched-link",
+        subject="/chatter",
+        message="the publisher matched nobody",
+        options=("--strict", "--timeout", "6"),
+    ),
+    Fault(
+        name="the listener is in a foreign partition and a tool listens instead",
+        edits=_ELSEWHERE,
+        intruder=("_ros2cli_4711", "--subscribe", CHATTER),
+        exit_code=ExitCode.VIOLATED,
+        rule="graph.unmatched-link",
+        subject="/chatter",
+        message="the publisher matched 1 others, not this one",
+        options=("--strict", "--timeout", "6"),
+    ),
+    *(
+        Fault(
+            name=f"{tool} publishes on a declared topic",
+            edits={},
+            intruder=(tool, "--publish", CHATTER, *more),
+            exit_code=ExitCode.VIOLATED,
+            rule="graph.undeclared-publisher",
+            subject="/chatter",
+            message=f"cannot allow the publisher of /chatter in {full}",
+            options=("--strict",),
+        )
+        for tool, full, more in (
+            ("rqt_robot_steering", "/rqt_robot_steering", ()),
+            ("rosbag2_player", "/far/away/rosbag2_player", ("--ros-args", "-r", "__ns:=/far/away")),
+            ("_lifecycle_observer_1", "/_lifecycle_observer_1", ()),
+        )
+    ),
+    Fault(
+        name="a tool that publishes and serves what it likes serves a declared service too",
+        edits={},
+        intruder=(
+            *("rviz_17", "--publish", "/goal_pose:std_msgs/msg/String:RELIABLE"),
+            *("--answer", "/listener/ping:std_srvs/srv/Trigger"),
+        ),
+        exit_code=ExitCode.VIOLATED,
+        rule="graph.undeclared-service-server",
+        subject="/listener/ping",
+        options=("--strict",),
+    ),
+    Fault(
+        name="a tool has a server of a declared action",
+        edits=_docked("--serve", "/dock:test_msgs/action/Fibonacci"),
+        intruder=("rqt_action", "--serve", "/dock:test_msgs/action/Fibonacci"),
+        exit_code=ExitCode.VIOLATED,
+        rule="graph.undeclared-action-server",
+        subject="/dock",
+        message="/rqt_action",
+    ),
+    Fault(
+        name="a tool listens where nobody is tolerated",
+        edits={"policy/tolerated_nodes": []},
+        intruder=("_ros2cli_4711", "--subscribe", CHATTER),
+        exit_code=ExitCode.VIOLATED,
+        rule="graph.undeclared-node",
+        subject="/_ros2cli_4711",
+    ),
+    Fault(
+        name="a plain DDS program may write a declared topic",
+        edits={},
+        intruder=("--write", "rt/chatter:std_msgs::msg::dds_::String_"),
+        intruder_is=BARE_DDS,
+        exit_code=ExitCode.VIOLATED,
+        rule="graph.unattributed-endpoint",
+        subject="/chatter",
+        message="a participant of Cyclone DDS, at 127.0.0.1",
+        options=("--strict", "--timeout", "6"),
+    ),
+    Fault(
+        name="a plain DDS program may answer for a declared service",
+        edits={},
+        intruder=("--write", "rr/listener/pingReply:std_srvs::srv::dds_::Trigger_Response_"),
+        intruder_is=BARE_DDS,
+        exit_code=ExitCode.VIOLATED,
+        rule="graph.unattributed-endpoint",
+        subject="/listener/ping",
+        options=("--strict", "--timeout", "6"),
+    ),
+)
+
+FAULTS = STATIC + START + TRANSITIONS + GRAPH + DEFINITIONS + FLOWS + ACTIVE + OUTSIDERS

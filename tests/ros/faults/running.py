@@ -21,7 +21,7 @@ from pathlib import Path
 import psutil
 
 from lifecycle.middleware import leftovers, segments_of
-from tests.ros.faults.system import FOREIGN, Fault
+from tests.ros.faults.system import Fault
 
 ROOT = Path(__file__).parents[3]
 LIMIT_S = 50.0
@@ -61,6 +61,7 @@ def run_up(fault: Fault, directory: Path) -> UpRun:
         **os.environ,
         "ROS_LOG_DIR": str(directory / "log"),
         "FAULT_SHARED_MEMORY_ONLY": str(Path(__file__).with_name("shared_memory_only.xml")),
+        "FAULT_FOREIGN_PARTITION": str(Path(__file__).with_name("foreign_partition.xml")),
     }
     # What somebody killed has left before is not ours to answer for, though we may use its port.
     before = leftovers()
@@ -123,7 +124,9 @@ def _intruder(fault: Fault, environment: dict[str, str]) -> Iterator[None]:
         yield
         return
     process = subprocess.Popen(
-        [sys.executable, FOREIGN, *fault.intruder], env=environment, stdout=subprocess.PIPE
+        [sys.executable, fault.intruder_is, *fault.intruder],
+        env=environment,
+        stdout=subprocess.PIPE,
     )
     try:
         assert process.stdout is not None

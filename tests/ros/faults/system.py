@@ -17,6 +17,7 @@ from lifecycle.errors import ExitCode
 
 NODES = "tests.ros.faults.nodes"
 FOREIGN = str(Path(__file__).with_name("foreign.py"))
+BARE_DDS = str(Path(__file__).with_name("bare_dds.py"))
 REMOVE = object()
 """As a value of an edit: take the key away."""
 
@@ -85,7 +86,8 @@ class Fault:
         subject: what the finding must name.
         message: a part of the message that tells the cause.
         options: more words for `lifecycle up`.
-        intruder: a foreign process that runs beside the system: arguments of foreign.py.
+        intruder: a foreign process that runs beside the system: arguments of `intruder_is`.
+        intruder_is: the program, foreign.py or bare_dds.py.
         activates: the fault strikes after a verdict ok, so activation is right.
     """
 
@@ -97,6 +99,7 @@ class Fault:
     rule: str = ""
     options: tuple[str, ...] = ()
     intruder: tuple[str, ...] = ()
+    intruder_is: str = FOREIGN
     activates: bool = False
 
     @property

@@ -90,3 +90,33 @@ def test_the_healthy_system_passes(tmp_path: Path) -> None:
     assert "listener message" not in run.markers[:activated]
     assert processes_of(run.token) == []
     assert run.shared_memory == ()
+
+
+def test_a_tool_that_only_listens_is_tolerated_and_listed(tmp_path: Path) -> None:
+    """What `ros2 topic echo` is: it must neither stop the system nor go unsaid."""
+    echo = Fault(
+        name="none",
+        edits={},
+        exit_code=ExitCode.OK,
+        subject="",
+        activates=True,
+        intruder=("_ros2cli_4711", "--subscribe", "/chatter:std_msgs/msg/String:RELIABLE"),
+        options=("--strict", "--stop-after", "1"),
+    )
+    run = run_up(echo, tmp_path)
+    assert run.exit_code == ExitCode.OK, _everything_said(run)
+    assert run.events[-1]["verdict"] == "ok"
+    assert run.events[-1]["tolerated"] == [
+        {
+            "node": "/_ros2cli_4711",
+            "because": "tolerated_nodes: _ros2cli_*",
+            "endpoints": [
+                {
+                    "kind": "subscriptions",
+                    "node": "/_ros2cli_4711",
+                    "name": "/chatter",
+                    "type": "std_msgs/msg/String",
+                }
+            ],
+        }
+    ]

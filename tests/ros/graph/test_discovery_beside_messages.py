@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any
+
+import pytest
 
 from lifecycle.graph import (
     GraphEvents,
@@ -36,24 +36,19 @@ ITS_OWN = NodeConfiguration(
 )
 
 
-class ShownByName:
-    """A node whose graph shows /it, and nothing on it yet."""
-
-    def get_node_names_and_namespaces(self) -> list[tuple[str, str]]:
-        return [("it", "/")]
-
-    def __getattr__(self, name: str) -> Callable[[str, str], list[Any]]:
-        assert name.endswith("_by_node") or name == "get_publishers_info_by_topic"
-        return lambda *_: []
-
-
-def test_a_node_that_reports_is_asked_although_its_services_are_not_shown_yet() -> None:
+def test_a_node_that_reports_is_asked_although_its_services_are_not_shown_yet(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # The graph shows /it, and nothing on it yet.
+    monkeypatch.setattr("lifecycle.middleware.census.node_names", lambda _: ["/it"])
+    monkeypatch.setattr("lifecycle.middleware.census.endpoints_of", lambda *_, **__: [])
+    monkeypatch.setattr("lifecycle.graph.discovery.endpoints_of_node", lambda *_: [])
     scheduler = ManualScheduler()
     network = InMemoryNetwork(scheduler)
     events = GraphEvents(network.transport(), scheduler)
     asker = SimpleNamespace(get_configuration=lambda _, done: done(ITS_OWN))
     discovery = Discovery(
-        ShownByName(),  # type: ignore[arg-type]
+        SimpleNamespace(),  # type: ignore[arg-type]
         events,
         asker,  # type: ignore[arg-type]
         reread=lambda _: None,

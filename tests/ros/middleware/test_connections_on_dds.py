@@ -431,7 +431,7 @@ def test_clients_of_a_discovery_server_find_each_other_and_a_super_client_sees_t
             exchange(sending, receiving, wait_until)
 
             def seen() -> bool:
-                _, endpoints = observer.snapshot(keep=("/_in", "/_out"))
+                _, endpoints = observer.snapshot(declared=("/_in", "/_out"))
                 return {each.node for each in endpoints if each.name == "/flow"} == {
                     "/_in",
                     "/_out",
@@ -457,7 +457,9 @@ def test_an_observer_sees_by_url_what_is_there_before_it(
         there.create_publisher(String, "/flow", QOS)
         with GraphObserver(fresh_domain, connect(urls[1])) as observer:
             wait_until(
-                lambda: [e for e in observer.snapshot(keep=("/_there",))[1] if e.node == "/_there"]
+                lambda: [
+                    e for e in observer.snapshot(declared=("/_there",))[1] if e.node == "/_there"
+                ]
             )
 
 

@@ -116,22 +116,18 @@ def test_the_parts_of_an_action_server_show_as_one_endpoint(
     wait_until(lambda: endpoints(observer) == [expected])
 
 
-def test_nodes_named_as_a_tool_are_only_shown_when_asked_for(
+def test_nodes_named_as_a_tool_are_shown_and_the_observer_itself_is_not(
     observer: GraphObserver, make_node: MakeNode, wait_until: WaitUntil
 ) -> None:
     make_node("launch_ros_42").create_publisher(String, "/a", 10)
-    make_node("seen")
-    wait_until(lambda: "/seen" in nodes(observer))
-
-    def kept() -> bool:
-        found, shown = observer.snapshot(keep=["/launch_ros_42"])
-        return "/launch_ros_42" in {node.full_name for node in found} and any(
-            each.name == "/a" for each in shown
+    wait_until(lambda: "/launch_ros_42" in nodes(observer))
+    wait_until(
+        lambda: (
+            [each[:3] for each in endpoints(observer)]
+            == [(EndpointKind.PUBLISHER, "/launch_ros_42", "/a")]
         )
-
-    wait_until(kept)
-    assert "/launch_ros_42" not in nodes(observer)
-    assert not [each for each in endpoints(observer) if each[2] == "/a"]
+    )
+    assert list(nodes(observer)) == ["/launch_ros_42"]
 
 
 def test_a_flow_participant_shows_as_its_hidden_node(

@@ -71,7 +71,7 @@ def test_an_observer_is_told_of_who_comes_and_who_leaves(
             left.enter_context(remote(fresh_domain, other))
 
         def endpoints() -> list[str]:
-            _, found = observer.snapshot(keep=("/_remote",))
+            _, found = observer.snapshot(declared=("/_remote",))
             return [each.node for each in found if each.name == "/flow"]
 
         wait_until(lambda: endpoints() == ["/_remote"])
@@ -98,7 +98,7 @@ def test_a_tcp_peer_that_comes_again_is_seen_again(
     with GraphObserver(fresh_domain, ParticipantConnections(urls=(own,))) as observer:
 
         def gids() -> list[str]:
-            _, found = observer.snapshot(keep=("/_remote",))
+            _, found = observer.snapshot(declared=("/_remote",))
             return [each.gid for each in found if each.name == "/flow"]
 
         seen = []

@@ -38,6 +38,7 @@ MARK = f"What process {os.getpid()} sends by the network can be read there. "
 """Nothing else on the wire has this, not even from the same test in another process."""
 COUNT = 5
 UDP = ("udpv4",)
+BOTH = ("udpv4", "udpv6")
 
 MakeNode = Callable[..., Node]
 SpinUntil = Callable[..., None]
@@ -322,7 +323,34 @@ def test_a_mark_that_was_lost_is_set_again(domain_id: int) -> None:
     with FlowParticipant("_flow", "/", domain_id, dscp=46) as participant:
         participant.create_publisher(String, "/flow", QOS)
         set_dscp(participant.network_flow_endpoints, 0)
+        assert participant.read_dscp() == 0
+        assert participant.read_dscp() == 0, "reading marks nothing"
         participant.ensure_dscp()
+        assert participant.read_dscp() == 46
+
+
+def test_one_socket_without_the_mark_is_what_is_read(domain_id: int) -> None:
+    from lifecycle.middleware.dscp import get_dscps, set_dscp
+
+    with FlowParticipant("_flow", "/", domain_id, dscp=46, transports=BOTH) as participant:
+        nfes = participant.network_flow_endpoints
+        assert len(nfes) > 1
+        for lost in (nfes[0], nfes[-1]):
+            set_dscp([lost], 10)
+            assert get_dscps(nfes) == {10, 46}
+            assert participant.read_dscp() == 10
+            participant.ensure_dscp()
+            assert participant.read_dscp() == 46
+
+
+def test_a_mark_that_was_lost_is_set_again_before_a_subscription_is_handed_out(
+    domain_id: int,
+) -> None:
+    from lifecycle.middleware.dscp import set_dscp
+
+    with FlowParticipant("_flow", "/", domain_id, dscp=46) as participant:
+        set_dscp(participant.network_flow_endpoints, 0)
+        participant.create_subscription(String, "/flow", print, QOS)
         assert participant.read_dscp() == 46
 
 

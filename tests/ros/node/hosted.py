@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from typing import Any
 
@@ -67,6 +68,8 @@ class Plain(Node):
     def __init__(self, **options: Any) -> None:
         super().__init__("its_own_name", **options)
         self.create_publisher(String, "out", 10)
+        label = self.declare_parameter("label", "none").value
+        print("label", label, file=sys.stderr, flush=True)
 
 
 NOT_A_CLASS = 1

@@ -244,7 +244,7 @@ class Up:
                     each.kill()
             time.sleep(0.01)
         if used:
-            sweep(only=used)
+            sweep(used)
         self.process.wait(BOUND_S)
         self._reader.join(BOUND_S)
         for stream in (self.process.stdout, self.process.stderr):
@@ -283,12 +283,14 @@ def command(verb: str) -> Sequence[str]:
     return (sys.executable, "-m", "lifecycle.cli", verb)
 
 
-def verb(name: str, *arguments: str, runtime: Path) -> subprocess.CompletedProcess[str]:
-    """Run a verb to its end."""
+def verb(
+    name: str, *arguments: str, runtime: Path, variables: Mapping[str, str] | None = None
+) -> subprocess.CompletedProcess[str]:
+    """Run a verb to its end, with more variables in its environment."""
     return subprocess.run(
         [*command(name), *arguments],
         cwd=ROOT,
-        env=environment(runtime, ""),
+        env={**environment(runtime, ""), **(variables or {})},
         capture_output=True,
         text=True,
         timeout=BOUND_S,

@@ -5,10 +5,14 @@ The environment variable of the process, MISBEHAVE=step:way, names the callback 
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
+import socket
 import subprocess
 import threading
+import time
+from pathlib import Path
 
 from std_msgs.msg import String
 
@@ -28,6 +32,16 @@ def misbehave(step: str) -> None:
         threading.Event().wait()
     if way == "raise":
         raise RuntimeError("the sensor is on fire")
+    if way == "unmark" and Path(os.environ.get("MISBEHAVE_IF", "/")).exists():
+        # Other code of the process, a library of sockets, say.
+        for number in [int(each.name) for each in Path("/proc/self/fd").iterdir()]:
+            with contextlib.suppress(OSError), socket.socket(fileno=os.dup(number)) as each:
+                each.setsockopt(socket.IPPROTO_IP, socket.IP_TOS, 0)
+    if way == "wait":
+        # Until a test says so, and bounded; its transition's limit is longer.
+        end = time.monotonic() + 4.0
+        while not Path(os.environ["MISBEHAVE_IF"]).exists() and time.monotonic() < end:
+            time.sleep(0.05)
     if way == "fork":
         # A grandchild in a session of its own that outlives whoever made it.
         subprocess.Popen(["sleep", "300"], start_new_session=True)
@@ -68,3 +82,11 @@ class Listener(LifecycleNode):
 
 class Quiet(LifecycleNode):
     """Has what its manifest declares, and does nothing with it."""
+
+
+class Stubborn(Talker):
+    """Declares a parameter itself, with another value than its manifest says."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.declare_parameter("rate", 99.0)

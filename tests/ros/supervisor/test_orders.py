@@ -212,6 +212,36 @@ def test_a_node_that_comes_back_different_waits_at_the_gate(
         assert phases(tmp_path) == ("active", {"/talker": "active", "/listener": "active"})
 
 
+@pytest.mark.parametrize("orders", [("pause", "resume"), ("restart",)], ids="-".join)
+def test_what_becomes_active_again_must_be_what_was_verified(
+    tmp_path: Path, fresh_domain: int, orders: tuple[str, ...]
+) -> None:
+    flag = tmp_path / "unmark"
+    edit = {
+        "nodes/talker/flows": {"publishers": {"chatter": {"dscp": "EF"}}},
+        "nodes/talker/run/environment/MISBEHAVE_IF": str(flag),
+    }
+    manifest = pair(tmp_path, fresh_domain, misbehave="activate:unmark", edit=edit)
+    with up(manifest, runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        begun = len(run.events)
+        flag.touch()
+        *before, last = orders
+        for order in before:
+            assert verb(order, "pair", runtime=tmp_path).returncode == ExitCode.OK
+        refused = verb(last, "pair", runtime=tmp_path)
+        assert refused.returncode == ExitCode.VIOLATED
+        assert "flow.dscp-not-applied" in refused.stderr
+        # It was active before anybody could know: the run is over, not held.
+        assert run.finish() == ExitCode.VIOLATED
+        assert_no_activate_before_a_new_gate(run, begun)
+        reached = [each.get("reached") for each in run.events[begun:]]
+        assert "active" not in reached
+        assert run.verdict["run"]["reason"].startswith(
+            "what became active is not what was verified; "
+        )
+
+
 def test_a_node_that_dies_while_it_restarts_ends_the_run(tmp_path: Path, fresh_domain: int) -> None:
     with up(pair(tmp_path, fresh_domain, misbehave="deactivate:kill"), runtime=tmp_path) as run:
         run.until("system", reached="active")
@@ -268,3 +298,169 @@ def test_a_node_of_somebody_else_is_not_restarted(
         refused = verb("restart", "pair", "intruder", runtime=tmp_path)
         assert refused.returncode == ExitCode.USAGE
         assert refused.stderr == "cannot restart '/intruder': somebody else runs it\n"
+
+
+def test_a_changed_manifest_is_neither_restarted_nor_resumed_in_silence(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    manifest = pair(tmp_path, fresh_domain)
+    with up(manifest, runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        begun = len(run.events)
+        pair(tmp_path, fresh_domain, edit={"nodes/talker/log_level": "warn"})
+        said = (
+            f"{manifest}:{line_of(manifest, '  talker:')}:3: nodes.talker.log_level: "
+            'was not set, is "warn"\n'
+        )
+        take = f"take the new one: lifecycle restart {manifest} --reload"
+        for words in (("restart",), ("restart", "listener")):
+            refused = verb(words[0], str(manifest), *words[1:], runtime=tmp_path)
+            assert refused.returncode == ExitCode.USAGE
+            assert refused.stderr == (
+                f"cannot restart 'pair': its manifest is not the one that runs:\n{said}"
+                f"{take}; or keep what runs: lifecycle restart pair\n"
+            )
+        assert requests(run, begun) == []
+
+        status = verb("status", str(manifest), runtime=tmp_path)
+        assert status.returncode == ExitCode.OK
+        notice = f"{manifest} is not the manifest that pair@{fresh_domain} runs:\n{said}"
+        assert status.stderr == notice
+        paused = verb("pause", str(manifest), runtime=tmp_path)
+        assert (paused.returncode, paused.stderr) == (ExitCode.OK, notice)
+        resumed = verb("resume", str(manifest), runtime=tmp_path)
+        assert resumed.returncode == ExitCode.USAGE
+        assert resumed.stderr == (
+            f"cannot resume 'pair': its manifest is not the one that runs:\n{said}"
+            f"{take}; or keep what runs: lifecycle resume pair\n"
+        )
+        assert verb("resume", "pair", runtime=tmp_path).returncode == ExitCode.OK
+
+        # One node is not what has changed.
+        refused = verb("restart", str(manifest), "listener", "--reload", runtime=tmp_path)
+        assert refused.returncode == ExitCode.USAGE
+        assert refused.stderr == (
+            f"cannot reload 'listener' alone: more has changed:\n{said}"
+            f"restart the whole system: lifecycle restart {manifest} --reload\n"
+        )
+        listener, talker = run.pid_of("listener"), run.pid_of("talker")
+        taken = verb("restart", str(manifest), "talker", "--reload", runtime=tmp_path)
+        assert (taken.returncode, taken.stderr) == (ExitCode.OK, "")
+        run.met("notice", message=f"takes the changed manifest: {said}".strip())
+        run.catch_up()
+        assert run.pid_of("listener") == listener
+        assert run.pid_of("talker") != talker
+        again = verb("restart", str(manifest), "listener", runtime=tmp_path)
+        assert (again.returncode, again.stderr) == (ExitCode.OK, "")
+        down = verb("down", str(manifest), runtime=tmp_path)
+        assert (down.returncode, down.stderr) == (ExitCode.OK, "")
+        run.assert_nothing_left()
+
+
+def line_of(manifest: Path, start: str) -> int:
+    lines = manifest.read_text().splitlines()
+    return next(number for number, line in enumerate(lines, 1) if line.startswith(start))
+
+
+def test_a_reloaded_system_has_the_nodes_of_the_new_manifest(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    manifest = pair(tmp_path, fresh_domain)
+    with up(manifest, runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        old = {run.pid_of("talker"), run.pid_of("listener")}
+        begun = len(run.events)
+        document = yaml.safe_load(manifest.read_text())
+        nodes = document["nodes"]
+        nodes["second"] = {**nodes["listener"], "after": {"talker": "connected"}}
+        del nodes["listener"]
+        document["links"][0]["to"] = "second"
+        manifest.write_text(yaml.safe_dump(document))
+        taken = verb("restart", str(manifest), "--reload", runtime=tmp_path)
+        assert (taken.returncode, taken.stderr) == (ExitCode.OK, "")
+        run.until("system", reached="active")
+        run.met(
+            "notice",
+            since=begun,
+            message=("takes the changed manifest: nodes.listener: was declared, is not declared"),
+        )
+        assert_no_activate_before_a_new_gate(run, begun)
+        assert not old & {run.pid_of("talker"), run.pid_of("second")}
+        assert phases(tmp_path) == ("active", {"/talker": "active", "/second": "active"})
+        judged = verb("verify", str(manifest), *ENOUGH, runtime=tmp_path)
+        assert judged.returncode == ExitCode.OK, judged.stdout
+        assert verb("restart", str(manifest), "second", runtime=tmp_path).returncode == ExitCode.OK
+        assert verb("down", str(manifest), runtime=tmp_path).returncode == ExitCode.OK
+        assert run.finish() == ExitCode.OK
+        run.assert_nothing_left()
+
+
+def test_a_reloaded_system_that_is_not_as_declared_is_held(
+    tmp_path: Path, fresh_domain: int, make_intruder: Intruders
+) -> None:
+    manifest = pair(tmp_path, fresh_domain, edit={"policy/undeclared_nodes": "open"})
+    make_intruder(fresh_domain)
+    with up(manifest, runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        begun = len(run.events)
+        pair(tmp_path, fresh_domain)
+        refused = verb("restart", str(manifest), "--reload", runtime=tmp_path)
+        assert refused.returncode == ExitCode.VIOLATED
+        assert "graph.undeclared-node" in refused.stderr
+        assert "activate" not in [operation for _, operation in requests(run, begun)]
+        assert phases(tmp_path) == ("held", {"/talker": "inactive", "/listener": "inactive"})
+        pair(tmp_path, fresh_domain, edit={"policy/undeclared_nodes": "open"})
+        taken = verb("restart", str(manifest), "--reload", runtime=tmp_path)
+        assert (taken.returncode, taken.stderr) == (ExitCode.OK, "")
+        assert phases(tmp_path) == ("active", {"/talker": "active", "/listener": "active"})
+
+
+def test_what_a_running_supervisor_cannot_take_is_refused_with_the_reason(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    manifest = pair(tmp_path, fresh_domain)
+    end = "; end it and start it anew: lifecycle down, then lifecycle up\n"
+    with up(manifest, runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        pair(tmp_path, fresh_domain, edit={"discovery/range": "subnet"})
+        refused = verb("restart", str(manifest), "--reload", runtime=tmp_path)
+        assert refused.returncode == ExitCode.USAGE
+        assert refused.stderr == (
+            "cannot reload the manifest of 'pair' while it runs: a running supervisor cannot "
+            'change this:\ndiscovery.range: was "localhost", is "subnet"' + end
+        )
+        refused = verb("restart", "pair", "--reload", runtime=tmp_path)
+        assert refused.returncode == ExitCode.USAGE
+        assert refused.stderr == (
+            "cannot reload 'pair': it is no manifest; name the manifest's file\n"
+        )
+        pair(tmp_path, fresh_domain + 1)
+        refused = verb("restart", str(manifest), "--reload", runtime=tmp_path)
+        assert refused.returncode == ExitCode.USAGE
+        assert refused.stderr.startswith(
+            f"cannot find a running system 'pair@{fresh_domain + 1}'; running: pair@{fresh_domain}"
+        )
+        assert phases(tmp_path)[0] == "active"
+
+
+def test_a_parameter_file_that_changed_is_not_taken_in_silence(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    parameters = tmp_path / "talker.yaml"
+    parameters.write_text("/talker: {ros__parameters: {rate: 1}}\n")
+    edit = {
+        "nodes/talker/parameter_files": ["talker.yaml"],
+        "nodes/talker/interface/parameters": {"rate": {"type": "int", "default_value": 1}},
+    }
+    manifest = pair(tmp_path, fresh_domain, edit=edit)
+    with up(manifest, runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        parameters.write_text("/talker: {ros__parameters: {rate: 2}}\n")
+        for words in ((str(manifest),), ("pair",), ("pair", "talker")):
+            refused = verb("restart", *words, runtime=tmp_path)
+            assert refused.returncode == ExitCode.USAGE
+            assert "nodes.talker.parameter_files: was [" in refused.stderr
+        assert verb("restart", "pair", "listener", runtime=tmp_path).returncode == ExitCode.OK
+        taken = verb("restart", str(manifest), "talker", "--reload", runtime=tmp_path)
+        assert (taken.returncode, taken.stderr) == (ExitCode.OK, "")
+        assert verb("restart", "pair", runtime=tmp_path).returncode == ExitCode.OK

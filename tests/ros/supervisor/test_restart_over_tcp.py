@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from lifecycle.errors import ExitCode
-from tests.ros.supervisor.contacts import restarts_by_tcp, up_by_tcp
-from tests.ros.supervisor.running import Up, pair, verb
+from tests.ros.supervisor.running import Up, pair, up, verb
 
 
 def by_tcp(directory: Path, domain_id: int, **discovery: str) -> Path:
@@ -30,6 +29,13 @@ def violations(run: Up) -> set[tuple[str, str, str]]:
     }
 
 
+def restarts(run: Up, runtime: Path, *node: str) -> None:
+    """Restart the system, or one node of it, and see it active again."""
+    done = verb("restart", "pair", *node, runtime=runtime)
+    assert (done.returncode, done.stderr) == (ExitCode.OK, "")
+    run.until("system", reached="active")
+
+
 def ends_with_nothing_left(run: Up, runtime: Path) -> None:
     assert verb("down", "pair", runtime=runtime).returncode == ExitCode.OK
     assert run.finish() == ExitCode.OK
@@ -40,10 +46,11 @@ def test_each_end_of_a_tcp_connection_is_found_again_after_its_restart(
     tmp_path: Path, fresh_domain: int
 ) -> None:
     manifest = by_tcp(tmp_path, fresh_domain, mode="static", transport="tcpv4")
-    with up_by_tcp(manifest, runtime=tmp_path) as run:
-        restarts_by_tcp(run, tmp_path, "talker")
+    with up(manifest, runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        restarts(run, tmp_path, "talker")
         begun = len(run.events)
-        restarts_by_tcp(run, tmp_path, "listener")
+        restarts(run, tmp_path, "listener")
         run.met("log", since=begun, line="heard hello")
         # Whoever looks on is told where they listen now.
         judged = verb("verify", str(manifest), "--timeout", "20", runtime=tmp_path)
@@ -54,11 +61,12 @@ def test_each_end_of_a_tcp_connection_is_found_again_after_its_restart(
 def test_clients_of_a_discovery_server_are_found_again_after_their_restart(
     tmp_path: Path, fresh_domain: int
 ) -> None:
-    with up_by_tcp(by_tcp(tmp_path, fresh_domain, mode="server"), runtime=tmp_path) as run:
+    with up(by_tcp(tmp_path, fresh_domain, mode="server"), runtime=tmp_path) as run:
+        run.until("system", reached="active")
         begun = len(run.events)
-        restarts_by_tcp(run, tmp_path, "listener")
+        restarts(run, tmp_path, "listener")
         run.met("log", since=begun, line="heard hello")
-        restarts_by_tcp(run, tmp_path)
+        restarts(run, tmp_path)
         ends_with_nothing_left(run, tmp_path)
 
 
@@ -66,7 +74,8 @@ def test_a_discovery_server_that_dies_is_a_violation_for_as_long_as_the_system_r
     tmp_path: Path, fresh_domain: int
 ) -> None:
     manifest = by_tcp(tmp_path, fresh_domain, mode="server")
-    with up_by_tcp(manifest, "--keep-going", runtime=tmp_path) as run:
+    with up(manifest, "--keep-going", runtime=tmp_path) as run:
+        run.until("system", reached="active")
         pid = run.pid_of("discovery_server")
         os.kill(pid, signal.SIGKILL)
         died = f"cannot keep process 'discovery_server' running: pid {pid} died: killed by SIGKILL"
@@ -82,5 +91,5 @@ def test_a_discovery_server_that_dies_is_a_violation_for_as_long_as_the_system_r
                 "lifecycle up\n"
             )
         assert verb("down", "pair", runtime=tmp_path).returncode == ExitCode.OK
-        assert run.finish() == ExitCode.OK
+        assert run.finish() == ExitCode.BRING_UP_FAILED
         run.assert_nothing_left()

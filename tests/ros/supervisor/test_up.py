@@ -5,15 +5,32 @@ from __future__ import annotations
 import json
 import os
 import signal
+import subprocess
 import sys
 import time
+import uuid
 from pathlib import Path
+from xml.etree import ElementTree as ET
 
 import pytest
+import rclpy
+from rclpy.node import Node
 
 from lifecycle.errors import ExitCode
 from lifecycle.middleware import segments_of
-from tests.ros.supervisor.running import BOUND_S, marked, pair, up, verb
+from lifecycle.supervisor.judge import SETTLED_S
+from tests.ros.supervisor.running import (
+    BOUND_S,
+    ROOT,
+    Up,
+    command,
+    environment,
+    left_of,
+    marked,
+    pair,
+    up,
+    verb,
+)
 
 
 def test_a_healthy_system_is_connected_verified_activated_held_and_taken_down(
@@ -51,6 +68,65 @@ def test_until_stops_short_of_activating(tmp_path: Path, fresh_domain: int, unti
         assert run.of_kind("gate") == []
         assert "activate" not in [each["operation"] for each in run.of_kind("request")]
         run.assert_nothing_left()
+
+
+MARKED = {"nodes/talker/flows": {"publishers": {"chatter": {"dscp": "EF"}}}}
+
+
+def test_a_mark_that_other_code_took_away_keeps_the_gate_closed(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    manifest = pair(tmp_path, fresh_domain, misbehave="connect:unmark", edit=MARKED)
+    with up(manifest, "--stop-after", "0", runtime=tmp_path) as run:
+        assert run.finish() == ExitCode.VIOLATED
+        (finding,) = [
+            each for each in run.verdict["findings"] if each["rule"] == "flow.dscp-not-applied"
+        ]
+        assert finding["message"] == (
+            "cannot accept the publisher of /chatter in /talker: its sockets carry DF = DSCP 0 = "
+            "TOS 0 (0x00) and not EF = DSCP 46 = TOS 184 (0xb8)"
+        )
+        assert run.of_kind("gate") == []
+        # What is reported is what was read, not what was planned.
+        (flow,) = run.verdict["flows"]
+        assert (flow["dscp"], flow["outcome"]) == (0, "violated")
+        run.assert_nothing_left()
+
+
+def test_what_became_active_must_be_what_was_verified(tmp_path: Path, fresh_domain: int) -> None:
+    manifest = pair(tmp_path, fresh_domain, misbehave="activate:unmark", edit=MARKED)
+    with up(manifest, "--stop-after", "0", runtime=tmp_path) as run:
+        assert run.finish() == ExitCode.VIOLATED
+        assert [each["reached"] for each in run.of_kind("system")] == ["connected", "verified"]
+        assert len(run.of_kind("gate")) == 1
+        assert "flow.dscp-not-applied" in [each["rule"] for each in run.verdict["findings"]]
+        assert run.verdict["run"]["reason"].startswith(
+            "what became active is not what was verified; "
+        )
+        run.assert_nothing_left()
+
+
+def test_a_violation_that_healed_while_the_system_was_held_still_counts(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    with up(pair(tmp_path, fresh_domain), "--stop-after", "8", runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        begun = len(run.events)
+        context = rclpy.Context()
+        context.init(args=[], domain_id=fresh_domain)
+        intruder = Node("intruder", context=context, enable_rosout=False)
+        run.until_found("graph.undeclared-node", since=begun)
+        # It counts once it stood for so long without any change: there is no event to wait for.
+        time.sleep(3 * SETTLED_S)
+        intruder.destroy_node()
+        context.try_shutdown()
+        context.destroy()
+        run.until_not_found("graph.undeclared-node", since=run.catch_up())
+        assert run.finish() == ExitCode.VIOLATED
+        assert run.verdict["verdict"] == "ok"
+        assert run.verdict["run"]["reason"].startswith("done, but violated meanwhile, ")
+        assert "graph.undeclared-node" in run.verdict["run"]["reason"]
+        assert run.verdict["run"]["reached"] == "active"
 
 
 def test_an_interrupt_takes_the_system_down_in_reverse_order(
@@ -94,11 +170,174 @@ def test_a_signal_while_the_supervisor_itself_is_starting_leaves_nothing(
             time.sleep(0.001)
         run.note_segments()
         run.signal(signal.SIGTERM)
-        assert run.finish() == ExitCode.OK
+        assert run.finish() == ExitCode.TERMINATED
         assert run.verdict["verdict"] == "unverifiable"
         assert run.verdict["run"]["reason"].startswith("terminated")
         run.assert_gate_held()
         run.assert_nothing_left()
+
+
+def _cases(report: Path) -> dict[str, str]:
+    """What each test case of a JUnit report comes to."""
+    return {
+        f"{case.get('classname')}: {case.get('name')}": next(
+            (each.tag for each in case if each.tag in {"failure", "skipped"}), "passed"
+        )
+        for case in ET.parse(report).getroot().iter("testcase")
+    }
+
+
+def _end(run: Up, how: int | str, runtime: Path) -> None:
+    if isinstance(how, int):
+        run.signal(how)
+    else:
+        assert verb(how, "pair", runtime=runtime).returncode == ExitCode.OK
+
+
+_ENDS = [
+    (signal.SIGTERM, ExitCode.TERMINATED),
+    (signal.SIGHUP, ExitCode.HUNG_UP),
+    ("down", ExitCode.BRING_UP_FAILED),
+]
+
+
+@pytest.mark.parametrize(("how", "code"), _ENDS)
+def test_a_run_that_is_ended_before_it_was_verified_is_no_success(
+    tmp_path: Path, fresh_domain: int, how: int | str, code: ExitCode
+) -> None:
+    report = tmp_path / "report.xml"
+    # The gate stays closed for as long as a node is missing that somebody else must start.
+    edit = {"nodes/third": {"run": {"attach": True}, "managed": False}}
+    with up(
+        pair(tmp_path, fresh_domain, edit=edit), "--report", str(report), runtime=tmp_path
+    ) as run:
+        run.until_found("graph.missing-node", "/third")
+        run.note_segments()
+        _end(run, how, tmp_path)
+        assert run.finish() == code
+        assert (
+            run.verdict["run"]
+            .pop("reason")
+            .endswith("; /third is still waiting to appear in the graph")
+        )
+        assert run.verdict["run"] == {"reached": "connected", "exit_code": code}
+        assert run.of_kind("gate") == []
+        cases = _cases(report)
+        assert cases["run: end"] == "failure"
+        assert cases["graph.missing-node: a declared node is not in the graph"] == "failure"
+        run.assert_nothing_left()
+
+
+def test_a_run_that_cannot_hold_for_as_long_as_asked_is_no_success_and_its_report_is_red(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    manifest = pair(tmp_path, fresh_domain)
+    reports = {name: tmp_path / f"{name}.xml" for name in ("short", "active", "invalid")}
+    for name, options, code in (
+        ("short", ("--stop-after", "30"), ExitCode.TERMINATED),
+        ("active", (), ExitCode.OK),
+    ):
+        with up(manifest, *options, "--report", str(reports[name]), runtime=tmp_path) as run:
+            run.until("system", reached="active")
+            run.signal(signal.SIGTERM)
+            assert run.finish() == code
+            assert run.verdict["verdict"] == "ok"
+            assert run.verdict["run"]["exit_code"] == code
+    cases = {name: _cases(path) for name, path in reports.items() if path.exists()}
+    assert set(cases["active"].values()) == {"passed"}
+    assert [name for name, came in cases["short"].items() if came != "passed"] == ["run: end"]
+    wrong = pair(tmp_path, fresh_domain, edit={"links": [{"topic": "/nothing"}]})
+    for name in ("up", "verify"):
+        done = verb(name, str(wrong), "--report", str(reports["invalid"]), runtime=tmp_path)
+        assert done.returncode == ExitCode.MANIFEST_INVALID
+        cases["invalid"] = _cases(reports["invalid"])
+        failed = [each for each, came in cases["invalid"].items() if came == "failure"]
+        assert failed == ["manifest: the manifest is valid", "run: end"]
+    assert list(cases["active"]) == list(cases["short"]) == list(cases["invalid"])
+
+
+def test_a_process_that_dies_while_a_run_must_hold_is_no_success_although_it_keeps_going(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    report = tmp_path / "report.json"
+    options = ("--keep-going", "--stop-after", "1", "--report", str(report))
+    with up(pair(tmp_path, fresh_domain), *options, runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        run.note_segments()
+        os.kill(run.pid_of("talker"), signal.SIGKILL)
+        assert run.finish() == ExitCode.BRING_UP_FAILED
+        found = [each["rule"] for each in json.loads(report.read_text())["findings"]]
+        assert found.count("run.process-died") == 1
+        run.assert_nothing_left()
+
+
+def test_a_reader_that_goes_away_before_the_system_is_verified_makes_no_success(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    report = tmp_path / "report.xml"
+    words = [str(pair(tmp_path, fresh_domain)), "--stop-after", "0", "--report", str(report)]
+    mark = uuid.uuid4().hex
+    run = subprocess.Popen(
+        [*command("up"), *words],
+        cwd=ROOT,
+        env=environment(tmp_path, mark),
+        stdout=subprocess.PIPE,
+        start_new_session=True,
+    )
+    assert run.stdout is not None
+    assert run.stdout.readline().startswith(b"pair: 2 nodes")
+    run.stdout.close()
+    assert run.wait(BOUND_S) == ExitCode.HUNG_UP
+    assert _cases(report)["run: end"] == "failure"
+    assert left_of(mark) == []
+
+
+_IMPORTING = "import time\nprint('importing', flush=True)\ntime.sleep(300)"
+
+
+def test_every_import_that_fails_is_named_once_and_whoever_still_imports_is_not_waited_for(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    broken = {"run": {"python": "tests.ros.faults.broken_import:Talker"}}
+    missing = {"run": {"python": "other_import:Talker"}}
+    manifest = pair(
+        tmp_path,
+        fresh_domain,
+        edit={
+            "nodes/broken": {**broken, "process": "shared"},
+            "nodes/missing": {**missing, "process": "shared"},
+            "nodes/alone": missing,
+            "nodes/slow": {"run": {"python": "slow_import:Talker"}},
+            "nodes/foreign": {
+                "run": {"command": [sys.executable, "-c", _IMPORTING]},
+                "managed": False,
+            },
+        },
+    )
+    talker = "from lifecycle import LifecycleNode\n\nclass Talker(LifecycleNode): ...\n"
+    (tmp_path / "slow_import.py").write_text(f"{_IMPORTING}\n{talker}")
+    (tmp_path / "other_import.py").write_text(f"import no_such_sensor\n{talker}")
+    done = verb(
+        "up", str(manifest), runtime=tmp_path, variables={"PYTHONPATH": f"{tmp_path}:{ROOT}"}
+    )
+    assert done.returncode == ExitCode.BRING_UP_FAILED
+    said = done.stdout
+    driver = "cannot start '/broken': ModuleNotFoundError: No module named 'no_such_driver'"
+    assert said.count(driver) == 1
+    for node in ("missing", "alone"):
+        sensor = f"cannot start '/{node}': ModuleNotFoundError: No module named 'no_such_sensor'"
+        assert said.count(sensor) == 1
+    assert said.count("Traceback") == 3, said
+    assert "KeyboardInterrupt" not in said
+    assert "had to be ended" not in said
+    for node in ("broken", "missing", "alone"):
+        assert said.count(f"failed: /{node} (run.start-failed)\n") == 1
+        assert said.count(f"violated run.start-failed: /{node}\n") == 1
+    assert "verdict: violated (3 violated)" in said
+    assert "/talker (run." not in said
+    for process in ("slow", "foreign"):
+        (log,) = (tmp_path / "log").glob(f"*/{process}.log")
+        assert log.read_text() == "importing\n"
 
 
 def test_a_second_interrupt_kills_what_does_not_end(tmp_path: Path, fresh_domain: int) -> None:
@@ -132,11 +371,11 @@ def test_a_process_that_dies_in_a_step_ends_the_run_and_is_named_with_its_last_w
             f"cannot keep '/talker' running: pid {run.pid_of('talker')} died while activating: "
             "killed by SIGKILL"
         )
-        assert failure["log_tail"][-1] == "about to kill in activate"
+        assert Path(failure["log"]).read_text().splitlines()[-1] == "about to kill in activate"
         assert run.verdict["verdict"] == "violated"
         assert run.verdict["findings"][0]["rule"] == "run.process-died"
         assert run.verdict["run"] == {
-            "reason": failure["message"],
+            "reason": "failed: /talker (run.process-died)",
             "reached": "verified",
             "exit_code": ExitCode.BRING_UP_FAILED,
         }
@@ -144,7 +383,7 @@ def test_a_process_that_dies_in_a_step_ends_the_run_and_is_named_with_its_last_w
         run.assert_nothing_left()
 
 
-def test_keep_going_reports_the_death_and_the_verdict_and_goes_on(
+def test_keep_going_reports_the_death_and_the_verdict_and_goes_on_but_is_no_success(
     tmp_path: Path, fresh_domain: int
 ) -> None:
     with up(pair(tmp_path, fresh_domain), "--keep-going", runtime=tmp_path) as run:
@@ -157,7 +396,9 @@ def test_keep_going_reports_the_death_and_the_verdict_and_goes_on(
         verdict = run.until_found("graph.missing-node", "/talker", since=before)
         assert verdict["verdict"] == "violated"
         run.signal(signal.SIGTERM)
-        assert run.finish() == ExitCode.OK
+        assert run.finish() == ExitCode.BRING_UP_FAILED
+        assert run.verdict["run"]["reason"] == "terminated; failed: /talker (run.process-died)"
+        assert run.verdict["findings"][0]["rule"] == "run.process-died"
         run.assert_nothing_left()
 
 

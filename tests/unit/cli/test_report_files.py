@@ -1,16 +1,22 @@
-"""`--report FILE`: the suffix says the format."""
+"""`--report FILE`: the suffix says the format, and every end of a command is written."""
 
 from __future__ import annotations
 
 import json
+import os
+import signal
+from collections.abc import Callable
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
+import click
 import pytest
 
-from lifecycle.cli.report import write_report
-from lifecycle.errors import UsageError
+from lifecycle.cli.report import Report, open_report
+from lifecycle.errors import MiddlewareError, UsageError
+from lifecycle.manifest import Diagnostic, ManifestError, Position, Severity
 from lifecycle.plan import build_plan
+from lifecycle.supervisor.ending import Ended
 from lifecycle.verify import Outcome, Stage, Verdict, verify
 from tests.unit.plan.samples import teleop
 from tests.unit.verify.edits import drop_node
@@ -27,34 +33,180 @@ def violated() -> Verdict:
 
 
 def written(directory: Path, name: str) -> str:
-    write_report(directory / name, violated(), PLAN)
-    text = (directory / name).read_text(encoding="utf-8")
+    path = directory / name
+    open_report(path)
+    with Report(path) as report:
+        report.begin(PLAN)
+        report.end(violated())
+    text = path.read_text(encoding="utf-8")
     assert text.endswith("\n")
     return text
 
 
-def test_xml_is_junit_and_names_what_failed(tmp_path: Path) -> None:
-    cases = ET.fromstring(written(tmp_path, "report.xml")).iter("testcase")
+@pytest.mark.parametrize("name", ["report.xml", "report.junit.XML"])
+def test_xml_is_junit_and_names_what_failed(tmp_path: Path, name: str) -> None:
+    cases = ET.fromstring(written(tmp_path, name)).iter("testcase")
     failed = [each.get("classname") for each in cases if each.find("failure") is not None]
     assert RULE in failed
 
 
-def test_sarif_is_sarif(tmp_path: Path) -> None:
-    results = json.loads(written(tmp_path, "report.sarif"))["runs"][0]["results"]
+@pytest.mark.parametrize("name", ["report.sarif", "report.sarif.json"])
+def test_sarif_is_sarif(tmp_path: Path, name: str) -> None:
+    results = json.loads(written(tmp_path, name))["runs"][0]["results"]
     assert RULE in {each["ruleId"] for each in results}
 
 
-@pytest.mark.parametrize("name", ["report.json", "report"])
-def test_any_other_suffix_is_json(tmp_path: Path, name: str) -> None:
-    assert RULE in {each["rule"] for each in json.loads(written(tmp_path, name))["findings"]}
+def test_json_is_json(tmp_path: Path) -> None:
+    findings = json.loads(written(tmp_path, "report.json"))["findings"]
+    assert RULE in {each["rule"] for each in findings}
 
 
 def test_txt_is_what_people_read(tmp_path: Path) -> None:
     assert written(tmp_path, "report.txt").startswith("verdict: violated")
 
 
-def test_a_report_that_cannot_be_written_is_one_clear_error(tmp_path: Path) -> None:
-    file = tmp_path / "no" / "report.json"
+@pytest.mark.parametrize("name", ["report", "report.yaml", "report.xml.bak", ".xml"])
+def test_a_suffix_that_says_no_format_is_an_error(tmp_path: Path, name: str) -> None:
     with pytest.raises(UsageError) as caught:
-        write_report(file, violated(), PLAN)
-    assert str(caught.value) == f"cannot write report {str(file)!r}: No such file or directory"
+        open_report(tmp_path / name)
+    path = tmp_path / name
+    assert str(caught.value) == (
+        f"cannot tell the format of report {str(path)!r} by its suffix {path.suffix!r}; "
+        "allowed: .json, .xml (JUnit), .sarif, .txt"
+    )
+    assert not path.exists()
+
+
+def _directory(path: Path) -> None:
+    (path / "report.json").mkdir(parents=True)
+
+
+def _file(path: Path) -> None:
+    path.touch()
+
+
+@pytest.mark.parametrize(
+    ("make", "reason"),
+    [
+        (lambda _: None, "No such file or directory"),
+        (_directory, "it is a directory"),
+        (_file, "Not a directory"),
+    ],
+)
+def test_a_report_that_cannot_be_written_is_one_clear_error(
+    tmp_path: Path, make: Callable[[Path], None], reason: str
+) -> None:
+    make(tmp_path / "no")
+    path = tmp_path / "no" / "report.json"
+    with pytest.raises(UsageError) as caught:
+        open_report(path)
+    assert str(caught.value) == f"cannot write report {str(path)!r}: {reason}"
+
+
+def test_nothing_old_outlives_a_run_that_is_killed(tmp_path: Path) -> None:
+    path = tmp_path / "report.xml"
+    path.write_text("<testsuites failures='0'/>")
+    open_report(path)
+    assert path.read_text() == ""
+    Report(path).begin(PLAN)
+    root = ET.parse(path).getroot()
+    assert root.get("failures") == "1"
+    (failure,) = root.iter("failure")
+    assert failure.get("message") == "it never came to its end: the process was killed"
+
+
+def test_a_pipe_is_written_once_in_the_end(tmp_path: Path) -> None:
+    path = tmp_path / "report.json"
+    os.mkfifo(path)
+    reader = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+    open_report(path)
+    with Report(path) as report:
+        report.begin(PLAN)
+        report.end(violated())
+    text = os.read(reader, 1 << 20).decode()
+    os.close(reader)
+    assert json.loads(text)["verdict"] == "violated"
+
+
+ENDS: list[tuple[BaseException, int, str]] = [
+    (UsageError("cannot run machine 'x'"), 2, "cannot run machine 'x'"),
+    (click.UsageError("no such option"), 2, "no such option"),
+    (MiddlewareError("cannot make a participant"), 6, "cannot make a participant"),
+    (Ended(signal.SIGTERM), 143, "terminated"),
+    (Ended(signal.SIGHUP), 129, "the terminal was closed"),
+    (Ended(signal.SIGINT), 130, "interrupted"),
+    (KeyboardInterrupt(), 130, "interrupted"),
+    (ValueError("oops"), 70, "a bug in lifecycle: ValueError: oops"),
+]
+
+
+@pytest.mark.parametrize(("error", "code", "reason"), ENDS, ids=lambda each: type(each).__name__)
+@pytest.mark.parametrize("suffix", ["json", "xml", "sarif", "txt"])
+def test_every_end_is_reported_and_none_of_these_is_a_success(
+    tmp_path: Path, error: BaseException, code: int, reason: str, suffix: str
+) -> None:
+    path = tmp_path / f"report.{suffix}"
+
+    def fail() -> None:
+        with Report(path):
+            raise error
+
+    with pytest.raises(type(error)):
+        fail()
+    text = path.read_text()
+    if suffix == "json":
+        document = json.loads(text)
+        assert document["run"] == {
+            "reason": reason,
+            "reached": None,
+            "exit_code": code,
+        }
+        assert (document["verdict"], document["judged"]) == ("unverifiable", False)
+    elif suffix == "xml":
+        root = ET.fromstring(text)
+        assert [each.get("message") for each in root.iter("failure")] == [reason]
+        assert {len(each) for each in root.iter("testcase")} == {0, 1}
+    elif suffix == "sarif":
+        (run,) = json.loads(text)["runs"]
+        assert run["invocations"][0]["exitCode"] == code
+        assert [each["level"] for each in run["results"]] == ["error"]
+    else:
+        assert f"exit code {code}: {reason}" in text
+
+
+def test_an_invalid_manifest_is_reported_with_every_error(tmp_path: Path) -> None:
+    at = Position(file="m.lifecycle.yaml", line=3, column=5, path="nodes.a")
+    wrong = [
+        Diagnostic(rule=f"manifest.{each}", severity=severity, at=at, message=f"cannot {each}")
+        for each, severity in (
+            ("read", Severity.ERROR),
+            ("warn", Severity.WARNING),
+            ("use", Severity.ERROR),
+        )
+    ]
+    path = tmp_path / "report.json"
+
+    def fail() -> None:
+        with Report(path):
+            raise ManifestError(wrong)
+
+    with pytest.raises(ManifestError):
+        fail()
+    document = json.loads(path.read_text())
+    assert document["verdict"] == "violated"
+    assert [each["message"] for each in document["findings"]] == ["cannot read", "cannot use"]
+    assert document["run"]["exit_code"] == 3
+    assert document["run"]["reason"] == "the manifest is invalid: 2 errors"
+
+
+def test_a_report_that_cannot_be_written_in_the_end_is_no_success(tmp_path: Path) -> None:
+    directory = tmp_path / "reports"
+    directory.mkdir()
+    path = directory / "report.json"
+    open_report(path)
+    with Report(path) as report:
+        report.begin(PLAN)
+        path.unlink()
+        directory.rmdir()
+        with pytest.raises(UsageError, match="cannot write report"):
+            report.end(violated())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 from pathlib import Path
 
@@ -9,10 +10,13 @@ import pytest
 from click.testing import CliRunner
 
 from lifecycle.cli import verb_up
-from lifecycle.errors import ExitCode
+from lifecycle.errors import ExitCode, UsageError
 
 
 class _NoForerunner:
+    def __init__(self, **_: object) -> None:
+        """Start nothing."""
+
     def close(self) -> None:
         """Nothing was started."""
 
@@ -21,7 +25,8 @@ class _NoForerunner:
     ("number", "reason", "exit_code"),
     [
         (signal.SIGINT, "interrupted", ExitCode.INTERRUPTED),
-        (signal.SIGTERM, "terminated", ExitCode.OK),
+        (signal.SIGTERM, "terminated", ExitCode.TERMINATED),
+        (signal.SIGHUP, "the terminal was closed", ExitCode.HUNG_UP),
     ],
 )
 def test_an_interrupt_while_the_manifest_is_read_is_told(
@@ -34,8 +39,29 @@ def test_an_interrupt_while_the_manifest_is_read_is_told(
     manifest = tmp_path / "m.lifecycle.yaml"
     manifest.write_text("manifest_version: 1\nsystem: s\n")
     monkeypatch.setattr("lifecycle.supervisor.run.Forerunner", _NoForerunner)
-    monkeypatch.setattr(verb_up, "load_manifest", lambda *_: signal.raise_signal(number))
-    result = CliRunner().invoke(verb_up.command, [str(manifest)], standalone_mode=False)
+    monkeypatch.setattr(verb_up, "load_manifest", lambda *_, **__: signal.raise_signal(number))
+    report = tmp_path / "report.json"
+    words = [str(manifest), "--report", str(report)]
+    result = CliRunner().invoke(verb_up.command, words, standalone_mode=False)
     assert result.return_value == exit_code
+    assert json.loads(report.read_text())["run"]["exit_code"] == exit_code
     assert result.stderr == f"ended before anything was started: {reason}\n"
     assert result.stdout == ""
+
+
+def test_a_report_that_cannot_be_written_is_refused_before_anything_is_started(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("lifecycle.supervisor.run.Forerunner", lambda: pytest.fail("it started"))
+    words = [str(tmp_path / "m.lifecycle.yaml"), "--report", str(tmp_path / "no" / "report.xml")]
+    with pytest.raises(UsageError, match=r"cannot write report .*: No such file or directory"):
+        CliRunner().invoke(verb_up.command, words, standalone_mode=False, catch_exceptions=False)
+
+
+def test_a_wrong_option_leaves_no_report_of_an_earlier_run(tmp_path: Path) -> None:
+    report = tmp_path / "report.xml"
+    report.write_text("<testsuites failures='0'/>")
+    words = ["m.lifecycle.yaml", "--until", "tomorrow", "--report", str(report)]
+    result = CliRunner().invoke(verb_up.command, words)
+    assert result.exit_code == ExitCode.USAGE
+    assert report.read_text() == ""

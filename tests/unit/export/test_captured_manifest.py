@@ -21,9 +21,11 @@ from lifecycle.verify.observation import (
     EndpointReport,
     Identity,
     NodeConfiguration,
+    NodeParameters,
     Observation,
     ObservedEndpoint,
     ObservedNode,
+    ParameterReport,
 )
 
 PUBLISHER, SUBSCRIPTION = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
@@ -81,6 +83,22 @@ PARAMETERS = {
     "/left/base": (),
 }
 
+ASKED = dataclasses.replace(
+    FOREIGN,
+    parameters=tuple(
+        NodeParameters(
+            node=node,
+            parameters=tuple(
+                ParameterReport.of(each.name, each.type, each.value, read_only=each.read_only)
+                for each in parameters
+            ),
+        )
+        for node, parameters in PARAMETERS.items()
+        if parameters is not None
+    ),
+)
+"""The same system, its nodes asked for their parameters as verification does."""
+
 
 def captured(observation: Observation = FOREIGN, **rest: object) -> CapturedSystem:
     return capture(
@@ -112,7 +130,7 @@ def test_a_captured_system_is_valid_and_verified_by_what_it_was_captured_from(
         ("right_scanner", "scanner", "/right", False),
     ]
     assert {node.run.kind for node in manifest.nodes} == {RunKind.ATTACH}
-    verdict = verify(build_plan(manifest, environment={}), FOREIGN, stage=Stage.ACTIVE)
+    verdict = verify(build_plan(manifest, environment={}), ASKED, stage=Stage.ACTIVE)
     assert [each.message for each in verdict.findings] == []
     assert verdict.verdict is Outcome.OK
 
@@ -202,7 +220,7 @@ def test_nodl_documents_stand_in_for_interfaces(tmp_path: Path) -> None:
         ]
 
     assert interfaces(by_reference) == interfaces(inline)
-    verdict = verify(build_plan(by_reference, environment={}), FOREIGN, stage=Stage.ACTIVE)
+    verdict = verify(build_plan(by_reference, environment={}), ASKED, stage=Stage.ACTIVE)
     assert verdict.findings == ()
 
 
@@ -263,7 +281,7 @@ def test_some_namespaces_leave_the_others_open(tmp_path: Path) -> None:
     system = captured(namespaces=("left",))
     assert [node.full_name for node in system.nodes] == ["/left/base", "/left/scanner"]
     plan = build_plan(loaded(system, tmp_path).manifest, environment={})
-    assert verify(plan, FOREIGN, stage=Stage.ACTIVE).findings == ()
+    assert verify(plan, ASKED, stage=Stage.ACTIVE).findings == ()
 
 
 def test_nodes_of_ours_tell_depth_uniqueness_dscp_and_their_hidden_participants(
@@ -318,3 +336,25 @@ def test_nodes_of_ours_tell_depth_uniqueness_dscp_and_their_hidden_participants(
     ) in text
     need = loaded(system, tmp_path).manifest.nodes[0].flows[0]
     assert (need.unique, need.dscp) == (UniqueRequirement.OPTIONALLY_REQUIRED, 46)
+
+
+def test_names_that_no_manifest_can_declare_are_left_out_and_are_gaps(tmp_path: Path) -> None:
+    odd = ("/foo-bar", "/", "bad/x", "/1foo", "/x\n/y", "/a\x1b[2J")
+    captured = capture(
+        Observation(
+            nodes=plain("/good", *odd),
+            endpoints=(
+                endpoint(PUBLISHER, "/good", "/fine"),
+                endpoint(PUBLISHER, "/good", "/not-fine\x1b"),
+                endpoint(PUBLISHER, "/foo-bar", "/lost"),
+            ),
+        ),
+        {},
+        system="s",
+        domain_id=0,
+        discovery_range=DiscoveryRange.LOCALHOST,
+    )
+    assert [each.name for each in loaded(captured, tmp_path).manifest.nodes] == ["good"]
+    for name in odd:
+        assert any(gap.startswith(f"node {name} is left out: ") for gap in captured.gaps)
+    assert any("/not-fine\x1b is left out: " in gap for gap in captured.nodes[0].gaps)

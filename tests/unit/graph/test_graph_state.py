@@ -362,6 +362,15 @@ def test_a_count_that_may_be_of_another_peer_proves_nothing() -> None:
     assert (outcome, reason) == (Outcome.UNVERIFIABLE, "matched 1 of 2, nobody tells which")
 
 
+@pytest.mark.parametrize(("peers", "outcome"), [(("0b",), Outcome.OK), (("77",), Outcome.VIOLATED)])
+def test_an_end_that_names_its_peers_proves_the_pair_and_no_other(
+    peers: tuple[str, ...], outcome: Outcome
+) -> None:
+    publisher = {"gid": "0a", "matched": 1, "peers": peers}
+    subscription = {"gid": "0b", "matched": 1, "peers": ("0a",)}
+    assert judged(publisher, subscription)[0] is outcome
+
+
 def test_a_link_says_by_which_flow_and_connections() -> None:
     found = link(
         "/t",

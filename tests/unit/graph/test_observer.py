@@ -22,13 +22,16 @@ from lifecycle.manifest.model import (
     RunKind,
     Timeouts,
 )
-from lifecycle.plan.model import Plan, PlannedNode
+from lifecycle.plan.model import ExpectedParameter, Plan, PlannedNode
+from lifecycle.verify.noise import NO_NAMES, DeclaredNames
 from lifecycle.verify.observation import (
     Identity,
     NodeConfiguration,
+    NodeParameters,
     Observation,
     ObservedEndpoint,
     ObservedNode,
+    ParameterReport,
 )
 from tests.unit.supervisor.fakes import run as run_jumping
 
@@ -48,9 +51,9 @@ class FakeGraph:
         self.arriving: list[tuple[ObservedNode, ...]] = []
 
     def snapshot(
-        self, *, keep: Collection[str] = ()
+        self, *, declared: Collection[str] = (), names: DeclaredNames = NO_NAMES
     ) -> tuple[tuple[ObservedNode, ...], tuple[ObservedEndpoint, ...]]:
-        self.kept = keep
+        self.kept = declared
         if self.arriving:
             self.nodes = self.arriving.pop(0)
         return self.nodes, self.endpoints
@@ -78,6 +81,9 @@ class FakeClients:
         self.followed: dict[str, Callable[[], None]] = {}
         self.forgotten: list[str] = []
         self.destroyed = False
+        self.listening = False
+        self.read: list[tuple[str, frozenset[str]]] = []
+        self.while_read: Callable[[], None] = lambda: None
 
     async def get_state(self, node: str, *, timeout_s: float) -> str:
         self.asked.append(node)
@@ -90,6 +96,20 @@ class FakeClients:
 
     def on_transition(self, node: str, callback: Callable[[], None]) -> None:
         self.followed[node] = callback
+
+    def serves_parameters(self, node: str) -> bool | None:
+        return True
+
+    async def report_parameters(
+        self, node: str, names: Collection[str], *, timeout_s: float
+    ) -> tuple[ParameterReport, ...]:
+        self.read.append((node, frozenset(names)))
+        self.while_read()
+        await asyncio.sleep(0)
+        return (ParameterReport(name="gain", type="double", value=1.5),)
+
+    def on_parameters(self, callback: Callable[[str, frozenset[str]], None]) -> None:
+        self.listening = True
 
     def forget(self, node: str) -> None:
         self.forgotten.append(node)
@@ -346,3 +366,49 @@ def test_an_observation_waits_for_who_answered_and_is_not_seen_yet() -> None:
     observer = Observer(graph, FakeClients())
     observation = asyncio.run(observer.observe(plan()))
     assert [node.full_name for node in observation.nodes] == ["/stranger"]
+
+
+def with_parameter(made: Plan, *names: str) -> Plan:
+    """Expect the parameter gain of some nodes."""
+    gain = ExpectedParameter(name="gain", type="double", at=made.nodes[0].at)
+    nodes = tuple(
+        dataclasses.replace(each, expected_parameters=(gain,)) if each.name in names else each
+        for each in made.nodes
+    )
+    return dataclasses.replace(made, nodes=nodes)
+
+
+def test_only_nodes_that_report_no_parameters_are_asked_for_those_that_are_planned(
+    observer: Observer, graph: FakeGraph, clients: FakeClients
+) -> None:
+    graph.nodes = managed("/foreign", "/ours", "/asked", "/unplanned")
+    observer.put_configuration(dataclasses.replace(configuration("/ours"), parameters=()))
+    clients.configurations["/asked"] = dataclasses.replace(configuration("/asked"), parameters=())
+    named = with_parameter(plan("foreign", "ours", "asked", "gone"), "foreign", "ours", "asked")
+    seen = run(observer.observe(named))
+    gain = ParameterReport(name="gain", type="double", value=1.5)
+    assert seen.parameters == (NodeParameters(node="/foreign", parameters=(gain,)),)
+    assert clients.read == [("/foreign", frozenset({"gain"}))]
+    assert clients.listening
+
+
+def test_without_a_planned_parameter_of_others_nobody_listens_for_changes(
+    observer: Observer, graph: FakeGraph, clients: FakeClients
+) -> None:
+    graph.nodes = managed("/foreign", "/ours")
+    observer.put_configuration(dataclasses.replace(configuration("/ours"), parameters=()))
+    seen = run(observer.observe(with_parameter(plan("foreign", "ours"), "ours")))
+    assert (seen.parameters, clients.read, clients.listening) == ((), [], False)
+
+
+def test_what_changed_while_parameters_were_read_is_seen(
+    observer: Observer, graph: FakeGraph, clients: FakeClients
+) -> None:
+    graph.nodes = managed("/foreign")
+
+    def more() -> None:
+        graph.nodes = managed("/foreign", "/late")
+
+    clients.while_read = more
+    seen = run(observer.observe(with_parameter(plan("foreign"), "foreign")))
+    assert [each.full_name for each in seen.nodes] == ["/foreign", "/late"]

@@ -41,7 +41,7 @@ def groups(*needs: FlowNeed, **rest: object) -> list[ParticipantGroup]:
 
 
 def carried(*needs: FlowNeed, **rest: object) -> list[tuple[str, ...]]:
-    return [each.publishers for each in groups(*needs, **rest)]
+    return [each.names for each in groups(*needs, **rest)]
 
 
 # --- as few participants as meet every need
@@ -75,7 +75,7 @@ def test_the_smaller_datagram_serves_all_of_a_class():
         need(PUB, "small", dscp=46, max_message_size=100),
         need(PUB, "large", dscp=46, max_message_size=60_000),
     )
-    assert (only.publishers, only.max_datagram_bytes) == (("small", "large"), 1400)
+    assert (only.names, only.max_datagram_bytes) == (("small", "large"), 1400)
 
 
 def test_a_priority_and_a_dscp_that_come_to_the_same_share():
@@ -96,9 +96,7 @@ def test_a_node_whose_own_participant_is_on_the_network_needs_no_other_for_it():
     )
     needs = FlowNeeds(manifest(only), [])
     assert needs.node_transports(only) == ("udpv4",)
-    assert [(each.publishers, each.transports) for each in needs.groups(only)] == [
-        (("c",), ("udpv4",))
-    ]
+    assert [(each.names, each.transports) for each in needs.groups(only)] == [(("c",), ("udpv4",))]
 
 
 def class_of_the_publisher(*hearers: FlowNeed | None, run: RunKind = RunKind.PYTHON):

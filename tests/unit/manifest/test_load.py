@@ -31,6 +31,7 @@ from lifecycle.manifest import (
     load,
 )
 from lifecycle.manifest.diagnostics import Position
+from lifecycle.manifest.qos import POLICIES
 from lifecycle.network.nfe import UniqueRequirement
 
 VALID = Path(__file__).parents[2] / "corpus" / "valid"
@@ -74,6 +75,7 @@ def test_discovery_and_policy(every_key: Manifest) -> None:
     assert policy.unverifiable_blocks
     assert policy.unpublished is Severity.WARNING
     assert policy.unheard is None
+    assert policy.tolerated_nodes == ("rviz*", "/tools/*")
 
 
 def test_machines_with_this_host_added_for_nodes_that_name_none(every_key: Manifest) -> None:
@@ -229,6 +231,30 @@ def test_qos_presets_and_overrides(monkeypatch: pytest.MonkeyPatch) -> None:
     assert qos["latched"] is not None
     assert qos["latched"].durability is Durability.TRANSIENT_LOCAL
     assert qos["latched"].depth == 2
+
+
+def test_what_of_a_qos_profile_is_not_written_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    endpoints = _corpus("qos", monkeypatch).nodes[0].interface.endpoints
+    defaults = {each.name: each.qos_defaults for each in endpoints}
+    assert defaults["none_given"] == POLICIES
+    assert (defaults["by_name"], defaults["overridden"], defaults["whatever"]) == ((), (), ())
+    assert set(POLICIES) - set(defaults["keep_all"]) == {"history"}
+    assert set(POLICIES) - set(defaults["zero_is_none"]) == {"deadline_ns"}
+    assert set(POLICIES) - set(defaults["latched"]) == {"history", "depth", "durability"}
+
+
+def test_each_number_of_a_flow_is_kept_with_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    manifest = _corpus("flows_every_key", monkeypatch)
+    found = [
+        (str(each), each.at.path)
+        for node in manifest.nodes
+        for need in node.flows
+        for each in need.quantities
+    ]
+    assert ("rate_hz 50", "nodes.camera.flows.publishers.pose.rate_hz") in found
+    assert not [text for text, _ in found if "auto" in text]
+    (delay,) = _corpus("teleop", monkeypatch).links[0].quantities
+    assert (str(delay), delay.at.path) == ("max_delay_ms 5", "links[0].max_delay_ms")
 
 
 def test_substitutions_take_the_type_that_the_place_needs(monkeypatch: pytest.MonkeyPatch) -> None:

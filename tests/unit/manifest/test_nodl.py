@@ -10,12 +10,14 @@ from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import Endpoint, EndpointKind, Interface, ParameterDeclaration
 from lifecycle.manifest.nodl import MAX_DOCUMENTS, read_interface
 from lifecycle.manifest.qos import (
+    POLICIES,
     PRESETS,
     Durability,
     History,
     Liveliness,
     QosProfile,
     Reliability,
+    not_written,
 )
 
 AT = Position(file="system.lifecycle.yaml", line=7, column=16, path="nodes.imu.interface")
@@ -80,6 +82,7 @@ def test_a_whole_document_becomes_an_interface(tmp_path: Path) -> None:
             name="/clock_offset",
             type="std_msgs/msg/Float64",
             qos=QosProfile(history=History.KEEP_ALL, depth=0, liveliness=Liveliness.SYSTEM_DEFAULT),
+            qos_defaults=not_written(["history", "reliability"]),
             at=at(11, 5, "subscriptions[0]"),
         ),
         Endpoint(
@@ -87,6 +90,7 @@ def test_a_whole_document_becomes_an_interface(tmp_path: Path) -> None:
             name="~/reset",
             type="std_srvs/srv/Trigger",
             qos=PRESETS["services_default"],
+            qos_defaults=POLICIES,
             at=at(13, 5, "service_servers[0]"),
         ),
         Endpoint(
@@ -96,6 +100,7 @@ def test_a_whole_document_becomes_an_interface(tmp_path: Path) -> None:
             qos=QosProfile(
                 history=History.SYSTEM_DEFAULT, depth=0, liveliness=Liveliness.SYSTEM_DEFAULT
             ),
+            qos_defaults=not_written(["history", "reliability"]),
             at=at(15, 5, "service_clients[0]"),
         ),
         Endpoint(

@@ -23,7 +23,7 @@ from lifecycle.manifest.model import (
     RunKind,
     UniqueHow,
 )
-from lifecycle.manifest.qos import PRESETS
+from lifecycle.manifest.qos import PRESETS, QosProfile, Reliability
 from lifecycle.manifest.semantics import check
 from lifecycle.network.nfe import UniqueRequirement
 
@@ -195,17 +195,57 @@ def test_numbers_out_of_range_are_refused_even_from_a_program(
     assert [each.message for each in found] == [message]
 
 
-def test_a_subscription_cannot_be_marked() -> None:
+def acknowledging(reliability: Reliability, **marks: int | None) -> Manifest:
+    """A stream whose subscription is marked."""
     manifest = streams(1, need=MARKED)
-    need = dataclasses.replace(MARKED, kind=EndpointKind.SUBSCRIPTION, name="s0", dscp=46)
-    sink = dataclasses.replace(manifest.nodes[1], flows=(need,))
-    found = check(dataclasses.replace(manifest, nodes=(manifest.nodes[0], sink)))
-    assert [str(each) for each in found] == [
-        (
-            "s:1:1: cannot mark subscription 's0' with a DSCP: only senders mark; "
-            "give it to the publishers of the topic"
-        )
+    given = {"dscp": 48, **marks}
+    need = dataclasses.replace(MARKED, kind=EndpointKind.SUBSCRIPTION, name="s0", **given)
+    sink = manifest.nodes[1]
+    (endpoint,) = sink.interface.endpoints
+    qos = dataclasses.replace(endpoint.qos or QosProfile(), reliability=reliability)
+    interface = dataclasses.replace(
+        sink.interface, endpoints=(dataclasses.replace(endpoint, qos=qos),)
+    )
+    sink = dataclasses.replace(sink, interface=interface, flows=(need,))
+    return dataclasses.replace(manifest, nodes=(manifest.nodes[0], sink))
+
+
+def test_a_reliable_subscription_can_be_marked_as_it_acknowledges() -> None:
+    assert [str(each) for each in check(acknowledging(Reliability.RELIABLE))] == []
+
+
+def test_a_best_effort_subscription_is_told_that_it_sends_nothing_to_mark() -> None:
+    (found,) = check(acknowledging(Reliability.BEST_EFFORT))
+    assert found.severity.value == "warning"
+    assert str(found) == (
+        "s:1:1: warning: cannot mark anything that subscription 's0' sends with a DSCP: it is "
+        "BEST_EFFORT and acknowledges nothing; make it RELIABLE, or mark the publishers of the "
+        "topic"
+    )
+
+
+def test_a_subscription_has_one_mark_too() -> None:
+    (found,) = check(acknowledging(Reliability.RELIABLE, transport_priority=0x20))
+    assert found.message == (
+        "cannot give subscription 's0' both dscp and transport_priority: each is the whole mark"
+    )
+
+
+def test_a_subscription_may_not_acknowledge_with_what_identifies_a_publisher() -> None:
+    network = Network(flow_identification=FlowIdentification.DSCP)
+    manifest = acknowledging(Reliability.RELIABLE, dscp=MARKED.dscp)
+    found = check(dataclasses.replace(manifest, network=network))
+    assert [each.rule for each in found if each.severity.value == "error"] == [
+        "check.dscp-not-unique"
     ]
+    assert "cannot give subscription '/s0' of" in str(found[0])
+
+
+def test_the_mark_of_a_subscription_makes_no_flow_unique() -> None:
+    manifest = acknowledging(Reliability.RELIABLE)
+    source = dataclasses.replace(manifest.nodes[0], flows=())
+    found = check(dataclasses.replace(manifest, nodes=(source, manifest.nodes[1])))
+    assert [each.rule for each in found] == ["check.link-not-unique"]
 
 
 def test_a_link_that_relies_on_a_dscp_counts_as_an_identifier_too() -> None:

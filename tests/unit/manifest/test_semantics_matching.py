@@ -22,6 +22,18 @@ nodes:
 """
 
 
+def test_of_a_node_of_others_only_what_is_written_is_presumed(findings: Findings) -> None:
+    """What its code asks for is not known here; whether it fits is judged when it runs."""
+    command = PAIR.replace('{{python: "demo:Talker"}}', "{{command: [talker]}}")
+    unwritten = command.replace(", qos: {offered}", "").format(
+        policy="", requested="{deadline_ns: 4}"
+    )
+    assert findings(unwritten) == []
+    written = command.format(policy="", offered="{reliability: BEST_EFFORT}", requested="default")
+    (found,) = findings(written)
+    assert "reliability is offered BEST_EFFORT and requested RELIABLE" in found
+
+
 def pair(offered: str, requested: str) -> str:
     return PAIR.format(policy="", offered=offered, requested=requested)
 

@@ -48,7 +48,11 @@ def test_an_endless_device_is_refused() -> None:
 
 def test_a_file_that_opens_and_cannot_be_read_is_refused() -> None:
     """As on a network file system that has gone away; the first page of memory is never there."""
-    assert _message("/proc/self/mem") == "cannot read this file: Input/output error"
+    assert (
+        _message("/proc/self/mem")
+        == "cannot read a file that the kernel makes up (/proc, /sys) as a "
+        "manifest; name a regular file"
+    )
 
 
 def test_a_socket_cannot_be_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -195,3 +199,15 @@ def test_thousands_of_endpoints_that_all_miss_their_counterparts_are_loaded(
         "check.unheard": 3000,
         "check.unpublished": 3000,
     }
+
+
+@pytest.mark.parametrize("path", ["/proc/kmsg", "/proc/version", "/sys/kernel/uevent_seqnum"])
+def test_a_file_that_the_kernel_makes_up_is_refused_unread(path: str) -> None:
+    if not os.access(path, os.R_OK):
+        pytest.skip(f"{path} cannot be opened here")
+    with pytest.raises(ManifestError) as caught:
+        read_document(path)
+    assert str(caught.value) == (
+        f"{path}:1:1: cannot read a file that the kernel makes up (/proc, /sys) as a manifest; "
+        "name a regular file"
+    )

@@ -10,7 +10,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from lifecycle.middleware.busy_sign import BusySign
+from lifecycle.middleware import busy_sign
+from lifecycle.middleware.busy_sign import BusySign, Overdue
 
 LIMIT_S = 0.05
 BOUND_S = 10.0
@@ -108,3 +109,80 @@ def test_a_stopped_process_does_not_keep_the_watcher_from_noticing(
     finally:
         os.kill(pid, signal.SIGKILL)
         os.waitpid(pid, 0)
+
+
+class Turns:
+    """Stands in for what the kernel counts of the holder's thread."""
+
+    def __init__(self, *, ready: bool, ran: float, waited: float, at_s: float = 0.0) -> None:
+        self.began = time.monotonic_ns()
+        self.ready, self.ran, self.waited, self.at_s = ready, ran, waited, at_s
+
+    def __call__(self, thread: int, now: int) -> busy_sign._Turns:
+        passed = now - self.began
+        counted = passed if passed >= self.at_s * 1e9 else 0
+        return busy_sign._Turns(
+            at_ns=now,
+            ran_ns=1 + round(counted * self.ran),
+            waited_ns=round(counted * self.waited),
+            ready=self.ready,
+        )
+
+
+def busy(
+    sides: tuple[BusySign, BusySign], monkeypatch: pytest.MonkeyPatch, turns: Turns, limits: float
+) -> list[tuple[float, Overdue]]:
+    """Be busy for so many limits; return after how many of them the watcher said what."""
+    holder, watcher = sides
+    monkeypatch.setattr(busy_sign, "_turns_of", turns)
+    monkeypatch.setattr(holder, "_note_turns", lambda: None)
+    began = turns.began = time.monotonic_ns()
+    said = []
+
+    def passed() -> float:
+        return (time.monotonic_ns() - began) / 1e9 / LIMIT_S
+
+    holder.begin()
+    while passed() < limits:
+        if fires(watcher, 0.01) and (why := watcher.overdue()):
+            said.append((passed(), why))
+            if why is Overdue.HANGS:
+                break
+    holder.end()
+    return said
+
+
+def test_time_without_a_processor_is_not_the_callbacks_own(
+    sides: tuple[BusySign, BusySign], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    turns = Turns(ready=True, ran=0.02, waited=0.98)
+    assert busy(sides, monkeypatch, turns, 4) == []
+
+
+def test_who_never_gets_a_processor_is_not_hung_and_is_unserved_after_a_while(
+    sides: tuple[BusySign, BusySign], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The kernel counts a wait when it is over: nothing is counted here.
+    turns = Turns(ready=True, ran=0, waited=0)
+    said = busy(sides, monkeypatch, turns, 8)
+    assert {why for _, why in said} == {Overdue.UNSERVED}
+    assert said[0][0] >= 5
+
+
+@pytest.mark.parametrize(("ready", "ran"), [(False, 0.0), (True, 1.0)])
+def test_who_sleeps_or_runs_beyond_the_limit_hangs(
+    sides: tuple[BusySign, BusySign], monkeypatch: pytest.MonkeyPatch, ready: bool, ran: float
+) -> None:
+    turns = Turns(ready=ready, ran=ran, waited=0)
+    ((passed, why),) = busy(sides, monkeypatch, turns, 100)
+    assert why is Overdue.HANGS
+    assert passed >= 1
+
+
+def test_a_hang_on_an_overloaded_machine_is_noticed_later_by_what_it_ran(
+    sides: tuple[BusySign, BusySign], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    turns = Turns(ready=True, ran=0.5, waited=0.5)
+    said = busy(sides, monkeypatch, turns, 100)
+    assert said[-1][1] is Overdue.HANGS
+    assert said[-1][0] >= 1.4

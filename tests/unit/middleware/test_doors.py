@@ -5,10 +5,11 @@ from __future__ import annotations
 import socket
 import struct
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
-from lifecycle.middleware.doors import knock_for
+from lifecycle.middleware.doors import chosen_otherwise, knock_for
 from lifecycle.network.connection_url import parse
 
 _WAIT_S = 5.0
@@ -84,3 +85,42 @@ def test_who_is_not_listed_is_not_asked(peer: socket.socket) -> None:
 )
 def test_over_shared_memory_and_tcp_and_behind_a_server_nobody_can_be_asked(url: str) -> None:
     assert knock_for(25, (parse(url),), {}) == ()
+
+
+@pytest.mark.parametrize(
+    "environment",
+    [
+        {"ROS_DISCOVERY_SERVER": "127.0.0.1:11811"},
+        {"FASTDDS_BUILTIN_TRANSPORTS": "SHM"},
+        {"FASTDDS_BUILTIN_TRANSPORTS": "TCPv4"},
+    ],
+)
+def test_where_the_user_chose_how_others_are_found_nobody_is_asked(
+    environment: dict[str, str],
+) -> None:
+    assert chosen_otherwise(environment)
+    assert knock_for(25, (), environment) == ()
+
+
+@pytest.mark.parametrize(
+    ("element", "chosen"),
+    [
+        ("<builtin><avoid_builtin_multicast>true</avoid_builtin_multicast></builtin>", True),
+        ("<useBuiltinTransports>false</useBuiltinTransports><userTransports/>", True),
+        ("<sendSocketBufferSize>65536</sendSocketBufferSize>", False),
+    ],
+)
+def test_a_profile_of_the_users_is_read_for_where_others_are_looked_for(
+    tmp_path: Path, element: str, chosen: bool
+) -> None:
+    file = tmp_path / "profile.xml"
+    file.write_text(
+        f"""<dds><profiles><participant profile_name="mine" is_default_profile="true">
+        <rtps>{element}</rtps></participant></profiles></dds>"""
+    )
+    assert chosen_otherwise({"FASTRTPS_DEFAULT_PROFILES_FILE": str(file)}) is chosen
+
+
+@pytest.mark.parametrize("transports", ["", "DEFAULT", "UDPv4?max_msg_size=1400B"])
+def test_transports_with_multicast_leave_everybody_to_be_asked(transports: str) -> None:
+    assert not chosen_otherwise({"FASTDDS_BUILTIN_TRANSPORTS": transports})

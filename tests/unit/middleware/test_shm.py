@@ -7,18 +7,19 @@ import ctypes
 import fcntl
 import mmap
 import os
+import select
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from lifecycle.middleware import leftovers, segments_of, shm, sweep
-from lifecycle.middleware.shm_lock import port_mutexes
-from lifecycle.supervisor.orphans import sweep_of
+from lifecycle.middleware.shm import Creations
 
 SEGMENT = "fastrtps_0123456789abcdef"
 PORT = "fastrtps_port7411"
 GROUP = (PORT, f"{PORT}_el", f"sem.{PORT}_mutex")
+ALL = (*GROUP, SEGMENT)
 
 
 @pytest.fixture
@@ -58,167 +59,144 @@ def names(directory: Path) -> tuple[str, ...]:
     return tuple(sorted(each.name for each in directory.iterdir()))
 
 
-def test_only_fast_dds_files_are_swept(directory: Path) -> None:
+def test_only_fast_dds_files_are_left_over(directory: Path) -> None:
     others = ("fastrtps_", "fastrtps_port", "fastrtps_xyz", "fastrtps_portal_el", "lttng", "sem.x")
     make(directory, *others, *GROUP, SEGMENT)
-    assert set(sweep()) == {*GROUP, SEGMENT}
-    assert names(directory) == tuple(sorted(others))
+    assert set(leftovers()) == {*GROUP, SEGMENT}
+    assert sweep(others) == ()
+    assert names(directory) == tuple(sorted((*others, *GROUP, SEGMENT)))
 
 
 def test_leftovers_removes_nothing(directory: Path) -> None:
     make(directory, *GROUP)
-    assert leftovers() == tuple(sorted(GROUP))
+    assert leftovers(only=GROUP) == tuple(sorted(GROUP))
     assert names(directory) == tuple(sorted(GROUP))
+
+
+def test_only_the_groups_that_were_seen_to_be_owned_are_removed(directory: Path) -> None:
+    make(directory, *GROUP, SEGMENT)
+    assert sweep(()) == ()
+    assert sweep(["fastrtps_port7413", "nonsense"]) == ()
+    assert sweep([f"{PORT}_el"]) == tuple(sorted(GROUP))
+    assert names(directory) == (SEGMENT,)
 
 
 def test_a_mapped_file_of_a_port_keeps_its_whole_group(directory: Path) -> None:
     make(directory, *GROUP, SEGMENT)
     with mapped(directory / PORT):
-        assert sweep() == (SEGMENT,)
-    assert sweep() == tuple(sorted(GROUP))
+        assert sweep(ALL) == (SEGMENT,)
+    assert sweep(ALL) == tuple(sorted(GROUP))
 
 
-def test_an_open_lock_file_keeps_its_whole_group(directory: Path) -> None:
-    make(directory, *GROUP, SEGMENT, f"{SEGMENT}_el")
-    with (directory / f"{SEGMENT}_el").open("rb"):
-        assert sweep() == tuple(sorted(GROUP))
-    assert sweep() == (SEGMENT, f"{SEGMENT}_el")
+def test_a_semaphore_in_use_keeps_its_whole_group(directory: Path) -> None:
+    """Its user is about to open the port, and has not come to the port's files yet."""
+    make(directory, *GROUP)
+    with mapped(directory / f"sem.{PORT}_mutex"):
+        assert sweep(ALL) == ()
+    assert sweep(ALL) == tuple(sorted(GROUP))
 
 
-def test_a_held_lock_keeps_its_group_though_the_holder_cannot_be_looked_into(
+@pytest.mark.parametrize("kind", ["el", "sl"])
+@pytest.mark.parametrize("how", [fcntl.LOCK_EX, fcntl.LOCK_SH])
+def test_a_held_lock_keeps_its_group(directory: Path, kind: str, how: int) -> None:
+    lock = f"{SEGMENT}_{kind}"
+    make(directory, SEGMENT, lock)
+    with (directory / lock).open("rb") as file:
+        fcntl.flock(file, how)
+        assert sweep(ALL) == ()
+    assert sweep(ALL) == (SEGMENT, lock)
+
+
+def test_use_is_noticed_without_a_look_at_other_processes(
     directory: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    make(directory, *GROUP)
-    monkeypatch.setattr(shm, "_all_pids", list)  # as if every process were another user's
-    with (directory / f"{PORT}_el").open("rb") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        assert sweep() == ()
-    assert sweep() == tuple(sorted(GROUP))
+    """/proc hides processes of other PID namespaces, and with hidepid those of other users."""
+    make(directory, *GROUP, SEGMENT)
+    monkeypatch.setattr(shm, "_peek", lambda *_: pytest.fail("looked into a process"))
+    with mapped(directory / PORT), mapped(directory / SEGMENT):
+        assert sweep(ALL) == ()
 
 
 def test_a_dead_owners_segment_goes_although_a_reader_still_maps_it(directory: Path) -> None:
     make(directory, SEGMENT, f"{SEGMENT}_el")
     with mapped(directory / SEGMENT) as address:
-        assert sweep() == (SEGMENT, f"{SEGMENT}_el")
+        assert sweep(ALL) == (SEGMENT, f"{SEGMENT}_el")
         assert ctypes.string_at(address, 4) == b"data"
 
 
 def test_a_mapped_segment_without_a_lock_file_stays(directory: Path) -> None:
     make(directory, SEGMENT)
     with mapped(directory / SEGMENT):
-        assert sweep() == ()
-
-
-def test_only_names_the_groups_that_may_go(directory: Path) -> None:
-    make(directory, *GROUP, SEGMENT)
-    assert sweep(only=["fastrtps_port7413", "nonsense"]) == ()
-    assert sweep(only=[f"{PORT}_el"]) == tuple(sorted(GROUP))
-    assert names(directory) == (SEGMENT,)
-
-
-def test_groups_with_a_file_from_before_the_time_stay(directory: Path) -> None:
-    make(directory, *GROUP, SEGMENT)
-    os.utime(directory / f"{PORT}_el", (1000, 1000))
-    assert sweep(created_after_s=2000) == (SEGMENT,)
-    assert sweep(created_after_s=1000) == tuple(sorted(GROUP))
+        assert sweep(ALL) == ()
+    assert sweep(ALL) == (SEGMENT,)
 
 
 def test_files_of_another_user_stay(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     make(directory, *GROUP)
     uid = os.getuid()
     monkeypatch.setattr(shm.os, "getuid", lambda: uid + 1)
-    assert sweep() == ()
+    assert sweep(ALL) == ()
 
 
-def test_a_port_that_is_being_opened_meanwhile_stays(
+def test_a_file_that_appeared_meanwhile_keeps_its_group(
     directory: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its opener holds the mutex, and has not come to the port's files yet."""
-    make(directory, *GROUP, SEGMENT, taken=True)
-    semaphore = directory / f"sem.{PORT}_mutex"
-    look = shm._unused
+    make(directory, PORT)
+    claim = shm._claim
 
-    def gone_on(*args: object, **options: object) -> list[object]:
-        found = look(*args, **options)
-        if options:  # the second look: the opener lets go right after it
-            semaphore.write_bytes(bytes([1]) + bytes(31))
-        return found
+    def opened(file: shm._File) -> contextlib.AbstractContextManager[None]:
+        make(directory, f"sem.{PORT}_mutex", taken=True)
+        return claim(file)
 
-    monkeypatch.setattr(shm, "_unused", gone_on)
-    assert sweep() == (SEGMENT,)
-    assert semaphore.read_bytes()[0] == 1  # given back
+    monkeypatch.setattr(shm, "_claim", opened)
+    assert sweep(ALL) == ()
+    assert names(directory) == tuple(sorted((PORT, f"sem.{PORT}_mutex")))
 
 
-def test_a_port_that_was_opened_between_the_two_looks_stays(
-    directory: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    make(directory, *GROUP)
-    with contextlib.ExitStack() as stack:
-        looks = shm._inodes_in_use
-
-        def opened(ours: set[tuple[int, int]]) -> tuple[set[object], set[object]]:
-            found = looks(ours)
-            stack.enter_context(mapped(directory / PORT))
-            return found
-
-        monkeypatch.setattr(shm, "_inodes_in_use", opened)
-        assert sweep() == ()
-    assert names(directory) == tuple(sorted(GROUP))
+def test_a_link_in_the_place_of_a_file_is_not_followed(directory: Path, tmp_path: Path) -> None:
+    (tmp_path / "precious").write_bytes(b"data")
+    (directory / SEGMENT).symlink_to(tmp_path / "precious")
+    assert sweep(ALL) == ()
 
 
 def test_a_mutex_that_a_killed_process_left_taken_goes(directory: Path) -> None:
     make(directory, *GROUP, taken=True)
-    assert sweep() == tuple(sorted(GROUP))
+    assert sweep(ALL) == tuple(sorted(GROUP))
 
 
-def test_a_port_whose_mutex_appeared_meanwhile_stays(
+def test_a_port_cannot_be_opened_while_it_is_being_removed(
     directory: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    make(directory, PORT)
-    looks = shm._inodes_in_use
-
-    def opened(ours: set[tuple[int, int]]) -> tuple[set[object], set[object]]:
-        found = looks(ours)
-        make(directory, f"sem.{PORT}_mutex", taken=True)
-        return found
-
-    monkeypatch.setattr(shm, "_inodes_in_use", opened)
-    assert sweep() == ()
-
-
-def test_nobody_opens_a_port_while_it_is_being_removed(
-    directory: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    """Whoever opens it meanwhile waits; the signal that announces it does no harm."""
     make(directory, *GROUP)
-    semaphore = directory / f"sem.{PORT}_mutex"
-    seen: list[bool] = []
-    look = shm._unused
+    seen: list[str] = []
+    unlink = Path.unlink
 
-    def opener(*args: object, **options: object) -> list[object]:
-        if options:
-            with port_mutexes([semaphore]) as mutexes:
-                seen.append(mutexes[semaphore].held)
-        return look(*args, **options)
+    def opener(path: Path, *, missing_ok: bool) -> None:
+        with pytest.raises(BlockingIOError):
+            os.open(directory / f"sem.{PORT}_mutex", os.O_RDWR | os.O_NONBLOCK)
+        seen.append(path.name)
+        if len(seen) == len(GROUP):
+            for each in GROUP:
+                unlink(directory / each, missing_ok=missing_ok)
 
-    monkeypatch.setattr(shm, "_unused", opener)
-    assert sweep() == tuple(sorted(GROUP))
-    assert seen == [False]
+    monkeypatch.setattr(Path, "unlink", opener)
+    removed = sweep(ALL)
+    monkeypatch.undo()
+    assert removed == tuple(sorted(seen)) == tuple(sorted(GROUP))
 
 
-def test_a_runs_sweep_takes_the_ports_of_its_domain_however_old_and_what_it_used(
-    directory: Path,
-) -> None:
-    foreign, unique = "fastrtps_port7650", "fastrtps_port7000"  # of domain 1, and of every domain
-    make(directory, *GROUP, SEGMENT, foreign, unique)
-    for path in directory.iterdir():
-        os.utime(path, (1000.0, 1000.0))
-    assert sweep_of(2000.0, (), None) == ()
-    with (directory / f"{PORT}_el").open("rb"):
-        assert sweep_of(2000.0, (), 0) == ()
-    assert sweep_of(2000.0, (), 0) == tuple(sorted(GROUP))
-    assert sweep_of(2000.0, (SEGMENT,), 0) == (SEGMENT,)
-    assert names(directory) == tuple(sorted((foreign, unique)))
-    assert sweep_of(500.0, (), 0) == tuple(sorted((foreign, unique)))
+def test_the_creation_of_a_lock_file_is_noticed_and_of_nothing_else(directory: Path) -> None:
+    creations = Creations()
+    try:
+        make(directory, "other_el", PORT, SEGMENT, f"sem.{PORT}_mutex")
+        assert not creations.take()
+        make(directory, f"{PORT}_sl")
+        assert select.select([creations.descriptor], [], [], 5)[0]
+        assert creations.take()
+        assert not creations.take()
+    finally:
+        creations.close()
 
 
 def test_a_process_owns_the_groups_whose_lock_file_it_has_open(directory: Path) -> None:
@@ -236,4 +214,6 @@ def test_a_machine_without_shared_memory_has_nothing_to_sweep(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(shm, "_DIRECTORY", tmp_path / "missing")
-    assert (sweep(), leftovers(), segments_of([os.getpid()])) == ((), (), frozenset())
+    assert (sweep(ALL), leftovers(), segments_of([os.getpid()])) == ((), (), frozenset())
+    with pytest.raises(FileNotFoundError):
+        Creations()

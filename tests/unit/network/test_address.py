@@ -63,3 +63,8 @@ def test_two_addresses_may_be_one_by_scope_and_machine(
         assert may_be_same(x, y, same_machine=True) is on_one_machine
         assert may_be_same(x, y, same_machine=None) is not_known
         assert may_be_same(x, y, same_machine=False) is on_two_machines
+
+
+def test_text_that_is_no_address_is_never_taken_for_one_that_is() -> None:
+    assert not may_be_same("robot", "10.0.0.1", same_machine=True)
+    assert not may_be_same("0.0.0.0", "robot", same_machine=True)

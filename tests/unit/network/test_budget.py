@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lifecycle.network.budget import describe_domains, overflows
-from lifecycle.network.ports import Platform, max_participants
+from lifecycle.network.ports import EphemeralRange, Platform, max_participants
 
 HINT = (
     "use another domain, run fewer processes, or give fewer publishers a flow of their own "
@@ -66,3 +66,24 @@ def test_negative_numbers_are_refused() -> None:
     with pytest.raises(ValueError) as caught:
         overflows(0, participants=-1)
     assert str(caught.value) == "cannot count -1 participants or subscriptions; use 0 or more"
+
+
+def test_every_unique_port_may_go_to_the_subscription_of_one_that_does_not_say_how_many() -> None:
+    assert overflows(0, participants=120) == ()
+    (message,) = overflows(0, participants=401, ephemeral=EVERYWHERE)
+    assert message.startswith("cannot run 401 participants in domain 0 on one host")
+
+
+EVERYWHERE = EphemeralRange(first=1, last=1)
+"""A host whose ephemeral range is in nobody's way, so that every domain is safe."""
+
+
+def test_safe_domains_are_not_listed_where_every_domain_is_safe() -> None:
+    (message,) = overflows(7, participants=121, ephemeral=EVERYWHERE)
+    assert message.endswith("or give fewer publishers a flow of their own")
+
+
+def test_safe_domains_are_listed_where_only_one_is_not() -> None:
+    last_domain_only = EphemeralRange(first=65400, last=65535)
+    (message,) = overflows(7, participants=121, ephemeral=last_domain_only)
+    assert message.endswith("a flow of their own (safe domains: 0–231)")

@@ -149,3 +149,15 @@ def test_the_refusal_of_ecn_bits_names_the_clean_byte() -> None:
 )
 def test_dscp_and_tos_are_described_side_by_side(dscp: int, text: str) -> None:
     assert describe(dscp) == text
+
+
+@pytest.mark.parametrize(
+    ("written", "hint"),
+    [(255, "; 255 is a TOS byte and sets ECN bits: DSCP 63"), (256, ""), (-1, "")],
+)
+def test_only_a_number_of_one_byte_may_have_been_meant_as_a_tos_byte(
+    written: int, hint: str
+) -> None:
+    with pytest.raises(ValueError) as caught:
+        parse_dscp(written)
+    assert str(caught.value) == f"cannot use DSCP {written}; {ALLOWED}{hint}"

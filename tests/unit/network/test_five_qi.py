@@ -270,3 +270,16 @@ def test_a_rate_alone_rules_out_classes_that_guarantee_none() -> None:
     found = propose(300, 1, None, rate_bps=1000).five_qi
     assert found is not None
     assert found.resource_type.guarantees_rate
+
+
+def test_of_equal_classes_the_one_with_the_lowest_number_is_proposed() -> None:
+    # 5QI 1 and 66 differ in nothing that is compared.
+    found = propose(100, 1e-2, True).five_qi
+    assert found is not None
+    assert found.value == 1
+
+
+def test_a_message_too_large_for_every_fast_class_is_told_the_largest_burst() -> None:
+    assert propose(5, 1e-3, None, message_bytes=5000).why.endswith(
+        "the largest burst is 1354 bytes, of 5QI 86 (Delay-critical GBR)"
+    )

@@ -124,3 +124,10 @@ def test_every_flow_has_its_ends_among_the_nfes_and_is_listed_once(
             (each.transport_protocol, each.internet_address, each.transport_port)
             for each in destination
         }
+
+
+def test_a_wildcard_sender_reaches_loopback_and_a_loopback_sender_a_group() -> None:
+    for source, destination in (("0.0.0.0", "127.0.0.1"), ("127.0.0.1", "239.255.0.1")):
+        (flow,) = flow_tuples([nfe(source, 7411)], [nfe(destination, 7401)])
+        assert ends(flow) == (source, 7411, destination, 7401)
+    assert flow_tuples([nfe("127.0.0.1", 7411)], [nfe("10.0.0.2", 7401)]) == ()

@@ -274,3 +274,32 @@ def test_one_more_unknown_endpoint_never_makes_a_verdict_better(
     before = is_unique_endpoint(own, others)
     after = is_unique_endpoint(own, [*others, None])
     assert after is (None if before else before)
+
+
+def test_an_endpoint_is_described_as_its_socket_or_as_shared_memory() -> None:
+    assert udp("10.0.0.1", 7411).describe() == "10.0.0.1:7411"
+    assert udp("fd09::1", 7411).describe() == "[fd09::1]:7411"
+    assert SHARED_MEMORY.describe() == "shm"
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"transport_protocol": TransportProtocol.UNKNOWN},
+        {"internet_protocol": InternetProtocol.UNKNOWN},
+        {"internet_address": ""},
+    ],
+)
+def test_an_nfe_that_lacks_protocol_or_address_is_no_ip_nfe(change: dict[str, object]) -> None:
+    assert is_ip(BASE)
+    assert not is_ip(dataclasses.replace(BASE, **change))  # type: ignore[arg-type]
+
+
+def test_both_ends_of_a_flow_are_compared_by_the_resources_asked_for() -> None:
+    marked, plain = [udp("10.0.0.1", 7411, dscp=46)], [udp("10.0.0.1", 7411)]
+    by = FlowIdentifier.SIX_TUPLE
+    assert uniqueness(marked, marked, [plain], [plain], by=by) is FlowUniqueness.STRONGLY
+    by = FlowIdentifier.FIVE_TUPLE
+    assert uniqueness(marked, marked, [plain], [plain], by=by) is FlowUniqueness.NOT
+    assert uniqueness(marked, marked, [], [plain], by=by) is FlowUniqueness.WEAKLY
+    assert uniqueness(marked, marked, [plain], [], by=by) is FlowUniqueness.WEAKLY

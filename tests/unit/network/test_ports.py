@@ -14,6 +14,7 @@ from lifecycle.network.ports import (
     Platform,
     PortUse,
     domain_base,
+    domain_of,
     max_participants,
     max_unique_subscriptions,
     overlaps,
@@ -265,3 +266,49 @@ def test_the_capacity_holds_for_narrow_ranges_close_to_the_domains_own_ports(
         assert fits(domain_id, 0, ephemeral, only_domain=only_domain)
         assert fits(domain_id, count - 1, ephemeral, only_domain=only_domain)
     assert not fits(domain_id, count, ephemeral, only_domain=only_domain)
+
+
+@pytest.mark.parametrize(
+    ("text", "domain"),
+    [
+        ("0", 0),
+        ("232", 232),
+        ("000000007", 7),
+        ("233", None),
+        ("-1", None),
+        ("", None),
+        ("0x7", None),
+        ("٧", None),
+        ("0000000007", None),
+        ("9" * 5000, None),
+    ],
+)
+def test_ros_domain_id_is_a_plain_number_up_to_232(text: str, domain: int | None) -> None:
+    assert domain_of(text) == domain
+
+
+def test_an_ephemeral_range_begins_at_1() -> None:
+    assert EphemeralRange(first=1, last=1).last == 1
+    with pytest.raises(ValueError, match="cannot use ephemeral port range 0–1"):
+        EphemeralRange(first=0, last=1)
+
+
+def test_participants_of_the_highest_domain_end_with_the_last_port() -> None:
+    out_of_the_way = EphemeralRange(first=1, last=1)
+    assert max_participants(232, out_of_the_way) == Capacity(
+        participants=63, limit="the highest port, 65535"
+    )
+    assert isinstance(max_participants(232, out_of_the_way).participants, int)
+    assert owner_of(65400) == PortUse(
+        domain_id=232, role="discovery_multicast", participant_id=None
+    )
+    assert owner_of(65535) == PortUse(domain_id=232, role="user_unicast", participant_id=62)
+
+
+@pytest.mark.parametrize("offset", [0, 1])
+def test_one_multicast_port_among_the_ephemeral_ports_is_enough(offset: int) -> None:
+    port = domain_base(3) + offset
+    capacity = max_participants(3, EphemeralRange(first=port, last=port))
+    assert capacity.participants == 0
+    beside = domain_base(3) - 1
+    assert max_participants(3, EphemeralRange(first=beside, last=beside)).participants == 120

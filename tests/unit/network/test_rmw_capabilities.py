@@ -90,3 +90,29 @@ def test_only_fast_dds_lets_us_mark_one_publisher() -> None:
         "endpoint, for the whole link, as a raw TOS byte (DSCP times 4); "
         "use RMW_IMPLEMENTATION=rmw_fastrtps_cpp"
     )
+
+
+def test_of_an_rmw_that_is_not_in_the_table_every_cell_is_unknown_and_says_so() -> None:
+    row = capabilities("rmw_new")
+    assert row.family == "rmw_new"
+    for cell in (row.unique_subscription, row.unique_publisher, row.getter, row.dscp):
+        assert cell.support is Support.UNKNOWN
+        assert (cell.how, cell.source) == ("nothing is known of 'rmw_new'", "not in the table")
+    for side in FlowSide:
+        assert feasibility("rmw_new", side, STRICTLY).feasible is None
+
+
+def test_each_side_of_a_flow_has_a_cell_of_its_own() -> None:
+    row = capabilities("rmw_fastrtps_cpp")
+    assert row.unique(FlowSide.PUBLISHER) is row.unique_publisher
+    assert row.unique(FlowSide.SUBSCRIPTION) is row.unique_subscription
+    assert row.unique_publisher != row.unique_subscription
+    for side in FlowSide:
+        assert feasibility("rmw_fastrtps_cpp", side, STRICTLY).why == row.unique(side).how
+    assert dscp_feasibility("rmw_fastrtps_cpp").why == row.dscp.how
+
+
+def test_a_refusal_names_each_rmw_that_could_once() -> None:
+    assert feasibility("rmw_zenoh_cpp", FlowSide.PUBLISHER, STRICTLY).why.endswith(
+        "; use RMW_IMPLEMENTATION=rmw_fastrtps_cpp"
+    )

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from fractions import Fraction
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -42,6 +45,30 @@ def test_a_mask_above_16_bits_is_shifted_by_4_until_it_fits() -> None:
     # 0x0ff00000 needs three shifts: 0x0000ff00 -> mask' 0xff00, masked 0xb800.
     mapped = map_priority(0x0B800000, TransportPriorityMapping(mask=0x0FF00000))
     assert mapped.tos == 0xB8
+
+
+def test_the_shift_is_of_4_bits_and_not_more() -> None:
+    # 0x1ffff needs one shift of 4: mask' 0x1fff, masked 0x1ffe; 8190 * 255 / 8191 is 254.97.
+    mapped = map_priority(0x1FFEF, TransportPriorityMapping(mask=0x1FFFF))
+    assert (mapped.tos, mapped.ignored_bits) == (254, 0xF)
+
+
+@pytest.mark.parametrize(("priority", "tos"), [(0, 3), (1, 24), (2, 45), (3, 67)])
+def test_the_division_is_that_of_integers_in_c_and_rounds_down(priority: int, tos: int) -> None:
+    # 64 / 3 is 21.33 and 128 / 3 is 42.67: rounded to the nearest, or up, either would differ.
+    mapped = map_priority(priority, TransportPriorityMapping(mask=3, low=3, high=67))
+    assert mapped.tos == tos
+
+
+@given(st.integers(0, 0xFFFFFFFF), MAPPINGS)
+def test_the_formula_of_section_3_24_1_holds_for_every_priority_and_mapping(
+    priority: int, mapping: TransportPriorityMapping
+) -> None:
+    n = next(n for n in range(5) if not (mapping.mask >> (4 * n)) & 0xFFFF0000)
+    masked_prio = (priority & mapping.mask) // 16**n
+    mask_ = mapping.mask // 16**n
+    exact = Fraction(masked_prio * (mapping.high - mapping.low), mask_) + mapping.low
+    assert map_priority(priority, mapping).tos == math.floor(exact)
 
 
 def test_mask_0_leaves_the_tos_byte_alone() -> None:
@@ -150,3 +177,22 @@ def test_a_higher_priority_inside_a_mask_without_gaps_never_gets_a_lower_byte(
     assert one is not None
     assert other is not None
     assert one <= other
+
+
+def test_a_priority_fits_32_bits_signed_or_not() -> None:
+    mapping = TransportPriorityMapping(mask=0)
+    for fits in (-(2**31), 2**32 - 1):
+        assert map_priority(fits, mapping).mapping is mapping
+    for beyond in (-(2**31) - 1, 2**32):
+        with pytest.raises(ValueError, match="does not fit 32 bits"):
+            map_priority(beyond, mapping)
+
+
+def test_with_mask_0_every_bit_of_the_priority_is_ignored() -> None:
+    assert map_priority(0xB8, TransportPriorityMapping(mask=0)).ignored_bits == 0xB8
+
+
+def test_the_widest_mask_is_32_bits() -> None:
+    assert map_priority(2**32 - 1, TransportPriorityMapping(mask=0xFFFFFFFF)).tos == 0xFF
+    with pytest.raises(ValueError, match="cannot use mask 0x100000000"):
+        TransportPriorityMapping(mask=0x100000000)

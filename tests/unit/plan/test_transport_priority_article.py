@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import pytest
 
-from lifecycle.manifest import ManifestError, load
+from lifecycle.manifest import load
 from lifecycle.manifest.model import EndpointKind, Machine, Manifest, Network
 from lifecycle.manifest.semantics import check
 from lifecycle.network.transport_priority import TransportPriorityMapping
@@ -91,20 +91,41 @@ def test_section_3_24_2_a_priority_is_per_datawriter():
     assert dscps(writers(0xB8, 0x20)) == [46, 8]
 
 
-def test_section_3_24_2_a_datareader_has_no_priority_here_as_it_sends_no_data(
+def test_section_3_24_2_a_priority_is_per_datareader_and_independent_of_the_datawriters(
     tmp_path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "s.lifecycle.yaml").write_text(
         "manifest_version: 1\nsystem: s\nnodes:\n  n:\n    run: {python: 'm:C'}\n    interface:\n"
-        "      subscriptions: [{name: a, type: std_msgs/msg/Empty}]\n"
-        "    flows: {subscriptions: {a: {transport_priority: 184}}}\n"
+        "      subscriptions:\n"
+        "        - {name: a, type: std_msgs/msg/Empty}\n"
+        "        - {name: b, type: std_msgs/msg/Empty}\n"
+        "        - {name: c, type: std_msgs/msg/Empty}\n"
+        "        - {name: d, type: std_msgs/msg/Empty}\n"
+        "      publishers:\n"
+        "        - {name: a, type: std_msgs/msg/Empty}\n"
+        "        - {name: e, type: std_msgs/msg/Empty}\n"
+        "    flows:\n"
+        "      subscriptions:\n"
+        "        a: {transport_priority: 184}\n"
+        "        b: {dscp: EF}\n"
+        "        d: {dscp: CS6}\n"
+        "      publishers:\n"
+        "        e: {transport_priority: 184}\n"
+        "policy: {unheard: ignore, unpublished: ignore}\n"
     )
-    with pytest.raises(ManifestError) as error:
-        load("s.lifecycle.yaml")
-    assert [each.message for each in error.value.diagnostics] == [
-        "cannot use the unknown key 'transport_priority'; allowed: unique, transport, lossy"
-    ]
+    (one,) = build_plan(load("s.lifecycle.yaml").manifest, environment={}).nodes
+    found = {(each.kind.noun, each.name): (each.dscp, each.participant) for each in one.endpoints}
+    # One set of send sockets for a mark, and none of them shared by a writer and a reader.
+    ef = found["subscription", "a"][1]
+    assert found["subscription", "a"] == found["subscription", "b"] == (46, ef)
+    assert found["subscription", "c"] == found["publisher", "a"] == (None, "")
+    assert found["subscription", "d"][0] == 48
+    assert found["publisher", "e"][0] == 46
+    assert len({ef, found["subscription", "d"][1], found["publisher", "e"][1]}) == 3
+    assert {each.name: each.reason for each in one.participants}[ef] == (
+        "subscriptions a, b marked EF = DSCP 46 = TOS 184 (0xb8)"
+    )
 
 
 @pytest.mark.parametrize(

@@ -258,6 +258,8 @@ class FakeProcess:
         reader, writer = await asyncio.open_connection(sock=control)
         with contextlib.closing(writer):
             spec = from_json(await reader.readline(), HostSpec)
+            if await self._cannot_host(writer):
+                return
             if not await self._act(f"{self._name} start", writer, Event(kind="ready")):
                 return
             del spec
@@ -278,6 +280,17 @@ class FakeProcess:
                 )
         if self._name not in self._spawner.ends_at:
             self.end(ProcessExit(status=0))
+
+    async def _cannot_host(self, writer: asyncio.StreamWriter) -> bool:
+        """Report every node that cannot be constructed, and end."""
+        failures = self._spawner.unhosted.get(self._name, {})
+        for node, error in failures.items():
+            writer.write(to_json(Event(kind="failed", node=node, ok=False, error=error)) + b"\n")
+            await writer.drain()
+            await asyncio.sleep(0.1)
+        if failures:
+            self.end(ProcessExit(status=1))
+        return bool(failures)
 
     async def _act(self, what: str, writer: asyncio.StreamWriter, answer: Event) -> bool:
         self._spawner.log.append(what)
@@ -306,6 +319,7 @@ class FakeSpawner:
         log: everything that happened, in order: `talker start`, `/talker configure`, signals.
         ways: what goes wrong: such a line → "hang", "die", or the error to answer with.
         takes_s: how long such a line takes.
+        unhosted: by process, nodes that cannot be constructed and why, reported 0.1 s apart.
         ends_at: processes that do not end by themselves, and the signal that ends them.
         processes: by name.
         interfaces: what a node reports, by full name; steps of wiring change it.
@@ -315,6 +329,7 @@ class FakeSpawner:
         self.log: list[str] = []
         self.ways: dict[str, str] = {}
         self.takes_s: dict[str, float] = {}
+        self.unhosted: dict[str, dict[str, str]] = {}
         self.ends_at: dict[str, int] = {}
         self.processes: dict[str, FakeProcess] = {}
         self.interfaces: dict[str, NodeConfiguration] = {}
@@ -354,6 +369,11 @@ class FakeGraph:
         self.observation = Observation()
         self.changed = asyncio.Event()
         self.put: list[NodeConfiguration] = []
+        self._count = 0
+
+    @property
+    def changes(self) -> int:
+        return self._count + self.changed.is_set()
 
     async def observe(self, plan: Plan) -> Observation:
         del plan
@@ -362,6 +382,7 @@ class FakeGraph:
     async def wait_change(self) -> None:
         await self.changed.wait()
         self.changed.clear()
+        self._count += 1
 
     def put_configuration(self, configuration: NodeConfiguration) -> None:
         self.put.append(configuration)

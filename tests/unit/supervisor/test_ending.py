@@ -16,8 +16,8 @@ from lifecycle.supervisor.ending import Ended, Ending
     ("number", "exit_code"),
     [
         (signal.SIGINT, ExitCode.INTERRUPTED),
-        (signal.SIGTERM, ExitCode.OK),
-        (signal.SIGHUP, ExitCode.OK),
+        (signal.SIGTERM, ExitCode.TERMINATED),
+        (signal.SIGHUP, ExitCode.HUNG_UP),
     ],
 )
 def test_a_signal_is_raised_and_says_how_the_run_exits(number: int, exit_code: ExitCode) -> None:

@@ -11,13 +11,24 @@ import pytest
 from lifecycle.errors import BringUpError
 from lifecycle.manifest.model import Condition, RunKind, Timeouts
 from lifecycle.node.control import Operation
-from lifecycle.supervisor.events import Notice, ProcessChanged, RequestSent
-from lifecycle.supervisor.failure import StepFailedError
-from lifecycle.supervisor.gate import Gate
+from lifecycle.supervisor.bring_up import ALSO_S
+from lifecycle.supervisor.events import Notice, ProcessChanged, Reach, RequestSent
+from lifecycle.supervisor.failure import StepFailedError, with_failure
+from lifecycle.supervisor.gate import Gate, Permit, VerificationError
+from lifecycle.supervisor.judge import Changes, Judge
 from lifecycle.supervisor.shutdown import TakeDown
-from lifecycle.supervisor.states import ProcessState
-from lifecycle.verify.verdict import Outcome
-from tests.unit.supervisor.fakes import World, plan_of, planned_node, run, verdict_of
+from lifecycle.supervisor.states import ProcessExit, ProcessState
+from lifecycle.supervisor.vigil import Vigil
+from lifecycle.verify.observation import Observation, ObservedNode
+from lifecycle.verify.verdict import NOT_JUDGED, Outcome, Stage, Verdict
+from tests.unit.supervisor.fakes import (
+    FakeGraph,
+    World,
+    plan_of,
+    planned_node,
+    run,
+    verdict_of,
+)
 
 LIMIT_S = 30.0
 
@@ -92,6 +103,90 @@ def test_no_activate_request_is_sent_without_a_permit(tmp_path: Path) -> None:
     run(main())
 
 
+def test_what_appears_while_a_chain_is_activated_keeps_the_rest_of_it_from_being_asked(
+    tmp_path: Path,
+) -> None:
+    """The last node of a chain is not activated on a verdict that is seconds old."""
+
+    async def main() -> None:
+        chain = {f"n{index}": {f"n{index - 1}": Condition.ACTIVE} for index in range(1, 3)}
+        world = _world(
+            tmp_path,
+            planned_node("n0"),
+            *(planned_node(key, after=after) for key, after in chain.items()),
+        )
+        judging = _Judging(world)
+        world.spawner.takes_s["/n1 activate"] = 5.0
+        await world.bring_up.connect(LIMIT_S)
+        permit = await judging.opened()
+        asyncio.get_running_loop().call_later(2.0, judging.intrude)
+        with pytest.raises(VerificationError, match=r"graph\.undeclared-publisher") as caught:
+            await world.bring_up.activate(permit, LIMIT_S)
+        assert caught.value.again
+        assert "/n1 activate" in world.log
+        assert "/n2 activate" not in world.log
+        assert [each.node for each in world.heard(RequestSent) if _activates(each)] == [
+            "/n0",
+            "/n1",
+        ]
+        assert world.system.nodes["n2"].undo == [Operation.CONFIGURE, Operation.CONNECT]
+        await _down(world)
+        # What was active was rolled back politely.
+        assert {"/n0 deactivate", "/n1 deactivate"} <= set(world.log)
+        await judging.changes.close()
+
+    run(main())
+
+
+def test_nodes_that_are_activated_side_by_side_are_not_judged_one_by_one(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = _world(tmp_path, *(planned_node(f"n{index}") for index in range(20)))
+        judging = _Judging(world)
+        await world.bring_up.connect(LIMIT_S)
+        permit = await judging.opened()
+        looks = judging.looks
+        judging.graph.changed.set()
+        await world.bring_up.activate(permit, LIMIT_S)
+        assert {node.reach for node in world.system.nodes.values()} == {Reach.ACTIVE}
+        assert 1 <= judging.looks - looks <= 3
+        await _down(world)
+        await judging.changes.close()
+
+    run(main())
+
+
+class _Judging:
+    """The real judge of a world; a node that nobody declared makes its verdict violated."""
+
+    def __init__(self, world: World) -> None:
+        self.graph = FakeGraph()
+        self.changes = Changes(world.system, self.graph)
+        self.looks = 0
+        self._judge = Judge(
+            world.system, self.graph, self.changes, world.emit, strict=False, verify_=self._verify
+        )
+
+    async def opened(self) -> Permit:
+        return Gate(strict=False, judging=self._judge).judge(
+            await self._judge.once(Stage.CONNECTED)
+        )
+
+    def intrude(self) -> None:
+        intruder = ObservedNode(full_name="/intruder")
+        self.graph.observation = Observation(nodes=(intruder,))
+        self.graph.changed.set()
+
+    def _verify(self, plan: object, observation: Observation, **_: object) -> Verdict:
+        self.looks += 1
+        if observation.nodes:
+            return verdict_of(Outcome.VIOLATED, "graph.undeclared-publisher")
+        return verdict_of(Outcome.OK)
+
+
+def _activates(request: RequestSent) -> bool:
+    return request.operation is Operation.ACTIVATE
+
+
 def test_a_failed_transition_ends_the_bring_up_with_the_nodes_own_reason(tmp_path: Path) -> None:
     async def main() -> None:
         world = _world(tmp_path, planned_node("a"), planned_node("b"))
@@ -121,7 +216,8 @@ def test_a_process_that_dies_says_what_its_node_was_doing_and_its_last_words(
         assert caught.value.message == (
             f"cannot keep '/a' running: pid {pid} died while connecting: killed by SIGSEGV"
         )
-        assert caught.value.log_tail == ("segmentation fault",)
+        assert caught.value.process == "a"
+        assert caught.value.log == str(tmp_path / "a.log")
         await _down(world)
 
     run(main())
@@ -292,3 +388,144 @@ def test_every_request_is_told_before_it_is_sent(tmp_path: Path) -> None:
         await _down(world)
 
     run(main())
+
+
+def _failed(caught: pytest.ExceptionInfo[StepFailedError]) -> list[tuple[str, str, str]]:
+    return [(each.rule, each.subject, each.message) for each in caught.value.every]
+
+
+def test_everything_that_fails_side_by_side_is_named_once_and_no_other_step_begins(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        world = _world(tmp_path, *(planned_node(key) for key in "abcd"))
+        world.spawner.ways["/b configure"] = "no camera"
+        world.spawner.ways["/c configure"] = "no arm"
+        world.spawner.takes_s["/c configure"] = 0.2
+        world.spawner.takes_s["/d configure"] = 0.1
+        world.spawner.takes_s["/a configure"] = 60.0
+        loop = asyncio.get_running_loop()
+        began = loop.time()
+        with pytest.raises(StepFailedError) as caught:
+            await world.bring_up.connect(LIMIT_S)
+        assert _failed(caught) == [
+            ("run.transition-failed", "/b", "cannot configure '/b': no camera"),
+            ("run.transition-failed", "/c", "cannot configure '/c': no arm"),
+        ]
+        assert loop.time() - began == pytest.approx(ALSO_S, abs=0.1)
+        assert "/d connect" not in world.log
+        await _down(world)
+
+    run(main())
+
+
+def test_a_lone_failure_waits_for_nobody_who_is_not_in_a_step(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = _world(
+            tmp_path, planned_node("a"), planned_node("b", after={"a": Condition.ACTIVE})
+        )
+        world.spawner.ways["/a connect"] = "no network"
+        world.spawner.takes_s["/a connect"] = 1.0
+        loop = asyncio.get_running_loop()
+        began = loop.time()
+        with pytest.raises(StepFailedError) as caught:
+            await world.bring_up.connect(LIMIT_S)
+        assert len(caught.value.every) == 1
+        assert loop.time() - began == pytest.approx(1.0, abs=0.1)
+        await _down(world)
+
+    run(main())
+
+
+def test_a_process_is_blamed_once_for_each_node_that_it_cannot_host_and_for_no_other(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        world = _world(
+            tmp_path,
+            *(planned_node(key, process="all") for key in "abc"),
+            planned_node("d"),
+        )
+        error = "ModuleNotFoundError: No module named 'camera_driver'"
+        world.spawner.unhosted["all"] = {"/b": error, "/c": "cannot import 'm:C': no module 'm'"}
+        world.spawner.takes_s["d start"] = 60.0
+        vigil = Vigil(world.system)
+        with pytest.raises(StepFailedError) as caught:
+            await vigil.during(world.bring_up.connect(LIMIT_S))
+        assert _failed(caught) == [
+            ("run.start-failed", "/b", f"cannot start '/b': {error}"),
+            ("run.start-failed", "/c", "cannot import 'm:C': no module 'm'"),
+        ]
+        await _down(world)
+
+    run(main())
+
+
+def test_every_process_that_died_by_then_is_named(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = _world(
+            tmp_path,
+            *(planned_node(key, kind=RunKind.COMMAND, managed=False) for key in "ab"),
+            planned_node("c"),
+        )
+        world.spawner.takes_s["c start"] = 60.0
+
+        async def die() -> None:
+            await asyncio.sleep(1.0)
+            world.spawner.processes["a"].end(ProcessExit(status=127))
+            await asyncio.sleep(0.1)
+            world.spawner.processes["b"].end(ProcessExit(status=127))
+
+        dying = asyncio.ensure_future(die())
+        with pytest.raises(StepFailedError) as caught:
+            await Vigil(world.system).during(world.bring_up.connect(LIMIT_S))
+        await dying
+        assert [(each.rule, each.subject) for each in caught.value.every] == [
+            ("run.process-died", "/a"),
+            ("run.process-died", "/b"),
+        ]
+        assert caught.value.reason == "failed: /a (run.process-died), /b (run.process-died)"
+        await _down(world)
+
+    run(main())
+
+
+@pytest.mark.parametrize("kind", [RunKind.PYTHON, RunKind.COMMAND])
+def test_a_process_that_is_still_starting_is_ended_at_once_and_not_by_an_interrupt(
+    tmp_path: Path, kind: RunKind
+) -> None:
+    """SIGINT would have Python print a traceback from the middle of an import."""
+
+    async def main() -> None:
+        managed = kind is RunKind.PYTHON
+        world = _world(tmp_path, planned_node("a", kind=kind, managed=managed), planned_node("b"))
+        world.spawner.takes_s["a start"] = 60.0
+        world.spawner.ends_at["a"] = signal.SIGTERM
+        world.spawner.ways["/b configure"] = "no arm"
+        with pytest.raises(StepFailedError):
+            await world.bring_up.connect(LIMIT_S)
+        loop = asyncio.get_running_loop()
+        began = loop.time()
+        await _down(world)
+        assert [each for each in world.log if each.startswith("a SIG")] == ["a SIGTERM"]
+        assert loop.time() - began < 0.1
+        assert world.heard(Notice) == []
+
+    run(main())
+
+
+def test_a_failure_is_one_finding_with_the_log_that_says_more() -> None:
+    failure = StepFailedError(
+        "cannot start '/a': no",
+        rule="run.start-failed",
+        subject="/a",
+        process="a",
+        log="/log/a.log",
+    )
+    again = StepFailedError("exit status 1", rule="run.process-died", subject="a", process="a")
+    verdict = with_failure(NOT_JUDGED, failure.joined([again, failure]))
+    (finding,) = verdict.findings
+    assert finding.message == "cannot start '/a': no"
+    assert finding.hint.endswith("the last lines of its log: /log/a.log")
+    assert with_failure(verdict, failure).findings == verdict.findings
+    assert not verdict.judged

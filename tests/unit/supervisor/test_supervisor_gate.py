@@ -2,12 +2,62 @@
 
 from __future__ import annotations
 
+import asyncio
+from collections.abc import Awaitable, Callable
+
 import pytest
 
 from lifecycle.errors import BringUpError, ExitCode
+from lifecycle.node.control import Operation
+from lifecycle.supervisor.driver import ServiceDriver
 from lifecycle.supervisor.gate import Gate, Permit, VerificationError
-from lifecycle.verify.verdict import Outcome
-from tests.unit.supervisor.fakes import verdict_of
+from lifecycle.verify.verdict import Outcome, Verdict
+from tests.unit.supervisor.fakes import planned_node, verdict_of
+
+
+class ForeignNode:
+    """The lifecycle services of a managed node that others started; remembers the requests."""
+
+    def __init__(self) -> None:
+        self.state = "inactive"
+        self.requests: list[str] = []
+
+    async def get_state(self, node: str, *, timeout_s: float) -> str:
+        return self.state
+
+    async def get_available_transitions(self, node: str, *, timeout_s: float) -> tuple[str, ...]:
+        return ("activate", "cleanup", "shutdown")
+
+    async def change_state(
+        self,
+        node: str,
+        transition: str,
+        *,
+        timeout_s: float,
+        before: Callable[[], Awaitable[None]] | None = None,
+    ) -> bool:
+        if before is not None:
+            await before()
+        self.requests.append(transition)
+        self.state = "active"
+        return True
+
+
+def test_a_foreign_managed_node_gets_no_activate_request_without_a_permit_that_holds() -> None:
+    async def main() -> None:
+        node, gate = ForeignNode(), Gate(strict=False)
+        driver = ServiceDriver(node, planned_node("b"))  # type: ignore[arg-type]
+        permit = gate.judge(verdict_of(Outcome.OK))
+        gate.close()
+        with pytest.raises(BringUpError, match="cannot activate '/b' without a permit"):
+            await driver.perform(Operation.ACTIVATE)
+        with pytest.raises(BringUpError, match="the gate was closed again before this request"):
+            await driver.perform(Operation.ACTIVATE, permit)
+        assert node.requests == []
+        await driver.perform(Operation.ACTIVATE, gate.judge(verdict_of(Outcome.OK)))
+        assert node.requests == ["activate"]
+
+    asyncio.run(main())
 
 
 def test_an_ok_verdict_opens_the_gate() -> None:
@@ -21,6 +71,7 @@ def test_a_violated_verdict_closes_it_with_exit_code_4_and_every_finding() -> No
     with pytest.raises(VerificationError) as caught:
         Gate(strict=False).judge(verdict)
     assert caught.value.exit_code is ExitCode.VIOLATED
+    assert caught.value.verdict is verdict
     assert str(caught.value) == (
         "cannot activate: the verdict is violated\n"
         "  graph.missing-node: graph.missing-node on /camera\n"
@@ -47,8 +98,10 @@ def test_a_permit_dies_with_the_gate() -> None:
     gate = Gate(strict=False)
     permit = gate.judge(verdict_of(Outcome.OK))
     gate.close()
-    with pytest.raises(BringUpError, match="the gate was closed again before this request"):
+    assert gate.permit is None
+    with pytest.raises(BringUpError) as caught:
         permit.check()
+    assert str(caught.value) == "cannot activate: the gate was closed again before this request"
 
 
 def test_a_newer_verdict_replaces_the_permit_of_an_older_one() -> None:
@@ -60,10 +113,121 @@ def test_a_newer_verdict_replaces_the_permit_of_an_older_one() -> None:
         old.check()
 
 
+def test_a_permit_says_what_it_rests_on() -> None:
+    verdict = verdict_of(Outcome.UNVERIFIABLE, "state.unverifiable")
+    assert Gate(strict=False).judge(verdict).verdict is verdict
+
+
+def test_a_violated_verdict_closes_the_gate_even_if_it_says_that_nothing_blocks() -> None:
+    with pytest.raises(VerificationError):
+        Gate(strict=False).judge(verdict_of(Outcome.VIOLATED, "graph.missing-node", blocking=False))
+
+
 def test_a_permit_made_past_the_gate_is_worth_nothing() -> None:
-    gate = Gate(strict=False)
-    forged = Permit(gate, verdict_of(Outcome.OK))
+    forged = Permit(Gate(strict=False), verdict_of(Outcome.OK))
     with pytest.raises(BringUpError):
         forged.check()
-    with pytest.raises(BringUpError):
-        Permit(gate, verdict_of(Outcome.VIOLATED, "graph.missing-node"))
+
+
+def test_no_permit_can_be_made_past_a_gate_that_would_refuse_it_or_has_given_one() -> None:
+    opened = Gate(strict=False)
+    opened.judge(verdict_of(Outcome.OK))
+    for gate, verdict in (
+        (Gate(strict=False), verdict_of(Outcome.VIOLATED, "graph.missing-node")),
+        (Gate(strict=True), verdict_of(Outcome.UNVERIFIABLE, "state.unverifiable")),
+        (opened, verdict_of(Outcome.OK)),
+    ):
+        with pytest.raises(BringUpError) as caught:
+            Permit(gate, verdict)
+        assert str(caught.value) == (
+            "cannot make a permit without an open gate; ask Gate.judge for one"
+        )
+
+
+class Changing:
+    """A system that changes, and verdicts for each time that it is judged again."""
+
+    def __init__(self, *verdicts: Verdict) -> None:
+        self.changed = False
+        self.begun = asyncio.Event()
+        self.asked: list[frozenset[str]] = []
+        self._verdicts = list(verdicts)
+
+    def is_current(self, verdict: Verdict) -> bool:
+        return not self.changed
+
+    async def again(self, ahead: frozenset[str]) -> Verdict:
+        self.asked.append(ahead)
+        self.begun.set()
+        await asyncio.sleep(0.01)
+        self.changed = False
+        return self._verdicts.pop(0)
+
+
+def test_a_verdict_of_the_moment_is_not_judged_again() -> None:
+    async def main() -> None:
+        system = Changing()
+        permit = Gate(strict=False, judging=system).judge(verdict_of(Outcome.OK))
+        await permit.use("/camera")
+        assert system.asked == []
+
+    asyncio.run(main())
+
+
+def test_whoever_asks_after_a_change_waits_for_one_judgement_that_knows_who_was_let_through() -> (
+    None
+):
+    async def main() -> None:
+        newer = verdict_of(Outcome.OK)
+        system = Changing(newer)
+        permit = Gate(strict=False, judging=system).judge(verdict_of(Outcome.OK))
+        await permit.use("/camera")
+        system.changed = True
+        await asyncio.gather(*(permit.use(f"/viewer_{index}") for index in range(20)))
+        assert system.asked == [frozenset({"/camera"})]
+        assert permit.verdict is newer
+
+    asyncio.run(main())
+
+
+def test_a_change_that_is_not_allowed_closes_the_gate_for_all_that_were_not_sent() -> None:
+    async def main() -> None:
+        system = Changing(verdict_of(Outcome.VIOLATED, "graph.undeclared-publisher"))
+        gate = Gate(strict=False, judging=system)
+        permit = gate.judge(verdict_of(Outcome.OK))
+        system.changed = True
+        refused = await asyncio.gather(
+            permit.use("/camera"), permit.use("/viewer"), return_exceptions=True
+        )
+        with pytest.raises(VerificationError) as later:
+            await permit.use("/radar")
+        for error in (*refused, later.value):
+            assert isinstance(error, VerificationError)
+            assert error.exit_code is ExitCode.VIOLATED
+            assert error.again
+            assert str(error) == (
+                "cannot activate: the system changed before every node was activated, "
+                "and its verdict now is violated\n"
+                "  graph.undeclared-publisher: graph.undeclared-publisher on /camera"
+            )
+        assert gate.permit is None
+        assert len(system.asked) == 1
+
+    asyncio.run(main())
+
+
+def test_a_gate_that_is_closed_while_it_is_judged_again_lets_nobody_through() -> None:
+    async def main() -> None:
+        system = Changing(verdict_of(Outcome.OK))
+        gate = Gate(strict=False, judging=system)
+        permit = gate.judge(verdict_of(Outcome.OK))
+        system.changed = True
+        waits = asyncio.ensure_future(permit.use("/camera"))
+        await system.begun.wait()
+        gate.close()
+        with pytest.raises(BringUpError, match="the gate was closed again"):
+            await waits
+        with pytest.raises(BringUpError, match="the gate was closed again"):
+            await permit.use("/camera")
+
+    asyncio.run(main())

@@ -12,18 +12,25 @@ import pytest
 
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.node.control import Event
+from lifecycle.plan.model import Plan
 from lifecycle.supervisor.driver import Standing
-from lifecycle.supervisor.events import Reach, VerdictChanged
-from lifecycle.supervisor.judge import Changes, Judge, without
+from lifecycle.supervisor.elsewhere import RemoteNode
+from lifecycle.supervisor.events import NodeJoined, Reach, VerdictChanged
+from lifecycle.supervisor.judge import Changes, Judge, with_findings, without, without_nodes
+from lifecycle.supervisor.liveliness import Cause
+from lifecycle.supervisor.process import ManagedProcess
 from lifecycle.supervisor.settling import PASSING_S
-from lifecycle.supervisor.watch import Watch
+from lifecycle.supervisor.states import ProcessExit, ProcessState
+from lifecycle.supervisor.system import System
+from lifecycle.supervisor.watch import Watch, first_death
 from lifecycle.verify.observation import (
     NodeConfiguration,
+    NodeParameters,
     Observation,
     ObservedEndpoint,
     ObservedNode,
 )
-from lifecycle.verify.verdict import Outcome, Stage, Verdict
+from lifecycle.verify.verdict import Finding, Outcome, Stage, Verdict
 from tests.unit.supervisor.fakes import (
     FakeGraph,
     World,
@@ -33,31 +40,45 @@ from tests.unit.supervisor.fakes import (
     run,
     verdict_of,
 )
+from tests.unit.supervisor.test_supervisor_negotiation import plan_of as negotiated_plan
 
 OK = verdict_of(Outcome.OK)
 MISSING = verdict_of(Outcome.VIOLATED, "graph.missing-node")
 UNDECLARED = verdict_of(Outcome.VIOLATED, "graph.undeclared-publisher")
 UNMATCHED = verdict_of(Outcome.VIOLATED, "graph.unmatched-link")
 UNATTRIBUTED = verdict_of(Outcome.UNVERIFIABLE, "graph.unattributed-endpoint")
+UNPROVEN = verdict_of(Outcome.VIOLATED, "flow.unverifiable")
+UNMEASURED = verdict_of(Outcome.UNVERIFIABLE, "flow.not-measured", blocking=True)
 UNKNOWN = verdict_of(Outcome.UNVERIFIABLE, "state.unverifiable", blocking=True)
+
+
+class _AskedGraph(FakeGraph):
+    """Remembers the plan that it was asked for last."""
+
+    asked: Plan | None = None
+
+    async def observe(self, plan: Plan) -> Observation:
+        self.asked = plan
+        return await super().observe(plan)
 
 
 class _Bench:
     """A judge over a graph whose verdicts are given: one for each number of nodes seen."""
 
-    def __init__(self, tmp_path: Path, *verdicts: Verdict) -> None:
+    def __init__(self, tmp_path: Path, *verdicts: Verdict, **options: Any) -> None:
         self.world = World(plan_of(planned_node("camera")), tmp_path)
-        self.graph = FakeGraph()
+        self.graph = _AskedGraph()
         self.verdicts = verdicts
         self.looks: list[float] = []
+        self.judged: list[dict[str, object]] = []
         self.changes = Changes(self.world.system, self.graph)
         self.judge = Judge(
             self.world.system,
             self.graph,
             self.changes,
             self.world.emit,
-            strict=False,
             verify_=self._verify,
+            **{"strict": False, **options},
         )
 
     def _verify(
@@ -70,6 +91,15 @@ class _Bench:
         ahead: frozenset[str] = frozenset(),
     ) -> Verdict:
         self.looks.append(self.now)
+        self.judged.append(
+            {
+                "plan": plan,
+                "observation": observation,
+                "stage": stage,
+                "machines": machines,
+                "ahead": ahead,
+            }
+        )
         return self.verdicts[min(len(observation.nodes), len(self.verdicts) - 1)]
 
     @property
@@ -86,9 +116,14 @@ class _Bench:
         return [event.verdict for event in self.world.heard(VerdictChanged)]
 
 
-def _run(tmp_path: Path, test: Callable[[_Bench], Coroutine[Any, Any, None]], *of: Verdict) -> None:
+def _run(
+    tmp_path: Path,
+    test: Callable[[_Bench], Coroutine[Any, Any, None]],
+    *of: Verdict,
+    **options: Any,
+) -> None:
     async def main() -> None:
-        bench = _Bench(tmp_path, *of)
+        bench = _Bench(tmp_path, *of, **options)
         try:
             await test(bench)
         finally:
@@ -134,6 +169,24 @@ def test_what_time_does_not_heal_fails_after_half_a_second(tmp_path: Path) -> No
         assert bench.now == pytest.approx(0.5, abs=0.05)
 
     _run(tmp_path, test, UNDECLARED)
+
+
+def test_what_only_a_report_could_prove_is_waited_for_a_moment_and_not_for_all_the_time(
+    tmp_path: Path,
+) -> None:
+    async def test(bench: _Bench) -> None:
+        assert await bench.judge.until_clear(Stage.CONNECTED, 30.0) == UNPROVEN
+        assert bench.now == pytest.approx(3.5, abs=0.1)
+
+    _run(tmp_path, test, UNPROVEN)
+
+
+def test_what_was_never_measured_is_not_waited_for(tmp_path: Path) -> None:
+    async def test(bench: _Bench) -> None:
+        assert await bench.judge.until_clear(Stage.CONNECTED, 30.0) == UNMEASURED
+        assert bench.now == pytest.approx(0.5, abs=0.05)
+
+    _run(tmp_path, test, UNMEASURED)
 
 
 def test_it_stands_although_the_graph_goes_on_changing(tmp_path: Path) -> None:
@@ -264,10 +317,450 @@ def test_a_dead_node_is_gone_although_discovery_shows_it_for_the_whole_lease() -
     endpoint = ObservedEndpoint(
         kind=EndpointKind.PUBLISHER, node="/dead", name="/topic", type="std_msgs/msg/String"
     )
-    seen = Observation(nodes=(of("/dead"), of("/other"), of("/twice", 2)), endpoints=(endpoint,))
-    assert without(seen, frozenset({"/dead", "/twice"})) == Observation(
-        nodes=(of("/other"), of("/twice", 1))
+    kept = dataclasses.replace(endpoint, node="/twice")
+    parameter = NodeParameters(node="/dead")
+    seen = Observation(
+        nodes=(of("/dead"), of("/other"), of("/twice", 3)),
+        endpoints=(endpoint, kept),
+        configurations=(interface_of("/dead"), interface_of("/other")),
+        parameters=(parameter, dataclasses.replace(parameter, node="/twice")),
     )
+    assert without(seen, frozenset({"/dead", "/twice"})) == Observation(
+        nodes=(of("/other"), of("/twice", 2)),
+        endpoints=(kept,),
+        configurations=(interface_of("/other"),),
+        parameters=(dataclasses.replace(parameter, node="/twice"),),
+    )
+    assert without(seen, frozenset()) is seen
+
+
+def test_nodes_that_are_silent_are_not_asked_for_and_judged_silent(tmp_path: Path) -> None:
+    async def test(bench: _Bench) -> None:
+        system = bench.world.system
+        await bench.judge.once(Stage.CONNECTED)
+        assert bench.graph.asked is system.plan
+        system.liveliness.fell_silent(("/camera",), Cause.HUNG, "a callback has been running")
+        verdict = await bench.judge.once(Stage.CONNECTED)
+        assert bench.graph.asked == dataclasses.replace(system.plan, nodes=())
+        assert bench.judged[-1]["plan"] is system.expected
+        assert (verdict.verdict, verdict.blocking) == (Outcome.VIOLATED, True)
+        assert verdict.findings == system.liveliness.findings()
+
+    _run(tmp_path, test, OK)
+
+
+def test_of_a_plan_only_silent_nodes_are_left_out() -> None:
+    plan = plan_of(planned_node("camera"), planned_node("viewer"))
+    assert without_nodes(plan, {}) is plan
+    assert without_nodes(plan, {"/camera": "why"}).nodes == plan.nodes[1:]
+
+
+class _Looker:
+    """Notes what it sees, and finds one thing wrong."""
+
+    def __init__(self) -> None:
+        self.seen: list[Observation] = []
+        self.wrong = verdict_of(Outcome.VIOLATED, "connection.missing").findings
+
+    def look(self, observation: Observation) -> None:
+        self.seen.append(observation)
+
+    def findings(self) -> tuple[Finding, ...]:
+        return self.wrong if self.seen else ()
+
+
+class _Agreement:
+    """Explains every finding, and finds one thing unverifiable in what was seen."""
+
+    def __init__(self) -> None:
+        self.seen: list[Observation] = []
+        self.unknown = verdict_of(Outcome.UNVERIFIABLE, "run.plan-unknown").findings
+
+    def explained(self, verdict: Verdict) -> Verdict:
+        return dataclasses.replace(
+            verdict,
+            findings=tuple(
+                dataclasses.replace(each, observed="explained") for each in verdict.findings
+            ),
+        )
+
+    def findings(self, observation: Observation) -> tuple[Finding, ...]:
+        self.seen.append(observation)
+        return self.unknown
+
+
+def test_what_is_seen_is_judged_against_what_is_expected_with_what_others_find(
+    tmp_path: Path,
+) -> None:
+    looker, agreement = _Looker(), _Agreement()
+
+    async def test(bench: _Bench) -> None:
+        system, judge = bench.world.system, bench.judge
+        assert (judge.latest, judge.seen, judge.ahead) == (None, Observation(), frozenset())
+        system.expected = plan_of(planned_node("camera"), planned_node("negotiated"))
+        system.machines = frozenset({"left"})
+        judge.ahead = frozenset({"/first"})
+        seen = Observation(nodes=(ObservedNode(full_name="/camera"),))
+        bench.graph.observation = seen
+        verdict = await judge.once(Stage.CONNECTED)
+        assert bench.judged == [
+            {
+                "plan": system.expected,
+                "observation": seen,
+                "stage": Stage.CONNECTED,
+                "machines": frozenset({"left"}),
+                "ahead": frozenset({"/first"}),
+            }
+        ]
+        assert looker.seen == agreement.seen == [judge.seen] == [seen]
+        assert system.present == frozenset({"/camera"})
+        assert [each.node for each in bench.world.heard(NodeJoined)] == ["/camera"]
+        told = tuple(
+            dataclasses.replace(each, observed="explained")
+            for each in (*looker.wrong, *UNATTRIBUTED.findings)
+        )
+        assert verdict == Verdict(
+            verdict=Outcome.VIOLATED, blocking=True, findings=(*agreement.unknown, *told), flows=()
+        )
+        assert judge.latest == verdict
+        (changed,) = bench.world.heard(VerdictChanged)
+        assert (changed.stage, changed.verdict) == (Stage.CONNECTED, verdict)
+
+    _run(tmp_path, test, UNATTRIBUTED, looker=looker, agreement=agreement)
+
+
+def test_what_the_supervisor_finds_comes_first_and_makes_a_verdict_worse_never_better() -> None:
+    for outcome, blocking in ((Outcome.VIOLATED, True), (Outcome.UNVERIFIABLE, False)):
+        (finding,) = verdict_of(outcome, "run.plan-unknown").findings
+        assert with_findings(UNATTRIBUTED, (finding,)) == dataclasses.replace(
+            UNATTRIBUTED,
+            verdict=outcome,
+            blocking=blocking,
+            findings=(finding, *UNATTRIBUTED.findings),
+        )
+        assert with_findings(MISSING, (finding,)).verdict is Outcome.VIOLATED
+        assert with_findings(MISSING, (finding,)).blocking
+    assert with_findings(MISSING, ()) is MISSING
+
+
+def test_of_a_process_that_ended_the_nodes_are_left_out_and_of_the_server_it_is_told(
+    tmp_path: Path,
+) -> None:
+    async def test(bench: _Bench) -> None:
+        system = bench.world.system
+        bench.graph.observation = Observation(
+            nodes=tuple(ObservedNode(full_name=each) for each in ("/camera", "/viewer"))
+        )
+        await bench.judge.once(Stage.ACTIVE)
+        assert system.present == frozenset({"/camera", "/viewer"})
+        _end(system.processes["camera"])
+        await bench.judge.once(Stage.ACTIVE)
+        assert bench.judge.seen == Observation(nodes=(ObservedNode(full_name="/viewer"),))
+        assert system.present == frozenset({"/viewer"})
+        system.server = system.make_process(
+            dataclasses.replace(system.plan.processes[0], name="discovery_server", nodes=())
+        )
+        _end(system.server)
+        verdict = await bench.judge.once(Stage.ACTIVE)
+        assert [(each.rule, each.subject) for each in verdict.findings] == [
+            ("run.process-died", "discovery_server")
+        ]
+
+    _run(tmp_path, test, OK)
+
+
+def _end(process: ManagedProcess, state: ProcessState = ProcessState.EXITED) -> None:
+    process.state = state
+    process.ended.set_result(ProcessExit(signal=11))
+
+
+def test_the_configurations_of_nodes_are_read_before_each_look(tmp_path: Path) -> None:
+    async def test(bench: _Bench) -> None:
+        node = bench.world.system.nodes["camera"]
+        node.driver = object()  # type: ignore[assignment]
+        node.tells = True
+        node.reach = Reach.CONNECTED
+        node.configuration = interface_of("/camera")
+        await bench.judge.once(Stage.CONNECTED)
+        assert bench.graph.put == [interface_of("/camera")]
+
+    _run(tmp_path, test, OK)
+
+
+def test_what_is_held_is_judged_at_its_stage_against_what_is_expected(tmp_path: Path) -> None:
+    async def test(bench: _Bench) -> None:
+        chatter = ("/chatter", "/camera")
+        bench.verdicts = (OK, _missing_endpoint(*chatter))
+        system = bench.world.system
+        assert await bench.judge.settled(Stage.ACTIVE) == (OK, None)
+        system.expected = _with_publisher(system.plan, chatter[0])
+        bench.grow()
+        # It is expected only since a moment ago.
+        assert await bench.judge.settled(Stage.ACTIVE) == (OK, PASSING_S)
+        await asyncio.sleep(PASSING_S)
+        assert await bench.judge.settled(Stage.ACTIVE) == (bench.verdicts[1], None)
+        assert [each["stage"] for each in bench.judged] == [Stage.ACTIVE] * 3
+        assert {each.stage for each in bench.world.heard(VerdictChanged)} == {Stage.ACTIVE}
+
+    _run(tmp_path, test, OK)
+
+
+def _with_publisher(plan: Plan, topic: str) -> Plan:
+    node = dataclasses.replace(plan.nodes[0], endpoints=negotiated_plan().nodes[0].endpoints[:1])
+    (end,) = node.endpoints
+    end = dataclasses.replace(end, kind=EndpointKind.PUBLISHER, resolved=topic)
+    return dataclasses.replace(plan, nodes=(dataclasses.replace(node, endpoints=(end,)),))
+
+
+def _missing_endpoint(topic: str, node: str) -> Verdict:
+    (finding,) = verdict_of(Outcome.VIOLATED, "graph.missing-endpoint").findings
+    finding = dataclasses.replace(
+        finding, subject=topic, node=node, endpoint=EndpointKind.PUBLISHER
+    )
+    return dataclasses.replace(MISSING, findings=(finding,))
+
+
+def test_changes_are_counted_and_waited_for_within_a_time(tmp_path: Path) -> None:
+    async def test(bench: _Bench) -> None:
+        loop = asyncio.get_running_loop()
+        assert bench.changes.count == 0
+        assert not await bench.changes.beyond(0, 2.0)
+        assert bench.now == pytest.approx(2.0)
+        loop.call_later(1.0, bench.graph.changed.set)
+        loop.call_later(2.0, bench.world.system.touched.set)
+        assert await bench.changes.beyond(0, None)
+        assert (bench.changes.count, bench.now) == (1, pytest.approx(3.0))
+        assert await bench.changes.beyond(0, 0.0)
+        assert await bench.changes.beyond(1, 2.0)
+        assert (bench.changes.count, bench.now) == (2, pytest.approx(4.0))
+
+    _run(tmp_path, test, OK)
+
+
+def test_an_observer_that_fails_fails_whoever_waits_for_a_change(tmp_path: Path) -> None:
+    async def test(bench: _Bench) -> None:
+        async def fail() -> None:
+            raise RuntimeError("the observer failed")
+
+        bench.graph.wait_change = fail  # type: ignore[method-assign]
+        await bench.changes.close()
+        changes = Changes(bench.world.system, bench.graph)
+        with pytest.raises(RuntimeError, match="the observer failed"):
+            await changes.beyond(0, 1.0) or await changes.beyond(0, 1.0)
+        await changes.close()
+
+    _run(tmp_path, test, OK)
+
+
+def test_after_the_end_of_listening_nothing_is_a_change(tmp_path: Path) -> None:
+    async def test(bench: _Bench) -> None:
+        await bench.changes.close()
+        bench.graph.changed.set()
+        bench.world.system.touched.set()
+        await asyncio.sleep(1.0)
+        assert bench.changes.count == 0
+
+    _run(tmp_path, test, OK)
+
+
+def test_findings_that_could_heal_are_given_up_once_unchanged_for_so_long_as_is_asked(
+    tmp_path: Path,
+) -> None:
+    async def test(bench: _Bench) -> None:
+        # A change of the graph that changes no finding, and one that does.
+        bench.verdicts = (MISSING, MISSING, UNMATCHED)
+        for delay_s in (2.0, 4.0):
+            asyncio.get_running_loop().call_later(delay_s, bench.grow)
+        assert await bench.judge.until_clear(Stage.CONNECTED, 30.0, unchanged_s=5.0) == UNMATCHED
+        assert bench.now == pytest.approx(9.0, abs=0.1)
+        bench.verdicts = (MISSING,)
+        assert await bench.judge.until_clear(Stage.CONNECTED, 3.0, unchanged_s=5.0) == MISSING
+        assert bench.now == pytest.approx(12.0, abs=0.1)
+
+    _run(tmp_path, test, MISSING)
+
+
+def test_what_time_does_not_heal_is_not_waited_for_longer_because_more_time_was_asked(
+    tmp_path: Path,
+) -> None:
+    async def test(bench: _Bench) -> None:
+        await bench.judge.until_clear(Stage.CONNECTED, 30.0, unchanged_s=5.0)
+        assert bench.now == pytest.approx(0.5, abs=0.05)
+
+    _run(tmp_path, test, UNDECLARED)
+
+
+def test_what_healed_and_broke_again_has_its_time_anew(tmp_path: Path) -> None:
+    async def test(bench: _Bench) -> None:
+        bench.verdicts = (UNKNOWN, MISSING, UNKNOWN)
+        for delay_s in (2.0, 3.0):
+            asyncio.get_running_loop().call_later(delay_s, bench.grow)
+        assert await bench.judge.until_clear(Stage.CONNECTED, 30.0) == UNKNOWN
+        assert bench.now == pytest.approx(6.5, abs=0.1)
+
+    _run(tmp_path, test, UNKNOWN)
+
+
+def test_a_verdict_that_closes_the_gate_without_a_finding_is_not_waited_for_all_the_time(
+    tmp_path: Path,
+) -> None:
+    async def test(bench: _Bench) -> None:
+        await bench.judge.until_clear(Stage.CONNECTED, 30.0)
+        assert bench.now == pytest.approx(3.5, abs=0.1)
+
+    _run(tmp_path, test, verdict_of(Outcome.VIOLATED))
+
+
+def test_strict_waits_for_what_is_unverifiable_and_else_it_is_clear(tmp_path: Path) -> None:
+    async def strict(bench: _Bench) -> None:
+        assert await bench.judge.until_clear(Stage.CONNECTED, 30.0) == UNATTRIBUTED
+        assert bench.now == pytest.approx(3.5, abs=0.1)
+
+    async def lenient(bench: _Bench) -> None:
+        assert await bench.judge.until_clear(Stage.CONNECTED, 30.0) == UNATTRIBUTED
+        assert bench.now == 0.0
+
+    _run(tmp_path, strict, UNATTRIBUTED, strict=True)
+    _run(tmp_path, lenient, UNATTRIBUTED)
+
+
+def test_nodes_are_asked_for_a_match_at_growing_intervals_up_to_half_a_second(
+    tmp_path: Path,
+) -> None:
+    async def test(bench: _Bench) -> None:
+        await bench.judge.until_clear(Stage.CONNECTED, 3.0)
+        assert bench.looks == pytest.approx(
+            [0.0, 0.02, 0.06, 0.14, 0.3, 0.62, 1.12, 1.62, 2.12, 2.62, 3.0]
+        )
+        assert {each["stage"] for each in bench.judged} == {Stage.CONNECTED}
+
+    _run(tmp_path, test, UNMATCHED)
+
+
+def test_a_match_that_is_only_unverifiable_is_not_asked_for(tmp_path: Path) -> None:
+    async def test(bench: _Bench) -> None:
+        await bench.judge.until_clear(Stage.CONNECTED, 3.0)
+        assert bench.looks == pytest.approx([0.0, 3.0])
+
+    _run(tmp_path, test, verdict_of(Outcome.UNVERIFIABLE, "graph.unmatched-link", blocking=True))
+
+
+@pytest.mark.parametrize("rule", ["state.wrong-state", "config.missing-configuration"])
+@pytest.mark.parametrize(("node", "asked"), [("/viewer", True), ("/camera", False)])
+def test_a_node_of_another_supervisor_that_has_a_step_to_go_is_asked_again(
+    tmp_path: Path, rule: str, node: str, asked: bool
+) -> None:
+    (finding,) = verdict_of(Outcome.VIOLATED, rule).findings
+    late = dataclasses.replace(MISSING, findings=(dataclasses.replace(finding, node=node),))
+
+    async def test(bench: _Bench) -> None:
+        bench.world.system.remote = {"viewer": RemoteNode(planned_node("viewer"))}
+        await bench.judge.until_clear(Stage.CONNECTED, 1.0)
+        assert (len(bench.looks) > 2) is asked
+
+    _run(tmp_path, test, late)
+
+
+def test_a_node_of_another_supervisor_that_is_missing_announces_itself(tmp_path: Path) -> None:
+    (finding,) = MISSING.findings
+    missing = dataclasses.replace(MISSING, findings=(dataclasses.replace(finding, node="/viewer"),))
+
+    async def test(bench: _Bench) -> None:
+        bench.world.system.remote = {"viewer": RemoteNode(planned_node("viewer"))}
+        await bench.judge.until_clear(Stage.CONNECTED, 1.0)
+        assert len(bench.looks) == 2
+
+    _run(tmp_path, test, missing)
+
+
+def test_a_burst_that_does_not_end_is_looked_at_every_50_ms(tmp_path: Path) -> None:
+    async def test(bench: _Bench) -> None:
+        async def burst() -> None:
+            while True:
+                await asyncio.sleep(0.003)
+                bench.graph.changed.set()
+
+        bursting = asyncio.ensure_future(burst())
+        await bench.judge.until_clear(Stage.CONNECTED, 0.5)
+        bursting.cancel()
+        gaps = [later - one for one, later in zip(bench.looks, bench.looks[1:], strict=False)]
+        assert all(0.05 <= each <= 0.062 for each in gaps[:-1])
+
+    _run(tmp_path, test, MISSING)
+
+
+def test_a_violation_is_waited_out_however_much_else_only_a_report_could_prove(
+    tmp_path: Path,
+) -> None:
+    both = dataclasses.replace(UNPROVEN, findings=(*UNPROVEN.findings, *MISSING.findings))
+
+    async def test(bench: _Bench) -> None:
+        await bench.judge.until_clear(Stage.CONNECTED, 30.0)
+        assert bench.now == pytest.approx(30.0, abs=0.1)
+
+    _run(tmp_path, test, both)
+
+
+def test_of_what_cannot_be_verified_one_that_does_not_heal_is_enough_not_to_wait(
+    tmp_path: Path,
+) -> None:
+    both = dataclasses.replace(UNKNOWN, findings=(*UNKNOWN.findings, *UNMEASURED.findings))
+    unproven = dataclasses.replace(UNPROVEN, findings=(*UNPROVEN.findings, *UNMEASURED.findings))
+
+    async def at_once(bench: _Bench) -> None:
+        await bench.judge.until_clear(Stage.CONNECTED, 30.0)
+        assert bench.now == pytest.approx(0.5, abs=0.05)
+
+    async def for_the_report(bench: _Bench) -> None:
+        await bench.judge.until_clear(Stage.CONNECTED, 30.0)
+        assert bench.now == pytest.approx(3.5, abs=0.1)
+
+    _run(tmp_path, at_once, both)
+    _run(tmp_path, for_the_report, unproven)
+
+
+def _system(tmp_path: Path) -> System:
+    system = World(plan_of(planned_node("camera"), planned_node("viewer")), tmp_path).system
+    system.server = system.make_process(
+        dataclasses.replace(system.plan.processes[0], name="discovery_server", nodes=())
+    )
+    return system
+
+
+def test_the_first_process_that_ends_is_told_and_each_only_once(tmp_path: Path) -> None:
+    async def test() -> None:
+        system = _system(tmp_path)
+        assert system.server is not None
+        camera, viewer = system.processes["camera"], system.processes["viewer"]
+        known: set[str] = set()
+        for process in (viewer, system.server, camera):
+            death = asyncio.ensure_future(first_death(system, known))
+            await asyncio.sleep(1.0)
+            assert not death.done()
+            _end(process)
+            assert await asyncio.wait_for(death, 1.0) is process
+            assert process.name in known
+        # All have ended: there is nothing to wait for but the end of the waiting.
+        death = asyncio.ensure_future(first_death(system, known))
+        await asyncio.sleep(60.0)
+        assert not death.done()
+        death.cancel()
+
+    run(test())
+
+
+def test_a_process_that_is_started_again_did_not_die(tmp_path: Path) -> None:
+    async def test() -> None:
+        system = _system(tmp_path)
+        system.server = None
+        death = asyncio.ensure_future(first_death(system, set()))
+        _end(system.processes["camera"], ProcessState.BACKOFF)
+        await asyncio.sleep(1.0)
+        assert not death.done()
+        _end(system.processes["viewer"])
+        assert await asyncio.wait_for(death, 1.0) is system.processes["viewer"]
+
+    run(test())
 
 
 def test_while_held_a_passing_violation_is_told_but_does_not_count(tmp_path: Path) -> None:
@@ -291,10 +784,24 @@ def test_while_held_a_violation_that_stands_counts_and_nothing_is_polled(tmp_pat
         asyncio.get_running_loop().call_later(1.0, bench.grow)
         await asyncio.sleep(60.0)
         watching.cancel()
-        assert watch.violated
+        assert watch.violated == "wrong: /camera (graph.undeclared-publisher)"
         assert len(bench.looks) == 3
+        assert {each["stage"] for each in bench.judged} == {Stage.ACTIVE}
+        assert {each.stage for each in bench.world.heard(VerdictChanged)} == {Stage.ACTIVE}
 
     _run(tmp_path, test, OK, UNDECLARED)
+
+
+def test_while_held_a_violated_verdict_without_findings_counts_too(tmp_path: Path) -> None:
+    async def test(bench: _Bench) -> None:
+        watch = Watch(bench.judge, bench.changes, Stage.ACTIVE)
+        assert watch.violated == ""
+        watching = asyncio.ensure_future(watch.run())
+        await asyncio.sleep(2.0)
+        watching.cancel()
+        assert watch.violated == "violated"
+
+    _run(tmp_path, test, verdict_of(Outcome.VIOLATED))
 
 
 def test_while_held_a_newcomer_that_is_not_known_by_name_yet_is_not_told(tmp_path: Path) -> None:

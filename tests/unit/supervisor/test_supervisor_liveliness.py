@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+import io
 import os
 import signal
 import socket
@@ -12,9 +13,10 @@ from pathlib import Path
 
 import pytest
 
+from lifecycle.cli.up_output import PlainLines
 from lifecycle.codec import from_json, to_json
 from lifecycle.manifest.model import DiscoveryRange, Machine, Run, RunKind, Timeouts
-from lifecycle.middleware.busy_sign import BusySign
+from lifecycle.middleware.busy_sign import BusySign, Overdue
 from lifecycle.node.control import SIGN_DESCRIPTORS, HostSpec, Operation
 from lifecycle.node.control import Event as HostEvent
 from lifecycle.plan.model import Plan, PlannedProcess
@@ -67,6 +69,41 @@ def test_a_silent_node_is_told_once_and_alive_when_its_last_cause_is_gone() -> N
     assert ears.kinds == ["silent", "alive"]
     assert ears.liveliness.silent == {}
     assert ears.changes == 4
+
+
+def test_a_node_is_not_called_alive_that_has_not_started_or_is_not_in_the_graph(
+    tmp_path: Path,
+) -> None:
+    async def test() -> None:
+        desk = Desk(tmp_path)
+        # Stopped in the middle of an import, and continued: it has not begun to live.
+        desk.system.liveliness.fell_silent(["/camera"], Cause.STOPPED, "it was stopped")
+        desk.system.liveliness.came_back(["/camera"], Cause.STOPPED)
+        # A supervisor that was started anew has not started its nodes yet.
+        desk.desk.heard(True)
+        await settle()
+        desk.desk.heard(False)
+        await settle()
+        desk.system.present = frozenset({"/lamp"})
+        desk.desk.heard(True)
+        await settle()
+        alive = [each for each in desk.events if isinstance(each, NodeAlive)]
+        assert {each.node: each.there for each in alive} == {
+            "/camera": False,
+            "/viewer": False,
+            "/lamp": True,
+        }
+        stream = io.StringIO()
+        for each in alive:
+            PlainLines(stream)(dataclasses.replace(each, silent_s=2.0))
+        assert stream.getvalue() == (
+            "/camera: not silent any more after 2.0 s, but not there yet\n"
+            "/viewer: not silent any more after 2.0 s, but not there yet\n"
+            "/lamp: alive again after 2.0 s\n"
+        )
+        await desk.neighbours.close()
+
+    run(test())
 
 
 def test_the_same_cause_twice_is_no_news() -> None:
@@ -411,10 +448,10 @@ def test_a_channel_tells_that_its_host_hangs_and_when_it_came_back() -> None:
         sign = BusySign(*descriptors)
         assert sign.limit_s == 0.05
         sign.begin()
-        assert await asyncio.wait_for(told.get(), 10) is True
+        assert await asyncio.wait_for(told.get(), 10) is Overdue.HANGS
         assert sign.end() is not None
         theirs.sendall(to_json(HostEvent(kind="beat")) + b"\n")
-        assert await asyncio.wait_for(told.get(), 10) is False
+        assert await asyncio.wait_for(told.get(), 10) is None
         sign.close()
         theirs.close()
         await channel.close()

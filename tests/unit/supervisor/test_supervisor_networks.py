@@ -43,7 +43,9 @@ class FakePrograms:
         self.asked = asyncio.Event()
         self._loop = asyncio.get_running_loop()
 
-    def update(self, flows: Sequence[FlowReport], *, hold: bool) -> tuple[Changes, ...]:
+    def update(
+        self, flows: Sequence[FlowReport], *, hold: bool, within_s: float | None
+    ) -> tuple[Changes, ...]:
         assert hold
         topics = tuple(each.topic for each in flows)
         if topics in self.seen:
@@ -60,12 +62,18 @@ class FakePrograms:
         change = Change(kind=ChangeKind.CREATE, key="k", what="w")
         return (Changes(target="fake", changes=(change,)),)
 
-    def renew(self) -> float | None:
+    def renew(self, *, within_s: float | None) -> float | None:
         return None
 
-    def close(self) -> tuple[Changes, ...]:
+    def close(self, *, within_s: float | None) -> tuple[Changes, ...]:
         self.seen.append(("closed",))
         return ()
+
+    def cancel(self) -> None:
+        pass
+
+    def resume(self) -> None:
+        pass
 
 
 def verdict(*topics: str) -> Verdict:

@@ -23,7 +23,7 @@ from lifecycle.supervisor.orders import (
     check_order,
 )
 from lifecycle.supervisor.remote import look, order
-from lifecycle.supervisor.server import Ask, ControlServer, Look, follow
+from lifecycle.supervisor.server import Ask, ControlServer, Look, Question, follow
 from lifecycle.supervisor.shutdown import TakeDown
 from lifecycle.verify.observation import Observation
 from lifecycle.verify.verdict import Outcome
@@ -115,7 +115,7 @@ def test_the_control_socket_looks_follows_and_orders(tmp_path: Path) -> None:
         loop = asyncio.get_running_loop()
         assert await loop.run_in_executor(None, look, tmp_path) == seen
         answer = await loop.run_in_executor(
-            None, lambda: order(tmp_path, Ask.RESTART, 5.0, node="camera")
+            None, lambda: order(tmp_path, Question(ask=Ask.RESTART, node="camera"), 5.0)
         )
         assert (answer.exit_code, answer.error) == (ExitCode.VIOLATED, "cannot activate: no")
         assert asked == [Order(kind=OrderKind.RESTART, node="camera")]

@@ -6,6 +6,8 @@ import csv
 import dataclasses
 import io
 import json
+import os
+import signal
 
 import pytest
 from rich.console import Console
@@ -23,6 +25,7 @@ from lifecycle.network.nfe import (
     UniqueRequirement,
 )
 from lifecycle.node.control import Operation
+from lifecycle.supervisor.ending import Ending
 from lifecycle.supervisor.events import (
     Event,
     Failure,
@@ -56,7 +59,8 @@ EVENTS: tuple[Event, ...] = (
         rule="run.process-died",
         subject="/camera",
         message="cannot keep '/camera' running: pid 7 died: killed by SIGSEGV",
-        log_tail=("shutter is stuck",),
+        process="camera",
+        log="/log/camera.log",
     ),
 )
 RESULT = UpResult(exit_code=ExitCode.OK, verdict=verdict_of(Outcome.OK))
@@ -100,10 +104,61 @@ def test_plain_lines_tell_a_person_what_happens() -> None:
         "connected: verdict ok\n"
         "gate open on verdict ok: activating 1 node\n"
         "system active after 1.25 s\n"
-        "run.process-died: cannot keep '/camera' running: pid 7 died: killed by SIGSEGV\n"
-        "    | shutter is stuck\n"
+        "failed: /camera (run.process-died)\n"
         "verdict: ok\n"
     )
+
+
+def test_a_death_that_the_run_outlives_is_told_in_full_at_once() -> None:
+    stream = io.StringIO()
+    failure = EVENTS[-1]
+    assert isinstance(failure, Failure)
+    PlainLines(stream)(dataclasses.replace(failure, ends_run=False))
+    assert stream.getvalue() == (
+        "failed: /camera (run.process-died): "
+        "cannot keep '/camera' running: pid 7 died: killed by SIGSEGV\n"
+    )
+
+
+def _said(*events: Event) -> list[str]:
+    stream = io.StringIO()
+    console = Console(file=stream, width=100, force_terminal=False)
+    for output in (PlainLines(stream), Live(console)):
+        for event in events:
+            output(event)
+    lines = [each for each in stream.getvalue().splitlines() if each.startswith("[")]
+    assert lines[: len(lines) // 2] == lines[len(lines) // 2 :]
+    return lines[: len(lines) // 2]
+
+
+def test_what_the_others_print_while_a_failed_run_is_rolled_back_does_not_bury_the_cause() -> None:
+    def says(process: str, line: str) -> LogLine:
+        return LogLine(process=process, stream="stderr", line=line)
+
+    ends = [
+        ProcessChanged(process=each, state=ProcessState.STOPPING) for each in ("camera", "viewer")
+    ]
+    after = (*ends, says("viewer", "Traceback"), says("camera", "shutter is stuck"))
+    # The cause may be read from its pipe after the end was noticed.
+    assert _said(EVENTS[-1], says("viewer", "hello"), *after) == [
+        "[viewer] hello",
+        "[camera] shutter is stuck",
+    ]
+    assert _said(*after) == ["[viewer] Traceback", "[camera] shutter is stuck"]
+
+
+@pytest.mark.parametrize("make", [PlainLines, JsonLines])
+def test_a_reader_that_goes_away_ends_the_run_like_a_terminal_that_is_closed(
+    make: type[PlainLines | JsonLines],
+) -> None:
+    read, write = os.pipe()
+    os.close(read)
+    with Ending() as ending, ending.noted(), os.fdopen(write, "w") as stream:
+        output = make(stream)
+        for event in EVENTS:
+            output(event)
+        output.finish(RESULT)
+        assert ending.number == signal.SIGHUP
 
 
 def test_a_verdict_that_reads_as_the_last_one_did_is_not_told_again() -> None:
@@ -121,6 +176,16 @@ def test_a_verdict_that_reads_as_the_last_one_did_is_not_told_again() -> None:
         "process camera: running (pid 7)\n"
         "active: verdict violated\n"
         "active: verdict ok\n"
+    )
+
+
+def test_a_gate_that_takes_something_on_trust_says_what() -> None:
+    stream = io.StringIO()
+    trusted = "rate_hz 500 of /video (flow.not-measured)"
+    PlainLines(stream)(GateOpened(outcome="unverifiable", nodes=("/camera",), trusted=trusted))
+    assert stream.getvalue() == (
+        "gate open on verdict unverifiable: activating 1 node; taken on trust: rate_hz 500 of"
+        " /video (flow.not-measured)\n"
     )
 
 
@@ -238,6 +303,9 @@ def test_a_flow_shows_its_tuple_dscp_and_tos_requirement_and_verdict() -> None:
         "weakly",
     ):
         assert cell in row
+    marked = dataclasses.replace(FLOW, reader_dscp=48)
+    _, row = render_flows([marked], "text").splitlines()
+    assert "EF = DSCP 46 = TOS 184 (0xb8); back CS6 = DSCP 48 = TOS 192 (0xc0)" in row
     assert render_flows([], "text") == "no flow"
     csv_head, csv_row = render_flows([FLOW], "csv").splitlines()
     cells = dict(zip(csv_head.split(","), csv_row.split(","), strict=True))
@@ -367,4 +435,25 @@ def test_a_status_lists_connections_below_their_node() -> None:
         "  connection net established; udpv4://10.77.0.1:7911; carries publishers/video",
         "  connection far failed: no route; tcpv4://10.77.0.1:5100; carries nothing",
         "  connection idle waits for peers; shm://; carries nothing",
+    ]
+
+
+def test_a_dead_node_is_shown_as_dead_with_how_it_ended() -> None:
+    dead = dataclasses.replace(
+        STATUS.nodes[0],
+        process_state=ProcessState.EXITED,
+        state="",
+        matched=0,
+        died="pid 7 died: killed by SIGKILL",
+    )
+    lines = status_text(dataclasses.replace(STATUS, nodes=(dead, *STATUS.nodes))).splitlines()
+    assert lines[0].startswith("robot: active 1/2, verdict ok, ")
+    assert lines[2].split(maxsplit=6) == [
+        "/camera",
+        "exited",
+        "7",
+        "dead",
+        "0/2",
+        "1/3",
+        "pid 7 died: killed by SIGKILL",
     ]

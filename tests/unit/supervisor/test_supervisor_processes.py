@@ -255,7 +255,7 @@ def _record(run_id: str, *children: ChildRecord, boot: str = "") -> RunRecord:
 def test_an_orphan_is_found_by_the_mark_of_its_run_even_if_nobody_recorded_it(
     stray: psutil.Popen,
 ) -> None:
-    assert end_run(_record("abc")) == (stray.pid,)
+    assert end_run(_record("abc")) == ((stray.pid,), frozenset())
     assert stray.wait(BOUND_S) == -signal.SIGTERM
 
 
@@ -264,7 +264,7 @@ def test_a_process_of_another_run_boot_or_start_time_is_left_alone(stray: psutil
     assert ticks is not None
     reused = ChildRecord(name="it", pid=stray.pid, start_ticks=ticks - 1)
     same = ChildRecord(name="it", pid=stray.pid, start_ticks=ticks)
-    assert end_run(_record("other", reused)) == ()
-    assert end_run(_record("abc", same, boot="another boot")) == ()
+    assert end_run(_record("other", reused)) == ((), frozenset())
+    assert end_run(_record("abc", same, boot="another boot")) == ((), frozenset())
     assert stray.poll() is None
-    assert end_run(_record("other", same)) == (stray.pid,)
+    assert end_run(_record("other", same)) == ((stray.pid,), frozenset())

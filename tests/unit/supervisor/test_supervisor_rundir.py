@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from lifecycle.errors import UsageError
 from lifecycle.supervisor.remote import find_run, running
 from lifecycle.supervisor.rundir import (
+    LEDGER_NAME,
     AlreadyRunningError,
     ChildRecord,
     RunDirectory,
@@ -17,7 +19,7 @@ from lifecycle.supervisor.rundir import (
     run_name,
     runtime_root,
 )
-from lifecycle.supervisor.server import Ask, ControlServer, ask
+from lifecycle.supervisor.server import Ask, ControlServer, Question, ask
 from lifecycle.supervisor.status import SystemStatus
 from tests.unit.supervisor.fakes import plan_of, planned_node
 
@@ -55,6 +57,7 @@ def test_what_a_killed_supervisor_wrote_is_found_by_the_next(tmp_path: Path) -> 
     killed.record((child,))
     record = (killed.path / "record.json").read_bytes()
     killed.release()
+    killed.path.mkdir(mode=0o700)
     (killed.path / "record.json").write_bytes(record)
     following = RunDirectory.acquire(tmp_path, "robot@30", "def")
     assert following.previous is not None
@@ -69,8 +72,86 @@ def test_a_directory_that_others_can_write_is_refused(tmp_path: Path) -> None:
     root = tmp_path / "open"
     root.mkdir()
     root.chmod(0o777)
-    with pytest.raises(UsageError, match="that others cannot write; remove it, or set XDG"):
+    with pytest.raises(UsageError, match=r"others can write it; .* remove it, or set XDG"):
         RunDirectory.acquire(root, "robot@30", "abc")
+
+
+def test_a_run_directory_is_removed_at_the_end(tmp_path: Path) -> None:
+    directory = RunDirectory.acquire(tmp_path, "robot@30", "abc")
+    (directory.path / "profiles.xml").touch()
+    directory.release()
+    directory.release()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_run_directory_that_lists_what_is_programmed_stays(tmp_path: Path) -> None:
+    directory = RunDirectory.acquire(tmp_path, "robot@30", "abc")
+    (directory.path / LEDGER_NAME).touch()
+    directory.release()
+    assert [each.name for each in directory.path.iterdir()] == [LEDGER_NAME]
+    RunDirectory.acquire(tmp_path, "robot@30", "def").release()
+
+
+@pytest.mark.parametrize("place", ["lifecycle", "lifecycle/robot@30"])
+def test_a_link_in_the_place_of_a_run_directory_is_refused_and_not_followed(
+    tmp_path: Path, place: str
+) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir(mode=0o700)
+    link = tmp_path / place
+    link.parent.mkdir(mode=0o700, exist_ok=True)
+    link.symlink_to(elsewhere)
+    with pytest.raises(UsageError) as caught:
+        RunDirectory.acquire(tmp_path / "lifecycle", "robot@30", "abc")
+    assert str(caught.value) == (
+        f"cannot use {str(link)!r} as run directory: it is a symbolic link; it must be a directory "
+        "of this user that others cannot write; remove it, or set XDG_RUNTIME_DIR to such a "
+        "directory"
+    )
+    assert list(elsewhere.iterdir()) == []
+
+
+@pytest.mark.parametrize("place", ["lifecycle", "lifecycle/robot@30"])
+def test_a_file_in_the_place_of_a_run_directory_is_refused(tmp_path: Path, place: str) -> None:
+    (tmp_path / place).parent.mkdir(mode=0o700, exist_ok=True)
+    (tmp_path / place).touch()
+    with pytest.raises(UsageError, match="it is not a directory"):
+        RunDirectory.acquire(tmp_path / "lifecycle", "robot@30", "abc")
+    if (tmp_path / "lifecycle").is_dir():
+        assert running(tmp_path / "lifecycle") == ()
+
+
+def test_a_link_in_the_place_of_the_lock_is_not_followed(tmp_path: Path) -> None:
+    directory = tmp_path / "robot@30"
+    directory.mkdir(mode=0o700)
+    (directory / "lock").symlink_to(tmp_path / "precious")
+    with pytest.raises(UsageError, match=r"cannot use .*lock' as run directory: Too many levels"):
+        RunDirectory.acquire(tmp_path, "robot@30", "abc")
+    assert not (tmp_path / "precious").exists()
+
+
+def test_another_users_runtime_directory_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    uid = os.getuid()
+    monkeypatch.setattr(os, "getuid", lambda: uid + 1)
+    if uid == 0:  # root is trusted with any directory above ours
+        os.chown(tmp_path, 12345, -1)
+    with pytest.raises(UsageError, match=r"belongs to user \d+, and this is user \d+"):
+        runtime_root({"XDG_RUNTIME_DIR": str(tmp_path)})
+    with pytest.raises(UsageError, match=r"belongs to user \d+, and this is user \d+"):
+        RunDirectory.acquire(tmp_path / "lifecycle", "robot@30", "abc")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_runtime_directory_that_everybody_can_write_is_refused_unless_it_is_sticky(
+    tmp_path: Path,
+) -> None:
+    tmp_path.chmod(0o777)
+    with pytest.raises(UsageError, match="everybody can write"):
+        runtime_root({"XDG_RUNTIME_DIR": str(tmp_path)})
+    tmp_path.chmod(0o1777)
+    assert runtime_root({"XDG_RUNTIME_DIR": str(tmp_path)}) == tmp_path / "lifecycle"
 
 
 def test_the_root_is_the_users_runtime_directory_or_one_of_its_own_in_tmp(tmp_path: Path) -> None:
@@ -113,10 +194,12 @@ def test_the_control_socket_answers_and_tells_of_the_end_however_deep_it_lies(
         server = ControlServer(deep / "control", lambda: STATUS, asked.set)
         await server.open()
         loop = asyncio.get_running_loop()
-        answer = await loop.run_in_executor(None, ask, deep / "control", Ask.STATUS, 5.0)
+        answer = await loop.run_in_executor(
+            None, ask, deep / "control", Question(ask=Ask.STATUS), 5.0
+        )
         assert answer is not None
         assert answer.status == STATUS
-        down = loop.run_in_executor(None, ask, deep / "control", Ask.DOWN, 5.0)
+        down = loop.run_in_executor(None, ask, deep / "control", Question(ask=Ask.DOWN), 5.0)
         await asyncio.wait_for(asked.wait(), 5.0)
         await server.close(0)
         answer = await down

@@ -100,6 +100,13 @@ def test_what_was_expected_before_may_not(finding: tuple[str, str, str]) -> None
     assert settling.standing(OK, bad, AFTER, 20.0) == (bad, None)
 
 
+def test_what_was_expected_at_the_first_look_may_not_be_missing_for_a_moment_later() -> None:
+    settling = Settling()
+    settling.standing(None, OK, BEFORE, 10.0)
+    bad = found(("graph.missing-endpoint", "/chatter", "/talker"))
+    assert settling.standing(OK, bad, BEFORE, 10.25) == (bad, None)
+
+
 def test_a_connection_that_was_only_just_negotiated_may_be_missing_for_a_moment() -> None:
     plan = plan_of(transport=FlowTransport.UDPV4)
     source = NegotiatedSource(plan)

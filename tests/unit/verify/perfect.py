@@ -35,7 +35,7 @@ from lifecycle.verify import (
     ObservedNode,
     Stage,
 )
-from lifecycle.verify.observation import ConnectionReport
+from lifecycle.verify.observation import ConnectionReport, ParameterReport
 from lifecycle.verify.view import connection_of
 
 _TOPIC_KINDS = (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION)
@@ -138,6 +138,12 @@ def _configuration(plan: Plan, node: PlannedNode, stage: Stage) -> NodeConfigura
         endpoints=tuple(_report(plan, node, index) for index in range(len(node.endpoints))),
         connections=tuple(_connection(node, each) for each in node.participants if each.connection),
         checksum=f"{number:016x}",
+        parameters=tuple(
+            ParameterReport(
+                name=each.name, type=each.type, value=each.value, read_only=each.read_only
+            )
+            for each in node.expected_parameters
+        ),
     )
 
 
@@ -170,7 +176,8 @@ def _report(plan: Plan, node: PlannedNode, index: int) -> EndpointReport:
         participant=planned.participant,
         connection=connection_of(node, planned),
         mapped=True,
-        matched=_matched(plan, planned) if is_topic else None,
+        matched=len(_peers(plan, planned)) if is_topic else None,
+        peers=_peers(plan, planned) if is_topic else None,
         server_matched=_server_matched(plan, planned),
         dscp=planned.dscp,
     )
@@ -191,13 +198,16 @@ def _server_matched(plan: Plan, planned: PlannedEndpoint) -> bool | None:
     )
 
 
-def _matched(plan: Plan, planned: PlannedEndpoint) -> int:
-    """Declared endpoints on the other side of the topic."""
+def _peers(plan: Plan, planned: PlannedEndpoint) -> tuple[str, ...]:
+    """GIDs of the declared endpoints on the other side of the topic."""
     other = _TOPIC_KINDS[planned.kind is EndpointKind.PUBLISHER]
-    return sum(
-        each.kind is other and each.resolved == planned.resolved
-        for node in plan.nodes
-        for each in node.endpoints
+    return tuple(
+        sorted(
+            _gid(node, index)
+            for node in plan.nodes
+            for index, each in enumerate(node.endpoints)
+            if each.kind is other and each.resolved == planned.resolved
+        )
     )
 
 

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 
+from lifecycle.plan.model import PlannedParticipant
 from lifecycle.verify.hidden import Owners, is_hidden_node
+from lifecycle.verify.observation import ConnectionReport, Identity, NodeConfiguration
 from tests.unit.plan.samples import node, planned, publisher
 
 PLAN = planned(
@@ -30,6 +34,72 @@ def test_a_connection_that_no_report_has_told_of_yet_is_known_by_its_name(
     hidden: str, owner: str
 ) -> None:
     assert Owners(PLAN.nodes, ()).of(hidden) == owner
+
+
+def says(name: str, *hidden: str) -> NodeConfiguration:
+    """The report of a node with connections on these hidden nodes."""
+    return NodeConfiguration(
+        identity=Identity(machine_id="m", process_id=1, node_id=name),
+        name=name,
+        state="active",
+        connected=True,
+        rmw="",
+        transports=(),
+        serializations=(),
+        paradigms=(),
+        endpoints=(),
+        connections=tuple(ConnectionReport(name="net", node_name=each) for each in hidden),
+    )
+
+
+def test_a_hidden_node_is_whose_report_names_it_whatever_it_is_called() -> None:
+    owners = Owners(
+        PLAN.nodes, [says("/other", "mine"), says("/robot/camera", "", "_camera_net_x", "net")]
+    )
+    assert owners.of("/robot/net") == "/robot/camera"
+    assert owners.of("/robot/_camera_net_x") == "/robot/camera"
+    assert owners.of("/robot/_camera_net_y") == "/robot/camera_net"
+    assert [owners.of(each) for each in ("/net", "/mine", "/robot/mine", "/robot/")] == [""] * 4
+
+
+def test_a_hidden_node_is_whose_plan_names_it_whatever_it_is_called() -> None:
+    (camera, net) = PLAN.nodes
+    carried = dataclasses.replace(
+        camera, participants=(PlannedParticipant(name="_camera_net_1", dscp=None, reason=""),)
+    )
+    assert Owners([carried, net], ()).of("/robot/_camera_net_1") == "/robot/camera"
+    assert Owners([net, carried], ()).of("/robot/_camera_net_1") == "/robot/camera"
+    assert Owners([camera, net], ()).of("/robot/_camera_net_1") == "/robot/camera_net"
+
+
+def test_a_hidden_node_of_a_flow_is_that_of_the_node_it_is_named_after() -> None:
+    plan = planned(node("camera", publisher("a")), node("camera_flow", publisher("b")))
+    assert Owners(plan.nodes, ()).of("/_camera_flow_0") == "/camera"
+    assert Owners(plan.nodes, ()).of("/_camera_flow_x") == "/camera_flow"
+    assert Owners(plan.nodes[1:], ()).of("/_camera_flow_0") == "/camera_flow"
+
+
+@pytest.mark.parametrize(
+    ("tolerated", "owner"),
+    [
+        (("_camera_*",), ""),
+        (("/robot/_camera_*",), ""),
+        (("/other/_camera_*",), "/robot/camera"),
+        (("*",), "/robot/camera"),
+        (("/_far/*", "*_data"), "/robot/camera"),
+        (("*", "_camera_d*"), ""),
+        ((), "/robot/camera"),
+    ],
+)
+def test_a_pattern_of_hidden_tools_takes_precedence_over_a_likeness(
+    tolerated: tuple[str, ...], owner: str
+) -> None:
+    assert Owners(PLAN.nodes, (), tolerated).of("/robot/_camera_data") == owner
+
+
+def test_a_node_of_the_ros2_command_is_nobodys_although_a_node_is_called_so() -> None:
+    plan = planned(node("ros2cli", publisher("a")))
+    assert Owners(plan.nodes, ()).of("/_ros2cli_4711") == ""
 
 
 @pytest.mark.parametrize(

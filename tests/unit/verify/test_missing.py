@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 
+import pytest
+
 from lifecycle.manifest.model import EndpointKind, Policy
 from lifecycle.plan import build_plan
-from lifecycle.verify import Stage, missing, not_ok, verify
+from lifecycle.verify import Finding, Outcome, Stage, Verdict, missing, not_ok, verify
+from lifecycle.verify.missing import taken_on_trust
 from tests.unit.plan.samples import teleop
 from tests.unit.verify.edits import (
     Edit,
@@ -50,15 +53,36 @@ def test_what_is_there_but_wrong_comes_after_what_is_missing():
     )
 
 
+def test_everything_that_is_missing_wrong_or_unknown_is_named_once():
+    edit = both(
+        *(change_node(name, state="active", count=2) for name in ("/robot/camera", "/viewer")),
+        drop_endpoint(PUB, "/robot/status"),
+        drop_endpoint(PUB, "/robot/battery"),
+        NOBODYS,
+        NOBODYS,
+        add_endpoint(PUB, "", "/news"),
+    )
+    assert line(edit) == (
+        "missing: /robot/battery (publisher of /robot/camera), /robot/status (publisher of"
+        " /robot/camera); wrong: /robot/camera (graph.duplicate-node), /viewer"
+        " (graph.duplicate-node), /robot/camera (state.wrong-state), /viewer (state.wrong-state);"
+        " unknown: /news (graph.unattributed-endpoint), /odometry (graph.unattributed-endpoint)"
+    )
+
+
 def test_a_report_is_waited_for_but_not_what_only_the_report_could_prove():
     assert line(drop_report("/viewer")) == "missing: /viewer (report)"
+    assert line(change_report(SUB, "/robot/video", nfes=None)) == (
+        "unknown: /robot/video (flow.unverifiable),"
+        " /robot/video: /robot/camera → /viewer (flow.unverifiable)"
+    )
 
 
 def test_an_unverifiable_finding_is_waited_for_only_where_it_blocks():
     edit = change_report(SUB, "/robot/status", qos=None)
     assert line(edit) == ""
     strict = dataclasses.replace(PLAN, policy=Policy(unverifiable_blocks=True))
-    assert line(edit, strict) == "unknown: /robot/status (graph.qos-unverifiable)"
+    assert line(edit, strict) == "unknown: /viewer (graph.qos-unverifiable)"
 
 
 def test_an_endpoint_of_an_unknown_node_is_unknown_and_not_wrong():
@@ -74,7 +98,63 @@ def test_an_endpoint_of_an_unknown_node_is_not_named_while_a_declared_node_is_mi
 def test_what_keeps_a_verdict_from_being_ok_is_named_although_the_gate_may_open():
     seen = change_report(SUB, "/robot/status", qos=None)(perfect(PLAN))
     verdict = verify(PLAN, seen, stage=Stage.CONNECTED)
-    assert not_ok(verdict) == "unknown: /robot/status (graph.qos-unverifiable)"
+    assert not_ok(verdict) == "unknown: /viewer (graph.qos-unverifiable)"
     assert not_ok(verify(PLAN, perfect(PLAN), stage=Stage.CONNECTED)) == ""
     missing_node = verify(PLAN, drop_node("/viewer")(perfect(PLAN)), stage=Stage.CONNECTED)
     assert not_ok(missing_node) == missing(missing_node) != ""
+
+
+def test_without_findings_that_close_the_gate_every_rule_that_keeps_it_from_ok_is_named():
+    edit = both(
+        change_report(SUB, "/robot/status", qos=None),
+        change_report(PUB, "/robot/battery", dscp=None),
+    )
+    verdict = verify(PLAN, edit(perfect(PLAN)), stage=Stage.CONNECTED)
+    assert not_ok(verdict) == (
+        "unknown: /viewer (graph.qos-unverifiable), /robot/battery (flow.dscp-unverifiable)"
+    )
+
+
+def unverifiable(rule: str, subject: str, expected: str = "") -> Finding:
+    return Finding(
+        rule=rule,
+        outcome=Outcome.UNVERIFIABLE,
+        subject=subject,
+        expected=expected,
+        observed="",
+        message="",
+    )
+
+
+def trusted(*findings: Finding) -> str:
+    verdict = Outcome.UNVERIFIABLE if findings else Outcome.OK
+    return taken_on_trust(Verdict(verdict=verdict, blocking=False, findings=findings, flows=()))
+
+
+def test_what_is_taken_on_trust_is_named_by_rule_two_of_each_at_most():
+    assert trusted() == ""
+    rates = [unverifiable("flow.not-measured", f"/t{n}", "rate_hz 5") for n in range(4)]
+    assert trusted(*rates, unverifiable("graph.qos-unverifiable", "/camera")) == (
+        "rate_hz 5 of /t0, rate_hz 5 of /t1 and 2 more (flow.not-measured);"
+        " /camera (graph.qos-unverifiable)"
+    )
+
+
+@pytest.mark.parametrize(
+    ("count", "words"),
+    [(1, "/0 (a.b)"), (2, "/0, /1 (a.b)"), (3, "/0, /1 and 1 more (a.b)")],
+)
+def test_two_subjects_of_a_rule_are_named_and_the_others_counted(count, words):
+    assert trusted(*(unverifiable("a.b", f"/{each}") for each in range(count))) == words
+
+
+@pytest.mark.parametrize(("count", "more"), [(4, ""), (5, "; and 1 more rules")])
+def test_four_rules_are_named_and_the_others_counted(count, more):
+    found = [unverifiable(f"a.r{each}", f"/{each}") for each in range(count)]
+    assert trusted(*found) == "/0 (a.r0); /1 (a.r1); /2 (a.r2); /3 (a.r3)" + more
+
+
+@pytest.mark.parametrize(("length", "cut"), [(494, False), (495, True), (900, True)])
+def test_what_is_taken_on_trust_is_one_line_of_at_most_500_characters(length, cut):
+    line = "x" * length + " (a.b)"
+    assert trusted(unverifiable("a.b", "x" * length)) == (line[:499] + "…" if cut else line)

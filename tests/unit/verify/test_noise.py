@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 
 from lifecycle.manifest.model import EndpointKind
@@ -14,6 +16,8 @@ from lifecycle.verify import (
     our_nodes,
     without_noise,
 )
+from lifecycle.verify.noise import DeclaredNames, known_node, tolerating_pattern
+from tests.unit.plan.samples import endpoint, node, planned, publisher, subscription
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
 SERVER, CLIENT = EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT
@@ -167,6 +171,20 @@ def test_the_five_parts_of_an_action_server_fold_into_one_endpoint():
     )
 
 
+def test_an_action_has_the_hashes_of_its_goal_result_and_feedback():
+    told = {"send_goal": "g1 g2", "get_result": "r1 r2", "feedback": "f", "status": "s"}
+    some = [
+        dataclasses.replace(part, type_hash=told.get(part.name.rpartition("/")[2], "c1 c2"))
+        for part in parts()
+    ]
+    (action,) = fold_actions(some)
+    assert action.type_hash == "g1 g2 r1 r2 f"
+    unseen = [dataclasses.replace(some[0], type_hash=None), *some[1:]]
+    assert fold_actions(unseen)[0].type_hash is None
+    unannounced = [dataclasses.replace(some[0], type_hash=""), *some[1:]]
+    assert fold_actions(unannounced)[0].type_hash == ""
+
+
 @pytest.mark.parametrize("missing", range(5))
 def test_an_incomplete_action_stays_in_parts(missing: int):
     some = [part for index, part in enumerate(parts()) if index != missing]
@@ -197,3 +215,133 @@ def test_an_endpoint_of_nobody_known_is_never_noise(
     kind: EndpointKind, name: str, type_: str
 ) -> None:
     assert not is_noise_endpoint(kind, "", name, type_, ours=True)
+
+
+def test_observers_notice_each_other_by_topics_that_are_nobody_elses():
+    topic = "/_lifecycle/patrol/robot/alive"
+    of_ours = is_noise_endpoint(
+        PUB, "/_lifecycle_observer_1", topic, "std_msgs/msg/Empty", ours=False
+    )
+    of_others = is_noise_endpoint(PUB, "/rviz2", topic, "std_msgs/msg/Empty", ours=False)
+    assert (of_ours, of_others) == (True, False)
+
+
+# --- declared names
+
+NAMES = DeclaredNames.of(
+    planned(
+        node("one", publisher("b"), subscription("a"), endpoint(SERVER, "ask", TRIGGER, None)),
+        node("two", endpoint(ACTION_CLIENT, "dock", "robot/action/Dock", None), namespace="/ns"),
+    )
+)
+
+
+@pytest.mark.parametrize(
+    ("kinds", "names"),
+    [
+        ((PUB, SUB), ("/a", "/b")),
+        ((SERVER, CLIENT), ("/ask",)),
+        ((ACTION_SERVER, ACTION_CLIENT), ("/ns/dock",)),
+    ],
+)
+def test_declared_names_are_known_by_the_kinds_that_meet_under_them(kinds, names) -> None:
+    for kind in kinds:
+        assert NAMES.of_kind(kind) == names
+        assert all(NAMES.has(kind, name) for name in names)
+        assert not NAMES.has(kind, "/other")
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "fed"),
+    [
+        (PUB, "/a", True),
+        (PUB, "/ask", False),
+        (SUB, "/a", False),
+        (SERVER, "/ask", True),
+        (CLIENT, "/ask", False),
+        (ACTION_SERVER, "/ns/dock", True),
+        (ACTION_CLIENT, "/ns/dock", False),
+        (PUB, "/ns/dock/_action/feedback", True),
+        (SUB, "/ns/dock/_action/feedback", False),
+        (PUB, "/ns/lift/_action/feedback", False),
+        (SERVER, "/ns/two/get_state", True),
+        (SERVER, "/ns/two/map_to", True),
+        (PUB, "/one/transition_event", True),
+        (PUB, "/one/get_state", False),
+        (SERVER, "/three/get_state", False),
+        (PUB, "/rosout", False),
+    ],
+)
+def test_who_offers_a_declared_name_or_a_declared_nodes_own_feeds_the_system(
+    kind: EndpointKind, name: str, fed: bool
+) -> None:
+    assert NAMES.fed_by(kind, name) is fed
+
+
+def test_what_feeds_the_system_is_left_in_although_it_looks_like_a_client_library() -> None:
+    def event(node: str) -> ObservedEndpoint:
+        return ObservedEndpoint(
+            kind=PUB, node=node, name=f"{node}/transition_event", type="lifecycle_msgs/msg/Any"
+        )
+
+    found = [event("/one"), event("/three"), server("/one/get_parameters", GET_PARAMETERS, "/one")]
+    assert without_noise(found) == ()
+    assert without_noise(found, but=NAMES) == (found[0], found[2])
+
+
+@pytest.mark.parametrize(
+    ("name", "patterns", "pattern"),
+    [
+        ("/far/rviz2", ("rviz2",), "rviz2"),
+        ("/far/rviz2", ("/rviz2",), ""),
+        ("/far/rviz2", ("/far/*", "rviz2"), "/far/*"),
+        ("/far/panel_1", ("panel_?",), "panel_?"),
+        ("/far/panel_12", ("panel_?",), ""),
+        ("/far/panelx1", ("panel.1",), ""),
+        ("/_lifecycle_observer_1", ("_*",), "_lifecycle_*"),
+    ],
+)
+def test_a_tool_is_tolerated_by_the_first_pattern_of_its_name(name, patterns, pattern) -> None:
+    assert tolerating_pattern(name, patterns) == pattern
+
+
+def test_an_action_of_no_node_keeps_the_gid_and_the_address_of_its_first_part() -> None:
+    def at_some_place(node: str) -> list[ObservedEndpoint]:
+        return [
+            dataclasses.replace(each, gid=f"{number:02}", address=f"10.0.0.{number}")
+            for number, each in enumerate(parts(node))
+        ]
+
+    nameless, named = fold_actions([*at_some_place(""), *at_some_place("/base")])
+    assert (nameless.gid, nameless.address) == ("00", "10.0.0.0")
+    assert (named.gid, named.address) == ("", "10.0.0.0")
+
+
+def test_several_actions_are_folded_each_by_itself() -> None:
+    lift = parts(action="/lift")
+    folded = dataclasses.replace(
+        parts()[0], kind=ACTION_SERVER, name="/dock", type="robot/action/Dock"
+    )
+    assert fold_actions([folded, *parts(), *lift]) == (
+        folded,
+        dataclasses.replace(folded, name="/lift"),
+    )
+
+
+def test_the_type_of_an_action_is_that_of_its_goal_whatever_the_order() -> None:
+    for order in (parts(), parts()[::-1]):
+        assert [each.type for each in fold_actions(order)] == ["robot/action/Dock"]
+
+
+@pytest.mark.parametrize(
+    ("name", "known"),
+    [
+        ("/robot/camera", "/robot/camera"),
+        ("/robot/_NODE_NAME_UNKNOWN_", ""),
+        ("_CREATED_BY_BARE_DDS_APP_/_CREATED_BY_BARE_DDS_APP_", ""),
+        ("/_NODE_NAME_UNKNOWN_/camera", "/_NODE_NAME_UNKNOWN_/camera"),
+        ("", ""),
+    ],
+)
+def test_a_placeholder_is_no_name_of_a_node(name: str, known: str) -> None:
+    assert known_node(name) == known

@@ -20,7 +20,7 @@ from lifecycle.manifest.model import (
 from lifecycle.network.nfe import InternetProtocol, NetworkFlowEndpoint, TransportProtocol
 from lifecycle.plan import Plan, PlannedNode
 from lifecycle.plan.model import ParticipantConnections, PlannedParticipant
-from lifecycle.verify import Outcome, Stage, render_text, to_json, verify
+from lifecycle.verify import Finding, Observation, Outcome, Stage, render_text, to_json, verify
 from lifecycle.verify.observation import ConnectionReport
 from lifecycle.verify.verdict import OpenEndpoint
 from tests.unit.plan.samples import at, link, node, planned, publisher, subscription
@@ -168,6 +168,212 @@ def test_a_connection_or_mapping_otherwise_than_planned_is_violated(
 ) -> None:
     assert findings(edit) == [expected]
     assert message(edit) == words
+
+
+def told(edit: Edit, plan: Plan = PLAN) -> Finding:
+    """The finding on a connection."""
+    (finding,) = (
+        each
+        for each in verify(plan, edit(perfect(plan)), stage=Stage.CONNECTED).findings
+        if each.rule.startswith("connection.")
+    )
+    return finding
+
+
+def with_urls(*urls: str, first_port: int = 7910) -> Plan:
+    """The plan with these URLs of the connection."""
+    return dataclasses.replace(
+        PLAN,
+        nodes=(connected(PLAN.nodes[0], *urls), PLAN.nodes[1]),
+        discovery=dataclasses.replace(PLAN.discovery, first_port=first_port),
+    )
+
+
+def test_a_connection_that_is_missing_is_told_whole() -> None:
+    others = tuple(ConnectionReport(name=name) for name in ("", "b", "a"))
+    assert told(change_configuration("/camera", connections=others)) == Finding(
+        rule="connection.missing",
+        outcome=Outcome.VIOLATED,
+        subject="/camera",
+        expected="connection net",
+        observed="'b', 'a'",
+        message="cannot find connection 'net' of /camera; it has 'b', 'a'",
+        at="robot.lifecycle.yaml:3:3",
+        node="/camera",
+        hint="see who was to make it: the node at connect, or the supervisor by connect_to",
+    )
+
+
+def test_a_connection_that_nobody_reports_is_told_whole() -> None:
+    assert told(unchanged, plan_of(run=Run(kind=RunKind.ATTACH))) == Finding(
+        rule="connection.missing",
+        outcome=Outcome.UNVERIFIABLE,
+        subject="/camera",
+        expected="connection net",
+        observed="unknown",
+        message="cannot verify connection 'net' of /camera: the node does not report its"
+        " connections",
+        at="robot.lifecycle.yaml:3:3",
+        node="/camera",
+        hint="see who was to make it: the node at connect, or the supervisor by connect_to",
+    )
+
+
+def test_a_connection_that_failed_is_told_whole_with_the_urls_that_were_tried() -> None:
+    assert told(reported("shm://", URL, error="port 7911 is taken")) == Finding(
+        rule="connection.failed",
+        outcome=Outcome.VIOLATED,
+        subject="/camera",
+        expected="connection net",
+        observed="port 7911 is taken",
+        message=f"cannot connect /camera to 'net' (shm://, {URL}): port 7911 is taken",
+        at="robot.lifecycle.yaml:3:3",
+        node="/camera",
+        hint="read the reason: addresses and ports of a URL must be free on the node's own machine",
+    )
+
+
+def test_a_connection_to_other_urls_is_told_whole() -> None:
+    assert told(reported("udpv4://", "udpv6://"), with_urls("shm://", URL)) == Finding(
+        rule="connection.differs",
+        outcome=Outcome.VIOLATED,
+        subject="/camera",
+        expected=f"shm://, {URL}",
+        observed="udpv4://, udpv6://",
+        message="cannot accept connection 'net' of /camera: it was connected to udpv4://, udpv6://"
+        f" and must be to shm://, {URL}",
+        at="robot.lifecycle.yaml:3:3",
+        node="/camera",
+        hint="see who called connect_to; disconnect it, and let its authority make it again",
+    )
+
+
+@pytest.mark.parametrize(
+    ("planned_urls", "urls", "spelled"),
+    [
+        ((URL,), (), "no URL"),
+        ((URL,), ("no url at all",), "no url at all"),
+        (("shm://", URL), (URL,), URL),
+        ((URL,), (URL, "shm://"), f"{URL}, shm://"),
+        (("shm://", URL), (URL, "shm://"), f"{URL}, shm://"),
+        (("shm://", URL), ("shm://", "udpv4://"), "shm://, udpv4://"),
+    ],
+)
+def test_every_url_must_be_the_planned_one(
+    planned_urls: tuple[str, ...], urls: tuple[str, ...], spelled: str
+) -> None:
+    finding = told(reported(*urls), with_urls(*planned_urls))
+    assert (finding.rule, finding.observed) == ("connection.differs", spelled)
+    assert f"it was connected to {spelled} and must be to" in finding.message
+
+
+TCP = "tcpv4://10.77.0.1:{port}?peer=10.77.0.2:{peer}"
+
+
+@pytest.mark.parametrize(
+    ("first_port", "port", "differs"),
+    [(6000, 8000, False), (6001, 8000, True), (6001, 8001, False)],
+)
+def test_what_a_node_has_after_a_restart_is_as_planned(
+    first_port: int, port: int, differs: bool
+) -> None:
+    plan = with_urls(URL, TCP.format(port=6100, peer=6101), first_port=first_port)
+    found = findings(reported(URL, TCP.format(port=port, peer=8200)), plan)
+    assert [each[0] for each in found] == (["connection.differs"] if differs else [])
+
+
+def test_a_mapping_otherwise_than_planned_is_told_whole() -> None:
+    assert told(change_report(PUB, "/video", connection="late")) == Finding(
+        rule="connection.wrong-mapping",
+        outcome=Outcome.VIOLATED,
+        subject="/video",
+        expected="connection 'net'",
+        observed="connection 'late'",
+        message="cannot accept the publisher of /video in /camera: it is mapped onto connection"
+        " 'late' and must be onto connection 'net'",
+        at="robot.lifecycle.yaml:10:9",
+        node="/camera",
+        endpoint=PUB,
+        hint="see who called map_to; map it back, or change the node's `connections`",
+    )
+
+
+@pytest.mark.parametrize(
+    "fields", [{"mapped": False}, {"error": "refused"}, {"error": "refused", "mapped": False}]
+)
+def test_an_endpoint_that_was_not_made_is_not_judged_as_mapped_elsewhere(
+    fields: dict[str, object],
+) -> None:
+    found = findings(change_report(PUB, "/video", connection="", **fields))
+    assert "connection.wrong-mapping" not in {rule for rule, _, _ in found}
+
+
+def test_a_connection_of_a_node_that_is_not_there_is_not_named_besides() -> None:
+    def gone(seen: Observation) -> Observation:
+        rest = tuple(each for each in seen.endpoints if each.node != "/_camera_net")
+        return dataclasses.replace(seen, endpoints=rest)
+
+    absent = both(gone, HIDDEN, drop_node("/camera"), change_configuration("/camera", endpoints=()))
+    edit = both(absent, change_configuration("/camera", connections=()))
+    assert [each for each in findings(edit) if each[0].startswith("connection.")] == []
+    # The nodes after it are judged all the same.
+    late = both(edit, change_report(SUB, "/video", connection="late"))
+    assert told(late).subject == "/video"
+
+
+def test_every_connection_and_mapping_of_a_node_is_judged() -> None:
+    plain = PlannedParticipant(name="_camera_flow_0", dscp=None, reason="")
+    (net,) = PLAN.nodes[0].participants
+    late = dataclasses.replace(net, name="_camera_late", connection="late")
+    camera = dataclasses.replace(PLAN.nodes[0], participants=(plain, net, late))
+    plan = dataclasses.replace(PLAN, nodes=(camera, PLAN.nodes[1]))
+    edit = both(
+        change_configuration("/camera", connections=()),
+        change_report(PUB, "/video", connection="other"),
+    )
+    found = [each for each in findings(edit, plan) if each[0].startswith("connection.")]
+    assert found == [
+        ("connection.missing", "violated", "/camera"),
+        ("connection.missing", "violated", "/camera"),
+        ("connection.wrong-mapping", "violated", "/video"),
+    ]
+
+
+def own_urls(*urls: str) -> Plan:
+    """The plan with these URLs of the viewer's own participant."""
+    viewer = dataclasses.replace(PLAN.nodes[1], connections=ParticipantConnections(urls=urls))
+    return dataclasses.replace(PLAN, nodes=(PLAN.nodes[0], viewer))
+
+
+def test_an_own_participant_that_was_connected_otherwise_is_told_whole() -> None:
+    own = (
+        ConnectionReport(name="net", urls=("udpv6://",)),
+        ConnectionReport(name="", urls=("udpv4://",)),
+    )
+    assert told(change_configuration("/viewer", connections=own), own_urls("shm://")) == Finding(
+        rule="connection.differs",
+        outcome=Outcome.VIOLATED,
+        subject="/viewer",
+        expected="shm://",
+        observed="udpv4://",
+        message="cannot accept the own participant of /viewer: it was connected to udpv4:// and"
+        " must be to shm://",
+        at="robot.lifecycle.yaml:3:3",
+        node="/viewer",
+        hint="see who called connect_to; disconnect it, and let its authority make it again",
+    )
+
+
+@pytest.mark.parametrize(
+    ("planned_urls", "urls"),
+    [((), ("udpv4://",)), (("shm://",), ()), (("shm://",), ("shm://",)), ((), ())],
+)
+def test_an_own_participant_is_compared_where_both_say_what_it_is_connected_to(
+    planned_urls: tuple[str, ...], urls: tuple[str, ...]
+) -> None:
+    own = (ConnectionReport(name="", urls=urls),)
+    found = findings(change_configuration("/viewer", connections=own), own_urls(*planned_urls))
+    assert [each for each in found if each[0].startswith("connection.")] == []
 
 
 def test_the_own_participant_is_judged_by_its_urls_too() -> None:

@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import pytest
 
-from lifecycle.manifest.model import EndpointKind, UniqueHow
-from lifecycle.network.nfe import UniqueRequirement
+from lifecycle.manifest.model import EndpointKind, Quantity, UniqueHow
+from lifecycle.network.nfe import (
+    InternetProtocol,
+    NetworkFlowEndpoint,
+    TransportProtocol,
+    UniqueRequirement,
+)
 from lifecycle.plan import Plan, build_plan
-from lifecycle.verify import FlowReport, Outcome, Stage, verify
-from tests.unit.plan.samples import link, need, node, planned, publisher, subscription, teleop
+from lifecycle.verify import Finding, FlowReport, Outcome, Stage, verify
+from tests.unit.plan.samples import at, link, need, node, planned, publisher, subscription, teleop
 from tests.unit.verify.edits import (
     Edit,
     both,
     change_report,
     drop_endpoint,
+    drop_endpoint_report,
     drop_node,
     drop_report,
 )
@@ -59,6 +65,61 @@ def test_shared_memory_can_carry_a_flow_only_on_one_machine(machines, transport)
     assert flow.transport == transport
 
 
+def test_the_dscp_of_a_flow_is_what_was_read_and_not_what_was_planned():
+    video, battery, _ = flows_after(
+        both(
+            change_report(PUB, "/robot/video", dscp=0),
+            change_report(PUB, "/robot/battery", dscp=None),
+        )
+    )
+    assert (video.dscp, battery.dscp) == (0, None)
+    assert {each.dscp for each in video.source} == {0}
+
+
+def two_on_one_topic(*dscps: int | None) -> Plan:
+    """A node whose two publishers of one topic are marked so, and one that takes both."""
+    names = ("a", "/a")
+    return planned(
+        node(
+            "one",
+            *map(publisher, names),
+            needs=[need(PUB, name, dscp=dscp) for name, dscp in zip(names, dscps, strict=True)],
+        ),
+        node("two", subscription("a")),
+    )
+
+
+@pytest.mark.parametrize(("marks", "shown"), [((46, 46), 46), ((46, 8), None), ((8, 46), None)])
+def test_of_publishers_that_differ_no_dscp_is_shown_for_all(marks, shown):
+    (flow,) = flows_after(unchanged, two_on_one_topic(*marks))
+    assert flow.dscp == shown
+
+
+MARKED_READER = planned(
+    node("one", publisher("a"), needs=[need(PUB, "a", dscp=46)]),
+    node("two", subscription("a"), needs=[need(SUB, "a", dscp=48)]),
+)
+
+
+def test_what_a_subscription_acknowledges_with_is_shown_beside_what_the_data_carry():
+    (flow,) = flows_after(unchanged, MARKED_READER)
+    assert (flow.dscp, flow.reader_dscp) == (46, 48)
+    assert {each.dscp for each in flow.source} == {46}
+    assert {each.dscp for each in flow.destination} == {0}, "data do not carry it"
+    (flow,) = flows_after(change_report(SUB, "/a", dscp=0), MARKED_READER)
+    assert (flow.dscp, flow.reader_dscp, flow.outcome) == (46, 0, Outcome.VIOLATED)
+
+
+@pytest.mark.parametrize(
+    ("read", "rule"), [(0, "flow.dscp-not-applied"), (None, "flow.dscp-unverifiable")]
+)
+def test_the_mark_of_a_subscription_is_judged_like_that_of_a_publisher(read, rule):
+    seen = change_report(SUB, "/a", dscp=read)(perfect(MARKED_READER))
+    (found,) = verify(MARKED_READER, seen, stage=Stage.CONNECTED).findings
+    assert (found.rule, found.node, found.endpoint) == (rule, "/two", SUB)
+    assert "the subscription of /a in /two" in found.message
+
+
 def test_a_flow_of_unknown_nfes_tells_neither_transport_nor_uniqueness():
     flow = flows_after(drop_report("/robot/camera"))[2]
     assert (flow.source, flow.unique, flow.transport) == ((), None, "unknown")
@@ -74,7 +135,7 @@ def test_a_flow_of_unknown_nfes_tells_neither_transport_nor_uniqueness():
         ),
         (
             change_report(PUB, "/robot/video", nfes=None),
-            [Outcome.UNVERIFIABLE, Outcome.OK, Outcome.OK],
+            [Outcome.VIOLATED, Outcome.OK, Outcome.OK],
         ),
         (
             both(
@@ -148,3 +209,424 @@ def test_a_link_between_nodes_that_declare_no_such_endpoints_is_unmatched():
         "graph.unmatched-link",
         "/one declares no publisher of it",
     )
+
+
+# --- what findings on flows say
+
+STRICTLY = UniqueRequirement.STRICTLY_REQUIRED
+NOT_UNIQUE_FIX = (
+    "ask for `unique:` on the endpoint itself, so that it gets sockets of its own; see"
+    " `lifecycle flows`"
+)
+UNVERIFIABLE_FIX = (
+    "run the node with `run: python` under rmw_fastrtps_cpp, which reports network flow"
+    " endpoints; or ask for `unique: optionally_required`, or drop the link's `unique`"
+)
+
+
+def nfe(port: int, address: str = "0.0.0.0") -> NetworkFlowEndpoint:
+    return NetworkFlowEndpoint(
+        transport_protocol=TransportProtocol.UDP,
+        internet_protocol=InternetProtocol.IPV6 if ":" in address else InternetProtocol.IPV4,
+        transport_port=port,
+        internet_address=address,
+    )
+
+
+SHM = NetworkFlowEndpoint(
+    transport_protocol=TransportProtocol.UNKNOWN,
+    internet_protocol=InternetProtocol.UNKNOWN,
+    transport_port=1,
+)
+
+
+def of_flows(edit: Edit, plan: Plan) -> list[Finding]:
+    """The findings of the rules on flows."""
+    verdict = verify(plan, edit(perfect(plan)), stage=Stage.CONNECTED)
+    return [each for each in verdict.findings if each.rule.startswith("flow.")]
+
+
+def strict(*, linked: UniqueHow | None = None) -> Plan:
+    """A publisher that strictly requires a unique flow, another one, and a subscription."""
+    return planned(
+        node(
+            "one",
+            publisher("a", line=11),
+            publisher("b", line=12),
+            needs=[need(PUB, "a", STRICTLY)],
+        ),
+        node("two", subscription("a", line=13)),
+        links=[link("/a", "one", "two", unique=linked)] if linked else [],
+    )
+
+
+SHARED = both(
+    change_report(PUB, "/a", nfes=(SHM, nfe(40000), nfe(40000), nfe(40001, "fd00::1"))),
+    change_report(PUB, "/b", nfes=(SHM, nfe(40000))),
+)
+
+
+def test_a_strict_endpoint_that_shares_its_flow_is_told_whole():
+    shared = "shm, udp 0.0.0.0:40000, udp [fd00::1]:40001"
+    assert of_flows(SHARED, strict()) == [
+        Finding(
+            rule="flow.not-unique",
+            outcome=Outcome.VIOLATED,
+            subject="/a",
+            expected="unique publisher",
+            observed=f"shares {shared}",
+            message="cannot accept the publisher of /a in /one: it strictly requires a unique"
+            f" network flow and shares {shared} with other publishers",
+            at="robot.lifecycle.yaml:11:9",
+            node="/one",
+            endpoint=PUB,
+            hint=NOT_UNIQUE_FIX,
+        )
+    ]
+
+
+def test_a_strict_publisher_without_any_socket_is_not_unique():
+    (found,) = of_flows(change_report(PUB, "/a", nfes=(SHM,)), strict())
+    assert (found.rule, found.observed) == ("flow.not-unique", "shares shm")
+
+
+@pytest.mark.parametrize(
+    ("edit", "why"),
+    [
+        (
+            change_report(PUB, "/a", nfes=None),
+            "its RMW does not report network flow endpoints",
+        ),
+        (
+            change_report(PUB, "/b", nfes=None),
+            "its process has endpoints whose network flow endpoints are not reported",
+        ),
+        (drop_report("/one"), "/one does not report its network flow endpoints"),
+        (
+            drop_endpoint_report(PUB, "/a"),
+            "/one does not report its network flow endpoints",
+        ),
+    ],
+)
+def test_a_strict_endpoint_whose_flow_cannot_be_proven_is_told_whole(edit: Edit, why: str):
+    assert of_flows(edit, strict()) == [
+        Finding(
+            rule="flow.unverifiable",
+            outcome=Outcome.VIOLATED,
+            subject="/a",
+            expected="unique publisher",
+            observed="network flow endpoints not reported",
+            message="cannot accept the publisher of /a in /one: it strictly requires a unique"
+            f" network flow, which cannot be proven: {why}",
+            at="robot.lifecycle.yaml:11:9",
+            node="/one",
+            endpoint=PUB,
+            hint=UNVERIFIABLE_FIX,
+        )
+    ]
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        change_report(PUB, "/a", nfes=()),
+        change_report(PUB, "/a", error="refused", nfes=None),
+        change_report(PUB, "/a", error="refused", nfes=(nfe(40000),)),
+        both(drop_endpoint(PUB, "/a"), drop_report("/one")),
+    ],
+)
+def test_a_strict_endpoint_that_was_not_made_is_not_named_besides(edit: Edit):
+    assert of_flows(edit, strict()) == []
+
+
+def test_one_endpoint_that_says_nothing_does_not_end_the_judgement_of_the_others():
+    plan = planned(
+        node("one", publisher("a"), publisher("b"), needs=[need(PUB, "b", STRICTLY)]),
+        node("two", subscription("c"), subscription("d"), needs=[need(SUB, "d", STRICTLY)]),
+    )
+    edit = both(
+        change_report(PUB, "/a", nfes=(nfe(1),)),
+        change_report(PUB, "/b", nfes=(nfe(1),)),
+        change_report(SUB, "/c", nfes=()),
+        change_report(SUB, "/d", nfes=None),
+    )
+    assert [(each.rule, each.subject) for each in of_flows(edit, plan)] == [
+        ("flow.not-unique", "/b"),
+        ("flow.broken-endpoint", "/c"),
+        ("flow.unverifiable", "/d"),
+    ]
+
+
+def test_a_subscription_that_nothing_can_reach_is_told_whole():
+    assert of_flows(change_report(SUB, "/a", nfes=()), strict()) == [
+        Finding(
+            rule="flow.broken-endpoint",
+            outcome=Outcome.VIOLATED,
+            subject="/a",
+            expected="at least one network flow endpoint",
+            observed="none",
+            message="cannot reach the subscription of /a in /two: it has no network flow endpoint",
+            at="robot.lifecycle.yaml:13:9",
+            node="/two",
+            endpoint=SUB,
+            hint="look for two processes with the same fixed ports, or an interface whitelist that"
+            " matches no interface",
+        )
+    ]
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        change_report(SUB, "/a", nfes=(), error="refused"),
+        change_report(SUB, "/a", nfes=None),
+        change_report(PUB, "/b", nfes=()),
+        drop_report("/two"),
+    ],
+)
+def test_only_a_subscription_that_was_made_and_has_no_nfe_is_broken(edit: Edit):
+    assert of_flows(edit, strict()) == []
+
+
+# --- links
+
+
+@pytest.mark.parametrize("how", [UniqueHow.WEAKLY, UniqueHow.STRONGLY])
+def test_a_link_whose_demand_is_not_met_is_told_whole(how: UniqueHow):
+    plan = planned(
+        node("one", publisher("a"), publisher("b")),
+        node("two", subscription("a"), subscription("b")),
+        links=[link("/a", "one", "two", unique=how)],
+    )
+    observed = "publisher not unique, subscription not unique"
+    assert of_flows(unchanged, plan) == [
+        Finding(
+            rule="flow.not-unique",
+            outcome=Outcome.VIOLATED,
+            subject="/a: /one → /two",
+            expected=f"{how.value} unique flow",
+            observed=observed,
+            message="cannot accept the flow /one → /two on /a: its link demands a"
+            f" {how.value} unique flow; {observed}",
+            at="robot.lifecycle.yaml:10:9",
+            hint=NOT_UNIQUE_FIX,
+        )
+    ]
+
+
+def test_a_link_whose_demand_cannot_be_proven_is_told_whole():
+    plan = strict(linked=UniqueHow.STRONGLY)
+    observed = "publisher unique, subscription unknown"
+    assert of_flows(change_report(SUB, "/a", nfes=None), plan) == [
+        Finding(
+            rule="flow.unverifiable",
+            outcome=Outcome.VIOLATED,
+            subject="/a: /one → /two",
+            expected="strongly unique flow",
+            observed=observed,
+            message="cannot accept the flow /one → /two on /a: its link demands a strongly unique"
+            f" flow, which cannot be proven; {observed}",
+            at="robot.lifecycle.yaml:13:9",
+            hint=UNVERIFIABLE_FIX,
+        )
+    ]
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        both(drop_endpoint(PUB, "/a"), drop_report("/one")),
+        both(drop_endpoint(SUB, "/a"), drop_report("/two")),
+    ],
+)
+def test_the_demand_of_a_link_without_one_of_its_ends_is_not_named_besides(edit: Edit):
+    plan = planned(
+        node("one", publisher("a")),
+        node("two", subscription("a")),
+        links=[link("/a", "one", "two", unique=UniqueHow.STRONGLY)],
+    )
+    assert of_flows(edit, plan) == []
+
+
+@pytest.mark.parametrize(("publishers", "subscriptions"), [((), ("a",)), (("a",), ()), ((), ())])
+def test_the_demand_of_a_link_between_nodes_that_declare_no_such_ends_is_not_named_besides(
+    publishers, subscriptions
+):
+    plan = planned(
+        node("one", *map(publisher, publishers)),
+        node("two", *map(subscription, subscriptions)),
+        links=[link("/a", "one", "two", unique=UniqueHow.STRONGLY)],
+    )
+    assert of_flows(unchanged, plan) == []
+
+
+def test_a_link_that_demands_nothing_does_not_end_the_judgement_of_the_others():
+    plan = planned(
+        node("one", publisher("a"), publisher("b")),
+        node("two", subscription("a"), subscription("b")),
+        links=[link("/b", "one", "two", unique=UniqueHow.WEAKLY)],
+    )
+    assert [each.subject for each in of_flows(unchanged, plan)] == ["/b: /one → /two"]
+
+
+# --- numbers
+
+
+def test_a_number_that_nobody_measures_is_told_whole():
+    rate = Quantity(name="rate_hz", value=5, at=at(22, 3))
+    delay = Quantity(name="max_delay_ms", value=2, at=at(40, 7))
+    plan = planned(
+        node("one", publisher("a"), needs=[need(PUB, "a", quantities=(rate,))]),
+        node("two", subscription("a")),
+        links=[link("/a", "one", "two", quantities=(delay,))],
+    )
+    fix = (
+        "nothing here measures it: measure it where the data are used, or leave it out of the"
+        " manifest; `--strict` refuses it, and so does `policy.unverifiable: block`"
+    )
+    assert of_flows(unchanged, plan) == [
+        Finding(
+            rule="flow.not-measured",
+            outcome=Outcome.UNVERIFIABLE,
+            subject="/a",
+            expected="rate_hz 5",
+            observed="not measured",
+            message="cannot verify rate_hz 5 of the publisher of /a in /one: nothing measures it",
+            at="robot.lifecycle.yaml:22:3",
+            node="/one",
+            endpoint=PUB,
+            hint=fix,
+        ),
+        Finding(
+            rule="flow.not-measured",
+            outcome=Outcome.UNVERIFIABLE,
+            subject="/a: /one → /two",
+            expected="max_delay_ms 2",
+            observed="not measured",
+            message="cannot verify max_delay_ms 2 of the flow /one → /two on /a: nothing measures"
+            " it",
+            at="robot.lifecycle.yaml:40:7",
+            hint=fix,
+        ),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("edit", "named"),
+    [
+        (unchanged, ["/a", "/b", "/a: /one → /two", "/b: /one → /two"]),
+        (both(drop_endpoint(PUB, "/a"), drop_report("/one")), ["/b", "/b: /one → /two"]),
+        (both(drop_endpoint(SUB, "/a"), drop_report("/two")), ["/a", "/b", "/b: /one → /two"]),
+        (drop_endpoint(PUB, "/a"), ["/a", "/b", "/a: /one → /two", "/b: /one → /two"]),
+        (drop_report("/one"), ["/a", "/b", "/a: /one → /two", "/b: /one → /two"]),
+    ],
+)
+def test_numbers_are_named_of_what_is_there_and_of_nothing_else(edit, named):
+    rate = (Quantity(name="rate_hz", value=5, at=at(22)),)
+    plan = planned(
+        node(
+            "one",
+            publisher("a"),
+            publisher("b"),
+            needs=[need(PUB, name, quantities=rate) for name in ("a", "b")],
+        ),
+        node("two", subscription("a"), subscription("b")),
+        links=[link(topic, "one", "two", quantities=rate) for topic in ("/a", "/b")],
+    )
+    found = [each for each in of_flows(edit, plan) if each.rule == "flow.not-measured"]
+    assert [each.subject for each in found] == named
+
+
+# --- DSCP
+
+
+def marked(*, enforce: bool = True) -> Plan:
+    return planned(
+        node(
+            "one",
+            publisher("a"),
+            publisher("b"),
+            needs=[need(PUB, name, dscp=46, enforce=enforce) for name in ("a", "b")],
+        )
+    )
+
+
+EF, CS1 = "EF = DSCP 46 = TOS 184 (0xb8)", "CS1 = DSCP 8 = TOS 32 (0x20)"
+
+
+@pytest.mark.parametrize(
+    ("enforce", "outcome", "waived", "hint"),
+    [
+        (
+            True,
+            Outcome.VIOLATED,
+            "",
+            "see the node's log for the refused socket option; `enforce: false` makes it a warning",
+        ),
+        (
+            False,
+            Outcome.UNVERIFIABLE,
+            "; the manifest does not enforce it",
+            "see the node's log for the refused option",
+        ),
+    ],
+)
+def test_sockets_that_carry_another_dscp_are_told_whole(enforce, outcome, waived, hint):
+    assert of_flows(change_report(PUB, "/a", dscp=8), marked(enforce=enforce)) == [
+        Finding(
+            rule="flow.dscp-not-applied",
+            outcome=outcome,
+            subject="/a",
+            expected=EF,
+            observed=CS1,
+            message="cannot accept the publisher of /a in /one: its sockets carry"
+            f" {CS1} and not {EF}{waived}",
+            at="robot.lifecycle.yaml:10:9",
+            node="/one",
+            endpoint=PUB,
+            hint=hint,
+        )
+    ]
+
+
+@pytest.mark.parametrize(
+    "edit", [change_report(PUB, "/a", dscp=None), drop_endpoint_report(PUB, "/a")]
+)
+def test_a_dscp_that_nobody_read_back_is_told_whole(edit: Edit):
+    assert of_flows(edit, marked()) == [
+        Finding(
+            rule="flow.dscp-unverifiable",
+            outcome=Outcome.UNVERIFIABLE,
+            subject="/a",
+            expected=EF,
+            observed="not read back",
+            message="cannot verify the DSCP of the publisher of /a in /one: nobody read it back",
+            at="robot.lifecycle.yaml:10:9",
+            node="/one",
+            endpoint=PUB,
+            hint="only nodes in our host mark and read back; mark a foreign node's flow in the"
+            " network",
+        )
+    ]
+
+
+def test_the_dscp_of_an_endpoint_that_only_its_node_tells_of_is_judged():
+    edit = both(drop_endpoint(PUB, "/a"), change_report(PUB, "/a", dscp=8))
+    assert [each.observed for each in of_flows(edit, marked())] == [CS1]
+
+
+def test_the_dscp_of_an_endpoint_that_is_missing_is_not_named_besides():
+    edit = both(drop_endpoint(PUB, "/a"), drop_endpoint_report(PUB, "/a"))
+    assert of_flows(edit, marked()) == []
+    late = both(edit, change_report(PUB, "/b", dscp=8))
+    assert [each.subject for each in of_flows(late, marked())] == ["/b"]
+
+
+def test_an_endpoint_without_a_dscp_does_not_end_the_judgement_of_the_others():
+    plan = planned(
+        node("one", publisher("a"), publisher("b"), needs=[need(PUB, "b", dscp=0)]),
+    )
+    edit = both(change_report(PUB, "/a", dscp=46), change_report(PUB, "/b", dscp=8))
+    assert [(each.subject, each.expected) for each in of_flows(edit, plan)] == [
+        ("/b", "DF = DSCP 0 = TOS 0 (0x00)")
+    ]

@@ -13,11 +13,17 @@ import jsonschema
 import pytest
 
 from lifecycle import codec
-from lifecycle.manifest.model import EndpointKind
+from lifecycle.manifest.model import EndpointKind, UniqueHow
 from lifecycle.network.flow import FlowTuple
-from lifecycle.network.nfe import InternetProtocol, NetworkFlowEndpoint, TransportProtocol
-from lifecycle.plan import build_plan
+from lifecycle.network.nfe import (
+    InternetProtocol,
+    NetworkFlowEndpoint,
+    TransportProtocol,
+    UniqueRequirement,
+)
+from lifecycle.plan import Plan, build_plan
 from lifecycle.verify import (
+    NOT_JUDGED,
     RULES,
     Finding,
     FlowReport,
@@ -32,6 +38,7 @@ from lifecycle.verify import (
     to_sarif,
     verify,
 )
+from lifecycle.verify.verdict import OpenEndpoint, ToleratedNode
 from tests.unit.plan.samples import teleop
 from tests.unit.verify.edits import (
     Edit,
@@ -74,6 +81,75 @@ EDITS = {
 
 def schema(name: str) -> dict:
     return json.loads((SCHEMAS / name).read_text(encoding="utf-8"))
+
+
+VIOLATED = Finding(
+    rule="graph.qos-differs",
+    outcome=Outcome.VIOLATED,
+    subject="/a",
+    expected="depth 10",
+    observed="depth 1",
+    message="cannot accept this",
+    at="my robot:1.yaml:18:9",
+    node="/one",
+    endpoint=SUB,
+    hint="correct it",
+)
+NOT_KNOWN = Finding(
+    rule="state.unverifiable",
+    outcome=Outcome.UNVERIFIABLE,
+    subject="/a → /b",
+    expected="inactive",
+    observed="unknown",
+    message="cannot verify that",
+)
+
+
+def _has(kind: EndpointKind, node: str, name: str, type_: str) -> OpenEndpoint:
+    return OpenEndpoint(kind=kind, node=node, name=name, type=type_)
+
+
+WRITTEN = Verdict(
+    verdict=Outcome.VIOLATED,
+    blocking=True,
+    findings=(VIOLATED, NOT_KNOWN),
+    flows=(
+        FlowReport(
+            topic="/a",
+            publisher="/one",
+            subscription="/two",
+            source=(),
+            destination=(),
+            unique=None,
+            dscp=None,
+            requirement=(
+                UniqueRequirement.OPTIONALLY_REQUIRED,
+                UniqueRequirement.STRICTLY_REQUIRED,
+            ),
+            demanded=UniqueHow.NOT,
+            transport="unknown",
+            outcome=Outcome.UNVERIFIABLE,
+            effective_transport="shm",
+        ),
+    ),
+    open_endpoints=(
+        _has(PUB, "/open", "/extra", "std_msgs/msg/String"),
+        _has(EndpointKind.ACTION_CLIENT, "/open", "/dock", "robot/action/Dock"),
+    ),
+    tolerated=(
+        ToleratedNode(
+            node="/rviz2",
+            because="tolerated_nodes: rviz*",
+            endpoints=(
+                _has(SUB, "/rviz2", "/a", "std_msgs/msg/String"),
+                _has(EndpointKind.SERVICE_CLIENT, "/rviz2", "/c", "std_srvs/srv/Empty"),
+            ),
+        ),
+        ToleratedNode(node="", because="undeclared_nodes: open"),
+    ),
+    run=RunEnd(reason="/one died", reached="active", exit_code=3, trusted="1 depth"),
+)
+"""A verdict that has everything."""
 
 
 # --- text
@@ -154,15 +230,126 @@ def test_a_bad_verdict_says_what_was_expected_and_observed_where_and_what_to_do(
 
 def test_colour_comes_only_when_asked_for():
     assert "\x1b" not in render_text(after(BAD))
-    assert "\x1b[31mviolated\x1b[0m graph.qos-differs" in render_text(after(BAD), colour=True)
+    red, yellow, green, reset = "\x1b[31m", "\x1b[33m", "\x1b[32m", "\x1b[0m"
+    plain = render_text(after(BAD)).splitlines()
+    assert plain[-2].split()[-2:] == ["udpv4", "ok"], "flows end with their outcome"
+    in_colour = {
+        plain[0]: f"{red}{plain[0]}{reset}",
+        plain[2]: f"{red}violated{reset} graph.qos-differs: /robot/status",
+        plain[10]: f"{yellow}unverifiable{reset} flow.dscp-unverifiable: /robot/battery",
+        plain[-6]: plain[-6].removesuffix("ok") + f"{green}ok{reset}",
+        plain[-4]: plain[-4].removesuffix("unverifiable") + f"{yellow}unverifiable{reset}",
+        plain[-2]: plain[-2].removesuffix("ok") + f"{green}ok{reset}",
+    }
+    coloured = render_text(after(BAD), colour=True).splitlines()
+    assert coloured == [in_colour.get(line, line) for line in plain]
 
 
-def test_sentences_wrap_at_the_width():
-    lines = render_text(after(BAD), width=60, flows=False).splitlines()
-    assert max(len(line) for line in lines) <= 60
+@pytest.mark.parametrize(("asked", "width"), [(61, 61), (41, 41), (40, 40), (1, 40)])
+def test_sentences_wrap_at_the_width_and_at_40_where_it_is_less(asked: int, width: int):
+    def wrapped(word: str) -> list[list[str]]:
+        finding = dataclasses.replace(VIOLATED, message=f"{word} " * 60, hint="")
+        run = RunEnd(reason=f"{word} " * 60, reached=None, exit_code=1)
+        tolerated = (ToleratedNode(node=word, because=""),) * 60
+        verdict = Verdict(
+            verdict=Outcome.VIOLATED,
+            blocking=True,
+            findings=(finding,),
+            flows=(),
+            tolerated=tolerated,
+            run=run,
+        )
+        blocks = render_text(verdict, width=asked).split("\n\n")
+        return [block.splitlines() for block in blocks[1:]]
+
+    # Between them these words end in every column.
+    by_block = zip(*(wrapped("a" * length) for length in range(2, 20)), strict=True)
+    for blocks in by_block:
+        assert max(len(line) for lines in blocks for line in lines) == width
+
+
+def test_sentences_wrap_at_100_columns_where_nobody_says_otherwise():
+    finding = dataclasses.replace(VIOLATED, message="aa " * 100)
+    lines = render_text(dataclasses.replace(WRITTEN, findings=(finding,))).splitlines()
+    assert max(len(line) for line in lines if line.endswith(" aa")) == 100
+
+
+def test_names_and_addresses_stay_whole_where_lines_are_wrapped():
+    name = "/robot/" + "a-long-name" * 5
+    finding = dataclasses.replace(VIOLATED, message=f"cannot find {name} anywhere")
+    text = render_text(dataclasses.replace(WRITTEN, findings=(finding,)), width=40)
+    assert f"\n  {name}\n" in text
+
+
+def test_what_a_verdict_allows_and_how_its_run_ended_follow_what_it_finds():
+    assert (
+        render_text(WRITTEN)
+        == """\
+verdict: violated (1 violated, 1 unverifiable, 1 flow)
+
+violated graph.qos-differs: /a
+  cannot accept this
+  expected  depth 10
+  observed  depth 1
+  at        my robot:1.yaml:18:9
+  to do     correct it
+
+unverifiable state.unverifiable: /a → /b
+  cannot verify that
+  expected  inactive
+  observed  unknown
+
+endpoints that `endpoints: open` allows
+  publisher of /extra in /open, std_msgs/msg/String
+  action client of /dock in /open, robot/action/Dock
+
+tolerated: /rviz2 (subscription of /a, service client of /c), an unknown node
+
+flows
+  /a  /one → /two  uniqueness unknown  shm  unverifiable
+
+ended after it was active, exit code 3: /one died; taken on trust: 1 depth
+"""
+    )
+
+
+def test_flows_are_left_out_where_nobody_asks_for_them():
+    assert "\nflows\n" not in render_text(WRITTEN, flows=False)
+    assert "\nflows\n" not in render_text(dataclasses.replace(WRITTEN, flows=()))
 
 
 # --- JSON
+
+
+def test_the_json_of_a_verdict_on_one_line_is_spelled_so():
+    assert to_json(WRITTEN) == (
+        '{"verdict":"violated","findings":['
+        '{"rule":"graph.qos-differs","outcome":"violated","subject":"/a","expected":"depth 10",'
+        '"observed":"depth 1","message":"cannot accept this","at":"my robot:1.yaml:18:9",'
+        '"node":"/one","endpoint":"subscriptions","hint":"correct it"},'
+        '{"rule":"state.unverifiable","outcome":"unverifiable","subject":"/a → /b",'
+        '"expected":"inactive","observed":"unknown","message":"cannot verify that","at":"",'
+        '"node":"","endpoint":null,"hint":""}],'
+        '"flows":[{"topic":"/a","publisher":"/one","subscription":"/two","source":[],'
+        '"destination":[],"unique":null,"dscp":null,"requirement":["optionally_required","strictly_required"],"demanded":"not",'
+        '"transport":"unknown","outcome":"unverifiable","max_delay_ms":null,"five_qi":null,'
+        '"five_qi_reason":"","effective_transport":"shm","reader_dscp":null,"tuples":[]}],'
+        '"open_endpoints":['
+        '{"kind":"publishers","node":"/open","name":"/extra","type":"std_msgs/msg/String"},'
+        '{"kind":"action_clients","node":"/open","name":"/dock","type":"robot/action/Dock"}],'
+        '"tolerated":[{"node":"/rviz2","because":"tolerated_nodes: rviz*","endpoints":['
+        '{"kind":"subscriptions","node":"/rviz2","name":"/a","type":"std_msgs/msg/String"},'
+        '{"kind":"service_clients","node":"/rviz2","name":"/c","type":"std_srvs/srv/Empty"}]},'
+        '{"node":"","because":"undeclared_nodes: open","endpoints":[]}],'
+        '"run":{"reason":"/one died","reached":"active","exit_code":3,"trusted":"1 depth"}}'
+    )
+
+
+def test_the_json_of_an_unjudged_run_is_spelled_so():
+    assert to_json(UNJUDGED) == (
+        '{"verdict":"unverifiable","findings":[],"flows":[],"judged":false,"run":{"reason":'
+        '"interrupted; /talker is still configuring","reached":null,"exit_code":130}}'
+    )
 
 
 @pytest.mark.parametrize("edit", EDITS)
@@ -228,11 +415,8 @@ def test_every_shipped_schema_is_a_schema(path: Path):
 
 # --- the end of a run
 
-UNJUDGED = Verdict(
-    verdict=Outcome.UNVERIFIABLE,
-    blocking=True,
-    findings=(),
-    flows=(),
+UNJUDGED = dataclasses.replace(
+    NOT_JUDGED,
     run=RunEnd(reason="interrupted; /talker is still configuring", reached=None, exit_code=130),
 )
 
@@ -264,9 +448,11 @@ def test_the_json_of_a_run_has_its_reason_and_fits_the_schema():
 def test_a_run_that_nobody_judged_is_no_success_in_junit_and_sarif():
     root = ET.fromstring(to_junit(UNJUDGED, PLAN))
     assert root.get("failures") == "1"
+    assert root.get("skipped") == str(len(RULES))
     (case,) = (each for each in root.iter("testcase") if each.find("failure") is not None)
     assert (case.get("classname"), case.get("name")) == ("run", "end")
     (run,) = json.loads(to_sarif(UNJUDGED))["runs"]
+    assert [(each["ruleId"], each["level"]) for each in run["results"]] == [("run.end", "error")]
     assert run["invocations"] == [
         {
             "executionSuccessful": False,
@@ -288,12 +474,115 @@ def test_junit_counts_what_it_holds(edit: str):
         assert element.get("tests") == str(len(element.findall(".//testcase")))
         assert element.get("failures") == str(len(element.findall(".//failure")))
         assert element.get("skipped") == str(len(element.findall(".//skipped")))
-    of_rules = [each for each in root.iter("testcase") if each.get("classname") != "flow"]
-    failed = [each for each in of_rules if each.find("failure") is not None]
-    assert len(failed) == sum(each.outcome is Outcome.VIOLATED for each in verdict.findings)
-    found = {each.rule for each in verdict.findings}
-    passed = {each.get("classname") for each in of_rules if len(each) == 0}
-    assert passed == {rule.id for rule in RULES} - found
+    failed = {
+        each.get("classname") for each in root.iter("testcase") if each.find("failure") is not None
+    }
+    assert failed == {each.rule for each in verdict.findings if each.outcome is Outcome.VIOLATED}
+    said = "".join(root.itertext())
+    for finding in verdict.findings:
+        assert finding.message.replace("\x07", r"\x07") in said
+        assert f"at: {finding.at}\n" in said
+
+
+def cases(verdict: Verdict, plan: Plan | None = PLAN, *, strict: bool = False) -> dict[str, str]:
+    """What each test case comes to, by its name."""
+    words = {"failure", "skipped"}
+    root = ET.fromstring(to_junit(verdict, plan, strict=strict))
+    found = [
+        (f"{each.get('classname')}/{each.get('name')}", words & {child.tag for child in each})
+        for each in root.iter("testcase")
+    ]
+    assert len(dict(found)) == len(found)
+    return {name: "".join(tags) or "passed" for name, tags in found}
+
+
+INVALID = dataclasses.replace(
+    UNJUDGED,
+    verdict=Outcome.VIOLATED,
+    findings=(
+        Finding(
+            rule="manifest.unknown-key",
+            outcome=Outcome.VIOLATED,
+            subject="nodes.camera.nmae",
+            expected="",
+            observed="",
+            message="cannot use key 'nmae'",
+            at="robot.lifecycle.yaml:4:5",
+        ),
+    ),
+)
+
+
+def test_test_cases_have_the_same_names_whatever_the_outcome():
+    names = list(cases(after(perfectly)))
+    for edit in EDITS.values():
+        assert list(cases(after(edit))) == names
+    assert list(cases(UNJUDGED)) == names
+    assert list(cases(UNJUDGED, plan=None)) == names
+    assert list(cases(INVALID, plan=None)) == names
+    assert sorted(each.partition("/")[0] for each in names) == sorted(
+        ["manifest", *(each.id for each in RULES), "run"]
+    )
+
+
+def test_an_invalid_manifest_fails_where_it_is_wrong():
+    root = ET.fromstring(to_junit(INVALID, None))
+    case = next(each for each in root.iter("testcase") if each.get("classname") == "manifest")
+    assert (case.get("file"), case.get("line")) == ("robot.lifecycle.yaml", "4")
+    assert case.find("failure").get("message") == "cannot use key 'nmae'"
+    (result,) = json.loads(to_sarif(INVALID))["runs"][0]["results"]
+    assert (result["ruleId"], result["level"]) == ("manifest.unknown-key", "error")
+    assert "ruleIndex" not in result
+    document = json.loads(to_json(INVALID))
+    jsonschema.Draft202012Validator(schema("verdict.v1.schema.json")).validate(document)
+    assert document["judged"] is False
+
+
+def test_what_may_be_unverifiable_neither_fails_nor_skips_a_test():
+    unverifiable = after(change_report(PUB, "/robot/battery", dscp=None))
+    assert unverifiable.verdict is Outcome.UNVERIFIABLE
+    assert set(cases(unverifiable).values()) == {"passed"}
+    assert "cannot verify the DSCP" in to_junit(unverifiable, PLAN)
+    failed = [name for name, came in cases(unverifiable, strict=True).items() if came == "failure"]
+    assert [each.partition("/")[0] for each in failed] == ["flow.dscp-unverifiable"]
+    policy = dataclasses.replace(PLAN.policy, unverifiable_blocks=True)
+    blocking = dataclasses.replace(PLAN, policy=policy)
+    assert list(cases(unverifiable, blocking).values()).count("failure") == 1
+
+
+def test_what_refuses_nothing_is_placed_at_the_first_declaration():
+    first = dataclasses.replace(VIOLATED, outcome=Outcome.UNVERIFIABLE)
+    found = (first, dataclasses.replace(first, at="other.yaml:2:3"))
+    root = ET.fromstring(to_junit(dataclasses.replace(WRITTEN, findings=found, run=None), PLAN))
+    (case,) = (each for each in root.iter("testcase") if each.get("file"))
+    assert (case.get("file"), case.get("line")) == ("my robot:1.yaml", "18")
+
+
+@pytest.mark.parametrize(
+    ("rule", "refuses"),
+    [
+        ("graph.qos-unverifiable", (True, True)),
+        ("flow.dscp-not-applied", (False, True)),
+        ("manifest.no-rule-of-the-system", (True, True)),
+    ],
+)
+def test_what_may_not_block_is_refused_by_who_is_strict_alone(
+    rule: str, refuses: tuple[bool, bool]
+):
+    found = dataclasses.replace(VIOLATED, rule=rule, outcome=Outcome.UNVERIFIABLE)
+    verdict = dataclasses.replace(WRITTEN, findings=(found,), run=None)
+    policy = dataclasses.replace(PLAN.policy, unverifiable_blocks=True)
+    blocking = dataclasses.replace(PLAN, policy=policy)
+    came = tuple(
+        "failure" in cases(verdict, blocking, strict=strict).values() for strict in (False, True)
+    )
+    assert came == refuses
+
+
+def test_what_was_judged_before_a_run_failed_is_not_skipped():
+    run = RunEnd(reason="failed: /camera (run.process-died)", reached="active", exit_code=6)
+    came = cases(dataclasses.replace(after(perfectly), run=run))
+    assert {name for name, each in came.items() if each != "passed"} == {"run/end"}
 
 
 def test_junit_puts_a_failure_at_the_declaration():
@@ -301,23 +590,231 @@ def test_junit_puts_a_failure_at_the_declaration():
     (case,) = (
         each for each in root.iter("testcase") if each.get("classname") == "graph.qos-differs"
     )
-    assert (case.get("name"), case.get("file"), case.get("line")) == (
-        "/robot/status",
-        "robot.lifecycle.yaml",
-        "18",
-    )
+    assert (case.get("file"), case.get("line")) == ("robot.lifecycle.yaml", "18")
     assert case.find("failure").get("message") == (
         "cannot accept the subscription of /robot/status in /viewer: depth is declared 10 and is 1"
     )
 
 
-def test_junit_replaces_what_xml_cannot_hold():
+def test_junit_escapes_what_xml_cannot_hold():
     text = to_junit(after(NOT_DECLARED), PLAN)
-    names = [each.get("name") for each in ET.fromstring(text).iter("testcase")]
-    assert "/spy<&>\ufffd" in names
+    assert r"/spy<&>\x07" in "".join(ET.fromstring(text).itertext())
+
+
+def suite(text: str, name: str) -> str:
+    """One suite as it is written, without its indentation."""
+    (found,) = (each for each in ET.fromstring(text) if each.get("name") == name)
+    lines = ET.tostring(found, encoding="unicode").strip().splitlines()
+    return "\n".join(line.strip() for line in lines)
+
+
+def test_the_junit_of_a_manifest_and_of_a_run_is_spelled_so():
+    text = to_junit(dataclasses.replace(INVALID, run=None), None)
+    assert text.startswith(
+        '<?xml version="1.0" encoding="UTF-8"?>\n'
+        f'<testsuites name="lifecycle verify" tests="{len(RULES) + 2}" failures="2"'
+        f' skipped="{len(RULES)}">\n'
+        '  <testsuite name="manifest" tests="1" failures="1" skipped="0">\n'
+        '    <testcase classname="manifest" name="the manifest is valid"'
+        ' file="robot.lifecycle.yaml" line="4">\n'
+    )
+    assert text.endswith("\n  </testsuite>\n</testsuites>\n")
+    assert suite(text, "manifest").splitlines()[2:] == [
+        (
+            """<failure message="cannot use key 'nmae'">violated manifest.unknown-key:"""
+            " nodes.camera.nmae"
+        ),
+        "cannot use key 'nmae'",
+        "expected:",
+        "observed:",
+        "at: robot.lifecycle.yaml:4:5",
+        "to do:",
+        "</failure>",
+        "</testcase>",
+        "</testsuite>",
+    ]
+    assert suite(text, "run").splitlines()[-5:] == [
+        '<testcase classname="run" name="end">',
+        (
+            '<failure message="nothing was judged">ended before it was connected, exit code 1:'
+            " nothing was judged"
+        ),
+        "</failure>",
+        "</testcase>",
+        "</testsuite>",
+    ]
+
+
+def test_the_junit_of_a_run_that_did_what_was_asked_for_says_how_it_ended():
+    done = RunEnd(reason="done", reached="active", exit_code=0)
+    text = to_junit(dataclasses.replace(after(perfectly), run=done), PLAN)
+    assert suite(text, "run").splitlines()[-5:] == [
+        '<testcase classname="run" name="end">',
+        "<system-out>ended after it was active, exit code 0: done",
+        "</system-out>",
+        "</testcase>",
+        "</testsuite>",
+    ]
+
+
+def test_the_junit_of_what_nobody_judged_says_where_to_look():
+    skipped = {
+        each.get("message") for each in ET.fromstring(to_junit(UNJUDGED, PLAN)).iter("skipped")
+    }
+    assert skipped == {"not judged; see the end of the run"}
+
+
+def test_the_junit_of_findings_and_flows_is_spelled_so():
+    first = dataclasses.replace(VIOLATED, outcome=Outcome.UNVERIFIABLE, message="cannot tell")
+    second = dataclasses.replace(VIOLATED, message="cannot accept that", at="other.yaml:2:3")
+    verdict = dataclasses.replace(WRITTEN, findings=(first, VIOLATED, second))
+    text = to_junit(verdict, PLAN)
+    (case,) = (
+        each
+        for each in ET.fromstring(text).iter("testcase")
+        if each.get("classname") == "graph.qos-differs"
+    )
+    assert (case.get("file"), case.get("line")) == ("my robot:1.yaml", "18")
+    assert [(each.tag, each.attrib, each.text) for each in case] == [
+        (
+            "failure",
+            {"message": "cannot accept this (and 1 more)"},
+            (
+                "violated graph.qos-differs: /a\ncannot accept this\nexpected: depth 10\n"
+                "observed: depth 1\nat: my robot:1.yaml:18:9\nto do: correct it\n"
+                "\n"
+                "violated graph.qos-differs: /a\ncannot accept that\nexpected: depth 10\n"
+                "observed: depth 1\nat: other.yaml:2:3\nto do: correct it\n"
+            ),
+        ),
+        (
+            "system-out",
+            {},
+            (
+                "unverifiable graph.qos-differs: /a\ncannot tell\nexpected: depth 10\n"
+                "observed: depth 1\nat: my robot:1.yaml:18:9\nto do: correct it\n"
+            ),
+        ),
+    ]
+    flows = ET.fromstring(text).find("testsuite[@name='flow']/system-out")
+    assert flows.text == "/a: /one → /two: unverifiable\n"
+    both_flows = ET.fromstring(
+        to_junit(dataclasses.replace(verdict, flows=verdict.flows * 2), PLAN)
+    )
+    assert both_flows.find("testsuite[@name='flow']/system-out").text == flows.text * 2
+    none = ET.fromstring(to_junit(dataclasses.replace(verdict, flows=()), PLAN))
+    assert none.find("testsuite[@name='flow']/system-out") is None
 
 
 # --- SARIF
+
+
+def test_the_sarif_of_a_verdict_is_spelled_so():
+    text = to_sarif(WRITTEN)
+    assert text.startswith('{\n  "$schema": ')
+    assert text.endswith("\n}\n")
+    assert "/a → /b" in text
+    log = json.loads(text)
+    rules = log["runs"][0]["tool"]["driver"].pop("rules")
+    assert rules == [
+        {
+            "id": each.id,
+            "shortDescription": {"text": each.meaning},
+            "help": {"text": each.fix},
+            "defaultConfiguration": {
+                "level": "error" if each.outcomes[0] is Outcome.VIOLATED else "warning"
+            },
+        }
+        for each in RULES
+    ]
+    index = {each.id: number for number, each in enumerate(RULES)}
+    assert log == {
+        "$schema": "https://json.schemastore.org/sarif-2.1.0.json",
+        "version": "2.1.0",
+        "runs": [
+            {
+                "tool": {"driver": {"name": "lifecycle"}},
+                "columnKind": "unicodeCodePoints",
+                "results": [
+                    {
+                        "ruleId": "graph.qos-differs",
+                        "ruleIndex": index["graph.qos-differs"],
+                        "level": "error",
+                        "message": {"text": "cannot accept this; correct it"},
+                        "locations": [
+                            {
+                                "logicalLocations": [
+                                    {"fullyQualifiedName": "/a", "kind": "resource"}
+                                ],
+                                "physicalLocation": {
+                                    "artifactLocation": {"uri": "my%20robot%3A1.yaml"},
+                                    "region": {"startLine": 18, "startColumn": 9},
+                                },
+                            }
+                        ],
+                        "properties": {
+                            "outcome": "violated",
+                            "expected": "depth 10",
+                            "observed": "depth 1",
+                        },
+                    },
+                    {
+                        "ruleId": "state.unverifiable",
+                        "ruleIndex": index["state.unverifiable"],
+                        "level": "warning",
+                        "message": {"text": "cannot verify that"},
+                        "locations": [
+                            {
+                                "logicalLocations": [
+                                    {"fullyQualifiedName": "/a → /b", "kind": "resource"}
+                                ]
+                            }
+                        ],
+                        "properties": {
+                            "outcome": "unverifiable",
+                            "expected": "inactive",
+                            "observed": "unknown",
+                        },
+                    },
+                ],
+                "properties": {"verdict": "violated"},
+                "invocations": [
+                    {
+                        "executionSuccessful": False,
+                        "exitCode": 3,
+                        "exitCodeDescription": WRITTEN.run.describe(),
+                    }
+                ],
+            }
+        ],
+    }
+
+
+def test_sarif_blames_the_end_of_a_run_only_where_no_finding_is_an_error():
+    def results(**changes: object) -> list[dict]:
+        (run,) = json.loads(to_sarif(dataclasses.replace(WRITTEN, **changes)))["runs"]
+        return run["results"]
+
+    assert [each["ruleId"] for each in results(findings=(NOT_KNOWN,))] == [
+        "state.unverifiable",
+        "run.end",
+    ]
+    assert results(findings=()) == [
+        {
+            "ruleId": "run.end",
+            "level": "error",
+            "message": {
+                "text": "ended after it was active, exit code 3: /one died; taken on trust: 1 depth"
+            },
+        }
+    ]
+    assert results(findings=(), run=None) == []
+    done = RunEnd(reason="done", reached="active", exit_code=0)
+    assert results(findings=(), run=done) == []
+    (run,) = json.loads(to_sarif(dataclasses.replace(WRITTEN, run=done)))["runs"]
+    assert run["invocations"][0]["executionSuccessful"] is True
+    (run,) = json.loads(to_sarif(dataclasses.replace(WRITTEN, run=None)))["runs"]
+    assert "invocations" not in run
 
 
 def test_sarif_points_at_the_declaration_and_describes_every_rule():

@@ -10,10 +10,19 @@ from lifecycle.manifest.model import (
     EndpointKind,
     EndpointPolicy,
     Policy,
+    Quantity,
     Run,
     RunKind,
+    UniqueHow,
 )
-from lifecycle.manifest.qos import Durability, Liveliness, QosProfile, Reliability
+from lifecycle.manifest.qos import (
+    Durability,
+    History,
+    Liveliness,
+    QosProfile,
+    Reliability,
+    not_written,
+)
 from lifecycle.network.nfe import (
     InternetProtocol,
     NetworkFlowEndpoint,
@@ -26,13 +35,16 @@ from lifecycle.verify import (
     Finding,
     Identity,
     NodeConfiguration,
+    Observation,
     Outcome,
     Stage,
     verify,
 )
 from tests.unit.plan.samples import (
     IMAGE,
+    at,
     endpoint,
+    link,
     need,
     node,
     planned,
@@ -244,7 +256,7 @@ FIRES: dict[str, tuple[Edit, list[tuple[str, str, str]]]] = {
     ),
     "a report without QoS": (
         change_report(SUB, STATUS, qos=None),
-        [("graph.qos-unverifiable", "unverifiable", STATUS)],
+        [("graph.qos-unverifiable", "unverifiable", "/viewer")],
     ),
     "a pair that is incompatible": (
         both(
@@ -272,7 +284,7 @@ FIRES: dict[str, tuple[Edit, list[tuple[str, str, str]]]] = {
             change_reported_qos(PUB, STATUS, reliability=Reliability.UNKNOWN),
         ),
         [
-            ("graph.qos-unverifiable", "unverifiable", STATUS),
+            ("graph.qos-unverifiable", "unverifiable", "/robot/camera"),
             ("graph.qos-incompatible", "unverifiable", "/robot/status: /robot/camera → /viewer"),
         ],
     ),
@@ -287,6 +299,55 @@ FIRES: dict[str, tuple[Edit, list[tuple[str, str, str]]]] = {
     "a flow that the only end with a count says is unmatched": (
         both(change_report(PUB, STATUS, matched=None), change_report(SUB, STATUS, matched=0)),
         [("graph.unmatched-flow", "violated", "/robot/status: /robot/camera → /viewer")],
+    ),
+    "a flow of which one end is matched with a tool instead": (
+        both(
+            add_endpoint(SUB, "/_ros2cli_4711", STATUS, gid="99", qos=QosProfile(depth=0)),
+            change_report(PUB, STATUS, peers=("99",)),
+        ),
+        [("graph.unmatched-flow", "violated", "/robot/status: /robot/camera → /viewer")],
+    ),
+    "a flow of which one end is matched with somebody unknown instead": (
+        change_report(PUB, STATUS, peers=()),
+        [("graph.unmatched-flow", "unverifiable", "/robot/status: /robot/camera → /viewer")],
+    ),
+    "a flow of which one end says that it is unmatched": (
+        change_report(PUB, STATUS, matched=0),
+        [("graph.unmatched-flow", "violated", "/robot/status: /robot/camera → /viewer")],
+    ),
+    "an end that only counts, fewer than could be": (
+        both(
+            add_endpoint(SUB, "/_ros2cli_4711", STATUS, gid="99", qos=QosProfile(depth=0)),
+            change_report(PUB, STATUS, peers=None),
+        ),
+        [("graph.unmatched-flow", "unverifiable", "/robot/status: /robot/camera → /viewer")],
+    ),
+    "an end that only counts, more than are known": (
+        change_report(PUB, STATUS, matched=2, peers=None),
+        [("graph.unmatched-flow", "unverifiable", "/robot/status: /robot/camera → /viewer")],
+    ),
+    "a tool that publishes on a declared topic": (
+        add_endpoint(PUB, "/rqt_robot_steering", STATUS, gid="99", qos=QosProfile()),
+        [("graph.undeclared-publisher", "violated", STATUS)],
+    ),
+    "a tool of any namespace that serves a declared service": (
+        add_endpoint(SERVER, "/far/rviz2", "/robot/camera/calibrate", type="std_srvs/srv/Trigger"),
+        [
+            ("graph.undeclared-service-server", "violated", "/robot/camera/calibrate"),
+            ("graph.unmatched-client", "unverifiable", CALIBRATE),
+        ],
+    ),
+    "a tool that publishes a part of a declared action": (
+        add_endpoint(PUB, "/rviz2", "/robot/dock/_action/feedback"),
+        [("graph.undeclared-publisher", "violated", "/robot/dock/_action/feedback")],
+    ),
+    "a tool that serves a declared node's own service": (
+        add_endpoint(SERVER, "/rviz2", "/viewer/get_state", type="lifecycle_msgs/srv/GetState"),
+        [("graph.undeclared-service-server", "violated", "/viewer/get_state")],
+    ),
+    "a node that calls itself one of our observers and publishes": (
+        add_endpoint(PUB, "/_lifecycle_observer_1", STATUS, gid="99", qos=QosProfile()),
+        [("graph.undeclared-publisher", "violated", STATUS)],
     ),
     "a service client that counts no server": (
         change_report(CLIENT, "/robot/camera/calibrate", server_matched=False),
@@ -329,13 +390,10 @@ FIRES: dict[str, tuple[Edit, list[tuple[str, str, str]]]] = {
     "a node that does not report": (
         drop_report("/robot/camera"),
         [
-            ("graph.qos-unverifiable", "unverifiable", VIDEO),
-            ("graph.qos-unverifiable", "unverifiable", BATTERY),
-            ("graph.qos-unverifiable", "unverifiable", STATUS),
-            ("graph.qos-unverifiable", "unverifiable", "/robot/camera/calibrate"),
+            ("graph.qos-unverifiable", "unverifiable", "/robot/camera"),
             ("config.missing-report", "violated", "/robot/camera"),
-            ("flow.unverifiable", "unverifiable", VIDEO),
-            ("flow.unverifiable", "unverifiable", FLOW),
+            ("flow.unverifiable", "violated", VIDEO),
+            ("flow.unverifiable", "violated", FLOW),
             ("flow.dscp-unverifiable", "unverifiable", VIDEO),
             ("flow.dscp-unverifiable", "unverifiable", BATTERY),
         ],
@@ -367,8 +425,8 @@ FIRES: dict[str, tuple[Edit, list[tuple[str, str, str]]]] = {
     "an RMW that does not tell NFEs": (
         change_report(SUB, VIDEO, nfes=None),
         [
-            ("flow.unverifiable", "unverifiable", VIDEO),
-            ("flow.unverifiable", "unverifiable", FLOW),
+            ("flow.unverifiable", "violated", VIDEO),
+            ("flow.unverifiable", "violated", FLOW),
         ],
     ),
     "a subscription without any NFE": (
@@ -443,7 +501,17 @@ SILENT: dict[str, Edit] = {
     ),
     "one end that reports no count": change_report(PUB, STATUS, matched=None),
     "more matches than the graph shows": change_report(PUB, STATUS, matched=5),
-    "one end that is late with its count": change_report(PUB, STATUS, matched=0),
+    "ends that only count, and count everybody": both(
+        change_report(PUB, STATUS, peers=None), change_report(SUB, STATUS, peers=None)
+    ),
+    "a tool that listens": both(
+        add_node("/_ros2cli_4711"),
+        add_endpoint(SUB, "/_ros2cli_4711", STATUS, gid="99", qos=QosProfile(depth=0)),
+        change_report(PUB, STATUS, matched=2),
+    ),
+    "a tool that asks": add_endpoint(CLIENT, "/rqt_gui_1", "/robot/camera/calibrate"),
+    "a tool that publishes what nobody declared": add_endpoint(PUB, "/rviz2", "/goal_pose"),
+    "what every node publishes": add_endpoint(PUB, "/rviz2", "/rosout"),
     "infinite durations however spelled": change_announced_qos(
         SUB, STATUS, deadline_ns=2**63 - 1, liveliness_lease_duration_ns=0
     ),
@@ -466,9 +534,10 @@ def test_no_rule_fires_on(case: str):
 
 def test_every_rule_has_a_case_in_which_it_fires():
     elsewhere = {"state.unverifiable", "flow.wrong-transport", "flow.wrong-medium"}
-    elsewhere |= {"graph.unseen-endpoint"}
-    elsewhere |= {each.id for each in RULES if each.id.startswith("connection.")}
+    elsewhere |= {"graph.unseen-endpoint", "graph.type-definition-differs", "flow.not-measured"}
+    elsewhere |= {each.id for each in RULES if each.id.startswith(("connection.", "param."))}
     elsewhere |= {each.id for each in RULES if each.id.startswith("run.")}
+    elsewhere.add("state.activated-at-closed-gate")  # tests/unit/supervisor, it is the guard's
     fired = {rule for _, expected in FIRES.values() for rule, _, _ in expected}
     assert fired | elsewhere == {rule.id for rule in RULES}
 
@@ -620,8 +689,8 @@ def test_a_foreign_depth_is_unverifiable_under_fast_dds():
         )
     )
     assert findings_after(edit, plan=plan) == [
-        ("graph.qos-unverifiable", "unverifiable", "/chatter"),
-        ("graph.qos-unverifiable", "unverifiable", "/chatter"),
+        ("graph.qos-unverifiable", "unverifiable", "/talker"),
+        ("graph.qos-unverifiable", "unverifiable", "/listener"),
     ]
 
 
@@ -642,12 +711,274 @@ def test_a_plain_node_has_no_state_to_judge():
     assert findings_after(edit, plan=foreign()) == []
 
 
-def test_a_foreign_node_that_needs_a_unique_flow_is_unverifiable():
+def test_a_foreign_node_that_strictly_requires_a_unique_flow_is_violated():
+    """Strictly required is not met by what nobody can prove."""
     strictly = need(PUB, "chatter", UniqueRequirement.STRICTLY_REQUIRED)
     finding = the_finding(lambda seen: seen, plan=foreign(needs=[strictly]))
+    assert (finding.rule, finding.outcome) == ("flow.unverifiable", Outcome.VIOLATED)
     assert finding.message == (
-        "cannot verify that the publisher of /chatter in /talker has a unique network flow:"
-        " nobody tells its network flow endpoints"
+        "cannot accept the publisher of /chatter in /talker: it strictly requires a unique network"
+        " flow, which cannot be proven: /talker does not report its network flow endpoints"
+    )
+    assert "unique: optionally_required" in finding.hint
+
+
+def test_a_link_demands_what_is_violated_when_it_cannot_be_proven():
+    plan = planned(
+        node("talker", publisher("chatter"), run=ATTACH, managed=False),
+        node("listener", subscription("chatter"), run=ATTACH, managed=False),
+        links=[link("/chatter", "talker", "listener", unique=UniqueHow.WEAKLY)],
+    )
+    match, finding = verify(plan, perfect(plan), stage=Stage.CONNECTED).findings
+    assert (match.rule, match.outcome) == ("graph.unmatched-link", Outcome.UNVERIFIABLE)
+    assert (finding.rule, finding.outcome) == ("flow.unverifiable", Outcome.VIOLATED)
+    assert finding.message == (
+        "cannot accept the flow /talker → /listener on /chatter: its link demands a weakly unique"
+        " flow, which cannot be proven; publisher unknown, subscription unknown"
+    )
+
+
+def test_what_is_optionally_required_of_a_foreign_node_is_no_finding():
+    optionally = need(PUB, "chatter", UniqueRequirement.OPTIONALLY_REQUIRED)
+    assert findings_after(lambda seen: seen, plan=foreign(needs=[optionally])) == []
+
+
+# --- what nobody wrote is not required
+
+
+def unwritten(*written: str) -> Plan:
+    """A foreign pair whose interfaces write these policies only."""
+    defaults = not_written(written)
+    return planned(
+        *(
+            node(
+                key,
+                dataclasses.replace(end, qos_defaults=defaults),
+                run=ATTACH,
+                managed=False,
+            )
+            for key, end in (
+                ("talker", publisher("chatter")),
+                ("listener", subscription("chatter")),
+            )
+        )
+    )
+
+
+def hidden(reliability: Reliability, **policies: object) -> Edit:
+    """Both ends of /chatter as Fast DDS announces them."""
+    return both(
+        *(
+            change_announced_qos(
+                kind,
+                "/chatter",
+                history=History.UNKNOWN,
+                depth=0,
+                reliability=reliability,
+                **policies,
+            )
+            for kind in (PUB, SUB)
+        )
+    )
+
+
+def test_qos_that_is_not_written_is_neither_compared_nor_unverifiable():
+    edit = hidden(Reliability.BEST_EFFORT, durability=Durability.TRANSIENT_LOCAL, deadline_ns=10**9)
+    assert findings_after(edit, plan=unwritten()) == []
+
+
+def test_only_the_policies_that_are_written_are_compared():
+    plan = unwritten("reliability")
+    assert findings_after(hidden(Reliability.RELIABLE, deadline_ns=5), plan=plan) == []
+    assert findings_after(hidden(Reliability.BEST_EFFORT), plan=plan) == [
+        ("graph.qos-differs", "violated", "/chatter"),
+        ("graph.qos-differs", "violated", "/chatter"),
+    ]
+
+
+def test_ends_that_do_not_fit_are_violated_although_nobody_wrote_their_qos():
+    edit = change_announced_qos(PUB, "/chatter", reliability=Reliability.BEST_EFFORT)
+    assert findings_after(edit, plan=unwritten()) == [
+        ("graph.qos-incompatible", "violated", "/chatter: /talker → /listener")
+    ]
+
+
+def test_a_written_depth_needs_keep_last_and_is_one_finding_for_all_endpoints_of_a_node():
+    plan = planned(
+        node(
+            "talker",
+            *(
+                dataclasses.replace(publisher(name, line=line), qos_defaults=not_written(["depth"]))
+                for name, line in (("a", 4), ("b", 5))
+            ),
+            run=ATTACH,
+            managed=False,
+        )
+    )
+    edit = both(
+        *(
+            change_announced_qos(PUB, name, history=History.UNKNOWN, depth=0)
+            for name in ("/a", "/b")
+        )
+    )
+    finding = the_finding(edit, plan=plan)
+    assert finding.message == (
+        "cannot verify history, depth of /talker on 2 endpoints: /a (publisher), /b (publisher):"
+        " neither discovery nor the node reports the actual value"
+    )
+    assert finding.expected == (
+        "/a (publisher): history KEEP_LAST, depth 10; /b (publisher): history KEEP_LAST, depth 10"
+    )
+    assert finding.at == "robot.lifecycle.yaml:4:9"
+
+
+# --- numbers that nobody measures
+
+
+def test_each_declared_number_is_unverifiable_by_name_at_its_place():
+    video = need(
+        PUB,
+        "a",
+        max_delay_ms=0.0001,
+        rate_hz=500.0,
+        quantities=(
+            Quantity(name="max_delay_ms", value=0.0001, at=at(21, 40)),
+            Quantity(name="rate_hz", value=500, at=at(22, 11)),
+        ),
+    )
+    plan = planned(
+        node("one", publisher("a"), needs=[video]),
+        node("two", subscription("a")),
+        links=[
+            link(
+                "/a", "one", "two", quantities=(Quantity(name="max_delay_ms", value=5, at=at(40)),)
+            )
+        ],
+    )
+    verdict = verify(plan, perfect(plan), stage=Stage.CONNECTED)
+    assert [
+        (each.rule, each.outcome.value, each.message, each.at) for each in verdict.findings
+    ] == [
+        (
+            "flow.not-measured",
+            "unverifiable",
+            "cannot verify max_delay_ms 0.0001 of the publisher of /a in /one: nothing measures it",
+            "robot.lifecycle.yaml:21:40",
+        ),
+        (
+            "flow.not-measured",
+            "unverifiable",
+            "cannot verify rate_hz 500 of the publisher of /a in /one: nothing measures it",
+            "robot.lifecycle.yaml:22:11",
+        ),
+        (
+            "flow.not-measured",
+            "unverifiable",
+            "cannot verify max_delay_ms 5 of the flow /one → /two on /a: nothing measures it",
+            "robot.lifecycle.yaml:40:1",
+        ),
+    ]
+    assert verdict.flows[0].outcome is Outcome.OK, "what it is, is proven; what it does, is not"
+
+
+def test_numbers_of_an_endpoint_that_is_missing_are_not_named_besides():
+    measured = need(PUB, "a", quantities=(Quantity(name="rate_hz", value=1, at=at(22)),))
+    plan = planned(node("one", publisher("a"), needs=[measured]))
+    edit = both(drop_endpoint(PUB, "/a"), drop_report("/one"))
+    assert "flow.not-measured" not in {rule for rule, _, _ in findings_after(edit, plan=plan)}
+
+
+# --- definitions of types
+
+HERE, OTHER = "RIHS01_" + "a" * 64, "RIHS01_" + "b" * 64
+NEWER = "RIHS02_" + "c" * 64
+
+
+def defined(installed: str, plan: Plan | None = None) -> Plan:
+    """A foreign pair, or another plan, and what is installed here of its type."""
+    plan = plan or foreign()
+    return dataclasses.replace(
+        plan,
+        nodes=tuple(
+            dataclasses.replace(
+                each,
+                endpoints=tuple(
+                    dataclasses.replace(end, type_hash=installed) for end in each.endpoints
+                ),
+            )
+            for each in plan.nodes
+        ),
+    )
+
+
+def hashes(publishes: str | None, subscribes: str | None) -> Edit:
+    return both(
+        change_endpoint(PUB, "/chatter", type_hash=publishes),
+        change_endpoint(SUB, "/chatter", type_hash=subscribes),
+    )
+
+
+def test_two_ends_of_one_type_name_and_two_definitions_are_violated():
+    plan = defined("")
+    assert findings_after(hashes(HERE, HERE), plan=plan) == []
+    finding = the_finding(hashes(HERE, OTHER), plan=plan)
+    assert (finding.rule, finding.outcome) == (
+        "graph.type-definition-differs",
+        Outcome.VIOLATED,
+    )
+    assert finding.message == (
+        "cannot accept the publisher of /chatter in /talker: its std_msgs/msg/String is not that of"
+        " /listener; both have the name, so the topic is matched and the data are not understood"
+    )
+
+
+def test_two_ends_that_agree_on_another_definition_than_the_installed_are_violated():
+    found = findings_after(hashes(OTHER, OTHER), plan=defined(HERE))
+    assert found == [("graph.type-definition-differs", "violated", "/chatter")] * 2
+
+
+def test_an_end_that_announces_no_hash_is_unverifiable_once_for_its_node():
+    finding = the_finding(hashes("", HERE), plan=defined(HERE))
+    assert (finding.outcome, finding.subject) == (Outcome.UNVERIFIABLE, "/talker")
+    assert finding.message == (
+        "cannot verify which definitions /talker uses on /chatter (publisher): it announces no type"
+        " hashes"
+    )
+
+
+def test_without_any_hash_there_is_nothing_to_compare():
+    assert findings_after(hashes("", ""), plan=defined("")) == []
+    assert findings_after(hashes(None, None), plan=defined(HERE)) == []
+
+
+def test_hashes_of_two_hash_versions_are_not_compared():
+    assert findings_after(hashes(NEWER, HERE), plan=defined(HERE)) == []
+
+
+def test_a_service_of_another_definition_is_violated():
+    plan = planned(
+        *(
+            node(
+                key, endpoint(kind, "ask", "std_srvs/srv/Trigger", None), run=ATTACH, managed=False
+            )
+            for key, kind in (("server", SERVER), ("client", CLIENT))
+        )
+    )
+    edit = both(
+        change_endpoint(SERVER, "/ask", type_hash=f"{HERE} {HERE}"),
+        change_endpoint(CLIENT, "/ask", type_hash=f"{HERE} {OTHER}"),
+    )
+    found = findings_after(edit, plan=defined("", plan))
+    assert found == [("graph.type-definition-differs", "violated", "/ask")]
+
+
+def test_an_undeclared_end_of_another_definition_is_violated_where_such_may_be():
+    plan = dataclasses.replace(defined(HERE), policy=Policy(undeclared_nodes=EndpointPolicy.OPEN))
+    edit = both(
+        hashes(HERE, HERE), add_endpoint(PUB, "/other", "/chatter", gid="99", type_hash=OTHER)
+    )
+    assert ("graph.type-definition-differs", "violated", "/chatter") in findings_after(
+        edit, plan=plan
     )
 
 
@@ -700,7 +1031,7 @@ def test_unknown_nfes_in_the_same_process_may_hide_an_equal_one():
     )
     assert findings_after(change_report(SUB, "/c", nfes=None), plan=plan) == []
     assert findings_after(change_report(SUB, "/b", nfes=None), plan=plan) == [
-        ("flow.unverifiable", "unverifiable", "/a")
+        ("flow.unverifiable", "violated", "/a")
     ]
 
 
@@ -834,3 +1165,89 @@ def test_after_the_gate_an_endpoint_of_an_unknown_node_is_unverifiable():
     finding = the_finding(add_endpoint(PUB, "", "/extra", gid="99"), stage=Stage.ACTIVE)
     assert finding.outcome is Outcome.UNVERIFIABLE
     assert finding.message == "cannot tell whose publisher of /extra this is (GID 99)"
+
+
+CYCLONE = "0110413d8c753ac053755be800000203"
+
+
+@pytest.mark.parametrize("stage", list(Stage))
+def test_a_writer_of_no_node_on_a_declared_topic_is_violated_at_every_stage(stage: Stage):
+    edit = add_endpoint(PUB, "", STATUS, gid=CYCLONE, address="10.0.0.7", qos=QosProfile())
+    finding = the_finding(edit, stage=stage)
+    assert (finding.rule, finding.outcome) == ("graph.unattributed-endpoint", Outcome.VIOLATED)
+    assert finding.message == (
+        f"cannot tell whose publisher of {STATUS} this is (a participant of Cyclone DDS, at "
+        f"10.0.0.7, GID {CYCLONE})"
+    )
+
+
+def test_a_reader_of_no_node_is_violated_before_the_gate_and_unverifiable_after_it():
+    edit = add_endpoint(SUB, "", STATUS, gid="99", qos=QosProfile(depth=0))
+    outcomes = [the_finding(edit, stage=stage).outcome for stage in Stage]
+    assert outcomes == [Outcome.VIOLATED, Outcome.UNVERIFIABLE]
+
+
+def test_a_late_name_of_a_service_is_that_of_the_node_on_its_participant_that_declares_it():
+    def edit(seen: Observation) -> Observation:
+        camera = next(each for each in seen.configurations if each.name == "/robot/camera")
+        prefix = next(each.gid for each in camera.endpoints if each.gid)[:24]
+        calibrate = "/robot/camera/calibrate"
+        nameless = {"type": "std_srvs/srv/Trigger", "gid": f"{prefix}00001204"}
+        return add_endpoint(SERVER, "", calibrate, **nameless)(
+            drop_endpoint(SERVER, calibrate)(seen)
+        )
+
+    assert findings_after(edit) == []
+
+
+@pytest.mark.parametrize(
+    ("tolerated", "name", "expected"),
+    [
+        (("teleop_*",), "/far/teleop_17", Outcome.OK),
+        (("/far/*",), "/far/panel", Outcome.OK),
+        (("/far/*",), "/near/panel", Outcome.VIOLATED),
+        (("panel?",), "/panel", Outcome.VIOLATED),
+        ((), "/rviz2", Outcome.VIOLATED),
+        ((), "/_lifecycle_observer_7", Outcome.OK),
+    ],
+)
+def test_the_manifest_says_whose_nodes_may_listen(
+    tolerated: tuple[str, ...], name: str, expected: Outcome
+):
+    plan = dataclasses.replace(PLAN, policy=Policy(tolerated_nodes=tolerated))
+    seen = both(add_node(name), add_endpoint(SUB, name, STATUS, gid="99", qos=QosProfile(depth=0)))(
+        perfect(plan)
+    )
+    verdict = verify(plan, seen, stage=Stage.CONNECTED)
+    assert verdict.verdict is expected
+    if expected is Outcome.OK:
+        assert [each.describe() for each in verdict.tolerated] == [
+            f"{name} (subscription of {STATUS})"
+        ]
+
+
+def test_an_open_system_tolerates_who_publishes_too_and_says_so():
+    plan = dataclasses.replace(PLAN, policy=Policy(undeclared_nodes=EndpointPolicy.OPEN))
+    seen = both(
+        add_node("/guest"), add_endpoint(PUB, "/guest", STATUS, gid="99", qos=QosProfile())
+    )(perfect(plan))
+    verdict = verify(plan, seen, stage=Stage.CONNECTED)
+    assert verdict.verdict is Outcome.OK
+    (guest,) = verdict.tolerated
+    assert (guest.because, guest.describe()) == (
+        "undeclared_nodes: open",
+        f"/guest (publisher of {STATUS})",
+    )
+
+
+def test_a_link_between_nodes_that_report_nothing_is_unverifiable():
+    plan = planned(
+        node("talker", publisher("chatter"), run=ATTACH, managed=False),
+        node("viewer", subscription("chatter"), run=ATTACH, managed=False),
+    )
+    assert findings_after(lambda seen: seen, plan=plan) == []
+    linked = dataclasses.replace(
+        plan, flows=tuple(dataclasses.replace(each, linked=True) for each in plan.flows)
+    )
+    finding = the_finding(lambda seen: seen, plan=linked)
+    assert (finding.rule, finding.outcome) == ("graph.unmatched-link", Outcome.UNVERIFIABLE)

@@ -6,7 +6,7 @@ import dataclasses
 
 import pytest
 
-from lifecycle.manifest.model import EndpointKind, FlowTransport, Machine, UniqueHow
+from lifecycle.manifest.model import DataLayer, EndpointKind, FlowTransport, Machine, UniqueHow
 from lifecycle.network.nfe import (
     InternetProtocol,
     NetworkFlowEndpoint,
@@ -14,10 +14,20 @@ from lifecycle.network.nfe import (
     UniqueRequirement,
 )
 from lifecycle.plan import Plan
+from lifecycle.plan.model import ParticipantConnections, PlannedParticipant
 from lifecycle.verify import Finding, Identity, Outcome, Stage, verify
+from lifecycle.verify.observation import ConnectionReport
 from lifecycle.verify.transport import carrier
 from tests.unit.plan.samples import at, link, need, node, planned, publisher, subscription
-from tests.unit.verify.edits import Edit, both, change_configuration, change_node, change_report
+from tests.unit.verify.edits import (
+    Edit,
+    both,
+    change_configuration,
+    change_node,
+    change_report,
+    drop_endpoint,
+    drop_endpoint_report,
+)
 from tests.unit.verify.perfect import perfect
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
@@ -37,6 +47,7 @@ def nfe(transport: str, internet: str, address: str, port: int = 7000) -> Networ
 SHM = nfe("unknown", "unknown", "")
 UDP4, UDP6 = nfe("udp", "ipv4", "10.0.0.1"), nfe("udp", "ipv6", "fd00::1")
 GROUP4 = nfe("udp", "ipv4", "239.255.1.9")
+ODD = nfe("unknown", "unknown", "10.0.0.1")
 TCP4, TCP6 = nfe("tcp", "ipv4", "10.0.0.1"), nfe("tcp", "ipv6", "fd00::1")
 
 
@@ -65,6 +76,12 @@ def process(number: int, machine: str = "m") -> Identity:
         ((TCP4,), (GROUP4, TCP4), process(1), process(2), "tcpv4"),
         ((UDP4,), (UDP6,), process(1), process(2), "none"),
         ((SHM,), (SHM,), process(1), process(2, "other"), "none"),
+        ((nfe("udp", "ipv4", ""),), (nfe("udp", "ipv4", ""),), process(1), process(2), "none"),
+        ((ODD, UDP4), (ODD, UDP4), process(1), process(2), "udpv4"),
+        ((UDP4,), (nfe("udp", "ipv4", "robot.local"),), process(1), process(2), "udpv4"),
+        ((TCP4,), (nfe("tcp", "ipv4", "239.255.1.9"),), process(1), process(2), "tcpv4"),
+        ((UDP4,), (nfe("udp", "ipv6", "ff02::9"),), process(1), process(2), "none"),
+        ((UDP6,), (nfe("udp", "ipv6", "ff02::9"),), process(1), process(2), "udpm"),
         ((), (UDP4,), process(1), process(2), "unknown"),
         ((UDP4,), (), process(1), process(2), "unknown"),
         ((UDP4,), (UDP4,), None, process(2), "unknown"),
@@ -273,3 +290,308 @@ def test_after_our_gate_every_node_must_be_active_wherever_it_is():
         change_node("/two", state="inactive"), change_configuration("/two", state="inactive")
     )
     assert rules_with(frozenset({"m1"}), edit, Stage.ACTIVE) == [("state.wrong-state", "active")]
+
+
+# --- what a connection carries where the RMW lists no NFE of it
+
+
+def seen_by(plan: Plan, edit: Edit) -> str:
+    """What carries the one flow of the plan."""
+    (flow,) = verify(plan, edit(perfect(plan)), stage=Stage.CONNECTED).flows
+    return flow.effective_transport
+
+
+def connected(node_name: str, *urls: str, name: str = "net") -> Edit:
+    """The node has this connection, and others before and after it."""
+    return change_configuration(
+        node_name,
+        connections=(
+            ConnectionReport(name="first", urls=("udpv6://",)),
+            ConnectionReport(name=name, urls=urls),
+            ConnectionReport(name="last", urls=("udpv6://",)),
+        ),
+    )
+
+
+def by_connection(kind: EndpointKind, *urls: str, **report: object) -> Edit:
+    """One end lists no NFE and is mapped onto a connection with these URLs."""
+    mapped = {"nfes": (), "connection": "net", "mapped": True, **report}
+    return both(
+        connected("/one" if kind is PUB else "/two", *urls), change_report(kind, "/a", **mapped)
+    )
+
+
+EVERYTHING = (TCP4, TCP6, UDP4, UDP6, SHM)
+ANY = pair(FlowTransport.ANY, FlowTransport.ANY)
+
+
+def apart(edit: Edit) -> Edit:
+    """The two nodes run on two machines."""
+    return both(edit, change_configuration("/two", identity=process(2, "other")))
+
+
+@pytest.mark.parametrize(
+    ("urls", "near", "far"),
+    [
+        (("shm://",), "shm", "none"),
+        (("udpv4://",), "udpv4", "udpv4"),
+        (("udpv4://10.0.0.1:7000",), "udpv4", "udpv4"),
+        (("udpv6://",), "udpv6", "udpv6"),
+        (("udpv6://[fd00::1]:7000",), "udpv6", "udpv6"),
+        (("tcpv4://10.0.0.1:5100",), "tcpv4", "tcpv4"),
+        (("tcpv4://:5100",), "tcpv4", "tcpv4"),
+        (("udpm://239.255.1.9:7901",), "udpv4", "udpv4"),
+        (("udpm://[ff02::9]:7901",), "udpv6", "udpv6"),
+        (("no url", "udpv6://"), "udpv6", "udpv6"),
+        (("no url",), "unknown", "unknown"),
+        ((), "unknown", "unknown"),
+    ],
+)
+def test_a_publisher_without_nfes_sends_by_what_it_was_connected_to(urls, near, far):
+    edit = both(by_connection(PUB, *urls), change_report(SUB, "/a", nfes=EVERYTHING))
+    assert seen_by(ANY, edit) == near
+    assert seen_by(ANY, apart(edit)) == far
+
+
+@pytest.mark.parametrize(
+    ("urls", "near", "far"),
+    [
+        (("shm://",), "shm", "none"),
+        (("udpv4://",), "udpv4", "udpv4"),
+        (("udpm://239.255.1.9:7901",), "udpm", "none"),
+        (("udpm://[ff02::9]:7901",), "udpm", "none"),
+    ],
+)
+def test_a_subscription_without_nfes_receives_by_what_it_was_connected_to(urls, near, far):
+    edit = both(change_report(PUB, "/a", nfes=EVERYTHING), by_connection(SUB, *urls))
+    assert seen_by(ANY, edit) == near
+    assert seen_by(ANY, apart(edit)) == far
+
+
+@pytest.mark.parametrize(
+    ("urls", "report", "used"),
+    [
+        # TCP is what the RMW does not list; what it lists is all of the rest.
+        (("tcpv4://:5100",), {"nfes": (UDP6,)}, "tcpv4"),
+        (("udpv4://",), {"nfes": (UDP6,)}, "udpv6"),
+        (("tcpv4://:5100",), {"nfes": (TCP6,)}, "tcpv6"),
+        (("tcpv4://:5100",), {"nfes": None}, "unknown"),
+        (("tcpv4://:5100",), {"mapped": False}, "unknown"),
+        (("tcpv4://:5100",), {"connection": "other"}, "unknown"),
+        (("tcpv4://:5100",), {"connection": "last"}, "udpv6"),
+    ],
+)
+def test_what_a_node_lists_wins_over_what_it_was_connected_to(urls, report, used):
+    edit = both(by_connection(PUB, *urls, **report), change_report(SUB, "/a", nfes=EVERYTHING))
+    assert seen_by(ANY, apart(edit)) == used
+
+
+def test_an_end_that_lists_nothing_does_not_hide_what_the_others_of_its_node_list():
+    plan = planned(node("one", publisher("a"), publisher("/a")), node("two", subscription("a")))
+
+    def first_silent(seen):
+        (one, two) = seen.configurations
+        first, second = one.endpoints
+        one = dataclasses.replace(
+            one,
+            endpoints=(
+                dataclasses.replace(first, nfes=None),
+                dataclasses.replace(second, nfes=(UDP6,)),
+            ),
+        )
+        return dataclasses.replace(seen, configurations=(one, two))
+
+    edit = both(first_silent, change_report(SUB, "/a", nfes=EVERYTHING))
+    assert seen_by(plan, edit) == "udpv6"
+
+
+def test_both_ends_of_a_flow_are_asked_which_process_they_are():
+    edit = both(
+        change_report(PUB, "/a", nfes=(UDP4,)),
+        change_report(SUB, "/a", nfes=(UDP4,)),
+        change_configuration("/one", identity=process(1)),
+    )
+    together = both(edit, change_configuration("/two", identity=process(1)))
+    asunder = both(edit, change_configuration("/two", identity=process(2)))
+    assert (seen_by(ANY, together), seen_by(ANY, asunder)) == ("intraprocess", "udpv4")
+
+
+# --- what findings on transports say
+
+
+def with_medium(medium: str, *, publishing: FlowTransport = FlowTransport.ANY) -> Plan:
+    """A plan whose data layer somebody asked for, with this medium for the flow."""
+    plan = pair(publishing, FlowTransport.ANY)
+    return dataclasses.replace(
+        plan,
+        data_layer=DataLayer(at=at(5)),
+        flows=tuple(dataclasses.replace(each, medium=medium) for each in plan.flows),
+    )
+
+
+def the_finding(plan: Plan, edit: Edit) -> Finding:
+    (finding,) = (
+        each
+        for each in verify(plan, edit(perfect(plan)), stage=Stage.CONNECTED).findings
+        if each.rule.startswith("flow.wrong-")
+    )
+    return finding
+
+
+NOBODY_TELLS = change_report(PUB, "/a", nfes=None)
+
+
+def test_a_flow_of_which_nobody_tells_that_the_network_carries_it_is_told_whole():
+    assert the_finding(pair(FlowTransport.ANY, NETWORK), NOBODY_TELLS) == Finding(
+        rule="flow.wrong-transport",
+        outcome=Outcome.UNVERIFIABLE,
+        subject="/a: /one → /two",
+        expected="an IP transport",
+        observed="not known",
+        message="cannot verify the flow /one → /two on /a: it needs the network, and nobody tells"
+        " what carries it",
+        at="robot.lifecycle.yaml:10:9",
+        hint="run both ends in our host and in processes of their own, or drop"
+        " `transport: network`",
+    )
+
+
+MEDIUM_FIX = (
+    "compare the connections of both ends with `lifecycle plan`; see what each process was given"
+    " by its environment"
+)
+
+
+@pytest.mark.parametrize(
+    ("medium", "nfes", "planned_words", "used_words"),
+    [
+        ("udpv4", (SHM, UDP4), "udpv4", "shared memory"),
+        ("shm", (UDP4,), "shared memory", "udpv4"),
+        ("udpm", (UDP4,), "UDP multicast", "udpv4"),
+        ("udpv4", (UDP6,), "udpv4", "no transport that both have"),
+        ("intraprocess", (TCP4,), "handed over inside their process", "tcpv4"),
+    ],
+)
+def test_a_flow_that_another_medium_carries_is_told_whole(medium, nfes, planned_words, used_words):
+    listed = (SHM, UDP4, TCP4)
+    edit = both(change_report(PUB, "/a", nfes=listed), change_report(SUB, "/a", nfes=nfes))
+    assert the_finding(with_medium(medium), edit) == Finding(
+        rule="flow.wrong-medium",
+        outcome=Outcome.VIOLATED,
+        subject="/a: /one → /two",
+        expected=planned_words,
+        observed=used_words,
+        message=f"cannot accept what carries /one → /two on /a: it must be {planned_words}, and it"
+        f" is {used_words}",
+        at="robot.lifecycle.yaml:10:9",
+        hint=MEDIUM_FIX,
+    )
+
+
+def test_a_flow_of_which_nobody_tells_the_medium_is_told_whole():
+    assert the_finding(with_medium("shm"), NOBODY_TELLS) == Finding(
+        rule="flow.wrong-medium",
+        outcome=Outcome.UNVERIFIABLE,
+        subject="/a: /one → /two",
+        expected="shared memory",
+        observed="not known",
+        message="cannot verify what carries /one → /two on /a: it must be shared memory, and"
+        " nobody tells what it is",
+        at="robot.lifecycle.yaml:10:9",
+        hint=MEDIUM_FIX,
+    )
+
+
+def test_a_flow_that_the_network_must_carry_is_found_wrong_once():
+    plan = with_medium("udpv4", publishing=NETWORK)
+    assert the_finding(plan, LISTED).rule == "flow.wrong-transport"
+    by_udp = both(
+        change_report(PUB, "/a", nfes=(UDP4, UDP6)), change_report(SUB, "/a", nfes=(UDP6,))
+    )
+    assert the_finding(plan, by_udp).rule == "flow.wrong-medium"
+
+
+def undecided() -> Plan:
+    """A plan that only says which medium is expected."""
+    plan = with_medium("shm")
+    return dataclasses.replace(plan, data_layer=DataLayer())
+
+
+def with_end(plan: Plan, index: int, **changes: object) -> Plan:
+    """The plan with the one endpoint of a node otherwise."""
+    nodes = list(plan.nodes)
+    (end,) = nodes[index].endpoints
+    nodes[index] = dataclasses.replace(
+        nodes[index], endpoints=(dataclasses.replace(end, **changes),)
+    )
+    return dataclasses.replace(plan, nodes=tuple(nodes))
+
+
+def with_node(plan: Plan, index: int, **changes: object) -> Plan:
+    """The plan with one node otherwise."""
+    nodes = list(plan.nodes)
+    nodes[index] = dataclasses.replace(nodes[index], **changes)
+    return dataclasses.replace(plan, nodes=tuple(nodes))
+
+
+NET = PlannedParticipant(name="_net", dscp=None, reason="", connection="net")
+
+
+@pytest.mark.parametrize("index", [0, 1])
+def test_a_medium_is_held_to_where_either_end_was_told_what_to_use(index):
+    plan = undecided()
+    edit = both(change_report(PUB, "/a", nfes=(UDP4,)), change_report(SUB, "/a", nfes=(UDP4,)))
+
+    def held(plan: Plan) -> bool:
+        verdict = verify(plan, edit(perfect(plan)), stage=Stage.CONNECTED)
+        return "flow.wrong-medium" in {each.rule for each in verdict.findings}
+
+    assert not held(plan)
+    assert not held(with_end(plan, index, transport=NETWORK))
+    assert held(with_end(plan, index, transport=FlowTransport.SHM))
+    assert held(with_node(plan, index, connections=ParticipantConnections(urls=("udpv4://",))))
+    mapped = with_node(with_end(plan, index, participant="_net"), index, participants=(NET,))
+    assert held(mapped)
+
+
+@pytest.mark.parametrize(
+    ("gone", "subjects"),
+    [
+        (unchanged, ["/a: /one → /two", "/b: /one → /two"]),
+        (both(drop_endpoint(PUB, "/a"), drop_endpoint_report(PUB, "/a")), ["/b: /one → /two"]),
+        (both(drop_endpoint(SUB, "/a"), drop_endpoint_report(SUB, "/a")), ["/b: /one → /two"]),
+        (drop_endpoint(SUB, "/a"), ["/a: /one → /two", "/b: /one → /two"]),
+        (drop_endpoint_report(SUB, "/a"), ["/a: /one → /two", "/b: /one → /two"]),
+    ],
+)
+def test_the_transport_of_a_flow_without_one_of_its_ends_is_not_named_besides(gone, subjects):
+    needs = [need(PUB, name, transport=NETWORK) for name in ("a", "b")]
+    plan = planned(
+        node("one", publisher("a"), publisher("b"), needs=needs),
+        node("two", subscription("a"), subscription("b")),
+    )
+    edit = both(change_report(PUB, "/a", nfes=(SHM,)), change_report(PUB, "/b", nfes=(SHM,)), gone)
+    verdict = verify(plan, edit(perfect(plan)), stage=Stage.CONNECTED)
+    found = [each.subject for each in verdict.findings if each.rule == "flow.wrong-transport"]
+    assert found == subjects
+
+
+@pytest.mark.parametrize(("publishers", "subscriptions"), [((), ("a",)), (("a",), ()), ((), ())])
+def test_the_transport_of_a_link_without_ends_is_not_judged_and_that_of_the_next_is(
+    publishers, subscriptions
+):
+    network = [need(PUB, "b", transport=NETWORK)]
+    plan = planned(
+        node("one", *map(publisher, publishers), publisher("b"), needs=network),
+        node("two", *map(subscription, subscriptions), subscription("b")),
+        links=[link("/a", "one", "two"), link("/b", "one", "two")],
+    )
+    plan = dataclasses.replace(
+        plan,
+        data_layer=DataLayer(at=at(5)),
+        flows=tuple(dataclasses.replace(each, medium="shm") for each in plan.flows),
+    )
+    edit = both(change_report(PUB, "/b", nfes=(SHM,)), change_report(SUB, "/b", nfes=(SHM,)))
+    verdict = verify(plan, edit(perfect(plan)), stage=Stage.CONNECTED)
+    found = [each.subject for each in verdict.findings if each.rule.startswith("flow.wrong-")]
+    assert found == ["/b: /one → /two"]

@@ -60,7 +60,8 @@ class Clock:
     def now_s(self) -> float:
         return self.now
 
-    def sleep(self, seconds: float) -> None:
+    def sleep(self, seconds: float, woken: threading.Event) -> None:
+        assert not woken.is_set()
         self.slept.append(seconds)
         self.now += seconds
 

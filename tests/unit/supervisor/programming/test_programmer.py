@@ -105,8 +105,16 @@ def test_one_target_that_fails_does_not_keep_another_from_being_programmed(
     broken.fails = "cannot do it"
     programs = programmer(tmp_path, broken, sound)
 
-    with pytest.raises(ProgrammingError, match="cannot do it"):
+    with pytest.raises(PartlyError) as caught:
         programs.update([report()])
+    what = "/robot/video /robot/camera → /viewer udp 10.77.0.2"
+    assert str(caught.value) == (
+        "cannot make 1 of 2 changes to targets:\n"
+        "  cannot do it\n"
+        "done all the same:\n"
+        "sound: 1 created, 0 unchanged\n"
+        f"  + {what}: {sound.rules[0].describe()}"
+    )
     assert len(sound.rules) == 1
     broken.fails = ""
     programs.update([report()])
@@ -279,7 +287,9 @@ class FakePrograms:
         self.renewed = 0
         self.loop = asyncio.get_running_loop()
 
-    def update(self, flows: Sequence[FlowReport], *, hold: bool) -> tuple[Changes, ...]:
+    def update(
+        self, flows: Sequence[FlowReport], *, hold: bool, within_s: float | None
+    ) -> tuple[Changes, ...]:
         assert hold
         self.seen.append(tuple(each.topic for each in flows))
         if self.fail:
@@ -289,13 +299,19 @@ class FakePrograms:
         change = Change(kind=ChangeKind.CREATE, key="k", what="w")
         return (Changes(target="fake", changes=(change,)),)
 
-    def renew(self) -> float | None:
+    def renew(self, *, within_s: float | None) -> float | None:
         self.renewed += 1
         return self.due_s
 
-    def close(self) -> tuple[Changes, ...]:
+    def close(self, *, within_s: float | None) -> tuple[Changes, ...]:
         self.seen.append(("closed",))
         return ()
+
+    def cancel(self) -> None:
+        pass
+
+    def resume(self) -> None:
+        pass
 
 
 async def _kept(programs: FakePrograms, told: list[str]) -> None:

@@ -15,7 +15,7 @@ from lifecycle.supervisor.programming.errors import (
     ProgrammingError,
 )
 from lifecycle.supervisor.programming.nft import NftTarget
-from lifecycle.supervisor.programming.tc import parse_rate, probe_features
+from lifecycle.supervisor.programming.tc import parse_queue, parse_rate, probe_features
 from lifecycle.supervisor.programming.tool import HostTool, Output, demand
 from tests.unit.supervisor.programming.fakes import FakeTool, failed
 from tests.unit.supervisor.programming.samples import ledger_in, rule
@@ -37,7 +37,8 @@ QDISCS = [
             PrivilegeError,
             (
                 "cannot mark: 'nft -f -' needs CAP_NET_ADMIN in this network namespace; "
-                "run this command as root"
+                "run this command as root, or give it that capability: in a container --cap-add "
+                "NET_ADMIN, in a systemd unit AmbientCapabilities=CAP_NET_ADMIN"
             ),
         ),
         (
@@ -130,13 +131,35 @@ def test_a_write_that_failed_is_not_taken_for_done(tmp_path: Path) -> None:
         target.apply([rule()])
 
     assert target.plan([rule()]).pending
+    assert ledger.read().targets == ()
 
 
 def test_where_no_namespace_can_be_made_nothing_is_known_of_the_kernel() -> None:
     tool = FakeTool(("unshare", failed("unshare failed: Operation not permitted")))
 
     assert probe_features(tool) is None
-    assert tool.lines == ["unshare -n true", "unshare -Urn true"]
+    assert tool.lines == ["unshare -n tc -batch -", "unshare -Urn tc -batch -"]
+
+
+def test_root_without_the_capability_is_not_taken_for_a_kernel_without_queues() -> None:
+    refused = failed("RTNETLINK answers: Operation not permitted\nCommand failed -:1\n")
+    tool = FakeTool(("unshare -n", refused))
+
+    features = probe_features(tool)
+
+    assert features is not None
+    assert features.qdiscs == ("htb", "prio")
+    assert {line.split()[1] for line in tool.lines[1:]} == {"-Urn"}
+    assert probe_features(FakeTool(("unshare", refused))) is None
+
+
+def test_a_kernel_without_traffic_control_has_no_queues_at_all() -> None:
+    tool = FakeTool(("unshare", failed("RTNETLINK answers: Operation not supported\n")))
+
+    features = probe_features(tool)
+
+    assert features is not None
+    assert features.qdiscs == ()
 
 
 @pytest.mark.parametrize(
@@ -144,6 +167,19 @@ def test_where_no_namespace_can_be_made_nothing_is_known_of_the_kernel() -> None
 )
 def test_rates_are_read_as_tc_spells_them(text: str, kbit: int) -> None:
     assert parse_rate(text) == kbit
+
+
+@pytest.mark.parametrize(("text", "ms"), [("50ms", 50.0), ("1.5s", 1500.0), ("500us", 0.5)])
+def test_times_are_read_as_tc_spells_them(text: str, ms: float) -> None:
+    assert parse_queue(text) == ms
+
+
+@pytest.mark.parametrize("text", ["", "50", "0ms", "-1ms", "1e3ms", "1.0000ms", "٣ms", "50kbit"])
+def test_what_is_no_time_is_refused(text: str) -> None:
+    with pytest.raises(ValueError) as caught:
+        parse_queue(text)
+
+    assert str(caught.value) == (f"cannot use queue {text!r}; use a number and us, ms or s: 50ms")
 
 
 @pytest.mark.parametrize("text", ["", "20", "20mbps", "-1kbit", "500bit", "1e3kbit", "٣kbit"])

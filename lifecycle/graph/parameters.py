@@ -1,0 +1,229 @@
+"""The parameters of nodes that do not report them, read through their parameter services.
+
+Owns: when a node's parameters are read. Once when it is there, again when `/parameter_events` says
+that one of them changed, and else rarely: rclpy publishes no event for a parameter that is
+undeclared, rclcpp need not publish any, and an event may pass before our subscription is matched.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import threading
+from collections.abc import Callable, Collection, Mapping
+from typing import Protocol
+
+from lifecycle.errors import MiddlewareError
+from lifecycle.graph.waiting import set_within
+from lifecycle.verify.observation import NodeParameters, ParameterReport
+
+_logger = logging.getLogger(__name__)
+
+ANSWER_S = 3.0
+"""A node that spins answers within milliseconds; one that does not may still be on its way."""
+
+UNSHOWN_S = 1.0
+"""Discovery shows a node before its services; one whose services are not there then has none."""
+
+AGAIN_S = 1.0
+"""Without an event a reading is repeated so long after it, ..."""
+
+AGAIN_AT_MOST_S = 10.0
+"""... then twice as long each time, down to this."""
+
+_BETWEEN_S = 0.02
+"""At least so long between two readings, however often a parameter changes."""
+
+_NONE = "serves no parameters"
+_NO_ANSWER = f"did not answer its parameter services within {ANSWER_S:g} s"
+
+
+class Clients(Protocol):
+    """Nodes' parameter services, see lifecycle.middleware.NodeClients."""
+
+    def serves_parameters(self, node: str) -> bool | None:
+        """Tell whether a node has them; None while discovery may not show them yet."""
+
+    async def report_parameters(
+        self, node: str, names: Collection[str], *, timeout_s: float
+    ) -> tuple[ParameterReport, ...]:
+        """Return those parameters that are named and that the node has."""
+
+    def on_parameters(self, callback: Callable[[str, frozenset[str]], None]) -> None:
+        """Call `callback` from any thread with each change of parameters, by node and names."""
+
+
+class ParameterReadings:
+    """The parameters of some nodes, kept as they are. To be used in one asyncio loop.
+
+    Args:
+        clients: where they are read.
+        wake: called, in any thread, when they are others than before.
+    """
+
+    def __init__(self, clients: Clients, wake: Callable[[], None]) -> None:
+        self._clients = clients
+        self._wake = wake
+        self._nodes: dict[str, _Node] = {}
+        self._lock = threading.Lock()
+        self._named: dict[str, frozenset[str]] = {}
+        self._loop: asyncio.AbstractEventLoop | None = None
+
+    def listen(self, named: Mapping[str, frozenset[str]]) -> None:
+        """Take each change of a named parameter as a reason to look again.
+
+        Args:
+            named: names of parameters by full node name; without any, nothing is subscribed to.
+        """
+        with self._lock:
+            self._named = dict(named)
+        if named:
+            self._loop = asyncio.get_running_loop()
+            self._clients.on_parameters(self._changed)
+
+    async def follow(self, nodes: Collection[str], *, reporting: Collection[str]) -> bool:
+        """Read the named parameters of nodes from now on.
+
+        Waits for those that were never read, no longer than a node may take to answer.
+
+        Args:
+            nodes: full names, which have been listened for.
+            reporting: nodes that report their parameters themselves now; they are not read.
+
+        Returns:
+            Whether it has waited, so that what was seen before may be so no more.
+        """
+        for name in reporting:
+            self.forget(name)
+        for name in nodes:
+            names = self._named[name]
+            known = self._nodes.get(name)
+            if known is None or known.names != names:
+                self.forget(name)
+                known = self._nodes[name] = _Node(name, names, self._clients, self._wake)
+            known.look()
+        first = [each.first for each in self._nodes.values() if not each.first.done()]
+        if first:
+            await asyncio.wait(first)
+        return bool(first)
+
+    @property
+    def latest(self) -> tuple[NodeParameters, ...]:
+        """What was read last of every node that is followed."""
+        return tuple(each.latest for each in self._nodes.values() if each.latest is not None)
+
+    def forget(self, node: str) -> None:
+        """Drop what is known of a node that left."""
+        known = self._nodes.pop(node, None)
+        if known is not None:
+            known.close()
+
+    def close(self) -> None:
+        """Stop reading."""
+        for name in tuple(self._nodes):
+            self.forget(name)
+
+    def _changed(self, node: str, names: frozenset[str]) -> None:
+        # Any thread.
+        with self._lock:
+            concerned = not names.isdisjoint(self._named.get(node, frozenset()))
+        if not concerned or self._loop is None:
+            return
+        try:
+            self._loop.call_soon_threadsafe(self._read_again, node)
+        except RuntimeError:
+            return  # the loop was closed meanwhile
+
+    def _read_again(self, node: str) -> None:
+        known = self._nodes.get(node)
+        if known is not None:
+            known.due.set()
+        else:
+            self._wake()  # it reports them itself, and is asked when there is another look
+
+
+class _Node:
+    """The parameters of one node, read again and again by a task."""
+
+    def __init__(
+        self, name: str, names: frozenset[str], clients: Clients, wake: Callable[[], None]
+    ) -> None:
+        self.names = names
+        self.latest: NodeParameters | None = None
+        self.due = asyncio.Event()
+        self.first: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._name = name
+        self._clients = clients
+        self._wake = wake
+        self._task = asyncio.ensure_future(self._follow())
+
+    def look(self) -> None:
+        """Read at once if the services have come that were missing."""
+        missing = self.latest is not None and self.latest.error == _NONE
+        if missing and self._clients.serves_parameters(self._name):
+            self.due.set()
+
+    def close(self) -> None:
+        self._task.cancel()
+        if not self.first.done():
+            self.first.set_result(None)
+
+    async def _follow(self) -> None:
+        pause_s = AGAIN_S
+        unanswered = 0
+        notified = True
+        while True:
+            self.due.clear()
+            found = await self._read()
+            unanswered = unanswered + 1 if found.error == _NO_ANSWER else 0
+            # A node that is busy for a moment, and of which no event says that it has changed,
+            # is what it was.
+            is_busy = unanswered == 1 and not notified
+            if found != self.latest and not is_busy:
+                self.latest = found
+                if self.first.done():
+                    self._wake()
+            if not self.first.done():
+                self.first.set_result(None)
+            notified = await set_within(self.due, pause_s)
+            if notified:
+                pause_s = AGAIN_S
+                await asyncio.sleep(_BETWEEN_S)
+            else:
+                pause_s = min(2 * pause_s, AGAIN_AT_MOST_S)
+
+    async def _read(self) -> NodeParameters:
+        try:
+            return await self._read_now()
+        except Exception:
+            # What a foreign node answers must not end the reading of its parameters.
+            _logger.exception("parameters of %s unknown", self._name)
+            return NodeParameters(node=self._name, error=_NO_ANSWER)
+
+    async def _read_now(self) -> NodeParameters:
+        serves = self._clients.serves_parameters(self._name)
+        if serves is None:
+            found = await self._ask(UNSHOWN_S)
+            if found is not None:
+                return NodeParameters(node=self._name, parameters=found)
+            serves = self._clients.serves_parameters(self._name)
+        if not serves:
+            return NodeParameters(node=self._name, error=_NONE)
+        found = await self._ask(ANSWER_S)
+        error = _NO_ANSWER if found is None else ""
+        return NodeParameters(node=self._name, parameters=found, error=error)
+
+    async def _ask(self, limit_s: float) -> tuple[ParameterReport, ...] | None:
+        asking = asyncio.ensure_future(
+            self._clients.report_parameters(self._name, self.names, timeout_s=limit_s)
+        )
+        try:
+            # Not wait_for, see waiting.py.
+            await asyncio.wait({asking}, timeout=limit_s)
+            if asking.done():
+                return asking.result()
+        except MiddlewareError as error:
+            _logger.info("parameters of %s unknown: %s", self._name, error)
+        finally:
+            asking.cancel()
+        return None

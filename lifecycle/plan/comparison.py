@@ -1,0 +1,255 @@
+"""How two plans of one system differ, in the manifest's words, and the checksum of what is planned.
+
+Owns: `changes`, `differences` and `plan_checksum`. Compared is what manifests declare, after
+includes and arguments: not where it is written, nor what follows from the host that planned it
+(folders, environment, installed types and executables), so that every host of a system comes to the
+same checksum from the same manifest. The order of entries counts where the manifest says it does:
+in a command line and among parameter files, and for nodes where ports are given out in their order.
+Pure.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+
+from lifecycle.codec import to_plain
+from lifecycle.manifest.diagnostics import Position
+from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedNode
+
+_VALUE_CHARACTERS = 80
+_MOST = 20
+
+_DECLARED = {
+    "endpoint_policy": "endpoints",
+    "enforce_dscp": "enforce",
+    "unverifiable_blocks": "unverifiable",
+    "default": "default_value",
+}
+"""Fields that the manifest calls otherwise."""
+
+_NODE_DERIVED = (
+    # What the planner, the authority or a restart makes of the rest, and what `_node` words itself.
+    *("key", "at", "run", "endpoints", "declared_parameters", "parameters", "parameter_files"),
+    *("remap", "participants", "after", "transports", "max_datagram_bytes", "connections"),
+    *("authority", "events", "membership", "files"),
+    *("expected_parameters", "unread_parameter_files"),
+)
+_ENDPOINT_DERIVED = (
+    *("kind", "name", "resolved", "type", "qos", "participant", "at"),
+    *("dscp_reason", "five_qi_reason", "max_message_size_reason"),
+    *("qos_defaults", "quantities", "type_hash"),
+)
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Change:
+    """One difference between two plans.
+
+    Attributes:
+        path: place in the manifest, `nodes.talker.run.python`.
+        node: key of the node that it belongs to; empty where it belongs to the whole system.
+        old: the value in words, "not set" or "not declared" without one; cut to 80 characters.
+        new: likewise.
+        at: the position of the node or endpoint in the new plan; None where it has none.
+    """
+
+    path: str
+    node: str
+    old: str
+    new: str
+    at: Position | None = None
+
+
+def changes(old: Plan, new: Plan) -> tuple[Change, ...]:
+    """Return every difference between what two plans declare, the system's first, then by node."""
+    before, after = _document(old), _document(new)
+    places = _positions(new)
+    return tuple(
+        Change(path=".".join(path), node=_node_of(path), old=was, new=now, at=_at(path, places))
+        for path, was, now in sorted(
+            _compared((), before, after), key=lambda each: (each[0][0] == "nodes", each[0])
+        )
+    )
+
+
+def differences(old: Plan, new: Plan, *, words: tuple[str, str] = ("was", "is")) -> tuple[str, ...]:
+    """Say how two plans differ: `nodes.talker.run.python: was "a:Old", is "a:New"`.
+
+    Args:
+        old: one plan.
+        new: the other.
+        words: put before the value of each, `("here", "there")` for plans of two hosts.
+
+    Returns:
+        One line per difference, at most 20 and then how many more there are; none of plans with the
+        same `plan_checksum`.
+    """
+    found = changes(old, new)
+    lines = [f"{each.path}: {words[0]} {each.old}, {words[1]} {each.new}" for each in found[:_MOST]]
+    if len(found) > _MOST:
+        lines.append(f"and {len(found) - _MOST} more")
+    return tuple(lines)
+
+
+def plan_checksum(plan: Plan) -> str:
+    """Return 16 hexadecimal digits (SHA-256) that are the same for plans without differences."""
+    text = json.dumps(_document(plan), sort_keys=True, ensure_ascii=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+_Tree = Mapping[str, object]
+_Path = tuple[str, ...]
+
+
+def _document(plan: Plan) -> _Tree:
+    """Return what is declared, as mappings by the manifest's keys."""
+    document: dict[str, object] = {
+        "system": plan.system,
+        "machines": {each.name: {"address": each.address} for each in plan.machines},
+        "discovery": _fields(plan.discovery, "at"),
+        "network": _fields(plan.network, "at"),
+        "data_layer": _fields(plan.data_layer, "at"),
+        "policy": _fields(plan.policy),
+        "links": {
+            f"{flow.topic} from {flow.publisher} to {flow.subscription}": _fields(
+                flow,
+                *("topic", "publisher", "subscription", "linked", "medium", "medium_reason"),
+                "quantities",
+            )
+            for flow in plan.flows
+            if flow.linked
+        },
+        "nodes": {node.key: _node(node) for node in plan.nodes},
+    }
+    if any(node.connections.urls for node in plan.nodes):
+        document["order of nodes"] = [node.key for node in plan.nodes]
+    return document
+
+
+def _node(node: PlannedNode) -> _Tree:
+    run = _fields(node.run, "kind", "environment", "working_directory")
+    run = {name: value for name, value in run.items() if value} or {node.run.kind.value: True}
+    written = {each.place: each for each in node.files}
+    folder = written.get("run.working_directory")
+    run["working_directory"] = folder.written if folder else node.run.working_directory or None
+    run["environment"] = dict(node.run.environment)
+    files = [written.get(f"parameter_files.{index}") for index in range(len(node.parameter_files))]
+    return {
+        **_fields(node, *_NODE_DERIVED),
+        "run": run,
+        "parameters": {name: to_plain(value) for name, value in node.parameters},
+        "parameter_files": [
+            {"path": each.written, "contents": each.digest} if each else {"path": path}
+            for path, each in zip(node.parameter_files, files, strict=True)
+        ],
+        "remap": dict(node.remap),
+        "after": {each.node: each.condition.value for each in node.after},
+        "interface": _interface(node),
+        "flows": _flows(node),
+        "connections": {
+            each.connection: {
+                "urls": [*each.connections.urls],
+                "map": sorted(
+                    f"{endpoint.kind.value} {endpoint.name}"
+                    for endpoint in node.endpoints
+                    if endpoint.participant == each.name
+                ),
+            }
+            for each in node.participants
+            if each.declared
+        },
+    }
+
+
+def _interface(node: PlannedNode) -> _Tree:
+    found: dict[str, dict[str, object]] = {
+        "parameters": {
+            each.name: _fields(each, "name", "description", "at")
+            for each in node.declared_parameters
+        }
+    }
+    for each in node.endpoints:
+        declared: dict[str, object] = {"type": each.type}
+        if each.qos is not None:
+            declared["qos"] = _fields(each.qos, *each.qos_defaults)
+        found.setdefault(each.kind.value, {})[each.name] = declared
+    return found
+
+
+def _flows(node: PlannedNode) -> _Tree:
+    """Return what each endpoint asks of its flow, without what it does not ask."""
+    found: dict[str, dict[str, object]] = {}
+    waiting = {each.name for each in node.participants if each.non_blocking_send}
+    defaults = {field.name: field.default for field in dataclasses.fields(PlannedEndpoint)}
+    for each in node.endpoints:
+        skipped = list(_ENDPOINT_DERIVED)
+        asked: dict[str, object] = {}
+        if each.five_qi_reason:  # proposed from sizes, which are known where types are installed
+            skipped += ["five_qi", "dscp"]
+            asked["five_qi"] = "auto"
+        if each.max_message_size_reason:
+            skipped.append("max_message_size")
+        asked |= {
+            _DECLARED.get(name, name): to_plain(getattr(each, name))
+            for name, default in defaults.items()
+            if name not in skipped and getattr(each, name) != default
+        }
+        if each.participant in waiting:
+            asked["non_blocking_send"] = True
+        found.setdefault(each.kind.value, {})[each.name] = asked
+    return found
+
+
+def _fields(value: object, *without: str) -> dict[str, object]:
+    """Return the fields of a dataclass by the names that the manifest has for them."""
+    plain = to_plain(value)
+    assert isinstance(plain, dict)
+    return {
+        _DECLARED.get(name, name): plain[name] for name in map(str, plain) if name not in without
+    }
+
+
+def _compared(path: _Path, old: object, new: object) -> Iterator[tuple[_Path, str, str]]:
+    """Yield (path, old value, new value) of what differs, as far down as both have it."""
+    if old == new:
+        return
+    if isinstance(old, Mapping) and isinstance(new, Mapping):
+        for key in {**old, **new}:
+            yield from _compared((*path, key), old.get(key), new.get(key))
+    else:
+        absent = "not declared" if isinstance(old or new, Mapping) else "not set"
+        yield path, _shown(old, absent), _shown(new, absent)
+
+
+def _shown(value: object, absent: str) -> str:
+    if value is None or value == "":
+        return absent
+    if isinstance(value, Mapping):
+        return "declared"
+    text = json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= _VALUE_CHARACTERS else f"{text[: _VALUE_CHARACTERS - 1]}…"
+
+
+def _node_of(path: _Path) -> str:
+    return path[1] if path[0] == "nodes" and len(path) > 1 else ""
+
+
+def _positions(plan: Plan) -> dict[_Path, Position]:
+    found: dict[_Path, Position] = {}
+    for node in plan.nodes:
+        found["nodes", node.key] = node.at
+        for each in node.endpoints:
+            found["nodes", node.key, "interface", each.kind.value, each.name] = each.at
+            found["nodes", node.key, "flows", each.kind.value, each.name] = each.at
+    return found
+
+
+def _at(path: _Path, places: Mapping[_Path, Position]) -> Position | None:
+    """Return the position of the innermost part of `path` that has one."""
+    for length in range(len(path), 0, -1):
+        if path[:length] in places:
+            return places[path[:length]]
+    return None

@@ -1,0 +1,213 @@
+"""What a node's parameters must be: what its interface declares, with the values it is given.
+
+Owns: from the manifest's sources of values to `ExpectedParameter`, and the one spelling of
+values that are compared. Reads parameter files. The checks, which know their layout, are imported
+late: whoever only wants a plan's types needs no YAML.
+
+Values come, weakest first, from a declaration's default, what a `command:` itself says after
+`--ros-args`, the parameter files, and `parameters:`. Among the sections of files rcl has an order
+of its own (measured, rclpy 7.1): sections of one name are one, in the place where that name stood
+first, and of those that match a node the later wins. `-p` goes into the section `/**`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, NamedTuple
+
+from lifecycle.manifest.diagnostics import Position
+from lifecycle.manifest.model import Node, ParameterDeclaration, ParameterValue
+from lifecycle.plan.model import ExpectedParameter
+
+if TYPE_CHECKING:
+    from lifecycle.manifest.semantics.parameter_sections import Section
+
+GIVEN = "parameters"
+COMMAND = "command"
+DEFAULT = "default_value"
+"""Sources of a value, as the manifest spells them; the fourth kind is a file's name."""
+
+NOT_FINITE = (".nan", ".inf", "-.inf")
+"""Doubles that JSON has no numbers for, as YAML spells them."""
+
+
+class _Given(NamedTuple):
+    value: ParameterValue | None  # None: it is given, and what it is is not known here
+    source: str
+    optional: bool
+    at: Position
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class _File:
+    shown: str
+    sections: tuple[Section, ...]
+    is_read: bool
+
+
+class ParameterFiles:
+    """The parameter files of one manifest, each read once.
+
+    Args:
+        manifest: path of the manifest, beside which files are named in messages.
+    """
+
+    def __init__(self, manifest: str) -> None:
+        self._manifest = manifest
+        self._files: dict[str, _File] = {}
+
+    def expected(self, node: Node) -> tuple[ExpectedParameter, ...]:
+        """Return what a node's parameters must be: the declared ones first, then the given ones."""
+        given = self._given(node)
+        declared = tuple(
+            _declared(each, given.pop(each.name, None)) for each in node.interface.parameters
+        )
+        undeclared = (_undeclared(name, each) for name, each in given.items())
+        return (*declared, *(each for each in undeclared if each is not None))
+
+    def unread(self, node: Node) -> tuple[str, ...]:
+        """Return the files of a node whose values are not known here."""
+        named = [path for path, _, _ in _command_line(node) if path]
+        files = [self._file(path) for path in (*named, *node.parameter_files)]
+        return tuple(each.shown for each in files if not each.is_read)
+
+    def _given(self, node: Node) -> dict[str, _Given]:
+        name_of_node = f"{node.namespace.rstrip('/')}/{node.name}"
+        sections: dict[str, dict[str, _Given]] = {}
+        for path, name, text in (
+            *_command_line(node),
+            *((p, "", "") for p in node.parameter_files),
+        ):
+            if not path:
+                value = _scalar(text)
+                given = _Given(value, COMMAND, optional=False, at=node.at)
+                sections.setdefault("/**", {})[name] = given
+                continue
+            file = self._file(path)
+            for section in file.sections:
+                if section.matches(name_of_node):
+                    sections.setdefault(section.pattern, {}).update(
+                        (name, _Given(value, file.shown, section.is_wildcard, at))
+                        for name, value, at in section.parameters
+                    )
+        found: dict[str, _Given] = {}
+        for section_values in sections.values():
+            for name, given in section_values.items():
+                optional = given.optional and (name not in found or found[name].optional)
+                found[name] = given._replace(optional=optional)
+        for name, value in node.parameters:
+            at = node.where(f"parameters.{name}")
+            found[name] = _Given(value, GIVEN, optional=False, at=at)
+        return found
+
+    def _file(self, path: str) -> _File:
+        from lifecycle.manifest.semantics.parameter_files import shown_path
+        from lifecycle.manifest.semantics.parameter_sections import read_sections
+
+        if path not in self._files:
+            shown = shown_path(path, self._manifest)
+            sections, flaws = read_sections(path, shown=shown)
+            self._files[path] = _File(shown=shown, sections=sections, is_read=not flaws)
+        return self._files[path]
+
+
+def _declared(declaration: ParameterDeclaration, given: _Given | None) -> ExpectedParameter:
+    from lifecycle.manifest.semantics.parameter_types import misfit
+
+    type_ = declaration.type
+    if given is None and declaration.default is not None:
+        default = as_type(declaration.default, type_)
+        if not misfit(default, type_):
+            given = _Given(default, DEFAULT, optional=False, at=declaration.at)
+    return ExpectedParameter(
+        name=declaration.name,
+        type=type_,
+        value=None
+        if given is None or given.value is None
+        else portable(as_type(given.value, type_)),
+        source="" if given is None or given.value is None else given.source,
+        read_only=declaration.read_only,
+        at=declaration.at if given is None else given.at,
+    )
+
+
+def _undeclared(name: str, given: _Given) -> ExpectedParameter | None:
+    from lifecycle.manifest.semantics.parameter_types import type_of
+
+    if given.value is None:
+        return None
+    return ExpectedParameter(
+        name=name,
+        type=type_of(given.value),
+        value=portable(given.value),
+        source=given.source,
+        optional=given.optional,
+        at=given.at,
+    )
+
+
+def _command_line(node: Node) -> Iterator[tuple[str, str, str]]:
+    """Yield what a node's own command line says of parameters: (file, "", "") or ("", name, text).
+
+    As rcl's parser reads it: between `--ros-args` and `--`, `-p name:=value`, which may begin with
+    the name of a node, and `--params-file`.
+    """
+    words = iter(node.run.command)
+    for word in words:
+        if word != "--ros-args":
+            continue
+        for option in words:
+            if option == "--":
+                break
+            if option in ("-p", "--param"):
+                name, separator, text = next(words, "").partition(":=")
+                base, _, alone = name.rpartition(":")
+                if separator and base in ("", node.name):
+                    yield "", alone, text
+            elif option == "--params-file":
+                folder = node.run.working_directory or os.curdir
+                yield os.path.abspath(os.path.join(folder, next(words, ""))), "", ""  # noqa: PTH100, PTH118
+
+
+def _scalar(text: str) -> ParameterValue | None:
+    """Return what rcl makes of a value on a command line; None of anything but a plain scalar."""
+    from lifecycle.manifest.semantics.parameter_types import read_scalar
+
+    if len(text) > 1 and text[0] == text[-1] in "'\"" and not {text[0], "\\"} & set(text[1:-1]):
+        return read_scalar(text[1:-1], quoted=True)
+    if not text or text[0] in "[{'\"!&*|>%@`,#?" or ": " in text or " #" in text:
+        return None
+    return read_scalar(text, quoted=False)
+
+
+def as_type(value: ParameterValue, type_: str) -> ParameterValue:
+    """Return `value` as a parameter of `type_` has it: YAML writes 5 where a double is meant."""
+    one = type_.removesuffix("_array")
+    if one != "double":
+        return value
+    if isinstance(value, tuple):
+        return tuple(float(each) if _is_int(each) else each for each in value)
+    return float(value) if _is_int(value) else value
+
+
+def portable(value: ParameterValue) -> ParameterValue:
+    """Return `value` so that JSON can carry it: doubles that are not finite become text."""
+    if isinstance(value, tuple):
+        return tuple(_portable(each) for each in value)
+    return _portable(value)
+
+
+def _portable(value: bool | float | str) -> bool | int | float | str:
+    if isinstance(value, float) and not math.isfinite(value):
+        return NOT_FINITE[0 if math.isnan(value) else 1 if value > 0 else 2]
+    if isinstance(value, str):
+        # A lone surrogate, which Python has and UTF-8 has not.
+        return value.encode("utf-8", "backslashreplace").decode("utf-8")
+    return value
+
+
+def _is_int(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)

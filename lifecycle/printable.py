@@ -1,0 +1,53 @@
+r"""Text from elsewhere as a terminal may show it: control characters and bidi overrides escaped.
+
+Owns: which characters reach a terminal, a log or a report as they are. Names in a graph, texts of
+other nodes and lines of processes are chosen by whoever runs them: ESC moves a cursor, a newline
+begins a line that looks like ours, U+202E turns a line around (CVE-2021-42574), a lone surrogate
+cannot be written at all. What `str.isprintable` calls no printable character is written as Python
+would, `\x1b`, `\n`, `\u202e`. Imports nothing of the package.
+"""
+
+from __future__ import annotations
+
+import re
+
+_COLOUR = re.compile("\x1b\\[[0-9;:]*m")
+"""SGR (ECMA-48 §8.3.117): it changes how text looks, and nothing else."""
+
+
+def one_line(text: str) -> str:
+    """Return a text that is one line of printable characters."""
+    return text if text.isprintable() else "".join(map(_escaped, text))
+
+
+def lines(text: str) -> str:
+    """Return a text of printable lines, which nothing but U+000A ends."""
+    return "\n".join(map(one_line, text.split("\n")))
+
+
+def log_line(text: str) -> str:
+    """Return a line that a process wrote, without the colours that it gave it."""
+    return one_line(_COLOUR.sub("", text).replace("\t", "    "))
+
+
+def json_text(text: str) -> str:
+    """Return a JSON document with what is not printable in its strings escaped (`u202e`).
+
+    Outside of strings JSON has no such character but newlines (RFC 8259 §2).
+    """
+    if text.isprintable():
+        return text
+    return "".join(each if each == "\n" else _json_escaped(each) for each in text)
+
+
+def _escaped(character: str) -> str:
+    if character.isprintable():
+        return character
+    return character.encode("unicode_escape", "surrogatepass").decode("ascii")
+
+
+def _json_escaped(character: str) -> str:
+    if character.isprintable():
+        return character
+    units = character.encode("utf-16-be", "surrogatepass").hex()
+    return "".join(f"\\u{units[at : at + 4]}" for at in range(0, len(units), 4))

@@ -1,0 +1,247 @@
+"""Rules about nodes' parameters: those that are declared and those that are given. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from lifecycle.manifest.model import ParameterValue
+from lifecycle.plan.model import ExpectedParameter, PlannedNode
+from lifecycle.plan.parameters import COMMAND, DEFAULT, GIVEN, NOT_FINITE
+from lifecycle.verify.observation import ParameterReport, digest_of
+from lifecycle.verify.rules.catalogue import Rule
+from lifecycle.verify.verdict import Finding, Outcome
+from lifecycle.verify.view import View
+
+MISSING = Rule(
+    id="param.missing",
+    meaning="a node does not have a parameter that is declared or given",
+    outcomes=(Outcome.VIOLATED,),
+    fix="correct the name, or have the node declare it; a value for none has no effect",
+)
+TYPE_DIFFERS = Rule(
+    id="param.type-differs",
+    meaning="a parameter has another type than is declared or given",
+    outcomes=(Outcome.VIOLATED,),
+    fix="correct the declaration, or the node; ROS converts nothing, 1 is no double",
+)
+VALUE_DIFFERS = Rule(
+    id="param.value-differs",
+    meaning="a parameter has another value than the manifest gives or declares as its default",
+    outcomes=(Outcome.VIOLATED,),
+    fix="give the value that is meant, in the manifest or with `ros2 param set`",
+)
+READ_ONLY_DIFFERS = Rule(
+    id="param.read-only-differs",
+    meaning="a parameter that is declared read_only can be set while the node runs",
+    outcomes=(Outcome.VIOLATED,),
+    fix="have the node declare it read-only, or remove read_only from the interface",
+)
+UNVERIFIABLE = Rule(
+    id="param.unverifiable",
+    meaning="parameters of a node could not be read, or not what they must be",
+    outcomes=(Outcome.UNVERIFIABLE,),
+    fix="see whether `ros2 param list` shows the node's parameters; look at its log",
+)
+RULES = (MISSING, TYPE_DIFFERS, VALUE_DIFFERS, READ_ONLY_DIFFERS, UNVERIFIABLE)
+
+_NAMED = 8
+_SHOWN_ITEMS = 8
+_SHOWN_TEXT = 60
+
+
+def check(view: View) -> Iterator[Finding]:
+    """Judge the parameters of every node that is there."""
+    for name, node in view.planned.items():
+        if view.is_absent(node):
+            continue
+        for file in node.unread_parameter_files:
+            yield _unread(node, file)
+        if not node.expected_parameters:
+            continue
+        known = _known(view, name)
+        if not isinstance(known, str):
+            for expected in node.expected_parameters:
+                yield from _judge(node, expected, known.get(expected.name))
+        elif known or name in view.configurations or not view.ours(node):
+            # Of a node of ours without a report config.missing-report says it all.
+            yield _unknown(node, known or "they were not read")
+
+
+def _known(view: View, name: str) -> dict[str, ParameterReport] | str:
+    """Return a node's parameters by name; why not if they are not known, empty if nobody asked."""
+    report = view.configurations.get(name)
+    if report is not None and report.parameters is not None:
+        return {each.name: each for each in report.parameters}
+    read = view.parameters.get(name)
+    if read is None:
+        return ""
+    if read.parameters is None:
+        return f"it {read.error}"
+    return {each.name: each for each in read.parameters}
+
+
+def _judge(
+    node: PlannedNode, expected: ExpectedParameter, actual: ParameterReport | None
+) -> Iterator[Finding]:
+    what = f"parameter {expected.name} of node {node.full_name}"
+    if actual is None:
+        if not expected.optional:
+            yield _finding(
+                MISSING,
+                node,
+                expected,
+                wanted=_wanted(expected),
+                observed="no such parameter",
+                message=f"cannot find {what}, which is {_origin(expected)}",
+            )
+        return
+    if not _is_of_type(actual, expected.type):
+        yield _finding(
+            TYPE_DIFFERS,
+            node,
+            expected,
+            wanted=expected.type,
+            observed=actual.type or "not set",
+            message=f"cannot accept {what}: it is {_with_type(actual)}, and must be "
+            f"{expected.type} as {_origin(expected)}",
+        )
+    elif expected.value is not None and not _is_value(actual, expected.value):
+        wanted = spell(expected.value, expected.type)
+        hint = ""
+        if expected.source == DEFAULT:
+            hint = "give the value that is meant under `parameters`, or correct the default"
+        yield _finding(
+            VALUE_DIFFERS,
+            node,
+            expected,
+            wanted=wanted,
+            observed=_value_of(actual),
+            message=f"cannot accept {what}: it is {_value_of(actual)}, and must be {wanted} as "
+            f"{_origin(expected)}",
+            hint=hint,
+        )
+    if expected.read_only and not actual.read_only:
+        yield _finding(
+            READ_ONLY_DIFFERS,
+            node,
+            expected,
+            wanted="read_only",
+            observed="can be set",
+            message=f"cannot accept {what}: it can be set, and must be read_only as its interface "
+            "declares it",
+        )
+
+
+def _finding(
+    rule: Rule,
+    node: PlannedNode,
+    expected: ExpectedParameter,
+    *,
+    wanted: str,
+    observed: str,
+    message: str,
+    hint: str = "",
+) -> Finding:
+    return rule.finding(
+        Outcome.VIOLATED,
+        subject=f"{node.full_name}: {expected.name}",
+        expected=wanted,
+        observed=observed,
+        message=message,
+        at=expected.at,
+        node=node.full_name,
+        hint=hint,
+    )
+
+
+def _unknown(node: PlannedNode, why: str) -> Finding:
+    names = [each.name for each in node.expected_parameters]
+    return UNVERIFIABLE.on_node(
+        Outcome.UNVERIFIABLE,
+        node,
+        expected=", ".join(names),
+        observed="unknown",
+        message=f"cannot verify {_listed(names)} of node {node.full_name}: {why}",
+    )
+
+
+def _unread(node: PlannedNode, file: str) -> Finding:
+    return UNVERIFIABLE.finding(
+        Outcome.UNVERIFIABLE,
+        subject=f"{node.full_name}: {file}",
+        expected=f"values of {file}",
+        observed="unknown",
+        message=f"cannot verify the parameters that {file} gives node {node.full_name}: "
+        "it could not be read",
+        at=node.at,
+        node=node.full_name,
+        hint="lifecycle check says what keeps it from being read",
+    )
+
+
+def _listed(names: Sequence[str]) -> str:
+    if len(names) == 1:
+        return f"parameter {names[0]}"
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    return f"parameters {', '.join(names[:_NAMED])}{more}"
+
+
+def _origin(expected: ExpectedParameter) -> str:
+    """Return where the demand comes from, to follow "is" or "as"."""
+    if not expected.source:
+        return "declared in its interface"
+    if expected.source == DEFAULT:
+        return "declared in its interface, where nothing else is given"
+    if expected.source == COMMAND:
+        return "given in its `command`"
+    if expected.source == GIVEN:
+        return "given under `parameters`"
+    return f"given in {expected.source}"
+
+
+def _wanted(expected: ExpectedParameter) -> str:
+    if expected.value is None:
+        return expected.type
+    return f"{expected.type} {spell(expected.value, expected.type)}"
+
+
+def _is_of_type(actual: ParameterReport, type_: str) -> bool:
+    if type_ == "array":
+        return actual.type.endswith("_array")
+    return actual.type == type_
+
+
+def _is_value(actual: ParameterReport, value: ParameterValue) -> bool:
+    """Compare values of one type; what is not a number equals itself, and 0.0 equals -0.0."""
+    if actual.digest:
+        return actual.digest == digest_of(value)
+    return actual.value is not None and actual.value == value
+
+
+def _with_type(actual: ParameterReport) -> str:
+    if not actual.type:
+        return "not set"
+    article = "an" if actual.type[0] in "ai" else "a"
+    return f"{article} {actual.type}, {_value_of(actual)}"
+
+
+def _value_of(actual: ParameterReport) -> str:
+    if actual.digest:
+        return f"too long to show (SHA-256 {actual.digest[:16]!r}…)"
+    return "not set" if actual.value is None else spell(actual.value, actual.type)
+
+
+def spell(value: ParameterValue, type_: str) -> str:
+    """Return a value for people, short and without a character that a terminal would obey."""
+    if isinstance(value, tuple):
+        shown = ", ".join(spell(each, type_) for each in value[:_SHOWN_ITEMS])
+        more = f", … {len(value)} items" if len(value) > _SHOWN_ITEMS else ""
+        return f"[{shown}{more}]"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if value in NOT_FINITE and type_.startswith("double"):
+        return str(value)
+    spelled = repr(value)
+    if len(spelled) > _SHOWN_TEXT:
+        return f"{spelled[: _SHOWN_TEXT - 2]}…{spelled[-1]}"
+    return spelled

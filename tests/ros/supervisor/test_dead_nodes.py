@@ -1,0 +1,145 @@
+"""What a killed process leaves in the graph: nothing, at once, though it could not say so."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import rclpy
+from rclpy.node import Node
+
+from lifecycle.errors import ExitCode
+from tests.ros.supervisor.running import ENOUGH, Up, pair, up, verb
+
+AT_ONCE_S = 8.0
+"""Far less than the lease of 20 s, on a machine that runs something else meanwhile."""
+
+CROWD = {
+    # Two nodes in the process that is killed, one of them with a participant of its own for its
+    # publisher: all three participants' worth must go.
+    "policy/undeclared_nodes": "open",
+    "nodes/talker/process": "crowd",
+    "nodes/talker/flows": {"publishers": {"chatter": {"unique": "strictly_required"}}},
+    "nodes/quiet": {
+        "run": {"python": "tests.ros.supervisor.systems:Quiet", "environment": {"MISBEHAVE": ""}},
+        "process": "crowd",
+    },
+}
+
+
+@pytest.fixture
+def bystander(fresh_domain: int) -> Iterator[Node]:
+    """A node of somebody else's in the domain, which knows nothing of the system."""
+    context = rclpy.Context()
+    context.init(args=[], domain_id=fresh_domain)
+    node = Node("_bystander", context=context, enable_rosout=False)
+    yield node
+    node.destroy_node()
+    context.try_shutdown()
+    context.destroy()
+
+
+def kill(run: Up, process: str) -> float:
+    """Kill a process; return the time of it."""
+    os.kill(run.pid_of(process), signal.SIGKILL)
+    return time.monotonic()
+
+
+def until(holds: Callable[[], object], since: float) -> float:
+    """Wait until something holds; return how many seconds after `since` it did."""
+    while not holds():
+        assert time.monotonic() - since < AT_ONCE_S, "not at once"
+        time.sleep(0.005)
+    return time.monotonic() - since
+
+
+def status(runtime: Path) -> dict[str, dict[str, Any]]:
+    """Return the status of each node."""
+    told = verb("status", "pair", "--format", "json", runtime=runtime)
+    return {each["node"]: each for each in json.loads(told.stdout)["nodes"]}
+
+
+def restarts_at_once(run: Up, runtime: Path) -> float:
+    """Restart the talker; return how many seconds the whole command took."""
+    begun = len(run.events)
+    began = time.monotonic()
+    done = verb("restart", "pair", "talker", runtime=runtime)
+    took_s = time.monotonic() - began
+    assert (done.returncode, done.stderr) == (ExitCode.OK, "")
+    run.until("system", reached="active")
+    rules = {
+        each["rule"]
+        for event in run.events[begun:]
+        if event.get("event") == "verdict"
+        for each in event["verdict"]["findings"]
+    }
+    assert "graph.duplicate-node" not in rules
+    assert run.of_kind("verdict")[-1]["verdict"]["verdict"] == "ok"
+    assert took_s < AT_ONCE_S
+    return took_s
+
+
+def test_a_killed_process_is_gone_for_everybody_at_once_and_comes_back_at_once(
+    tmp_path: Path, fresh_domain: int, bystander: Node
+) -> None:
+    with up(pair(tmp_path, fresh_domain, edit=CROWD), "--keep-going", runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        run.note_segments()
+        dead = {"talker", "quiet"}
+        until(lambda: dead < {*bystander.get_node_names()}, time.monotonic())
+        until(lambda: bystander.count_publishers("/chatter") == 1, time.monotonic())
+        pid = run.pid_of("crowd")
+        at = kill(run, "crowd")
+        gone_s = until(lambda: not dead & {*bystander.get_node_names()}, at)
+        until(lambda: bystander.count_publishers("/chatter") == 0, at)
+        run.until("failure", rule="run.process-died")
+        until(lambda: status(tmp_path)["/listener"]["matched"] == 0, at)
+        seen = status(tmp_path)
+        for name in ("/talker", "/quiet"):
+            assert seen[name]["died"] == f"pid {pid} died: killed by SIGKILL"
+            assert (seen[name]["state"], seen[name]["matched"]) == ("", 0)
+        # The verdict follows the death by a moment.
+        run.until_found("graph.missing-node", "/quiet")
+        told = verb("status", "pair", runtime=tmp_path).stdout.splitlines()
+        assert told[0].startswith("pair: active 1/3, verdict violated (missing: /quiet (node), ")
+        states = [line.split()[3] for line in told if line.startswith("/")]
+        assert sorted(states) == ["active", "dead", "dead"]
+        # Also who looks on from outside.
+        judged = verb(
+            "verify", str(tmp_path / "pair.lifecycle.yaml"), "--timeout", "5", runtime=tmp_path
+        )
+        assert judged.returncode == ExitCode.VIOLATED
+        assert "/talker" in judged.stdout
+        back_s = restarts_at_once(run, tmp_path)
+        print(f"gone after {gone_s:.3f} s, back after {back_s:.1f} s")
+        assert status(tmp_path)["/talker"]["state"] == "active"
+        judged = verb("verify", str(tmp_path / "pair.lifecycle.yaml"), *ENOUGH, runtime=tmp_path)
+        assert judged.returncode == ExitCode.OK, judged.stdout
+        assert verb("down", "pair", runtime=tmp_path).returncode == ExitCode.OK
+        assert run.finish() == ExitCode.OK
+        run.assert_nothing_left()
+
+
+def test_where_ports_are_fixed_a_killed_node_is_unmatched_and_comes_back_at_once(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        first_port = 20000 + server.getsockname()[1] % 10000
+    how = {"domain_id": fresh_domain, "mode": "static", "first_port": first_port}
+    manifest = pair(tmp_path, fresh_domain, edit={"discovery": how})
+    with up(manifest, "--keep-going", runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        at = kill(run, "talker")
+        run.until("failure", rule="run.process-died")
+        gone_s = until(lambda: status(tmp_path)["/listener"]["matched"] == 0, at)
+        back_s = restarts_at_once(run, tmp_path)
+        print(f"unmatched after {gone_s:.3f} s, back after {back_s:.1f} s")
+        assert verb("down", "pair", runtime=tmp_path).returncode == ExitCode.OK
+        assert run.finish() == ExitCode.OK

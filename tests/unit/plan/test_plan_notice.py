@@ -1,0 +1,97 @@
+"""What supervisors announce of their plans: whose must be ours, and what comes over the network."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import zlib
+
+import pytest
+
+from lifecycle.manifest.model import Machine
+from lifecycle.plan import notice as notices
+from lifecycle.plan.comparison import plan_checksum
+from lifecycle.plan.model import Plan
+from lifecycle.plan.notice import (
+    PlanNotice,
+    PlanNoticeError,
+    announced_plan,
+    concerns,
+    decode,
+    encode,
+    notice_of,
+)
+from tests.unit.supervisor.fakes import HERE, plan_of, planned_node
+
+
+def plan(system: str = "robot", *names: str) -> Plan:
+    nodes = [
+        dataclasses.replace(planned_node(name), machine=machine)
+        for name, machine in zip(names or ("camera", "viewer"), ("left", "right"), strict=False)
+    ]
+    machines = tuple(Machine(name=each, address="", at=HERE) for each in ("left", "right"))
+    return dataclasses.replace(plan_of(*nodes), system=system, machines=machines)
+
+
+def said(of: Plan, machine: str = "right", run: str = "1", host: str = "h2") -> PlanNotice:
+    return notice_of(of, run=run, host=host, machines=(machine,))
+
+
+OURS = frozenset({"left"})
+
+
+def test_a_notice_brings_the_plan_and_its_checksum() -> None:
+    notice = decode(encode(said(plan())))
+    assert notice.checksum == plan_checksum(plan())
+    assert announced_plan(notice) == plan()
+
+
+def test_the_same_system_on_another_of_its_machines_concerns_us() -> None:
+    assert concerns(plan(), OURS, said(plan("robot", "lidar", "screen")))
+
+
+def test_another_system_concerns_us_only_if_it_plans_a_node_of_ours() -> None:
+    assert concerns(plan(), OURS, said(plan("other")))
+    assert not concerns(plan(), OURS, said(plan("other", "lidar", "screen")))
+
+
+def test_a_system_of_our_name_on_machines_of_its_own_does_not_concern_us() -> None:
+    elsewhere = said(plan("robot", "lidar", "screen"), machine="attic")
+    assert not concerns(plan(), OURS, elsewhere)
+
+
+def test_a_notice_is_replaced_by_what_comes_in_its_place() -> None:
+    first = said(plan())
+    assert said(plan(), run="2").replaces(first)
+    # Started again under another name, on the same host.
+    assert said(plan("other"), run="2").replaces(first)
+    assert not said(plan("other"), run="2", host="h3").replaces(first)
+    gone = dataclasses.replace(first, left=True)
+    assert said(plan("other"), run="2", host="h3").replaces(gone)
+
+
+def test_what_is_no_notice_is_refused() -> None:
+    shown_badly = encode(dataclasses.replace(said(plan()), reason="\x1b[2J"))
+    for text in ("", "{}", '{"run": 1}', shown_badly, "x" * (notices.MAX_TEXT + 1)):
+        with pytest.raises(PlanNoticeError, match=r"^cannot read"):
+            decode(text)
+
+
+def test_a_plan_that_is_too_long_is_announced_by_its_checksum_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(notices, "MAX_TEXT", 500)
+    notice = said(plan())
+    assert (notice.plan, notice.checksum) == ("", plan_checksum(plan()))
+
+
+def test_a_plan_that_cannot_be_unpacked_is_none_of_ours(monkeypatch: pytest.MonkeyPatch) -> None:
+    def packed(data: bytes) -> PlanNotice:
+        return dataclasses.replace(said(plan()), plan=base64.b64encode(data).decode())
+
+    for data in (b"", b"no zlib", zlib.compress(b"{}"), zlib.compress(b"[" * 100_000)):
+        assert announced_plan(packed(data)) is None
+    assert announced_plan(dataclasses.replace(said(plan()), plan="no base 64")) is None
+    # What unpacks to more than the limit is not unpacked further.
+    monkeypatch.setattr(notices, "_MAX_PLAN_BYTES", 100)
+    assert announced_plan(said(plan())) is None

@@ -1,0 +1,289 @@
+"""What nodes run, looked for without running it."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from lifecycle.manifest.model import EndpointKind, Run, RunKind
+from lifecycle.plan.programs import Resolution, resolve_programs
+from tests.unit.plan.samples import endpoint, manifest, node, publisher, subscription
+
+TALKER = """
+from lifecycle import LifecycleNode, on_message, on_service, on_action, on_goal, on_timer
+raise SystemExit("this was run")
+ORDERS = "orders"
+class Talker(LifecycleNode):
+    @on_timer(period_s=1)
+    def tick(self):
+        self.publisher("chatter").publish(1)
+    @on_message(ORDERS)
+    def take(self, message): ...
+"""
+COMPLETE = (publisher("chatter"), subscription("orders"))
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def write(folder: Path, **modules: str) -> None:
+    """Write modules by name."""
+    for name, text in modules.items():
+        (folder / f"{name}.py").write_text(text)
+
+
+def python(
+    reference: str, *endpoints: object, ours: bool = True, working_directory: str = ""
+) -> Resolution:
+    """Look for one class; `ours`: its machine is this host."""
+    run = Run(kind=RunKind.PYTHON, python=reference, working_directory=working_directory)
+    system = manifest(node("talker", *endpoints, run=run, machine="" if ours else "robot"))
+    return resolve_programs(system, environment={}, is_ours=lambda name: name != "robot")
+
+
+def command(*words: str, environment: dict[str, str] | None = None, **rest: object) -> Resolution:
+    run = Run(kind=RunKind.COMMAND, command=words, **rest)
+    return resolve_programs(manifest(node("talker", run=run)), environment=environment or {})
+
+
+def said(found: Resolution) -> list[str]:
+    """Messages and hints of the diagnostics, then what is unresolved."""
+    lines = [f"{each.message}; {each.hint}".removesuffix("; ") for each in found.diagnostics]
+    return lines + [f"? {each.subject}: {each.reason}" for each in found.unresolved]
+
+
+def test_a_class_with_all_its_handlers_is_found_and_nothing_is_run(folder: Path) -> None:
+    write(folder, talk=TALKER)
+    assert python("talk:Talker", *COMPLETE) == Resolution()
+    assert "talk" not in sys.modules
+
+
+@pytest.mark.parametrize(
+    ("reference", "message"),
+    [
+        (
+            "talk:Talkr",
+            "cannot find class 'Talkr' in talk (talk.py); it has Talker; did you mean 'Talker'?",
+        ),
+        ("talk:ORDERS", "cannot use 'ORDERS' of talk (talk.py:4) as a class: it is 'orders'"),
+        ("talk.more:Talker", "cannot import 'talk.more': 'talk' is no package (talk.py)"),
+        ("pkg.none:Talker", "cannot find module 'pkg.none'; looked in pkg"),
+        ("pkg:mod", "cannot use 'mod' of pkg as a class: it is a module"),
+        (
+            "pkg.mod:Plain",
+            (
+                "cannot use 'Plain' of pkg.mod (pkg/mod.py) as a node: it is no node class; derive "
+                "it from lifecycle.LifecycleNode, or from rclpy.node.Node"
+            ),
+        ),
+        (
+            "pkg.mod:helper",
+            "cannot use 'helper' of pkg.mod (pkg/mod.py:2) as a class: it is a function",
+        ),
+        ("broken:Talker", "cannot import 'broken': broken.py:1: invalid syntax"),
+        ("talk", "cannot read 'talk'; write package.module:Class"),
+    ],
+)
+def test_what_python_would_refuse_is_an_error(folder: Path, reference: str, message: str) -> None:
+    write(folder, talk=TALKER, broken="class class")
+    (folder / "pkg").mkdir()
+    (folder / "pkg" / "__init__.py").write_text("from . import mod\n")
+    (folder / "pkg" / "mod.py").write_text("class Plain: ...\ndef helper(): ...\n")
+    found = [line.replace(f"{folder}/", "") for line in said(python(reference))]
+    assert found == [message]
+
+
+def test_a_module_that_is_nowhere_says_where_it_is_looked_for(folder: Path) -> None:
+    assert said(python("nowhere.nodes:Talker")) == [
+        f"cannot find module 'nowhere'; it is looked for in {folder} and in what is installed"
+    ]
+
+
+@pytest.mark.parametrize(
+    "init",
+    [
+        "from .talker import Talker",
+        "from pkg.talker import Talker",
+        "from .talker import *",
+        "from . import talker\nTalker = talker.Talker",
+        "import pkg.talker as t\nTalker = t.Talker",
+        "from .again import Other as Talker",
+    ],
+)
+def test_names_are_followed_through_imports(folder: Path, init: str) -> None:
+    (folder / "pkg").mkdir()
+    (folder / "pkg" / "__init__.py").write_text(init)
+    (folder / "pkg" / "talker.py").write_text(TALKER)
+    (folder / "pkg" / "again.py").write_text("from .talker import Talker as Other")
+    assert python("pkg:Talker", *COMPLETE) == Resolution()
+    assert said(python("pkg:Talker", publisher("chatter"))) == [
+        (
+            "cannot use handler Talker.take (pkg/talker.py:10): @on_message('orders') names no "
+            "subscription that 'talker' declares; declared: none"
+        )
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("def __getattr__(name): ...", "talk has a __getattr__ (talk.py)"),
+        ("globals()['Talker'] = type", "talk uses globals() (talk.py)"),
+        ("Talker = make()", "Talker is made by running talk.py"),
+        (
+            "try:\n    from a import Talker\nexcept ImportError:\n    Talker = None",
+            "Talker is defined in several places of talk.py",
+        ),
+        (
+            "from nowhere_x import Base\nclass Talker(Base): ...",
+            "its base Base is not known: cannot find module 'nowhere_x'",
+        ),
+    ],
+)
+def test_what_only_running_would_tell_is_named(folder: Path, text: str, reason: str) -> None:
+    write(folder, talk=text)
+    (line,) = said(python("talk:Talker"))
+    assert line.startswith("? ")
+    assert reason in line
+
+
+def test_a_compiled_module_is_named(folder: Path) -> None:
+    (folder / "fast.abi3.so").write_bytes(b"")
+    assert said(python("fast:Talker")) == ["? class 'fast:Talker': fast is compiled"]
+
+
+def test_handlers_and_endpoints_are_paired_as_at_run_time(folder: Path) -> None:
+    text = TALKER.replace("class Talker", "class Base") + (
+        "class Talker(Base):\n"
+        "    def take(self, message): ...\n"  # inherits what it overrides
+        "    @on_service('reset')\n"
+        "    def reset(self, request, response): self.publisher('chater')\n"
+        "    @on_service('reset')\n"
+        "    def again(self, request, response): self.client('plan')\n"
+        "    @on_goal('dock')\n"
+        "    def may(self, goal): ...\n"
+    )
+    write(folder, talk=text)
+    found = python(
+        "talk:Talker",
+        publisher("chatter"),
+        subscription("order"),
+        endpoint(EndpointKind.SERVICE_SERVER, "reset", "std_srvs/srv/Trigger"),
+        endpoint(EndpointKind.ACTION_SERVER, "dock", "robot/action/Dock", None),
+    )
+    assert sorted(said(found)) == [
+        (
+            "cannot serve action server 'dock': no method of Talker (talk.py) is decorated with "
+            "@on_action('dock')"
+        ),
+        (
+            "cannot serve subscription 'order': no method of Talker (talk.py) is decorated with "
+            "@on_message('order')"
+        ),
+        (
+            "cannot tell what self.client('plan') (talk.py:16) is to get: 'talker' declares no "
+            "service client 'plan'; declared: none"
+        ),
+        (
+            "cannot tell what self.publisher('chater') (talk.py:14) is to get: 'talker' declares "
+            "no publisher 'chater'; did you mean 'chatter'? declared: 'chatter'"
+        ),
+        (
+            "cannot use handler Base.take (talk.py:10): @on_message('orders') names no "
+            "subscription that 'talker' declares; did you mean 'order'? declared: 'order'"
+        ),
+        (
+            "cannot use two handlers of service server 'reset': Talker.reset (talk.py:14) and "
+            "Talker.again (talk.py:16)"
+        ),
+    ]
+
+
+def test_endpoints_that_code_declares_itself_are_not_guessed(folder: Path) -> None:
+    write(folder, talk=TALKER + "    def on_configure(self): self.declare_publisher('x', 1)\n")
+    (line,) = said(python("talk:Talker"))
+    assert line.startswith("? endpoints of class 'talk:Talker': its code declares endpoints itself")
+
+
+def test_of_another_machine_only_what_is_here_is_judged(folder: Path) -> None:
+    write(folder, talk=TALKER)
+    assert said(python("nowhere:Talker", ours=False))[0].startswith(
+        "? class 'nowhere:Talker': it is for machine 'robot'; here, there is no module 'nowhere'"
+    )
+    assert said(python("talk:Talkr", ours=False))[0].startswith("cannot find class 'Talkr'")
+
+
+def test_a_working_directory_is_looked_in_first(folder: Path) -> None:
+    (folder / "work").mkdir()
+    write(folder, talk="class Other: ...")
+    write(folder / "work", talk=TALKER)
+    found = python("talk:Talker", *COMPLETE, working_directory=str(folder / "work"))
+    assert found == Resolution()
+
+
+def test_programs_are_found_as_exec_would_find_them(folder: Path) -> None:
+    (folder / "bin").mkdir()
+    (folder / "bin" / "talk").write_text("#!/bin/sh\n")
+    (folder / "bin" / "listen").write_text("#!/bin/sh\n")
+    (folder / "bin" / "talk").chmod(0o755)
+    path = {"PATH": "/nowhere"}
+    own = (("PATH", f"{folder}/bin"),)
+    run = Run(kind=RunKind.COMMAND, command=("talk",), environment=own)
+    assert resolve_programs(manifest(node("t", run=run)), environment=path) == Resolution()
+    assert command("bin/talk") == Resolution()
+    assert said(command("talk", environment=path)) == [
+        (
+            "cannot find program 'talk' on PATH; install it, name its path, or set PATH in "
+            "run.environment; PATH is /nowhere"
+        )
+    ]
+    assert said(command("bin/talkr")) == [
+        f"cannot find program 'bin/talkr' in '{folder}'; did you mean 'talk'?"
+    ]
+    assert said(command("bin/listen")) == [
+        "cannot run 'bin/listen': it is not executable; chmod +x bin/listen"
+    ]
+    assert said(command(sys.executable, "talk.py")) == [
+        f"cannot find script 'talk.py' in '{folder}'"
+    ]
+    assert said(command("bin/talk", working_directory="/nowhere")) == [
+        "cannot find the working directory '/nowhere'"
+    ]
+
+
+def test_executables_of_packages_are_looked_for_where_there_are_packages(folder: Path) -> None:
+    (folder / "lib" / "demo").mkdir(parents=True)
+    (folder / "lib" / "demo" / "talk").write_text("")
+    (folder / "lib" / "demo" / "talk").chmod(0o755)
+
+    def package(executable: str, prefix: str) -> list[str]:
+        run = Run(kind=RunKind.COMMAND, package="demo", executable=executable)
+        variables = {"AMENT_PREFIX_PATH": prefix} if prefix else {}
+        return said(resolve_programs(manifest(node("t", run=run)), environment=variables))
+
+    assert package("talk", str(folder)) == []
+    assert package("talkr", str(folder)) == [
+        "cannot find executable 'talkr' of package 'demo': the package has talk"
+    ]
+    assert package("talk", "") == [
+        (
+            "? executable 'talk' of package 'demo': AMENT_PREFIX_PATH is empty; source the setup "
+            "file of its workspace"
+        )
+    ]
+
+
+def test_a_hundred_nodes_of_one_class_are_read_once(folder: Path) -> None:
+    write(folder, talk=TALKER)
+    run = Run(kind=RunKind.PYTHON, python="talk:Talker")
+    system = manifest(*(node(f"talker_{n}", *COMPLETE, run=run) for n in range(500)))
+    began = time.process_time()
+    assert resolve_programs(system, environment=os.environ) == Resolution()
+    assert time.process_time() - began < 5

@@ -1,0 +1,90 @@
+"""The guard over nodes that others activate: who is deactivated, how often, and what is found."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import cast
+
+from lifecycle.manifest.model import RunKind
+from lifecycle.node.control import Operation
+from lifecycle.supervisor.activation_guard import TRIES, ActivationGuard
+from lifecycle.supervisor.driver import LifecycleServices, ServiceDriver
+from lifecycle.supervisor.events import Notice, Reach
+from lifecycle.supervisor.system import NodeRun
+from lifecycle.verify.observation import Observation, ObservedNode
+from tests.unit.supervisor.fakes import World, plan_of, planned_node, run
+from tests.unit.supervisor.test_supervisor_gate import ForeignNode
+
+
+class _Attached(ForeignNode):
+    """A managed node of somebody else's, which does what it is asked."""
+
+    async def change_state(self, node: str, transition: str, **_: object) -> bool:  # type: ignore[override]
+        self.requests.append(transition)
+        self.state = "inactive"
+        return True
+
+
+class _Bench:
+    def __init__(self, tmp_path: Path) -> None:
+        self.world = World(plan_of(planned_node("base", kind=RunKind.ATTACH)), tmp_path)
+        self.services = _Attached()
+        self.guard = ActivationGuard(self.world.system)
+        self.node: NodeRun = self.world.system.nodes["base"]
+        self.node.driver = ServiceDriver(
+            cast("LifecycleServices", self.services), self.node.planned
+        )
+        self.node.undo = [Operation.CONFIGURE, Operation.CONNECT]
+        self.node.advance(Reach.CONNECTED)
+
+    async def looked(self) -> list[str]:
+        """What is found when somebody has activated the node, once that was answered."""
+        self.services.state = "active"
+        self.guard.look(Observation(nodes=(ObservedNode(full_name="/base", state="active"),)))
+        found = [each.rule for each in self.guard.findings()]
+        for _ in range(20):
+            await asyncio.sleep(0)
+        return found
+
+
+def test_a_node_that_somebody_activates_is_deactivated_at_once_and_found(tmp_path: Path) -> None:
+    async def main() -> None:
+        bench = _Bench(tmp_path)
+        assert await bench.looked() == ["state.activated-at-closed-gate"]
+        assert bench.services.requests == ["deactivate"]
+        assert bench.guard.findings() == ()
+        assert bench.world.system.touched.is_set()
+        assert [each.message for each in bench.world.heard(Notice)] == [
+            "'/base' was activated by somebody else while the gate is closed: it is deactivated"
+        ]
+
+    run(main())
+
+
+def test_whoever_activates_it_again_and_again_is_not_fought_for_ever(tmp_path: Path) -> None:
+    async def main() -> None:
+        bench = _Bench(tmp_path)
+        for _ in range(TRIES + 3):
+            await bench.looked()
+        assert bench.services.requests == ["deactivate"] * TRIES
+        assert bench.world.heard(Notice)[-1].message.endswith(
+            f"it is deactivated for the last time, after {TRIES - 1} times in vain"
+        )
+
+    run(main())
+
+
+def test_what_the_gate_let_through_is_left_alone_and_so_is_what_was_not_brought_up(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        bench = _Bench(tmp_path)
+        bench.node.undo.append(Operation.ACTIVATE)
+        assert await bench.looked() == []
+        bench.node.undo.clear()
+        bench.node.advance(Reach.STARTED)
+        assert await bench.looked() == []
+        assert bench.services.requests == []
+
+    run(main())

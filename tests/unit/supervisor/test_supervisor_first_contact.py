@@ -1,0 +1,73 @@
+"""Who is started again because TCP did not let it be discovered."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from lifecycle.supervisor.first_contact import undiscovered
+from lifecycle.verify.verdict import Finding, Outcome, Verdict
+
+OURS = frozenset(("/talker", "/listener", "/neighbour"))
+MISSING = ("graph.missing-node", "/listener")
+NAMELESS = ("graph.unattributed-endpoint", "/rosout")
+TO_LISTENER = ("graph.unmatched-flow", "/chatter: /talker → /listener")
+TO_NEIGHBOUR = ("graph.unmatched-flow", "/chatter: /talker → /neighbour")
+AWAITED = ("graph.missing-node", "/elsewhere")
+TO_AWAITED = ("graph.unmatched-flow", "/chatter: /talker → /elsewhere")
+WRONG = ("graph.qos-incompatible", "/chatter: /talker → /listener")
+
+
+def verdict(*found: tuple[str, str], outcome: Outcome = Outcome.VIOLATED) -> Verdict:
+    return Verdict(
+        verdict=outcome,
+        blocking=True,
+        findings=tuple(
+            Finding(
+                rule=rule, outcome=outcome, subject=subject, expected="", observed="", message=""
+            )
+            for rule, subject in found
+        ),
+        flows=(),
+    )
+
+
+@pytest.mark.parametrize(
+    ("found", "tries", "again"),
+    [
+        ((MISSING, NAMELESS), {}, "/listener"),
+        ((TO_LISTENER, TO_NEIGHBOUR), {}, "/talker"),
+        ((TO_LISTENER,), {}, "/talker"),
+        ((TO_LISTENER,), {"/talker": 1}, "/listener"),
+        ((MISSING, TO_LISTENER), {}, "/listener"),
+        ((MISSING, WRONG), {}, None),
+        ((NAMELESS,), {}, None),
+        ((AWAITED,), {}, None),
+        ((AWAITED, TO_AWAITED), {}, None),
+        ((AWAITED, TO_AWAITED, TO_NEIGHBOUR), {}, "/talker"),
+    ],
+)
+def test_who_lacks_most_is_started_again_and_nobody_where_more_is_wrong(
+    found: tuple[tuple[str, str], ...], tries: dict[str, int], again: str | None
+) -> None:
+    assert undiscovered(verdict(*found), OURS, tries) == again
+
+
+@pytest.mark.parametrize("rule", ["state.wrong-state", "config.missing-configuration"])
+def test_who_waits_for_a_node_that_is_on_its_way_is_not_started_again(rule: str) -> None:
+    on_its_way = verdict(TO_AWAITED, (rule, "what is said of it"))
+    waiting, late = on_its_way.findings
+    of = dataclasses.replace(
+        on_its_way, findings=(waiting, dataclasses.replace(late, node="/elsewhere"))
+    )
+    assert undiscovered(of, OURS, {}) is None
+    # The same of a node that nobody lacks: then the match is what is missing.
+    of = dataclasses.replace(
+        on_its_way, findings=(waiting, dataclasses.replace(late, node="/other"))
+    )
+    assert undiscovered(of, OURS, {}) == "/talker"
+
+
+def test_what_cannot_be_verified_starts_nobody_again() -> None:
+    assert undiscovered(verdict(MISSING, outcome=Outcome.UNVERIFIABLE), OURS, {}) is None

@@ -1,0 +1,84 @@
+"""Whose participants are removed from the graph when a process ends, and how often that is said."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+from collections.abc import Iterable
+from types import SimpleNamespace
+from typing import Any, cast
+
+from lifecycle.supervisor.events import ProcessChanged
+from lifecycle.supervisor.stale import StaleNodes
+from lifecycle.supervisor.states import ProcessState
+from lifecycle.supervisor.system import System
+
+PREFIX = "010f7f015d3c1b4c00000000"
+ENDED = ProcessChanged(process="camera", state=ProcessState.EXITED, pid=7)
+
+
+class Graph:
+    """Shows one participant until it was removed often enough."""
+
+    def __init__(self, removals: int) -> None:
+        self.asked: list[tuple[int, frozenset[str]]] = []
+        self.removed: list[tuple[frozenset[str], tuple[int, ...]]] = []
+        self._removals = removals
+
+    def participants_of(
+        self, pid: int, *, nodes: Iterable[str], reported: Iterable[str]
+    ) -> frozenset[str]:
+        self.asked.append((pid, frozenset(reported)))
+        return frozenset((PREFIX,)) if len(self.removed) < self._removals else frozenset()
+
+    def remove_participants(self, prefixes: Iterable[str], pids: Iterable[int]) -> None:
+        self.removed.append((frozenset(prefixes), tuple(pids)))
+
+
+def system() -> System:
+    """A system of one node whose process has ended, and one process that lives."""
+    configuration = SimpleNamespace(
+        identity=SimpleNamespace(node_id=f"/camera@{PREFIX}"), endpoints=()
+    )
+    node = SimpleNamespace(name="/camera", configuration=configuration)
+    process = SimpleNamespace(pid=7, planned=SimpleNamespace(nodes=("camera",)))
+    living = (SimpleNamespace(pid=8),)
+    fake: Any = SimpleNamespace(
+        nodes={"camera": node}, processes={"camera": process}, living=living
+    )
+    return cast("System", fake)
+
+
+def after(graph: Graph, *events: ProcessChanged, seconds: float = 0.0) -> None:
+    async def run() -> None:
+        stale = StaleNodes(system(), graph)
+        for event in events:
+            stale.on_event(event)
+        await asyncio.sleep(seconds)
+        stale.close()
+        await asyncio.sleep(0)
+
+    asyncio.run(run())
+
+
+def test_a_process_that_ended_is_removed_by_what_its_nodes_reported() -> None:
+    graph = Graph(removals=1)
+    after(graph, ENDED)
+    assert graph.asked == [(7, frozenset((PREFIX,)))]
+    assert graph.removed == [(frozenset((PREFIX,)), (8,))]
+
+
+def test_it_is_said_again_although_it_is_gone() -> None:
+    graph = Graph(removals=1)
+    after(graph, ENDED, seconds=0.3)
+    assert len(graph.removed) >= 2  # once more after 0.1 s
+
+
+def test_nobody_is_removed_whom_discovery_does_not_show_or_who_lives() -> None:
+    graph = Graph(removals=0)
+    running = dataclasses.replace(ENDED, state=ProcessState.RUNNING)
+    another = dataclasses.replace(ENDED, pid=6)
+    server = dataclasses.replace(ENDED, process="discovery_server")
+    after(graph, ENDED, running, another, server)
+    assert graph.removed == []
+    assert len(graph.asked) == 1

@@ -1,0 +1,42 @@
+"""Nothing that others wrote commands a terminal, begins a line or leaves JSON unreadable."""
+
+from __future__ import annotations
+
+import json
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lifecycle.printable import json_text, lines, log_line, one_line
+
+ANY = st.text(st.characters())
+
+
+def test_what_is_printable_stays_as_it_is():
+    assert one_line("/robot/vidéo → [red]\\x1b") == "/robot/vidéo → [red]\\x1b"
+
+
+def test_what_is_not_is_written_as_python_escapes_it():
+    assert one_line("\x1b[2J\n\r\t\x9b\u202e\ud800") == r"\x1b[2J\n\r\t\x9b\u202e\ud800"
+
+
+def test_only_a_newline_ends_a_line():
+    assert lines("a\nb\u2028c\x85d\re") == "a\nb\\u2028c\\x85d\\re"
+
+
+def test_the_colours_of_a_log_line_are_left_out_and_its_commands_are_shown():
+    assert log_line("\x1b[31m[ERROR]\x1b[0m\tgone\x1b[2J") == "[ERROR]    gone\\x1b[2J"
+
+
+@given(ANY)
+def test_any_text_becomes_one_line(text):
+    assert one_line(text).isprintable()
+    assert log_line(text).isprintable()
+    one_line(text).encode()
+
+
+@given(st.dictionaries(ANY, ANY), st.sampled_from([None, 2]))
+def test_json_reads_back_the_same_and_is_printable(value, indent):
+    text = json_text(json.dumps(value, ensure_ascii=False, indent=indent))
+    assert json.loads(text) == value
+    assert text.replace("\n", "").isprintable()

@@ -1,0 +1,1309 @@
+"""What findings on nodes, their endpoints, types, states and reports say, word for word."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+import pytest
+
+from lifecycle.manifest.model import EndpointKind, EndpointPolicy, Policy, Run, RunKind
+from lifecycle.manifest.qos import QosProfile
+from lifecycle.plan import Plan, build_plan
+from lifecycle.plan.model import ParticipantConnections, PlannedParticipant
+from lifecycle.verify import (
+    Finding,
+    Identity,
+    NodeConfiguration,
+    Observation,
+    Outcome,
+    Stage,
+    verify,
+)
+from lifecycle.verify.rules.definitions import differ
+from lifecycle.verify.rules.nodes import UNDECLARED_NODE
+from tests.unit.plan.samples import (
+    endpoint,
+    node,
+    planned,
+    publisher,
+    subscription,
+    teleop,
+)
+from tests.unit.verify.edits import (
+    Edit,
+    add_configuration,
+    add_endpoint,
+    add_node,
+    both,
+    change_configuration,
+    change_endpoint,
+    change_node,
+    change_report,
+    drop_endpoint,
+    drop_endpoint_report,
+    drop_node,
+    drop_report,
+)
+from tests.unit.verify.perfect import perfect
+from tests.unit.verify.told import told
+
+PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
+SERVER, CLIENT = EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT
+ACTION_SERVER, ACTION_CLIENT = EndpointKind.ACTION_SERVER, EndpointKind.ACTION_CLIENT
+STATUS, CALIBRATE, DOCK = "/robot/status", "/robot/camera/calibrate", "/robot/dock"
+TRIGGER = "std_srvs/srv/Trigger"
+HERE, OTHER = "RIHS01_" + "a" * 8, "RIHS01_" + "b" * 8
+
+PLAN = build_plan(teleop(), environment={})
+OPEN = dataclasses.replace(PLAN, policy=Policy(undeclared_nodes=EndpointPolicy.OPEN))
+FOREIGN = planned(
+    node("talker", publisher("chatter"), run=Run(kind=RunKind.ATTACH)),
+    node("listener", subscription("chatter"), run=Run(kind=RunKind.ATTACH), managed=False),
+)
+
+
+def unchanged(seen: Observation) -> Observation:
+    return seen
+
+
+def wired(plan: Plan, key: str, *urls: str) -> Plan:
+    """The plan with all endpoints of a node on one connection, which others need not see."""
+    nodes = []
+    for each in plan.nodes:
+        if each.key == key:
+            net = PlannedParticipant(
+                name=f"_{each.name}_net",
+                dscp=None,
+                reason="",
+                connection="net",
+                connections=ParticipantConnections(urls=urls or ("udpv4://10.77.0.1:7911",)),
+            )
+            each = dataclasses.replace(  # noqa: PLW2901
+                each,
+                endpoints=tuple(
+                    dataclasses.replace(end, participant=net.name) for end in each.endpoints
+                ),
+                participants=(net,),
+            )
+        nodes.append(each)
+    return dataclasses.replace(plan, nodes=tuple(nodes))
+
+
+class Case(NamedTuple):
+    """What is seen, and of which rule the findings are compared."""
+
+    rule: str
+    edit: Edit
+    plan: Plan = PLAN
+    stage: Stage = Stage.CONNECTED
+    machines: frozenset[str] | None = None
+
+
+def findings_of(case: Case) -> list[Finding]:
+    seen = case.edit(perfect(case.plan, case.stage))
+    verdict = verify(case.plan, seen, stage=case.stage, machines=case.machines)
+    return [each for each in verdict.findings if each.rule == case.rule]
+
+
+def defined(plan: Plan, installed: str) -> Plan:
+    """The plan with this definition of every type installed here."""
+    nodes = tuple(
+        dataclasses.replace(
+            each,
+            endpoints=tuple(
+                dataclasses.replace(end, type_hash=installed) for end in each.endpoints
+            ),
+        )
+        for each in plan.nodes
+    )
+    return dataclasses.replace(plan, nodes=nodes)
+
+
+def twin(number: int) -> NodeConfiguration:
+    """The report of a second node of the camera's name."""
+    identity = Identity(machine_id="other", process_id=number, node_id=f"/robot/camera@{number}")
+    return dataclasses.replace(perfect(PLAN).configurations[0], identity=identity)
+
+
+FAR_CAMERA = dataclasses.replace(
+    PLAN,
+    nodes=(
+        dataclasses.replace(PLAN.nodes[0], connections=ParticipantConnections(urls=("shm://",))),
+        PLAN.nodes[1],
+    ),
+)
+TWO_TYPES = planned(
+    node("talker", publisher("chatter"), publisher("chatter", "std_msgs/msg/Empty")),
+    policy=Policy(undeclared_nodes=EndpointPolicy.OPEN),
+)
+SIMILAR = planned(
+    node(
+        "one",
+        publisher("a"),
+        publisher("b"),
+        publisher("number", "std_msgs/msg/Int32"),
+        subscription("c"),
+    )
+)
+
+
+def unreported(name: str) -> Edit:
+    """The node reports none of its endpoints."""
+    return change_configuration(name, endpoints=())
+
+
+SAYS: dict[str, tuple[Case, str]] = {
+    "a node is missing": (
+        Case("graph.missing-node", drop_node("/viewer")),
+        """\
+violated graph.missing-node: /viewer
+cannot find node /viewer in domain 7
+expected: node in the graph
+observed: no such node
+at: robot.lifecycle.yaml:3:3, on /viewer
+to do: look at the node's process and its log; compare domain, RMW and discovery range
+""",
+    ),
+    "nodes are missing that others start": (
+        Case("graph.missing-node", lambda seen: dataclasses.replace(seen, nodes=()), FOREIGN),
+        """\
+violated graph.missing-node: /talker
+cannot find node /talker in domain 0
+expected: node in the graph
+observed: no such node
+at: robot.lifecycle.yaml:3:3, on /talker
+to do: start it: the manifest attaches to it; compare domain, RMW and discovery range
+
+violated graph.missing-node: /listener
+cannot find node /listener in domain 0
+expected: node in the graph
+observed: no such node
+at: robot.lifecycle.yaml:3:3, on /listener
+to do: start it: the manifest attaches to it; compare domain, RMW and discovery range
+""",
+    ),
+    "a node of another machine is missing that others start": (
+        Case("graph.missing-node", drop_node("/talker"), FOREIGN, machines=frozenset({"far"})),
+        """\
+violated graph.missing-node: /talker
+cannot find node /talker in domain 0
+expected: node in the graph
+observed: no such node
+at: robot.lifecycle.yaml:3:3, on /talker
+to do: start it: the manifest attaches to it; compare domain, RMW and discovery range
+""",
+    ),
+    "a node is out of reach": (
+        Case(
+            "graph.missing-node",
+            both(drop_node("/robot/camera"), drop_node("/robot/_camera_net")),
+            FAR_CAMERA,
+            machines=frozenset({"operator"}),
+        ),
+        """\
+unverifiable graph.missing-node: /robot/camera
+cannot verify node /robot/camera: it talks by the shared memory of machine 'robot' alone
+expected: node in the graph
+observed: out of reach
+at: robot.lifecycle.yaml:3:3, on /robot/camera
+to do: the supervisor of machine 'robot' verifies it
+""",
+    ),
+    "one name is that of two nodes, and of three reports": (
+        Case(
+            "graph.duplicate-node",
+            both(
+                change_node("/robot/camera", count=2),
+                add_configuration(twin(1)),
+                add_configuration(twin(2)),
+            ),
+        ),
+        """\
+violated graph.duplicate-node: /robot/camera
+cannot tell 3 nodes named /robot/camera apart
+expected: 1 node of this name
+observed: 3 nodes
+at: robot.lifecycle.yaml:3:3, on /robot/camera
+to do: stop the other one, or give each its own name or namespace
+""",
+    ),
+    "one name is that of two nodes that nobody declared": (
+        Case("graph.duplicate-node", add_node("/spy", count=2), OPEN),
+        """\
+violated graph.duplicate-node: /spy
+cannot tell 2 nodes named /spy apart
+expected: 1 node of this name
+observed: 2 nodes
+at: nowhere, on /spy
+to do: stop the other one, or give each its own name or namespace
+""",
+    ),
+    "nodes that nobody declared": (
+        Case(
+            "graph.undeclared-node",
+            both(
+                add_node("/spy"),
+                *(add_endpoint(PUB, "/nosy", "/b", gid=gid) for gid in ("98", "99")),
+                add_endpoint(SUB, "/nosy", "/a", gid="97"),
+            ),
+        ),
+        """\
+violated graph.undeclared-node: /nosy
+cannot allow node /nosy: the manifest does not declare it
+expected: no such node
+observed: node with subscription of /a, publisher of /b
+at: nowhere, on /nosy
+to do: declare it, stop it, give the system a domain of its own, or set policy.undeclared_nodes:
+  open
+
+violated graph.undeclared-node: /spy
+cannot allow node /spy: the manifest does not declare it
+expected: no such node
+observed: node
+at: nowhere, on /spy
+to do: declare it, stop it, give the system a domain of its own, or set policy.undeclared_nodes:
+  open
+""",
+    ),
+    "an endpoint is missing of which its node does not report": (
+        Case(
+            "graph.missing-endpoint",
+            both(drop_endpoint(ACTION_SERVER, DOCK), drop_endpoint_report(ACTION_SERVER, DOCK)),
+        ),
+        """\
+violated graph.missing-endpoint: /robot/dock
+cannot find the action server of /robot/dock that /robot/camera declares
+expected: action server of /robot/camera
+observed: no such action server
+at: robot.lifecycle.yaml:15:9, on /robot/camera (action server)
+to do: compare the declared name, remaps and namespace with what the node creates
+""",
+    ),
+    "an endpoint is missing although its node reports it": (
+        Case("graph.missing-endpoint", drop_endpoint(SUB, STATUS)),
+        """\
+violated graph.missing-endpoint: /robot/status
+cannot find the subscription of /robot/status that /viewer declares
+expected: subscription of /viewer
+observed: no such subscription
+at: robot.lifecycle.yaml:18:9, on /viewer (subscription)
+to do: compare the declared name, remaps and namespace with what the node creates
+""",
+    ),
+    "an endpoint was remapped": (
+        Case(
+            "graph.missing-endpoint",
+            both(
+                drop_endpoint(SERVER, CALIBRATE),
+                change_report(SERVER, CALIBRATE, resolved="/other"),
+            ),
+        ),
+        """\
+violated graph.missing-endpoint: /robot/camera/calibrate
+cannot find the service server of /robot/camera/calibrate that /robot/camera declares
+expected: service server of /robot/camera
+observed: no such service server
+at: robot.lifecycle.yaml:14:9, on /robot/camera (service server)
+to do: service_servers/~/calibrate is /other now: is a remap wrong, or did somebody call
+  /robot/camera/remap? the name '' gives back the declared one
+""",
+    ),
+    "an endpoint has another type": (
+        Case("graph.type-mismatch", change_endpoint(PUB, STATUS, type="std_msgs/msg/Int32")),
+        """\
+violated graph.type-mismatch: /robot/status
+cannot accept the publisher of /robot/status in /robot/camera: it is declared as
+  std_msgs/msg/String and is std_msgs/msg/Int32
+expected: std_msgs/msg/String
+observed: std_msgs/msg/Int32
+at: robot.lifecycle.yaml:13:9, on /robot/camera (publisher)
+to do: correct the type in the manifest or in the node; DDS never matches two types
+""",
+    ),
+    "an endpoint has no known type": (
+        Case("graph.type-mismatch", change_endpoint(CLIENT, CALIBRATE, type="")),
+        """\
+violated graph.type-mismatch: /robot/camera/calibrate
+cannot accept the service client of /robot/camera/calibrate in /viewer: it is declared as
+  std_srvs/srv/Trigger and is of unknown type
+expected: std_srvs/srv/Trigger
+observed: no type
+at: robot.lifecycle.yaml:19:9, on /viewer (service client)
+to do: correct the type in the manifest or in the node; DDS never matches two types
+""",
+    ),
+    "an endpoint has another type of which only its node tells": (
+        Case(
+            "graph.type-mismatch",
+            both(drop_endpoint(PUB, STATUS), change_report(PUB, STATUS, type="std_msgs/msg/Int32")),
+        ),
+        """\
+violated graph.type-mismatch: /robot/status
+cannot accept the publisher of /robot/status in /robot/camera: it is declared as
+  std_msgs/msg/String and is std_msgs/msg/Int32
+expected: std_msgs/msg/String
+observed: std_msgs/msg/Int32
+at: robot.lifecycle.yaml:13:9, on /robot/camera (publisher)
+to do: correct the type in the manifest or in the node; DDS never matches two types
+""",
+    ),
+    "undeclared ends of a declared service have other types": (
+        Case(
+            "graph.type-mismatch",
+            both(
+                add_endpoint(CLIENT, "/other", CALIBRATE, type="std_srvs/srv/Empty"),
+                add_endpoint(CLIENT, "", CALIBRATE, type=""),
+            ),
+            OPEN,
+        ),
+        """\
+violated graph.type-mismatch: /robot/camera/calibrate
+cannot match the service client of /robot/camera/calibrate in /other: it is std_srvs/srv/Empty,
+  the manifest declares the service as std_srvs/srv/Trigger
+expected: std_srvs/srv/Trigger
+observed: std_srvs/srv/Empty
+at: nowhere, on /other (service client)
+to do: correct the type in the manifest or in the node; DDS never matches two types
+
+violated graph.type-mismatch: /robot/camera/calibrate
+cannot match the service client of /robot/camera/calibrate in an unknown node: it is of unknown
+  type, the manifest declares the service as std_srvs/srv/Trigger
+expected: std_srvs/srv/Trigger
+observed: no type
+at: nowhere, on no node (service client)
+to do: correct the type in the manifest or in the node; DDS never matches two types
+""",
+    ),
+    "an undeclared publisher has a type that no declaration of its topic has": (
+        Case(
+            "graph.type-mismatch",
+            add_endpoint(
+                PUB, "/other", "/chatter", type="std_msgs/msg/Int32", gid="99", qos=QosProfile()
+            ),
+            TWO_TYPES,
+        ),
+        """\
+violated graph.type-mismatch: /chatter
+cannot match the publisher of /chatter in /other: it is std_msgs/msg/Int32, the manifest
+  declares the topic as std_msgs/msg/String or std_msgs/msg/Empty
+expected: std_msgs/msg/String or std_msgs/msg/Empty
+observed: std_msgs/msg/Int32
+at: nowhere, on /other (publisher)
+to do: correct the type in the manifest or in the node; DDS never matches two types
+""",
+    ),
+    "a node could not make an endpoint": (
+        Case(
+            "endpoint.error",
+            both(
+                drop_endpoint(PUB, STATUS),
+                change_report(PUB, STATUS, gid="", nfes=None, matched=None, error="not feasible"),
+            ),
+        ),
+        """\
+violated endpoint.error: /robot/status
+cannot make the publisher 'status' of /robot/camera: not feasible
+expected: publisher of /robot/camera
+observed: not feasible
+at: robot.lifecycle.yaml:13:9, on /robot/camera (publisher)
+to do: read the reason: it is the middleware's own
+""",
+    ),
+    "a hidden endpoint is not reported": (
+        Case(
+            "graph.unseen-endpoint",
+            both(drop_endpoint(PUB, "/chatter"), drop_endpoint(SUB, "/chatter")),
+            wired(FOREIGN, "talker"),
+        ),
+        """\
+unverifiable graph.unseen-endpoint: /chatter
+cannot verify the publisher of /chatter in /talker: discovery does not show it here, and its
+  node does not report it
+expected: publisher of /talker
+observed: not shown by discovery
+at: robot.lifecycle.yaml:10:9, on /talker (publisher)
+to do: verify it where it can be seen: on its own host, or with its connection's peers
+""",
+    ),
+    "nobody counts whom a hidden service is matched with": (
+        Case("graph.unseen-endpoint", drop_endpoint(SERVER, CALIBRATE), wired(PLAN, "camera")),
+        """\
+unverifiable graph.unseen-endpoint: /robot/camera/calibrate
+cannot verify the service server of /robot/camera/calibrate in /robot/camera: discovery does not
+  show it here, and nobody counts whom it is matched with
+expected: service server of /robot/camera
+observed: not shown by discovery
+at: robot.lifecycle.yaml:14:9, on /robot/camera (service server)
+to do: verify it where it can be seen: on its own host, or with its connection's peers
+""",
+    ),
+    "a hidden endpoint is matched with more than are known": (
+        Case(
+            "graph.unseen-endpoint",
+            both(
+                drop_endpoint(PUB, STATUS),
+                add_endpoint(SUB, "/rviz2", STATUS, gid="99", qos=QosProfile()),
+                add_endpoint(SUB, "/rviz2", "/else", gid="98", qos=QosProfile()),
+                change_report(PUB, STATUS, matched=5),
+            ),
+            wired(PLAN, "camera"),
+        ),
+        """\
+unverifiable graph.unseen-endpoint: /robot/status
+cannot verify the publisher of /robot/status in /robot/camera: it is matched with 5, of which 2
+  are known here
+expected: publisher of /robot/camera
+observed: not shown by discovery
+at: robot.lifecycle.yaml:13:9, on /robot/camera (publisher)
+to do: verify it where it can be seen: on its own host, or with its connection's peers
+""",
+    ),
+    "an undeclared publisher": (
+        Case("graph.undeclared-publisher", add_endpoint(PUB, "/robot/camera", "/extra", gid="99")),
+        """\
+violated graph.undeclared-publisher: /extra
+cannot allow the publisher of /extra in /robot/camera: the manifest does not declare it
+expected: no such publisher of /robot/camera
+observed: publisher of type std_msgs/msg/String
+at: robot.lifecycle.yaml:3:3, on /robot/camera (publisher)
+to do: declare it in the node's interface, remove it, or set `endpoints: open` on the node
+""",
+    ),
+    "an undeclared service server of unknown type": (
+        Case(
+            "graph.undeclared-service-server",
+            add_endpoint(SERVER, "/robot/camera", "/extra", type=""),
+        ),
+        """\
+violated graph.undeclared-service-server: /extra
+cannot allow the service server of /extra in /robot/camera: the manifest does not declare it
+expected: no such service server of /robot/camera
+observed: service server
+at: robot.lifecycle.yaml:3:3, on /robot/camera (service server)
+to do: declare it in the node's interface, remove it, or set `endpoints: open` on the node
+""",
+    ),
+    "an undeclared publisher of the only missing one's type": (
+        Case(
+            "graph.undeclared-publisher",
+            both(
+                change_endpoint(PUB, STATUS, name="/robot/stauts"),
+                drop_endpoint_report(PUB, STATUS),
+            ),
+        ),
+        """\
+violated graph.undeclared-publisher: /robot/stauts
+cannot allow the publisher of /robot/stauts in /robot/camera: the manifest does not declare it
+expected: no such publisher of /robot/camera
+observed: publisher of type std_msgs/msg/String
+at: robot.lifecycle.yaml:3:3, on /robot/camera (publisher)
+to do: /robot/status of the same type is missing: is a remap or a name wrong?
+""",
+    ),
+    "an alias": (
+        Case(
+            "graph.undeclared-publisher",
+            both(
+                add_endpoint(PUB, "/robot/camera", "/copy", gid="99"),
+                change_report(PUB, STATUS, aliases=("/copy",)),
+            ),
+        ),
+        """\
+violated graph.undeclared-publisher: /copy
+cannot allow the publisher of /copy in /robot/camera: the manifest does not declare it
+expected: no such publisher of /robot/camera
+observed: publisher of type std_msgs/msg/String
+at: robot.lifecycle.yaml:3:3, on /robot/camera (publisher)
+to do: it is an alias of publishers/status: see who called /robot/camera/alias
+""",
+    ),
+    "another name": (
+        Case(
+            "graph.undeclared-publisher",
+            both(
+                change_endpoint(PUB, STATUS, name="/else"),
+                change_report(PUB, STATUS, resolved="/else"),
+            ),
+        ),
+        """\
+violated graph.undeclared-publisher: /else
+cannot allow the publisher of /else in /robot/camera: the manifest does not declare it
+expected: no such publisher of /robot/camera
+observed: publisher of type std_msgs/msg/String
+at: robot.lifecycle.yaml:3:3, on /robot/camera (publisher)
+to do: it is publishers/status under another name: is a remap wrong, or did somebody call
+  /robot/camera/remap?
+""",
+    ),
+    "a tool publishes on a declared topic": (
+        Case(
+            "graph.undeclared-publisher",
+            add_endpoint(PUB, "/rviz2", STATUS, gid="99", qos=QosProfile()),
+        ),
+        """\
+violated graph.undeclared-publisher: /robot/status
+cannot allow the publisher of /robot/status in /rviz2: the manifest does not declare it, and it
+  feeds the system
+expected: no such publisher of /rviz2
+observed: publisher of type std_msgs/msg/String
+at: nowhere, on /rviz2 (publisher)
+to do: policy.tolerated_nodes (rviz2) lets it listen only: stop it, or declare its node
+""",
+    ),
+    "a tool serves a declared service": (
+        Case(
+            "graph.undeclared-service-server",
+            both(
+                add_endpoint(CLIENT, "/rviz2", CALIBRATE),
+                add_endpoint(SERVER, "/rviz2", CALIBRATE, type=""),
+            ),
+        ),
+        """\
+violated graph.undeclared-service-server: /robot/camera/calibrate
+cannot allow the service server of /robot/camera/calibrate in /rviz2: the manifest does not
+  declare it, and it serves the system
+expected: no such service server of /rviz2
+observed: service server
+at: nowhere, on /rviz2 (service server)
+to do: policy.tolerated_nodes (rviz2) lets it listen only: stop it, or declare its node
+""",
+    ),
+    "endpoints whose node is not known": (
+        Case(
+            "graph.unattributed-endpoint",
+            both(
+                add_endpoint(SUB, "", "/a"),
+                add_endpoint(PUB, "", "/b", gid="0104" + "0" * 28, address="10.0.0.7"),
+                add_endpoint(PUB, "", "/c", gid="0" * 32),
+                add_endpoint(PUB, "", "/d", gid="010f" + "0" * 28),
+            ),
+        ),
+        """\
+violated graph.unattributed-endpoint: /a
+cannot tell whose subscription of /a this is
+expected: subscription of a declared node
+observed: subscription of an unknown node
+at: nowhere, on no node (subscription)
+to do: wait for discovery; a plain DDS program never tells a node name: give it another domain
+
+violated graph.unattributed-endpoint: /b
+cannot tell whose publisher of /b this is (a participant of DDS vendor 0x0104, at 10.0.0.7, GID
+  01040000000000000000000000000000)
+expected: publisher of a declared node
+observed: publisher of an unknown node
+at: nowhere, on no node (publisher)
+to do: wait for discovery; a plain DDS program never tells a node name: give it another domain
+
+violated graph.unattributed-endpoint: /c
+cannot tell whose publisher of /c this is (GID 00000000000000000000000000000000)
+expected: publisher of a declared node
+observed: publisher of an unknown node
+at: nowhere, on no node (publisher)
+to do: wait for discovery; a plain DDS program never tells a node name: give it another domain
+
+violated graph.unattributed-endpoint: /d
+cannot tell whose publisher of /d this is (a participant of Fast DDS, GID
+  010f0000000000000000000000000000)
+expected: publisher of a declared node
+observed: publisher of an unknown node
+at: nowhere, on no node (publisher)
+to do: wait for discovery; a plain DDS program never tells a node name: give it another domain
+""",
+    ),
+    "endpoints whose node is not known, of which one feeds nothing, after the gate": (
+        Case(
+            "graph.unattributed-endpoint",
+            both(add_endpoint(SUB, "", STATUS, gid="98"), add_endpoint(PUB, "", STATUS, gid="99")),
+            stage=Stage.ACTIVE,
+        ),
+        """\
+violated graph.unattributed-endpoint: /robot/status
+cannot tell whose publisher of /robot/status this is (GID 99)
+expected: publisher of a declared node
+observed: publisher of an unknown node
+at: nowhere, on no node (publisher)
+to do: wait for discovery; a plain DDS program never tells a node name: give it another domain
+
+unverifiable graph.unattributed-endpoint: /robot/status
+cannot tell whose subscription of /robot/status this is (GID 98)
+expected: subscription of a declared node
+observed: subscription of an unknown node
+at: nowhere, on no node (subscription)
+to do: wait for discovery; a plain DDS program never tells a node name: give it another domain
+""",
+    ),
+    "a type has another definition than is installed": (
+        Case(
+            "graph.type-definition-differs",
+            change_endpoint(SUB, "/chatter", type_hash=OTHER),
+            defined(FOREIGN, HERE),
+        ),
+        """\
+violated graph.type-definition-differs: /chatter
+cannot accept the subscription of /chatter in /listener: its std_msgs/msg/String is not that of
+  the definition installed here; both have the name, so the topic is matched and the data are
+  not understood
+expected: std_msgs/msg/String as RIHS01_aaaaaaaa
+observed: std_msgs/msg/String as RIHS01_bbbbbbbb
+at: robot.lifecycle.yaml:10:9, on /listener (subscription)
+to do: build both ends from one version of the interface package, and install the same here
+""",
+    ),
+    "types of services have other definitions": (
+        Case(
+            "graph.type-definition-differs",
+            both(
+                change_endpoint(SERVER, CALIBRATE, type_hash=HERE),
+                change_endpoint(CLIENT, CALIBRATE, type_hash=OTHER),
+                add_endpoint(CLIENT, "", CALIBRATE, type=TRIGGER, type_hash=OTHER),
+                add_endpoint(CLIENT, "/other", CALIBRATE, type=TRIGGER, type_hash=OTHER),
+                add_endpoint(CLIENT, "/rviz2", CALIBRATE, type=TRIGGER, type_hash=OTHER),
+                add_endpoint(
+                    ACTION_CLIENT, "/robot/camera", DOCK, type="robot/action/Dock", type_hash=OTHER
+                ),
+                change_endpoint(ACTION_SERVER, DOCK, type_hash=HERE),
+            ),
+            defined(OPEN, ""),
+        ),
+        """\
+violated graph.type-definition-differs: /robot/camera/calibrate
+cannot accept the service client of /robot/camera/calibrate in /viewer: its std_srvs/srv/Trigger
+  is not that of /robot/camera; both have the name, so the service is matched and the data are
+  not understood
+expected: std_srvs/srv/Trigger as RIHS01_aaaaaaaa
+observed: std_srvs/srv/Trigger as RIHS01_bbbbbbbb
+at: robot.lifecycle.yaml:19:9, on /viewer (service client)
+to do: build both ends from one version of the interface package, and install the same here
+
+violated graph.type-definition-differs: /robot/camera/calibrate
+cannot accept the service client of /robot/camera/calibrate in /other: its std_srvs/srv/Trigger
+  is not that of /robot/camera; both have the name, so the service is matched and the data are
+  not understood
+expected: std_srvs/srv/Trigger as RIHS01_aaaaaaaa
+observed: std_srvs/srv/Trigger as RIHS01_bbbbbbbb
+at: nowhere, on /other (service client)
+to do: build both ends from one version of the interface package, and install the same here
+
+violated graph.type-definition-differs: /robot/camera/calibrate
+cannot accept the service client of /robot/camera/calibrate in /rviz2: its std_srvs/srv/Trigger
+  is not that of /robot/camera; both have the name, so the service is matched and the data are
+  not understood
+expected: std_srvs/srv/Trigger as RIHS01_aaaaaaaa
+observed: std_srvs/srv/Trigger as RIHS01_bbbbbbbb
+at: nowhere, on /rviz2 (service client)
+to do: build both ends from one version of the interface package, and install the same here
+
+violated graph.type-definition-differs: /robot/camera/calibrate
+cannot accept the service client of /robot/camera/calibrate in an unknown node: its
+  std_srvs/srv/Trigger is not that of /robot/camera; both have the name, so the service is
+  matched and the data are not understood
+expected: std_srvs/srv/Trigger as RIHS01_aaaaaaaa
+observed: std_srvs/srv/Trigger as RIHS01_bbbbbbbb
+at: nowhere, on no node (service client)
+to do: build both ends from one version of the interface package, and install the same here
+
+violated graph.type-definition-differs: /robot/dock
+cannot accept the action client of /robot/dock in /robot/camera: its robot/action/Dock is not
+  that of /robot/camera; both have the name, so the action is matched and the data are not
+  understood
+expected: robot/action/Dock as RIHS01_aaaaaaaa
+observed: robot/action/Dock as RIHS01_bbbbbbbb
+at: nowhere, on /robot/camera (action client)
+to do: build both ends from one version of the interface package, and install the same here
+""",
+    ),
+    "nodes announce no hashes": (
+        Case(
+            "graph.type-definition-differs",
+            both(
+                add_endpoint(PUB, "", STATUS, gid="99", type_hash="", qos=QosProfile()),
+                *(
+                    change_endpoint(*each, type_hash="")
+                    for each in ((SERVER, CALIBRATE), (PUB, STATUS), (SUB, STATUS))
+                ),
+            ),
+            defined(OPEN, HERE),
+        ),
+        """\
+unverifiable graph.type-definition-differs: an unknown node
+cannot verify which definitions an unknown node uses on /robot/status (publisher): it announces
+  no type hashes
+expected: a type hash
+observed: none announced
+at: nowhere, on no node
+to do: ROS 2 announces them since Iron; run the node under a newer one, or accept the gap
+
+unverifiable graph.type-definition-differs: /robot/camera
+cannot verify which definitions /robot/camera uses on /robot/status (publisher),
+  /robot/camera/calibrate (service server): it announces no type hashes
+expected: a type hash
+observed: none announced
+at: robot.lifecycle.yaml:13:9, on /robot/camera
+to do: ROS 2 announces them since Iron; run the node under a newer one, or accept the gap
+
+unverifiable graph.type-definition-differs: /viewer
+cannot verify which definitions /viewer uses on /robot/status (subscription): it announces no
+  type hashes
+expected: a type hash
+observed: none announced
+at: robot.lifecycle.yaml:18:9, on /viewer
+to do: ROS 2 announces them since Iron; run the node under a newer one, or accept the gap
+""",
+    ),
+    "a client counts no server": (
+        Case("graph.unmatched-client", change_report(ACTION_CLIENT, DOCK, server_matched=False)),
+        """\
+violated graph.unmatched-client: /robot/dock: /viewer → /robot/camera
+cannot see /viewer → /robot/camera matched on action /robot/dock: the client counts no server as
+  available
+expected: matched
+observed: the client counts no server as available
+at: robot.lifecycle.yaml:20:9, on /viewer (action client)
+to do: look at the QoS of both ends, and at the network between the two
+""",
+    ),
+    "a client does not say whether it has a server": (
+        Case("graph.unmatched-client", change_report(CLIENT, CALIBRATE, server_matched=None)),
+        """\
+unverifiable graph.unmatched-client: /robot/camera/calibrate: /viewer → /robot/camera
+cannot verify that /viewer → /robot/camera are matched on service /robot/camera/calibrate: its
+  client does not tell
+expected: matched
+observed: its client does not tell
+at: robot.lifecycle.yaml:19:9, on /viewer (service client)
+to do: look at the QoS of both ends, and at the network between the two
+""",
+    ),
+    "a client has one of three servers": (
+        Case(
+            "graph.unmatched-client",
+            both(
+                add_endpoint(SERVER, "/other", CALIBRATE, type=TRIGGER),
+                add_endpoint(SERVER, "/viewer", CALIBRATE, type=TRIGGER),
+            ),
+            OPEN,
+        ),
+        """\
+unverifiable graph.unmatched-client: /robot/camera/calibrate: /viewer → /robot/camera
+cannot verify that /viewer → /robot/camera are matched on service /robot/camera/calibrate: it
+  has 3 servers, and the client does not tell which it is matched with
+expected: matched
+observed: it has 3 servers, and the client does not tell which it is matched with
+at: robot.lifecycle.yaml:19:9, on /viewer (service client)
+to do: look at the QoS of both ends, and at the network between the two
+""",
+    ),
+    "a node is in another state": (
+        Case("state.wrong-state", change_node("/viewer", state="unconfigured")),
+        """\
+violated state.wrong-state: /viewer
+cannot accept node /viewer: it is unconfigured and must be inactive, connected
+expected: inactive, connected
+observed: unconfigured
+at: robot.lifecycle.yaml:3:3, on /viewer
+to do: look at the node's log for the transition that failed, or at who else drives it
+""",
+    ),
+    "a node is in another state after the gate": (
+        Case(
+            "state.wrong-state",
+            change_configuration("/viewer", state="inactive"),
+            stage=Stage.ACTIVE,
+        ),
+        """\
+violated state.wrong-state: /viewer
+cannot accept node /viewer: it is inactive and must be active
+expected: active
+observed: inactive
+at: robot.lifecycle.yaml:3:3, on /viewer
+to do: look at the node's log for the transition that failed, or at who else drives it
+""",
+    ),
+    "a node that others start is in another state": (
+        Case("state.wrong-state", change_node("/talker", state="unconfigured"), FOREIGN),
+        """\
+violated state.wrong-state: /talker
+cannot accept node /talker: it is unconfigured and must be inactive
+expected: inactive
+observed: unconfigured
+at: robot.lifecycle.yaml:3:3, on /talker
+to do: look at the node's log for the transition that failed, or at who else drives it
+""",
+    ),
+    "a node of another machine is in another state": (
+        Case(
+            "state.wrong-state",
+            change_node("/talker", state="unconfigured"),
+            FOREIGN,
+            machines=frozenset({"far"}),
+        ),
+        """\
+violated state.wrong-state: /talker
+cannot accept node /talker: it is unconfigured and must be inactive or active
+expected: inactive or active
+observed: unconfigured
+at: robot.lifecycle.yaml:3:3, on /talker
+to do: look at the node's log for the transition that failed, or at who else drives it
+""",
+    ),
+    "a node has not connected": (
+        Case("state.wrong-state", change_configuration("/viewer", connected=False)),
+        """\
+violated state.wrong-state: /viewer
+cannot accept node /viewer: it is inactive, disconnected and must be inactive, connected
+expected: inactive, connected
+observed: inactive, disconnected
+at: robot.lifecycle.yaml:3:3, on /viewer
+to do: look at the node's log for the transition that failed, or at who else drives it
+""",
+    ),
+    "a node is no managed node": (
+        Case("state.wrong-state", change_node("/talker", state=None, managed=False), FOREIGN),
+        """\
+violated state.wrong-state: /talker
+cannot accept node /talker: it offers no lifecycle services
+expected: managed node, inactive
+observed: not a managed node
+at: robot.lifecycle.yaml:3:3, on /talker
+to do: make it a managed node, or declare it `managed: false`
+""",
+    ),
+    "a node of ours is no managed node and reports nothing": (
+        Case(
+            "state.wrong-state",
+            both(drop_report("/viewer"), change_node("/viewer", state=None, managed=False)),
+            stage=Stage.ACTIVE,
+        ),
+        """\
+violated state.wrong-state: /viewer
+cannot accept node /viewer: it offers no lifecycle services
+expected: managed node, active
+observed: not a managed node
+at: robot.lifecycle.yaml:3:3, on /viewer
+to do: make it a managed node, or declare it `managed: false`
+""",
+    ),
+    "a state is not known": (
+        Case("state.unverifiable", change_node("/talker", state=None, managed=None), FOREIGN),
+        """\
+unverifiable state.unverifiable: /talker
+cannot verify the state of node /talker: nobody tells it
+expected: inactive
+observed: unknown
+at: robot.lifecycle.yaml:3:3, on /talker
+to do: see whether its ~/get_state answers; a plain node must be declared `managed: false`
+""",
+    ),
+    "a node of ours does not report": (
+        Case("config.missing-report", drop_report("/viewer")),
+        """\
+violated config.missing-report: /viewer
+cannot judge node /viewer: it did not report its configuration
+expected: node configuration
+observed: no report
+at: robot.lifecycle.yaml:3:3, on /viewer
+to do: see whether its ~/get_configuration answers; look at its log
+""",
+    ),
+    "a node of ours leaves endpoints out of its report": (
+        Case(
+            "config.incomplete-report",
+            both(drop_endpoint_report(SUB, STATUS), drop_endpoint_report(CLIENT, CALIBRATE)),
+        ),
+        """\
+violated config.incomplete-report: /robot/status
+cannot judge the subscription of /robot/status: /viewer does not report it
+expected: subscription in the report of /viewer
+observed: not mentioned
+at: robot.lifecycle.yaml:18:9, on /viewer (subscription)
+to do: the node runs from another manifest, or has not connected: compare and restart it
+
+violated config.incomplete-report: /robot/camera/calibrate
+cannot judge the service client of /robot/camera/calibrate: /viewer does not report it
+expected: service client in the report of /viewer
+observed: not mentioned
+at: robot.lifecycle.yaml:19:9, on /viewer (service client)
+to do: the node runs from another manifest, or has not connected: compare and restart it
+""",
+    ),
+    "two missing publishers could be the undeclared one": (
+        Case(
+            "graph.undeclared-publisher",
+            both(
+                unreported("/one"),
+                drop_endpoint(PUB, "/a"),
+                drop_endpoint(PUB, "/b"),
+                add_endpoint(PUB, "/one", "/x", gid="99", qos=QosProfile()),
+            ),
+            SIMILAR,
+        ),
+        """\
+violated graph.undeclared-publisher: /x
+cannot allow the publisher of /x in /one: the manifest does not declare it
+expected: no such publisher of /one
+observed: publisher of type std_msgs/msg/String
+at: robot.lifecycle.yaml:3:3, on /one (publisher)
+to do: declare it in the node's interface, remove it, or set `endpoints: open` on the node
+""",
+    ),
+    "of what is missing one only is of the kind and type of the undeclared one": (
+        Case(
+            "graph.undeclared-publisher",
+            both(
+                unreported("/one"),
+                *(drop_endpoint(*each) for each in ((PUB, "/b"), (PUB, "/number"), (SUB, "/c"))),
+                add_endpoint(PUB, "/one", "/x", gid="99", qos=QosProfile()),
+            ),
+            SIMILAR,
+        ),
+        """\
+violated graph.undeclared-publisher: /x
+cannot allow the publisher of /x in /one: the manifest does not declare it
+expected: no such publisher of /one
+observed: publisher of type std_msgs/msg/String
+at: robot.lifecycle.yaml:3:3, on /one (publisher)
+to do: /b of the same type is missing: is a remap or a name wrong?
+""",
+    ),
+    "a second publisher where one is declared": (
+        Case(
+            "graph.undeclared-publisher",
+            add_endpoint(PUB, "/robot/camera", STATUS, gid="99", qos=QosProfile()),
+        ),
+        """\
+violated graph.undeclared-publisher: /robot/status
+cannot allow the publisher of /robot/status in /robot/camera: the manifest does not declare it
+expected: no such publisher of /robot/camera
+observed: publisher of type std_msgs/msg/String
+at: robot.lifecycle.yaml:3:3, on /robot/camera (publisher)
+to do: declare it in the node's interface, remove it, or set `endpoints: open` on the node
+""",
+    ),
+    "an alias of a service whose node leaves others out of its report": (
+        Case(
+            "graph.undeclared-service-server",
+            both(
+                drop_endpoint_report(PUB, "/robot/video"),
+                change_report(SERVER, CALIBRATE, aliases=("/copy",)),
+            ),
+        ),
+        """\
+violated graph.undeclared-service-server: /copy
+cannot allow the service server of /copy in /robot/camera: the manifest does not declare it
+expected: no such service server of /robot/camera
+observed: service server of type std_srvs/srv/Trigger
+at: robot.lifecycle.yaml:3:3, on /robot/camera (service server)
+to do: it is an alias of service_servers/~/calibrate: see who called /robot/camera/alias
+""",
+    ),
+    "parts of services of two definitions, and as many as are not": (
+        Case(
+            "graph.type-definition-differs",
+            both(
+                change_endpoint(SERVER, CALIBRATE, type_hash=f"{HERE} {HERE}"),
+                change_endpoint(CLIENT, CALIBRATE, type_hash=HERE),
+            ),
+            defined(PLAN, ""),
+        ),
+        """\
+violated graph.type-definition-differs: /robot/camera/calibrate
+cannot accept the service client of /robot/camera/calibrate in /viewer: its std_srvs/srv/Trigger
+  is not that of /robot/camera; both have the name, so the service is matched and the data are
+  not understood
+expected: std_srvs/srv/Trigger as RIHS01_aaaaaaaa RIHS01_aaaaaaaa
+observed: std_srvs/srv/Trigger as RIHS01_aaaaaaaa
+at: robot.lifecycle.yaml:19:9, on /viewer (service client)
+to do: build both ends from one version of the interface package, and install the same here
+""",
+    ),
+    "a publisher of nobody known is the first of two definitions": (
+        Case(
+            "graph.type-definition-differs",
+            both(
+                change_endpoint(PUB, STATUS, type_hash=HERE),
+                add_endpoint(PUB, "", STATUS, gid="99", type_hash=OTHER, qos=QosProfile()),
+            ),
+            defined(OPEN, ""),
+        ),
+        """\
+violated graph.type-definition-differs: /robot/status
+cannot accept the publisher of /robot/status in /robot/camera: its std_msgs/msg/String is not
+  that of an unknown node; both have the name, so the topic is matched and the data are not
+  understood
+expected: std_msgs/msg/String as RIHS01_bbbbbbbb
+observed: std_msgs/msg/String as RIHS01_aaaaaaaa
+at: robot.lifecycle.yaml:13:9, on /robot/camera (publisher)
+to do: build both ends from one version of the interface package, and install the same here
+""",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", SAYS)
+def test_a_finding_is_told_whole_where(case: str):
+    how, expected = SAYS[case]
+    assert told(findings_of(how)) == expected
+
+
+WRONG = "std_srvs/srv/Empty"
+FOUR = planned(
+    node("one", publisher("a"), endpoints=EndpointPolicy.OPEN),
+    node("plain", run=Run(kind=RunKind.ATTACH), managed=False),
+    node("two", publisher("b"), subscription("c")),
+    node("wild", publisher("d"), run=Run(kind=RunKind.ATTACH)),
+)
+ASKING = planned(
+    node("base", endpoint(SERVER, "a", TRIGGER, None), endpoint(SERVER, "b", TRIGGER, None)),
+    node("panel", endpoint(CLIENT, "a", TRIGGER, None), endpoint(CLIENT, "b", TRIGGER, None)),
+)
+
+
+def gone(name: str) -> Edit:
+    """Nothing of the node is seen."""
+    return both(
+        drop_node(name),
+        drop_report(name),
+        lambda seen: dataclasses.replace(
+            seen, endpoints=tuple(each for each in seen.endpoints if each.node != name)
+        ),
+    )
+
+
+def reporting_itself(name: str, state: str) -> Edit:
+    """A node that another program runs reports as ours do."""
+    return add_configuration(
+        dataclasses.replace(perfect(PLAN).configurations[0], name=name, state=state, endpoints=())
+    )
+
+
+SUBJECTS: dict[str, tuple[Case, list[str]]] = {
+    "the second of two nodes is missing": (
+        Case("graph.missing-node", gone("/two"), FOUR),
+        ["/two"],
+    ),
+    "the last of several nodes is there twice": (
+        Case("graph.duplicate-node", change_node("/wild", count=2), FOUR),
+        ["/wild"],
+    ),
+    "one of two reports of one name is late, and the graph shows one node": (
+        Case("graph.duplicate-node", add_configuration(twin(1))),
+        ["/robot/camera"],
+    ),
+    "nothing of a node is seen whose endpoints are hidden anyway": (
+        Case("graph.unseen-endpoint", gone("/talker"), wired(FOREIGN, "talker")),
+        [],
+    ),
+    "a node that may have more endpoints comes before one that may not": (
+        Case(
+            "graph.undeclared-publisher",
+            both(
+                add_endpoint(PUB, "/one", "/x", gid="98"), add_endpoint(PUB, "/two", "/y", gid="99")
+            ),
+            FOUR,
+        ),
+        ["/y"],
+    ),
+    "undeclared clients of a service of nobody, of a declared one, and of one of another type": (
+        Case(
+            "graph.type-mismatch",
+            both(
+                add_endpoint(CLIENT, "/other", "/a", type=WRONG),
+                add_endpoint(CLIENT, "/other", CALIBRATE, type=TRIGGER),
+                add_endpoint(ACTION_CLIENT, "/other", DOCK, type=WRONG),
+            ),
+            OPEN,
+        ),
+        [DOCK],
+    ),
+    "a topic and a service of one name": (
+        Case("graph.type-mismatch", add_endpoint(CLIENT, "/other", STATUS, type=WRONG), OPEN),
+        [],
+    ),
+    "a tool publishes in a system that is open": (
+        Case("graph.undeclared-publisher", add_endpoint(PUB, "/rviz2", STATUS, gid="99"), OPEN),
+        [],
+    ),
+    "an undeclared topic comes before a declared one of two definitions": (
+        Case(
+            "graph.type-definition-differs",
+            both(
+                add_endpoint(PUB, "/aa", "/x", gid="99", type_hash=OTHER, qos=QosProfile()),
+                change_endpoint(PUB, STATUS, type_hash=HERE),
+                change_endpoint(SUB, STATUS, type_hash=OTHER),
+            ),
+            defined(OPEN, ""),
+        ),
+        [STATUS],
+    ),
+    "a topic without hashes comes before one of two definitions": (
+        Case(
+            "graph.type-definition-differs",
+            both(
+                change_endpoint(PUB, "/robot/battery", type_hash=""),
+                change_endpoint(PUB, STATUS, type_hash=HERE),
+                change_endpoint(SUB, STATUS, type_hash=OTHER),
+            ),
+            defined(PLAN, ""),
+        ),
+        [STATUS],
+    ),
+    "two publishers of a node differ from what is installed, which is one finding": (
+        Case(
+            "graph.type-definition-differs",
+            both(
+                change_endpoint(PUB, STATUS, type_hash=OTHER),
+                lambda seen: dataclasses.replace(
+                    seen,
+                    endpoints=(
+                        *seen.endpoints,
+                        *(
+                            dataclasses.replace(each, node="/aa", gid=gid)
+                            for each in seen.endpoints
+                            if (each.kind, each.name) == (PUB, STATUS)
+                            for gid in ("98", "99")
+                        ),
+                    ),
+                ),
+            ),
+            defined(OPEN, HERE),
+        ),
+        [STATUS, STATUS],
+    ),
+    "a client without a report comes before one that counts no server": (
+        Case(
+            "graph.unmatched-client",
+            both(
+                drop_endpoint_report(CLIENT, "/a"),
+                change_report(CLIENT, "/b", server_matched=False),
+            ),
+            ASKING,
+        ),
+        ["/b: /panel → /base"],
+    ),
+    "a client that is missing comes before one that counts no server": (
+        Case(
+            "graph.unmatched-client",
+            both(drop_endpoint(CLIENT, "/a"), change_report(CLIENT, "/b", server_matched=False)),
+            ASKING,
+        ),
+        ["/b: /panel → /base"],
+    ),
+    "the server of a client that counts none is missing": (
+        Case(
+            "graph.unmatched-client",
+            both(drop_endpoint(SERVER, "/a"), change_report(CLIENT, "/a", server_matched=False)),
+            ASKING,
+        ),
+        [],
+    ),
+    "two servers of one node count as two, and are named once": (
+        Case(
+            "graph.unmatched-client",
+            unchanged,
+            planned(
+                node("base", *(endpoint(SERVER, "a", TRIGGER, None) for _ in range(2))),
+                node("panel", endpoint(CLIENT, "a", TRIGGER, None)),
+            ),
+        ),
+        ["/a: /panel → /base"],
+    ),
+    "a client is about to go": (
+        Case(
+            "graph.unmatched-client",
+            change_report(CLIENT, CALIBRATE, mapped=False, server_matched=False),
+        ),
+        [],
+    ),
+    "nothing is seen of a node whose state would be judged": (
+        Case("state.unverifiable", both(gone("/wild")), FOUR),
+        [],
+    ),
+    "both sources of a state are unknown, of a node of another machine": (
+        Case(
+            "state.unverifiable",
+            change_node("/wild", state=None, managed=None),
+            FOUR,
+            machines=frozenset({"far"}),
+        ),
+        ["/wild"],
+    ),
+    "a node of another machine is active already": (
+        Case(
+            "state.wrong-state",
+            change_node("/wild", state="active"),
+            FOUR,
+            machines=frozenset({"far"}),
+        ),
+        [],
+    ),
+    "a node of another machine is inactive after the gate": (
+        Case(
+            "state.wrong-state",
+            change_node("/wild", state="inactive"),
+            FOUR,
+            Stage.ACTIVE,
+            frozenset({"far"}),
+        ),
+        ["/wild"],
+    ),
+    "only its report says that a node of others is managed": (
+        Case(
+            "state.wrong-state",
+            both(
+                change_node("/wild", state=None, managed=False),
+                reporting_itself("/wild", "inactive"),
+            ),
+            FOUR,
+        ),
+        ["/wild"],
+    ),
+    "a node of ours that is not there, and one that does not report": (
+        Case("config.missing-report", both(gone("/one"), drop_report("/two")), FOUR),
+        ["/two"],
+    ),
+    "two nodes do not report": (
+        Case("config.missing-report", both(drop_report("/one"), drop_report("/two")), FOUR),
+        ["/one", "/two"],
+    ),
+    "one node does not report, and one leaves an endpoint out": (
+        Case(
+            "config.incomplete-report",
+            both(drop_report("/one"), drop_endpoint_report(SUB, "/c")),
+            FOUR,
+        ),
+        ["/c"],
+    ),
+}
+
+
+@pytest.mark.parametrize("case", SUBJECTS)
+def test_findings_are_on_these_alone_where(case: str):
+    how, expected = SUBJECTS[case]
+    assert [each.subject for each in findings_of(how)] == expected
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "expected"),
+    [
+        (HERE, HERE, False),
+        (HERE, OTHER, True),
+        (f"{HERE} {HERE}", f"{HERE} {OTHER}", True),
+        (f"{HERE} {HERE}", f"{HERE}\n{HERE}", False),
+        (f"{HERE} {HERE}", HERE, True),
+        (HERE, f"{HERE} {HERE}", True),
+        (HERE, "RIHS02_" + "b" * 8, False),
+        (f"{HERE} RIHS02_b", f"{OTHER} RIHS01_b", True),
+    ],
+)
+def test_hashes_differ_where_those_of_one_version_do(one: str, other: str, expected: bool):
+    assert differ(one, other) is expected
+
+
+def test_a_rule_gives_no_outcome_that_it_is_not_documented_to_have():
+    with pytest.raises(
+        ValueError, match=r"^cannot give rule graph\.undeclared-node the outcome unverifiable$"
+    ):
+        UNDECLARED_NODE.finding(
+            Outcome.UNVERIFIABLE, subject="/spy", expected="", observed="", message=""
+        )

@@ -1,0 +1,257 @@
+"""What a flow report takes from findings and sockets."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from lifecycle.manifest.model import EndpointKind, Machine, UniqueHow
+from lifecycle.network.nfe import (
+    InternetProtocol,
+    NetworkFlowEndpoint,
+    TransportProtocol,
+)
+from lifecycle.plan import Plan, build_plan
+from lifecycle.verify import Finding, FlowReport, Outcome, Stage, verify
+from lifecycle.verify.flow_reports import flow_reports
+from lifecycle.verify.layout import lay_out
+from tests.unit.plan.samples import at, node, planned, publisher, subscription, teleop
+from tests.unit.verify.edits import (
+    Edit,
+    both,
+    change_report,
+    drop_report,
+)
+from tests.unit.verify.perfect import perfect
+
+PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
+PLAN = build_plan(teleop(), environment={})
+
+
+def flows_after(edit: Edit, plan: Plan = PLAN) -> tuple[FlowReport, ...]:
+    return verify(plan, edit(perfect(plan)), stage=Stage.CONNECTED).flows
+
+
+def unchanged(seen):
+    return seen
+
+
+NET = planned(
+    node("one", publisher("a"), machine="m"),
+    node("two", subscription("a"), machine="n"),
+)
+
+
+def finding(
+    subject: str,
+    node: str = "",
+    endpoint: EndpointKind | None = None,
+    *,
+    outcome: Outcome = Outcome.UNVERIFIABLE,
+    rule: str = "graph.qos-incompatible",
+) -> Finding:
+    return Finding(
+        rule=rule,
+        outcome=outcome,
+        subject=subject,
+        expected="",
+        observed="",
+        message="",
+        node=node,
+        endpoint=endpoint,
+    )
+
+
+def outcome_with(*findings: Finding) -> Outcome:
+    (flow,) = flow_reports(lay_out(NET, perfect(NET), Stage.CONNECTED), findings)
+    return flow.outcome
+
+
+SUBJECT = "/a: /one → /two"
+
+
+@pytest.mark.parametrize(
+    ("place", "concerns"),
+    [
+        ((SUBJECT, "", None), True),
+        (("/one", "/one", None), True),
+        (("/two", "/two", None), True),
+        (("/a", "/one", PUB), True),
+        (("/a", "/two", SUB), True),
+        (("/a", "/one", SUB), False),
+        (("/a", "/two", PUB), False),
+        (("/a", "", None), False),
+        (("/b", "/one", PUB), False),
+        (("/three", "/three", None), False),
+        ((SUBJECT, "/one", None), False),
+    ],
+)
+def test_a_finding_concerns_a_flow_at_its_pair_its_nodes_and_its_endpoints(place, concerns):
+    expected = Outcome.UNVERIFIABLE if concerns else Outcome.OK
+    assert outcome_with(finding(*place)) is expected
+    assert outcome_with(finding(*place, rule="graph.qos-differs")) is Outcome.OK
+
+
+@pytest.mark.parametrize("places", [((SUBJECT,), (SUBJECT,)), ((SUBJECT,), ("/a", "/one", PUB))])
+def test_a_flow_is_violated_whichever_finding_comes_first(places):
+    one, other = places
+    violated = finding(*one, outcome=Outcome.VIOLATED)
+    assert outcome_with(violated, finding(*other)) is Outcome.VIOLATED
+    assert outcome_with(finding(*other), violated) is Outcome.VIOLATED
+
+
+def nfe(protocol: str, family: str = "ipv4", address: str = "10.0.0.1") -> NetworkFlowEndpoint:
+    return NetworkFlowEndpoint(
+        transport_protocol=TransportProtocol(protocol),
+        internet_protocol=InternetProtocol(family),
+        transport_port=7000,
+        internet_address=address,
+    )
+
+
+SHM = nfe("unknown", "unknown", "")
+UDP4, UDP6 = nfe("udp"), nfe("udp", "ipv6", "fd00::1")
+TCP4, TCP6 = nfe("tcp"), nfe("tcp", "ipv6", "fd00::1")
+GROUP = nfe("udp", address="239.255.1.9")
+
+
+def flow_between(source, destination, *, machines=("m", "n"), dscp: int | None = 46) -> FlowReport:
+    plan = planned(
+        node("one", publisher("a"), machine=machines[0]),
+        node("two", subscription("a"), machine=machines[1]),
+    )
+    (flow,) = flows_after(
+        both(
+            change_report(PUB, "/a", nfes=source, dscp=dscp),
+            change_report(SUB, "/a", nfes=destination, dscp=dscp),
+        ),
+        plan,
+    )
+    return flow
+
+
+@pytest.mark.parametrize(
+    ("source", "destination", "machines", "transport"),
+    [
+        ((SHM, UDP4), (SHM, UDP4), "mm", "shm or udp"),
+        ((SHM, UDP4), (SHM, UDP4), "mn", "udp"),
+        ((SHM,), (SHM,), "mm", "shm"),
+        ((SHM,), (SHM,), "mn", "none"),
+        ((SHM, UDP4), (UDP4,), "mm", "udp"),
+        ((UDP4,), (SHM, UDP4), "mm", "udp"),
+        ((UDP4, TCP4), (TCP4, UDP4), "mn", "udp or tcp"),
+        ((TCP4, UDP4), (UDP4, TCP4), "mn", "tcp or udp"),
+        ((UDP4, UDP6), (UDP4, UDP6), "mn", "udp"),
+        ((UDP4, TCP6), (UDP6, TCP6), "mn", "tcp"),
+        ((UDP4,), (UDP6,), "mn", "none"),
+        ((UDP4,), (TCP4,), "mn", "none"),
+        ((), (UDP4,), "mn", "unknown"),
+        ((UDP4,), (), "mn", "unknown"),
+        (None, (UDP4,), "mn", "unknown"),
+    ],
+)
+def test_what_can_carry_a_flow_is_what_both_ends_list(source, destination, machines, transport):
+    assert flow_between(source, destination, machines=machines).transport == transport
+
+
+def test_a_flow_between_nodes_of_which_one_does_not_report_may_not_go_by_shared_memory():
+    plan = planned(node("one", publisher("a")), node("two", subscription("a")))
+    (flow,) = flows_after(drop_report("/one"), plan)
+    assert flow.transport == "unknown"
+
+
+@pytest.mark.parametrize(
+    ("carried_by", "source", "destination", "used", "dscp"),
+    [
+        ("tcpv4", (TCP4, UDP6), (TCP4, UDP4), ((TCP4,), (TCP4,)), None),
+        ("tcpv6", (TCP6, UDP4), (TCP6, UDP6), ((TCP6,), (TCP6,)), None),
+        ("udpv4", (TCP4, UDP4), (TCP6, UDP4), ((UDP4,), (UDP4,)), 46),
+        ("udpv6", (TCP4, UDP6), (TCP6, UDP6), ((UDP6,), (UDP6,)), 46),
+        ("none", (TCP4, UDP4), (UDP6,), ((TCP4, UDP4), (UDP6,)), 46),
+    ],
+)
+def test_only_sockets_of_what_carries_a_flow_are_shown(carried_by, source, destination, used, dscp):
+    flow = flow_between(source, destination)
+    assert flow.effective_transport == carried_by
+    assert (
+        tuple(
+            tuple(dataclasses.replace(each, dscp=0) for each in end)
+            for end in (flow.source, flow.destination)
+        )
+        == used
+    )
+    assert (flow.dscp, flow.reader_dscp) == (dscp, dscp)
+
+
+def test_of_a_flow_to_a_group_only_the_sockets_of_udp_are_shown():
+    flow = flow_between((UDP4, TCP4), (GROUP, TCP6), machines="mm")
+    assert flow.effective_transport == "udpm"
+    assert [each.transport_protocol for each in (*flow.source, *flow.destination)] == [
+        TransportProtocol.UDP,
+        TransportProtocol.UDP,
+    ]
+    assert flow.dscp == 46
+
+
+def test_of_ends_that_report_nothing_no_dscp_is_shown():
+    plan = planned(node("one", publisher("a")), node("two", subscription("a")))
+    (flow,) = flows_after(both(drop_report("/one"), drop_report("/two")), plan)
+    assert (flow.dscp, flow.reader_dscp, flow.unique) == (None, None, None)
+
+
+def reasoned(*reasons: str) -> Plan:
+    """A node whose publishers of one topic have a 5QI for these reasons."""
+    plan = planned(node("one", publisher("a"), publisher("/a")), node("two", subscription("a")))
+    ends = tuple(
+        dataclasses.replace(end, five_qi=85, five_qi_reason=reason)
+        for end, reason in zip(plan.nodes[0].endpoints, reasons, strict=True)
+    )
+    one = dataclasses.replace(plan.nodes[0], endpoints=ends)
+    return dataclasses.replace(plan, nodes=(one, plan.nodes[1]))
+
+
+@pytest.mark.parametrize(
+    ("reasons", "shown"),
+    [
+        (("fast", "small"), "fast; small"),
+        (("fast", "fast"), "fast"),
+        (("", "small"), "small"),
+        (("", ""), ""),
+    ],
+)
+def test_a_flow_says_once_each_why_its_publishers_have_their_5qi(reasons, shown):
+    (flow,) = flows_after(unchanged, reasoned(*reasons))
+    assert (flow.five_qi, flow.five_qi_reason) == (85, shown)
+
+
+def test_the_5qi_of_a_flow_is_the_planned_one():
+    assert [each.five_qi for each in flows_after(unchanged)] == [85, None, None]
+
+
+def test_a_finding_that_concerns_no_flow_hides_none_that_does():
+    other = finding(SUBJECT, rule="graph.qos-differs")
+    assert outcome_with(other, finding(SUBJECT)) is Outcome.UNVERIFIABLE
+
+
+@pytest.mark.parametrize(
+    ("address", "unique"), [("10.0.0.1", UniqueHow.STRONGLY), ("", UniqueHow.WEAKLY)]
+)
+def test_a_flow_is_as_unique_as_it_is_on_the_declared_address_of_its_machine(address, unique):
+    plan = planned(
+        node("one", publisher("a"), publisher("b"), machine="m"),
+        node("two", subscription("a"), machine="n"),
+        machines=(
+            Machine(name="m", address=address, at=at(2)),
+            Machine(name="n", address="10.0.0.2", at=at(2)),
+        ),
+    )
+    here, elsewhere = nfe("udp"), nfe("udp", address="10.9.9.9")
+    flow, *_ = flows_after(
+        both(
+            change_report(PUB, "/a", nfes=(here, elsewhere)),
+            change_report(PUB, "/b", nfes=(elsewhere,)),
+        ),
+        plan,
+    )
+    assert flow.unique is unique

@@ -1,0 +1,613 @@
+"""What is seen, laid beside what is planned: whose it is, and what is left over."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from lifecycle.manifest.model import EndpointKind, Run, RunKind
+from lifecycle.manifest.qos import QosProfile
+from lifecycle.plan import Plan, build_plan
+from lifecycle.plan.model import ParticipantConnections
+from lifecycle.verify import (
+    EndpointReport,
+    Identity,
+    NodeConfiguration,
+    Observation,
+    ObservedEndpoint,
+    Stage,
+)
+from lifecycle.verify.layout import lay_out
+from lifecycle.verify.observation import NodeParameters
+from lifecycle.verify.view import Actual, Seen, View
+from tests.unit.plan.samples import (
+    at,
+    endpoint,
+    link,
+    node,
+    planned,
+    publisher,
+    subscription,
+    teleop,
+)
+from tests.unit.verify.edits import (
+    Edit,
+    add_configuration,
+    add_endpoint,
+    add_node,
+    both,
+    change_configuration,
+    change_endpoint,
+    change_node,
+    change_report,
+    drop_endpoint,
+    drop_report,
+)
+from tests.unit.verify.perfect import perfect
+
+PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
+SERVER, CLIENT = EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT
+ACTION_SERVER = EndpointKind.ACTION_SERVER
+STATUS = "/robot/status"
+STRING, TRIGGER = "std_msgs/msg/String", "std_srvs/srv/Trigger"
+ATTACH = Run(kind=RunKind.ATTACH)
+PLAN = build_plan(teleop(), environment={})
+
+
+def view_after(edit: Edit, plan: Plan = PLAN, **rest: object) -> View:
+    return lay_out(plan, edit(perfect(plan)), Stage.CONNECTED, **rest)
+
+
+def unchanged(seen: Observation) -> Observation:
+    return seen
+
+
+def actual(view: View, kind: EndpointKind, name: str) -> Actual:
+    (found,) = (
+        each for each in view.actual if (each.planned.kind, each.planned.resolved) == (kind, name)
+    )
+    return found
+
+
+def test_a_view_has_what_it_was_asked_with() -> None:
+    parameters = NodeParameters(node="/viewer", parameters=())
+    seen = dataclasses.replace(perfect(PLAN), parameters=(parameters,))
+    view = lay_out(
+        PLAN,
+        seen,
+        Stage.ACTIVE,
+        machines=frozenset({"robot"}),
+        ahead=frozenset({"/viewer"}),
+    )
+    assert (view.plan, view.stage) == (PLAN, Stage.ACTIVE)
+    assert (view.machines, view.ahead) == ({"robot"}, {"/viewer"})
+    assert view.parameters == {"/viewer": parameters}
+    assert view.planned == {each.full_name: each for each in PLAN.nodes}
+    assert list(view.actual_by_node) == ["/robot/camera", "/viewer"]
+    assert view.actual == tuple(each for ends in view.actual_by_node.values() for each in ends)
+    assert [each.planned for each in view.actual] == [
+        each for node in PLAN.nodes for each in node.endpoints
+    ]
+    nobody = lay_out(PLAN, Observation(), Stage.CONNECTED)
+    assert (nobody.machines, nobody.ahead, nobody.parameters) == (None, frozenset(), {})
+
+
+def test_of_a_perfect_system_nothing_is_left_over() -> None:
+    view = view_after(unchanged)
+    assert (view.undeclared, view.unattributed, view.foreign) == ((), (), ())
+    assert (view.tools, view.of_tools) == ({}, ())
+    assert all(each.observed and each.report for each in view.actual)
+    assert not any(each.unseen or each.beyond for each in view.actual)
+    assert list(view.observed) == ["/robot/camera", "/viewer"]
+
+
+# --- nodes
+
+
+def test_a_node_that_the_graph_lists_twice_counts_all_of_them() -> None:
+    view = view_after(both(change_node("/viewer", count=2), add_node("/viewer", count=3)))
+    assert view.observed["/viewer"].count == 5
+    assert view.observed["/robot/camera"].count == 1
+
+
+def test_nodes_are_sorted_without_tools_hidden_participants_and_placeholders() -> None:
+    view = view_after(
+        both(
+            add_node("/zed"),
+            add_node("/rviz2"),
+            add_node("/robot/_camera_net"),
+            add_node("/_NODE_NAME_UNKNOWN_"),
+            add_node("/an_arm"),
+        )
+    )
+    assert list(view.observed) == ["/an_arm", "/robot/camera", "/viewer", "/zed"]
+    assert view.tools == {"/rviz2": "rviz2"}
+
+
+def test_a_declared_node_that_is_named_like_a_tool_or_a_hidden_one_is_no_tool() -> None:
+    plan = planned(
+        node("rviz2", publisher("a")),
+        node("cam", publisher("b")),
+        node("_cam_net", publisher("c")),
+    )
+    view = view_after(unchanged, plan)
+    assert list(view.observed) == ["/_cam_net", "/cam", "/rviz2"]
+    assert view.tools == {}
+    assert [each.observed.node for each in view.actual if each.observed] == [
+        "/rviz2",
+        "/cam",
+        "/_cam_net",
+    ]
+
+
+def test_tools_are_sorted_and_known_by_their_endpoints_too() -> None:
+    view = view_after(
+        both(
+            add_endpoint(SUB, "/rviz2", STATUS, gid="98"),
+            add_endpoint(SUB, "/_ros2cli_7", STATUS, gid="99"),
+            add_node("/_lifecycle_observer_1"),
+        )
+    )
+    assert list(view.tools.items()) == [
+        ("/_lifecycle_observer_1", "_lifecycle_*"),
+        ("/_ros2cli_7", "_ros2cli_*"),
+        ("/rviz2", "rviz2"),
+    ]
+    assert [(each.node, each.name) for each in view.of_tools] == [
+        ("/_ros2cli_7", STATUS),
+        ("/rviz2", STATUS),
+    ]
+    assert [each.node for each in view.seen_of_tools] == ["/_ros2cli_7", "/rviz2"]
+    assert {"/rviz2", "/_ros2cli_7"}.isdisjoint(each.node for each in view.seen)
+    assert view.foreign == ()
+
+
+def test_what_belongs_to_nobody_known_and_to_others_is_kept_apart() -> None:
+    view = view_after(
+        both(
+            add_endpoint(PUB, "", "/b", gid="2"),
+            add_endpoint(PUB, "_NODE_NAMESPACE_UNKNOWN_/_NODE_NAME_UNKNOWN_", "/a", gid="1"),
+            add_endpoint(PUB, "/other", "/c", gid="3"),
+            add_endpoint(PUB, "/another", "/d", gid="4"),
+        )
+    )
+    assert [(each.node, each.name, each.gid) for each in view.unattributed] == [
+        ("", "/a", "1"),
+        ("", "/b", "2"),
+    ]
+    assert [(each.node, each.name, each.gid) for each in view.foreign] == [
+        ("/another", "/d", "4"),
+        ("/other", "/c", "3"),
+    ]
+
+
+# --- reports
+
+
+def twin(node_id: str, **fields: object) -> NodeConfiguration:
+    viewer = perfect(PLAN).configurations[1]
+    identity = Identity(machine_id="m", process_id=7, node_id=node_id)
+    return dataclasses.replace(viewer, identity=identity, **fields)
+
+
+@pytest.mark.parametrize("names", [("a", "b", "c"), ("c", "b", "a"), ("b", "c", "a")])
+def test_of_several_reports_of_one_name_the_first_by_identity_counts(names) -> None:
+    edit = both(drop_report("/viewer"), *(add_configuration(twin(each)) for each in names))
+    view = view_after(edit)
+    assert [each.identity.node_id[:1] for each in view.reported] == ["/", "a", "b", "c"]
+    assert view.configurations["/viewer"].identity.node_id == "a"
+    assert view.configurations["/viewer"] is actual_report_owner(view)
+
+
+def actual_report_owner(view: View) -> NodeConfiguration:
+    """The report that the viewer's endpoints are taken from."""
+    report = actual(view, SUB, STATUS).report
+    return next(each for each in view.reported if any(report is end for end in each.endpoints))
+
+
+# --- whose an endpoint is
+
+
+def test_an_endpoint_of_a_hidden_participant_is_its_nodes() -> None:
+    view = view_after(add_endpoint(PUB, "/robot/_camera_net", "/extra", gid="99"))
+    assert view.undeclared == (
+        ObservedEndpoint(
+            kind=PUB, node="/robot/camera", name="/extra", type=STRING, qos=None, gid="99"
+        ),
+    )
+
+
+def test_an_endpoint_of_no_node_is_the_one_that_reported_its_gid() -> None:
+    view = view_after(change_endpoint(PUB, STATUS, node=""))
+    found = actual(view, PUB, STATUS).observed
+    assert found is not None
+    assert (found.node, found.gid) == ("/robot/camera", actual(view, PUB, STATUS).report.gid)
+    assert view.unattributed == ()
+
+
+def nameless_service(name: str, kind: EndpointKind = SERVER, type_: str = TRIGGER) -> Edit:
+    """A service of an unknown node on the participant of the camera's publishers."""
+
+    def edit(seen: Observation) -> Observation:
+        camera = next(each for each in seen.configurations if each.name == "/robot/camera")
+        prefix = camera.endpoints[2].gid[:24]
+        return add_endpoint(kind, "", name, type=type_, gid=f"{prefix}00001204")(seen)
+
+    return edit
+
+
+def test_a_service_of_no_node_is_that_of_the_node_on_its_participant_that_declares_it() -> None:
+    calibrate = "/robot/camera/calibrate"
+    view = view_after(both(drop_endpoint(SERVER, calibrate), nameless_service(calibrate)))
+    assert actual(view, SERVER, calibrate).observed == ObservedEndpoint(
+        kind=SERVER, node="/robot/camera", name=calibrate, type=TRIGGER
+    )
+    for other in (nameless_service("/other"), nameless_service(calibrate, CLIENT)):
+        (found,) = view_after(other).unattributed
+        assert (found.node, found.gid[24:]) == ("", "00001204")
+
+
+def test_a_part_of_an_action_of_no_node_is_that_of_the_node_that_declares_the_action() -> None:
+    dock = "/robot/dock/_action"
+    view = view_after(nameless_service(f"{dock}/send_goal", type_="robot/action/Dock_SendGoal"))
+    assert (view.unattributed, view.undeclared, view.foreign) == ((), (), ())
+    view = view_after(nameless_service("/other/_action/send_goal"))
+    assert [each.name for each in view.unattributed] == ["/other/_action/send_goal"]
+
+
+def test_a_topic_of_no_node_is_nobodys_although_its_participant_is_known() -> None:
+    view = view_after(nameless_service(STATUS, PUB, STRING))
+    assert [(each.node, each.name) for each in view.unattributed] == [("", STATUS)]
+
+
+# --- matching
+
+
+def other_type(name: str, kind: EndpointKind = PUB, **fields: object) -> Edit:
+    return add_endpoint(kind, "/robot/camera", name, type="std_msgs/msg/Int32", **fields)
+
+
+def test_an_endpoint_of_the_declared_type_is_matched_before_one_of_another() -> None:
+    plan = planned(
+        node(
+            "one", publisher("a"), publisher("/a", "std_msgs/msg/Int32"), run=ATTACH, managed=False
+        )
+    )
+    view = lay_out(plan, reverse(perfect(plan)), Stage.CONNECTED)
+    assert [each.observed.type for each in view.actual if each.observed] == [
+        STRING,
+        "std_msgs/msg/Int32",
+    ]
+    edit = change_endpoint(PUB, "/a", type="std_msgs/msg/Int32")
+    view = lay_out(plan, edit(perfect(plan)), Stage.CONNECTED)
+    assert [each.observed is not None for each in view.actual] == [True, True]
+    assert view.undeclared == ()
+
+
+def reverse(seen: Observation) -> Observation:
+    return dataclasses.replace(seen, endpoints=seen.endpoints[::-1])
+
+
+def test_reports_are_matched_by_their_declared_name_before_their_resolved_one() -> None:
+    plan = planned(node("one", publisher("a"), publisher("b")))
+    a, b = perfect(plan).configurations[0].endpoints
+    swapped = change_configuration("/one", endpoints=(b, a))
+    view = view_after(swapped, plan)
+    assert [each.report for each in view.actual] == [a, b]
+    nameless = dataclasses.replace(a, name="")
+    view = view_after(change_configuration("/one", endpoints=(b, nameless)), plan)
+    assert [each.report for each in view.actual] == [nameless, b]
+    named_otherwise = dataclasses.replace(a, name="c")
+    view = view_after(change_configuration("/one", endpoints=(b, named_otherwise)), plan)
+    assert [each.report for each in view.actual] == [None, b]
+
+
+def test_a_nameless_report_of_the_declared_type_is_chosen_before_one_of_another() -> None:
+    plan = planned(node("one", publisher("a"), publisher("/a", "std_msgs/msg/Int32")))
+    first, second = (
+        dataclasses.replace(each, name="") for each in perfect(plan).configurations[0].endpoints
+    )
+    view = view_after(change_configuration("/one", endpoints=(second, first)), plan)
+    assert [each.report for each in view.actual] == [first, second]
+    wrong = dataclasses.replace(first, type="std_msgs/msg/Bool")
+    seen = change_configuration("/one", endpoints=(wrong, second))(perfect(plan))
+    shown = dataclasses.replace(seen.endpoints[0], type="std_msgs/msg/Bool")
+    seen = dataclasses.replace(seen, endpoints=(shown, *seen.endpoints[1:]))
+    view = lay_out(plan, seen, Stage.CONNECTED)
+    assert [each.report for each in view.actual] == [wrong, second]
+    assert [each.observed for each in view.actual] == list(seen.endpoints)
+
+
+def test_of_several_endpoints_of_one_name_the_one_with_the_reported_gid_is_the_declared() -> None:
+    seen = perfect(PLAN)
+    gid = next(each.gid for each in seen.endpoints if (each.kind, each.name) == (PUB, STATUS))
+    for other in ("00", "ff" * 16):
+        view = view_after(add_endpoint(PUB, "/robot/camera", STATUS, gid=other, qos=QosProfile()))
+        assert actual(view, PUB, STATUS).observed.gid == gid
+        assert [each.gid for each in view.undeclared] == [other]
+
+
+def test_a_service_that_is_seen_by_name_only_stands_for_all_of_its_node() -> None:
+    calibrate = "/robot/camera/calibrate"
+    view = view_after(add_endpoint(SERVER, "/robot/camera", calibrate, type=TRIGGER))
+    assert actual(view, SERVER, calibrate).observed is not None
+    assert view.undeclared == ()
+
+
+def test_nothing_is_left_over_of_two_nodes_of_one_name() -> None:
+    extra = add_endpoint(PUB, "/viewer", "/extra", gid="99")
+    assert [each.name for each in view_after(extra).undeclared] == ["/extra"]
+    assert view_after(both(extra, change_node("/viewer", count=2))).undeclared == ()
+    other = both(extra, change_node("/robot/camera", count=2))
+    assert [each.name for each in view_after(other).undeclared] == ["/extra"]
+
+
+def test_what_only_a_report_says_is_left_over_with_all_that_it_says() -> None:
+    report = EndpointReport(
+        kind=PUB,
+        name="",
+        resolved="/extra",
+        type=STRING,
+        qos=QosProfile(depth=3),
+        gid="99",
+        type_hash="RIHS01_aa",
+        mapped=True,
+    )
+    camera = perfect(PLAN).configurations[0]
+    edit = change_configuration("/robot/camera", endpoints=(*camera.endpoints, report))
+    found = ObservedEndpoint(
+        kind=PUB,
+        node="/robot/camera",
+        name="/extra",
+        type=STRING,
+        qos=QosProfile(depth=3),
+        gid="99",
+        type_hash="RIHS01_aa",
+    )
+    assert view_after(edit).undeclared == (found,)
+    shown = both(edit, add_endpoint(PUB, "/robot/camera", "/extra", gid="99"))
+    assert [each.qos for each in view_after(shown).undeclared] == [None]
+
+
+def test_what_client_libraries_bring_along_is_not_left_over_of_a_report_either() -> None:
+    rosout = EndpointReport(kind=PUB, name="", resolved="/rosout", type="rcl_interfaces/msg/Log")
+    remap = EndpointReport(
+        kind=SERVER,
+        name="",
+        resolved="/robot/camera/remap",
+        type="rcl_interfaces/srv/SetParameters",
+    )
+    camera = perfect(PLAN).configurations[0]
+    edit = change_configuration("/robot/camera", endpoints=(*camera.endpoints, rosout, remap))
+    assert view_after(edit).undeclared == ()
+
+
+def test_further_names_of_a_declared_endpoint_are_left_over() -> None:
+    edit = change_report(PUB, STATUS, aliases=("/also", "/too"))
+    assert [(each.kind, each.node, each.name) for each in view_after(edit).undeclared] == [
+        (PUB, "/robot/camera", "/also"),
+        (PUB, "/robot/camera", "/too"),
+    ]
+    shown = both(edit, add_endpoint(PUB, "/robot/camera", "/also", gid="99"))
+    assert [(each.name, each.gid == "99") for each in view_after(shown).undeclared] == [
+        ("/also", True),
+        ("/too", False),
+    ]
+    for gone in ({"mapped": False}, {"error": "not feasible"}):
+        edit = change_report(PUB, STATUS, aliases=("/also",), **gone)
+        assert view_after(edit).undeclared == ()
+    moved = change_report(PUB, STATUS, resolved="/moved", aliases=(STATUS,))
+    assert [each.name for each in view_after(moved).undeclared] == ["/moved"]
+
+
+def test_parts_of_an_action_that_is_declared_or_seen_are_not_left_over() -> None:
+    part = add_endpoint(PUB, "/robot/camera", "/robot/dock/_action/feedback", gid="99")
+    assert view_after(part).undeclared == ()
+    assert view_after(both(part, drop_endpoint(ACTION_SERVER, "/robot/dock"))).undeclared == ()
+    other = add_endpoint(PUB, "/robot/camera", "/lift/_action/feedback", gid="99")
+    assert [each.name for each in view_after(other).undeclared] == ["/lift/_action/feedback"]
+    elsewhere = add_endpoint(PUB, "/viewer", "/robot/dock/_action/feedback", gid="99")
+    assert [each.node for each in view_after(elsewhere).undeclared] == ["/viewer"]
+    lift = add_endpoint(ACTION_SERVER, "/robot/camera", "/lift", type="a/action/B")
+    assert [each.name for each in view_after(both(other, lift)).undeclared] == ["/lift"]
+
+
+def test_what_is_left_over_is_sorted_by_node_name_kind_type_and_gid() -> None:
+    found = [
+        (SUB, "/robot/camera", "/z", "a/msg/A", "1"),
+        (PUB, "/viewer", "/a", "a/msg/A", "1"),
+        (PUB, "/viewer", "/b", "a/msg/A", "3"),
+        (PUB, "/viewer", "/b", "a/msg/A", "4"),
+        (PUB, "/viewer", "/b", "a/msg/B", "2"),
+        (SUB, "/viewer", "/b", "a/msg/A", "1"),
+    ]
+    for order in (found, found[::-1], found[3:] + found[:3]):
+        edit = both(
+            *(
+                add_endpoint(kind, node, name, type=type_, gid=gid)
+                for kind, node, name, type_, gid in order
+            )
+        )
+        assert [
+            (each.kind, each.node, each.name, each.type, each.gid)
+            for each in view_after(edit).undeclared
+        ] == found
+
+
+# --- what discovery need not show
+
+
+def connected(url: str) -> Plan:
+    """Two nodes that are told how to connect, each on its machine."""
+    plan = planned(
+        node("one", publisher("a"), machine="m1"),
+        node("two", subscription("a"), subscription("b"), machine="m2"),
+    )
+    connections = ParticipantConnections(urls=(url,))
+    return dataclasses.replace(
+        plan, nodes=tuple(dataclasses.replace(each, connections=connections) for each in plan.nodes)
+    )
+
+
+def test_an_endpoint_that_discovery_need_not_show_is_as_its_node_says() -> None:
+    plan = connected("udpv4://10.0.0.1:7911")
+    edit = both(
+        drop_endpoint(PUB, "/a"),
+        change_report(PUB, "/a", qos=QosProfile(depth=3), type_hash="RIHS01_aa"),
+    )
+    found = actual(view_after(edit, plan), PUB, "/a")
+    assert found.unseen
+    assert found.observed == ObservedEndpoint(
+        kind=PUB,
+        node="/one",
+        name="/a",
+        type=STRING,
+        qos=QosProfile(depth=3),
+        gid=found.report.gid,
+        type_hash="RIHS01_aa",
+    )
+    (seen,) = (each for each in view_after(edit, plan).seen if each.kind is PUB)
+    assert seen == Seen(
+        kind=PUB,
+        node="/one",
+        name="/a",
+        type=STRING,
+        qos=QosProfile(depth=3),
+        report=found.report,
+        planned=found.planned,
+        type_hash="RIHS01_aa",
+    )
+    for gone in (
+        drop_report("/one"),
+        change_report(PUB, "/a", mapped=False),
+        change_report(PUB, "/a", error="no"),
+        change_report(PUB, "/a", resolved="/b"),
+    ):
+        view = view_after(both(drop_endpoint(PUB, "/a"), gone), plan)
+        found = actual(view, PUB, "/a")
+        assert (found.unseen, found.observed) == (True, None)
+        assert [each.kind for each in view.seen] == [SUB, SUB]
+    must_show = view_after(drop_endpoint(PUB, "/a"), planned(node("one", publisher("a"))))
+    assert (must_show.actual[0].unseen, must_show.actual[0].observed) == (False, None)
+
+
+@pytest.mark.parametrize(
+    ("url", "machines", "beyond"),
+    [
+        ("shm://", {"m1"}, ["/two"]),
+        ("shm://", {"m2"}, ["/one"]),
+        ("shm://", {"m1", "m2"}, []),
+        ("shm://", None, []),
+        ("udpv4://10.0.0.1:7911", {"m1"}, []),
+    ],
+)
+def test_shared_memory_of_a_machine_that_others_bring_up_is_beyond_reach(
+    url: str, machines: set[str] | None, beyond: list[str]
+) -> None:
+    ours = None if machines is None else frozenset(machines)
+    view = view_after(unchanged, connected(url), machines=ours)
+    assert list(dict.fromkeys(each.node.full_name for each in view.actual if each.beyond)) == beyond
+
+
+def test_who_is_beyond_reach_counts_among_what_is_seen_as_it_is_planned() -> None:
+    plan = connected("shm://")
+    view = lay_out(plan, Observation(), Stage.CONNECTED, machines=frozenset({"m1"}))
+    assert view.seen == tuple(
+        Seen(
+            kind=SUB,
+            node="/two",
+            name=each.resolved,
+            type=STRING,
+            qos=each.qos,
+            report=None,
+            planned=each,
+        )
+        for each in plan.nodes[1].endpoints
+    )
+
+
+def test_of_what_is_beyond_reach_only_topics_are_seen() -> None:
+    plan = connected("shm://")
+    service = endpoint(SERVER, "s", TRIGGER, None)
+    two = dataclasses.replace(
+        planned(node("two", service, machine="m2")).nodes[0],
+        connections=plan.nodes[1].connections,
+    )
+    plan = dataclasses.replace(plan, nodes=(plan.nodes[0], two), flows=())
+    view = lay_out(plan, Observation(), Stage.CONNECTED, machines=frozenset({"m1"}))
+    assert [each.beyond for each in view.actual] == [False, True]
+    assert view.seen == ()
+
+
+# --- what is seen of topics
+
+
+def test_publishers_and_subscriptions_are_seen_with_report_and_declaration() -> None:
+    view = view_after(add_endpoint(PUB, "/guest", STATUS, gid="99", qos=QosProfile(depth=4)))
+    status = [each for each in view.seen if each.name == STATUS]
+    camera, viewer = actual(view, PUB, STATUS), actual(view, SUB, STATUS)
+    assert [(each.kind, each.node, each.type) for each in status] == [
+        (PUB, "/guest", STRING),
+        (PUB, "/robot/camera", STRING),
+        (SUB, "/viewer", STRING),
+    ]
+    assert [each.report for each in status] == [None, camera.report, viewer.report]
+    assert [each.planned for each in status] == [None, camera.planned, viewer.planned]
+    assert [each.qos.depth for each in status] == [4, 10, 10]
+    assert all(each.kind.is_topic for each in view.seen)
+
+
+@pytest.mark.parametrize(
+    ("shown", "reported", "known"),
+    [
+        ("d", "r", "d"),
+        ("", "r", "r"),
+        (None, "r", "r"),
+        (None, "", ""),
+        ("", None, ""),
+        ("d", None, "d"),
+        (None, None, None),
+    ],
+)
+def test_the_hash_that_discovery_shows_wins_over_the_reported_one(shown, reported, known) -> None:
+    edit = both(
+        change_endpoint(PUB, STATUS, type_hash=shown),
+        change_report(PUB, STATUS, type_hash=reported),
+    )
+    (seen,) = (each for each in view_after(edit).seen if (each.kind, each.name) == (PUB, STATUS))
+    assert seen.type_hash == known
+    foreign = add_endpoint(PUB, "/guest", "/x", gid="99", type_hash=shown)
+    (seen,) = (each for each in view_after(foreign).seen if each.node == "/guest")
+    assert seen.type_hash == shown
+
+
+# --- flows
+
+
+def test_a_flow_has_all_declared_ends_of_its_two_nodes_and_no_others() -> None:
+    plan = planned(
+        node("one", publisher("a"), publisher("/a"), publisher("b"), subscription("a", line=7)),
+        node("two", subscription("a", line=8), subscription("/a", line=9), publisher("a")),
+    )
+    view = view_after(unchanged, plan)
+    flow = next(
+        each
+        for each in view.flows
+        if (each.planned.topic, each.publisher, each.subscription) == ("/a", "/one", "/two")
+    )
+    one, two = view.actual_by_node["/one"], view.actual_by_node["/two"]
+    assert (flow.publishers, flow.subscriptions) == (one[:2], two[:2])
+    assert flow.at == at(8, 9)
+    assert flow.subject == "/a: /one → /two"
+
+
+def test_a_flow_without_a_declared_subscription_is_at_its_publisher() -> None:
+    plan = planned(
+        node("one", publisher("a", line=5)), node("two"), links=[link("/a", "one", "two")]
+    )
+    (flow,) = view_after(unchanged, plan).flows
+    assert (flow.at, flow.subscriptions) == (at(5, 9), ())
+    plan = planned(node("one"), node("two"), links=[link("/a", "one", "two")])
+    (flow,) = view_after(unchanged, plan).flows
+    assert flow.at is None

@@ -1,0 +1,283 @@
+"""What a node says of itself, under what its manifest says of it, as a party of a negotiation."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from lifecycle.manifest.model import EndpointKind, FlowTransport
+from lifecycle.manifest.qos import QosProfile
+from lifecycle.network.connection_url import Peer
+from lifecycle.network.nfe import UniqueRequirement
+from lifecycle.plan.contacts import Contact
+from lifecycle.plan.data_layer import RMW_DEFAULT, TRANSPORTS, Party, PartyEndpoint
+from lifecycle.plan.model import ParticipantConnections, PlannedNode, PlannedParticipant
+from lifecycle.verify import EndpointReport, Identity, NodeConfiguration
+from lifecycle.verify.observation import ConnectionReport
+from lifecycle.verify.party import party_of
+from tests.unit.plan.samples import need, node, planned, publisher, subscription
+
+PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
+STRING = "std_msgs/msg/String"
+URL = "tcpv4://10.0.0.1:5100"
+STRICTLY, OPTIONALLY = UniqueRequirement.STRICTLY_REQUIRED, UniqueRequirement.OPTIONALLY_REQUIRED
+DEFAULT, NOT = UniqueRequirement.SYSTEM_DEFAULT, UniqueRequirement.NOT_REQUIRED
+
+VIDEO = EndpointReport(
+    kind=PUB,
+    name="video",
+    resolved="/video",
+    type=STRING,
+    qos=QosProfile(depth=3),
+    unique=STRICTLY,
+    lossy=True,
+    size_bytes=70_000,
+)
+CAMERA = NodeConfiguration(
+    identity=Identity(machine_id="m", process_id=42, node_id="/camera@01"),
+    name="/camera",
+    state="inactive",
+    connected=True,
+    rmw="rmw_fastrtps_cpp",
+    transports=("udpv4", "tcpv4"),
+    serializations=("cdr",),
+    paradigms=("publish-subscribe",),
+    endpoints=(
+        VIDEO,
+        EndpointReport(
+            kind=EndpointKind.SERVICE_SERVER,
+            name="reset",
+            resolved="/reset",
+            type="std_srvs/srv/Trigger",
+        ),
+    ),
+)
+
+
+def camera(**changes: object) -> NodeConfiguration:
+    return dataclasses.replace(CAMERA, **changes)
+
+
+def own_endpoint(
+    configuration: NodeConfiguration, of: PlannedNode | None = None, **rest: object
+) -> PartyEndpoint:
+    (endpoint,) = party_of(configuration, "h", planned=of, **rest).endpoints
+    return endpoint
+
+
+def video(**changes: object) -> NodeConfiguration:
+    return camera(endpoints=(dataclasses.replace(VIDEO, **changes),))
+
+
+def test_a_node_that_no_manifest_declares_takes_part_with_all_that_it_says():
+    assert party_of(CAMERA, "10.0.0.1") == Party(
+        key="/camera",
+        full_name="/camera",
+        host="10.0.0.1",
+        process="42",
+        transports=("udpv4", "tcpv4"),
+        own=RMW_DEFAULT,
+        connectable=True,
+        serializations=("cdr",),
+        paradigms=("publish-subscribe",),
+        endpoints=(
+            PartyEndpoint(
+                kind=PUB,
+                name="video",
+                resolved="/video",
+                type=STRING,
+                qos=QosProfile(depth=3),
+                alone=True,
+                lossy=True,
+                size_bytes=70_000,
+            ),
+        ),
+    )
+
+
+def test_what_a_node_says_that_it_can_speak_is_what_it_takes_part_with():
+    party = party_of(camera(serializations=("xcdr2",), paradigms=("request-response",)), "h")
+    assert (party.serializations, party.paradigms) == (("xcdr2",), ("request-response",))
+
+
+def test_a_node_that_names_no_transports_can_be_connected_by_all():
+    assert party_of(camera(transports=()), "h").transports == TRANSPORTS
+
+
+def test_a_node_of_an_rmw_that_we_cannot_connect_has_no_transports_at_all():
+    party = party_of(camera(rmw="rmw_cyclonedds_cpp"), "h")
+    assert (party.transports, party.own, party.connectable) == ((), (), False)
+
+
+def test_an_endpoint_made_in_code_takes_part_under_its_resolved_name():
+    assert own_endpoint(video(name="")).label == "publishers//video"
+
+
+@pytest.mark.parametrize(
+    ("kind", "unique", "alone"),
+    [
+        (PUB, STRICTLY, True),
+        (PUB, OPTIONALLY, True),
+        (PUB, DEFAULT, False),
+        (PUB, NOT, False),
+        (SUB, STRICTLY, False),
+        (SUB, NOT, False),
+    ],
+)
+def test_only_a_publisher_that_asks_for_a_flow_of_its_own_is_alone(kind, unique, alone):
+    assert own_endpoint(video(kind=kind, unique=unique)).alone is alone
+
+
+# --- what the own participant was connected to
+
+OWN = ConnectionReport(name="", urls=(URL,))
+CONTACT = Contact(host="h", transport="tcpv4", peer=Peer(address="10.0.0.1", port=5100))
+
+
+def test_the_own_participant_is_reached_where_the_node_says_that_it_is():
+    other = ConnectionReport(name="net", urls=("shm://",))
+    party = party_of(camera(connections=(other, OWN)), "h")
+    assert (party.own, party.contacts) == (("tcpv4",), (CONTACT,))
+
+
+def test_a_contact_without_an_address_is_on_the_host_of_the_node():
+    own = ConnectionReport(name="", urls=("tcpv4://:5100",))
+    (contact,) = party_of(camera(connections=(own,)), "10.0.0.9").contacts
+    assert (contact.host, contact.peer.address) == ("10.0.0.9", "10.0.0.9")
+
+
+def declared(**changes: object) -> PlannedNode:
+    """The camera as its manifest declares it."""
+    plan = planned(
+        node(
+            "cam",
+            subscription("video"),
+            publisher("video", qos=QosProfile(depth=7)),
+            needs=[need(PUB, "video", OPTIONALLY)],
+            name="camera",
+        )
+    )
+    (only,) = plan.nodes
+    return dataclasses.replace(only, **{"participants": (), **changes})
+
+
+def with_endpoint(**changes: object) -> PlannedNode:
+    """The camera with its publisher declared otherwise."""
+    only = declared()
+    first, last = only.endpoints
+    return dataclasses.replace(
+        only, endpoints=(first, dataclasses.replace(last, participant="", **changes))
+    )
+
+
+@pytest.mark.parametrize(
+    ("reported", "own"),
+    [((OWN,), ("tcpv4",)), ((ConnectionReport(name=""),), ("shm",)), ((), ("shm",))],
+)
+def test_planned_urls_of_the_own_participant_hold_until_the_node_reports_its_own(reported, own):
+    planned_urls = ParticipantConnections(urls=("shm://",))
+    party = party_of(camera(connections=reported), "h", planned=declared(connections=planned_urls))
+    assert party.own == own
+
+
+@pytest.mark.parametrize(("transports", "own"), [(("udpv6",), ("udpv6",)), ((), RMW_DEFAULT)])
+def test_without_urls_the_own_participant_has_what_the_plan_gives_it_or_the_rmw(transports, own):
+    assert party_of(CAMERA, "h", planned=declared(transports=transports)).own == own
+
+
+# --- what the manifest says wins
+
+
+def test_a_declared_node_takes_part_under_its_key_and_with_what_is_declared_of_its_endpoints():
+    party = party_of(CAMERA, "h", planned=with_endpoint(transport=FlowTransport.NETWORK))
+    assert (party.key, party.full_name) == ("cam", "/camera")
+    assert party.endpoints == (
+        PartyEndpoint(
+            kind=PUB,
+            name="video",
+            resolved="/video",
+            type=STRING,
+            qos=QosProfile(depth=7),
+            alone=True,
+            transport=FlowTransport.NETWORK,
+            lossy=True,
+            size_bytes=70_000,
+        ),
+    )
+
+
+def test_an_endpoint_that_the_manifest_of_its_node_does_not_declare_takes_part_by_its_report():
+    assert own_endpoint(video(name="news", resolved="/news"), with_endpoint()) == PartyEndpoint(
+        kind=PUB,
+        name="news",
+        resolved="/news",
+        type=STRING,
+        qos=QosProfile(depth=3),
+        alone=True,
+        lossy=True,
+        size_bytes=70_000,
+    )
+
+
+@pytest.mark.parametrize(
+    ("reported", "resolved"), [("/stage/video", "/stage/video"), ("", "/video")]
+)
+def test_a_declared_endpoint_is_where_its_node_says_that_it_is_now(reported, resolved):
+    assert own_endpoint(video(resolved=reported), with_endpoint()).resolved == resolved
+
+
+@pytest.mark.parametrize(
+    ("written", "hint", "lossy"), [(None, True, True), (False, True, False), (True, None, True)]
+)
+def test_that_data_bear_loss_is_the_nodes_hint_only_where_the_manifest_says_nothing(
+    written, hint, lossy
+):
+    assert own_endpoint(video(lossy=hint), with_endpoint(lossy=written)).lossy is lossy
+
+
+@pytest.mark.parametrize(("written", "hint", "size"), [(None, 9, 9), (5, 9, 5), (5, None, 5)])
+def test_a_size_is_the_nodes_hint_only_where_the_manifest_says_nothing(written, hint, size):
+    found = own_endpoint(video(size_bytes=hint), with_endpoint(max_message_size=written))
+    assert found.size_bytes == size
+
+
+# --- connections that are there already
+
+NET = ConnectionReport(name="net", urls=(URL,))
+BARE = ConnectionReport(name="bare")
+MAPPED = dataclasses.replace(VIDEO, connection="net", mapped=True)
+
+
+def test_connections_that_somebody_else_made_are_taken_and_what_is_on_them_stays():
+    seen = camera(connections=(OWN, BARE, NET), endpoints=(MAPPED,))
+    assert party_of(seen, "h").connections == ("bare", "net")
+    found = own_endpoint(seen)
+    assert (found.by, found.fixed, found.name) == (("tcpv4",), True, "video")
+
+
+def test_a_connection_without_urls_is_what_the_rmw_makes():
+    seen = camera(connections=(BARE,), endpoints=(dataclasses.replace(MAPPED, connection="bare"),))
+    found = own_endpoint(seen)
+    assert (found.by, found.fixed) == (RMW_DEFAULT, True)
+
+
+def test_what_a_negotiation_made_before_it_may_unmake():
+    seen = camera(connections=(NET, BARE), endpoints=(MAPPED,))
+    assert party_of(seen, "h", negotiated={"net"}).connections == ("bare",)
+    found = own_endpoint(seen, negotiated={"net"})
+    assert (found.by, found.fixed) == ((), False)
+
+
+def test_what_is_on_the_own_participant_may_be_mapped_elsewhere():
+    found = own_endpoint(camera(connections=(OWN, NET), endpoints=(VIDEO,)))
+    assert (found.by, found.fixed) == ((), False)
+
+
+def test_names_of_planned_connections_are_taken_beside_those_that_exist():
+    carriers = tuple(
+        PlannedParticipant(name=f"_camera_{name}", dscp=None, reason="", connection=name)
+        for name in ("late", "")
+    )
+    party = party_of(camera(connections=(NET,)), "h", planned=declared(participants=carriers))
+    assert party.connections == ("late", "net")

@@ -1,0 +1,399 @@
+"""Which declared pairs are matched, by what either end says of the other."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from lifecycle.manifest.model import EndpointKind, EndpointPolicy, Policy, Run, RunKind
+from lifecycle.manifest.qos import QosProfile, Reliability
+from lifecycle.plan import Plan
+from lifecycle.verify import Finding, Observation, Outcome, Stage, verify
+from tests.unit.plan.samples import BEST_EFFORT, link, node, planned, publisher, subscription
+from tests.unit.verify.edits import (
+    Edit,
+    add_endpoint,
+    both,
+    change_announced_qos,
+    change_configuration,
+    change_endpoint,
+    change_report,
+    drop_endpoint,
+)
+from tests.unit.verify.perfect import perfect
+
+PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
+ATTACH = Run(kind=RunKind.ATTACH)
+INT = "std_msgs/msg/Int32"
+OPEN = Policy(undeclared_nodes=EndpointPolicy.OPEN)
+
+
+def pair(qos: QosProfile = QosProfile(), *, linked: bool = False) -> Plan:  # noqa: B008
+    return planned(
+        node("one", publisher("a", qos=qos, line=11)),
+        node("two", subscription("a", qos=qos, line=12)),
+        links=[link("/a", "one", "two")] if linked else [],
+        policy=OPEN,
+    )
+
+
+def unchanged(seen: Observation) -> Observation:
+    return seen
+
+
+def matching(edit: Edit, plan: Plan) -> list[Finding]:
+    """The findings of these two rules alone."""
+    verdict = verify(plan, edit(perfect(plan)), stage=Stage.CONNECTED)
+    return [each for each in verdict.findings if each.rule.startswith("graph.unmatched-")]
+
+
+def said(edit: Edit, plan: Plan) -> list[tuple[str, str]]:
+    return [(each.outcome.value, each.observed) for each in matching(edit, plan)]
+
+
+def silent(kind: EndpointKind) -> Edit:
+    """One end says nothing of its matches."""
+    return change_report(kind, "/a", matched=None)
+
+
+# --- whole findings
+
+
+@pytest.mark.parametrize(
+    ("linked", "rule", "hint"),
+    [
+        (
+            True,
+            "graph.unmatched-link",
+            (
+                "see the other findings on its ends; if there are none, look at the network between"
+                " them"
+            ),
+        ),
+        (
+            False,
+            "graph.unmatched-flow",
+            "look at the network between the two: discovery range, multicast, firewall, peers",
+        ),
+    ],
+)
+def test_a_pair_that_is_not_matched_is_told_whole(linked: bool, rule: str, hint: str):
+    edit = both(change_report(PUB, "/a", matched=0), change_report(SUB, "/a", matched=0))
+    reason = "the publisher matched nobody, the subscription matched nobody"
+    assert matching(edit, pair(linked=linked)) == [
+        Finding(
+            rule=rule,
+            outcome=Outcome.VIOLATED,
+            subject="/a: /one → /two",
+            expected="matched",
+            observed=reason,
+            message=f"cannot see /one → /two matched on /a: {reason}",
+            at="robot.lifecycle.yaml:12:9",
+            hint=hint,
+        )
+    ]
+
+
+def test_a_pair_that_may_be_matched_is_unverifiable_and_told_whole():
+    (found,) = matching(change_report(PUB, "/a", peers=()), pair())
+    reason = "the publisher matched 1, of which 1 are not known to its node"
+    assert (found.outcome, found.observed) == (Outcome.UNVERIFIABLE, reason)
+    assert found.message == f"cannot verify that /one → /two are matched on /a: {reason}"
+
+
+# --- why a link cannot be matched at all
+
+TYPES = change_endpoint(PUB, "/a", type=INT)
+LESS = change_announced_qos(PUB, "/a", reliability=Reliability.BEST_EFFORT)
+
+
+@pytest.mark.parametrize(
+    ("edit", "cause"),
+    [
+        (drop_endpoint(PUB, "/a"), "the publisher is missing"),
+        (drop_endpoint(SUB, "/a"), "the subscription is missing"),
+        (TYPES, f"the types differ, {INT} and std_msgs/msg/String"),
+        (LESS, "the QoS is incompatible"),
+    ],
+)
+def test_a_link_names_why_its_ends_cannot_match_and_a_flow_leaves_it_to_that_finding(
+    edit: Edit, cause: str
+):
+    assert said(edit, pair(linked=True)) == [("violated", cause)]
+    assert said(edit, pair()) == []
+
+
+@pytest.mark.parametrize(
+    ("endpoints", "cause"),
+    [
+        (((), (subscription("a"),)), "/one declares no publisher of it"),
+        (((publisher("a"),), ()), "/two declares no subscription of it"),
+    ],
+)
+def test_a_link_that_names_a_node_without_such_an_endpoint_is_violated(endpoints, cause):
+    one, two = endpoints
+    plan = planned(node("one", *one), node("two", *two), links=[link("/a", "one", "two")])
+    assert said(unchanged, plan) == [("violated", cause)]
+
+
+def test_a_cause_of_one_flow_does_not_end_the_judgement_of_the_others():
+    plan = planned(
+        node("one", publisher("a"), publisher("b"), publisher("c")),
+        node("two", subscription("a"), subscription("b"), subscription("c")),
+    )
+    edit = both(
+        drop_endpoint(PUB, "/a"),
+        change_report(PUB, "/c", matched=0),
+        change_report(SUB, "/c", matched=0),
+    )
+    assert [each.subject for each in matching(edit, plan)] == ["/c: /one → /two"]
+
+
+def test_types_and_qos_are_those_that_are_there_and_not_those_declared():
+    plan = pair(BEST_EFFORT, linked=True)
+    edit = change_announced_qos(SUB, "/a", reliability=Reliability.RELIABLE)
+    assert said(edit, plan) == [("violated", "the QoS is incompatible")]
+    both_otherwise = both(TYPES, change_endpoint(SUB, "/a", type=INT))
+    assert said(both_otherwise, pair(linked=True)) == []
+
+
+@pytest.mark.parametrize("kind", [PUB, SUB])
+def test_a_policy_that_discovery_does_not_know_is_that_of_the_nodes_report(kind: EndpointKind):
+    other = SUB if kind is PUB else PUB
+    hides = change_announced_qos(kind, "/a", reliability=Reliability.UNKNOWN)
+    reports = change_report(kind, "/a", qos=QosProfile(reliability=Reliability.BEST_EFFORT))
+    needs = change_announced_qos(other, "/a", reliability=Reliability.RELIABLE)
+    expected = [("violated", "the QoS is incompatible")] if kind is PUB else []
+    assert said(both(hides, reports, needs), pair(linked=True)) == expected
+    assert said(both(hides, needs), pair(linked=True)) == []
+
+
+def test_ends_whose_qos_nobody_knows_may_match():
+    edit = both(
+        change_endpoint(PUB, "/a", qos=None),
+        change_report(PUB, "/a", qos=None),
+    )
+    assert said(edit, pair(linked=True)) == []
+
+
+# --- what either end says
+
+
+@pytest.mark.parametrize(("kind", "word"), [(PUB, "publisher"), (SUB, "subscription")])
+@pytest.mark.parametrize(
+    ("report", "outcome", "words"),
+    [
+        ({"matched": 0}, "violated", "matched nobody"),
+        ({"matched": 2, "peers": ("98", "99")}, "violated", "matched 2 others, not this one"),
+        (
+            {"matched": 3, "peers": ("99",)},
+            "unverifiable",
+            "matched 3, of which 2 are not known to its node",
+        ),
+    ],
+)
+@pytest.mark.parametrize("other_says", ["nothing", "matched"])
+def test_one_end_that_does_not_name_the_other_is_enough(
+    kind, word, report, outcome, words, other_says
+):
+    other = SUB if kind is PUB else PUB
+    edits = [change_report(kind, "/a", **report)]
+    if other_says == "nothing":
+        edits.append(silent(other))
+    assert said(both(*edits), pair()) == [(outcome, f"the {word} {words}")]
+
+
+def test_ends_that_fail_in_two_ways_are_told_by_the_worse():
+    edit = both(change_report(PUB, "/a", peers=()), change_report(SUB, "/a", matched=0))
+    assert said(edit, pair()) == [("violated", "the subscription matched nobody")]
+
+
+@pytest.mark.parametrize("kind", [PUB, SUB])
+def test_one_end_that_names_the_other_is_enough_where_the_other_says_nothing(kind: EndpointKind):
+    for linked in (False, True):
+        assert said(silent(kind), pair(linked=linked)) == []
+
+
+def test_where_neither_end_says_anything_a_flow_goes_by_discovery_and_a_link_does_not():
+    edit = both(silent(PUB), silent(SUB))
+    assert said(edit, pair()) == []
+    assert said(edit, pair(linked=True)) == [
+        ("unverifiable", "neither end reports whom it is matched with")
+    ]
+
+
+def gid_of(kind: EndpointKind, plan: Plan) -> str:
+    return next(each.gid for each in perfect(plan).endpoints if each.kind is kind)
+
+
+def test_a_gid_that_discovery_does_not_show_is_that_of_the_nodes_report():
+    plan = pair()
+    shown = change_endpoint(SUB, "/a", gid="")
+    assert said(both(shown, silent(SUB)), plan) == []
+    wrong = change_report(PUB, "/a", peers=("99",))
+    assert said(both(shown, silent(SUB), wrong), plan) == [
+        ("violated", "the publisher matched 1 others, not this one")
+    ]
+
+
+def test_the_gid_that_discovery_shows_wins_over_that_of_the_nodes_report():
+    plan = pair()
+    edit = both(silent(SUB), change_report(SUB, "/a", gid="77"))
+    assert said(edit, plan) == []
+
+
+def test_an_end_of_unknown_gid_is_judged_by_how_many_are_matched():
+    plan = pair()
+    edit = both(
+        change_endpoint(SUB, "/a", gid=""),
+        change_report(SUB, "/a", gid="", matched=None),
+        change_report(PUB, "/a", matched=1, peers=("99",)),
+    )
+    assert said(edit, plan) == []
+
+
+# --- one match does not count as all
+
+
+def several(publishers: int, subscriptions: int, *, linked: bool = False) -> Plan:
+    """Two nodes with several endpoints of one topic, of which each is matched with each."""
+    return planned(
+        node("one", *(publisher(name) for name in ("a", "/a")[:publishers])),
+        node("two", *(subscription(name) for name in ("a", "/a")[:subscriptions])),
+        links=[link("/a", "one", "two")] if linked else [],
+    )
+
+
+def second(node_name: str, **fields: object) -> Edit:
+    """The node reports its second endpoint otherwise."""
+
+    def edit(seen: Observation) -> Observation:
+        first, other = next(
+            each.endpoints for each in seen.configurations if each.name == node_name
+        )
+        endpoints = (first, dataclasses.replace(other, **fields))
+        return change_configuration(node_name, endpoints=endpoints)(seen)
+
+    return edit
+
+
+@pytest.mark.parametrize(
+    ("counts", "name", "words"),
+    [
+        ((2, 1), "/one", "the publisher matched nobody"),
+        ((1, 2), "/two", "the subscription matched nobody"),
+    ],
+)
+@pytest.mark.parametrize("linked", [False, True])
+def test_one_match_of_several_endpoints_does_not_count_as_all(counts, name, words, linked):
+    plan = several(*counts, linked=linked)
+    assert said(unchanged, plan) == []
+    assert said(second(name, matched=0, peers=()), plan) == [("violated", words)]
+
+
+def test_one_proven_pair_does_not_prove_a_link_of_several_endpoints():
+    plan = several(2, 1, linked=True)
+    edit = both(change_report(SUB, "/a", matched=None), second("/one", matched=None, peers=None))
+    assert said(edit, plan) == [("unverifiable", "neither end reports whom it is matched with")]
+    unlinked = several(2, 1)
+    assert said(edit, unlinked) == []
+
+
+def test_one_missing_endpoint_of_several_spoils_a_link():
+    plan = several(2, 1, linked=True)
+
+    def edit(seen: Observation) -> Observation:
+        gone = next(each for each in seen.endpoints if each.kind is PUB)
+        rest = tuple(each for each in seen.endpoints if each is not gone)
+        return dataclasses.replace(seen, endpoints=rest)
+
+    assert said(edit, plan) == [("violated", "the publisher is missing")]
+
+
+def test_one_endpoint_of_several_that_cannot_match_spoils_a_link():
+    plan = several(2, 1, linked=True)
+
+    def edit(seen: Observation) -> Observation:
+        last = [each for each in seen.endpoints if each.kind is PUB][-1]
+        qos = QosProfile(reliability=Reliability.BEST_EFFORT)
+        return dataclasses.replace(
+            seen,
+            endpoints=tuple(
+                dataclasses.replace(each, qos=qos) if each is last else each
+                for each in seen.endpoints
+            ),
+        )
+
+    assert said(edit, plan) == [("violated", "the QoS is incompatible")]
+
+
+# --- ends that only count
+
+
+def counts(kind: EndpointKind, matched: int) -> Edit:
+    """One end counts and the other says nothing."""
+    other = SUB if kind is PUB else PUB
+    return both(change_report(kind, "/a", matched=matched, peers=None), silent(other))
+
+
+def stranger(kind: EndpointKind, **fields: object) -> Edit:
+    return add_endpoint(kind, "/rviz2", "/a", gid="99", **fields)
+
+
+RELIABLE = QosProfile()
+BEST = QosProfile(reliability=Reliability.BEST_EFFORT)
+
+
+@pytest.mark.parametrize(
+    ("plan", "edit", "expected"),
+    [
+        (pair(), counts(PUB, 1), []),
+        (pair(), counts(SUB, 1), []),
+        (pair(), counts(PUB, 0), [("violated", "the publisher matched 0 of 1")]),
+        (pair(), counts(SUB, 0), [("violated", "the subscription matched 0 of 1")]),
+        (
+            pair(),
+            counts(PUB, 2),
+            [("unverifiable", "the publisher matched 2 of 1, and does not tell which")],
+        ),
+        (
+            pair(),
+            both(counts(PUB, 1), stranger(SUB, qos=BEST)),
+            [("unverifiable", "the publisher matched 1 of 2, and does not tell which")],
+        ),
+        (
+            pair(),
+            both(counts(PUB, 0), stranger(SUB, qos=BEST)),
+            [("violated", "the publisher matched 0 of 2")],
+        ),
+        (pair(), both(counts(PUB, 2), stranger(SUB, qos=None)), []),
+        (pair(), both(counts(SUB, 2), stranger(PUB, qos=None)), []),
+        (several(1, 2), counts(PUB, 1), [("violated", "the publisher matched 1 of 2")]),
+    ],
+)
+def test_a_count_proves_a_pair_only_if_it_is_that_of_all_who_can_match(plan, edit, expected):
+    assert said(edit, plan) == expected
+
+
+@pytest.mark.parametrize(
+    ("kind", "qos", "other"),
+    [
+        (PUB, BEST, {"qos": RELIABLE}),
+        (SUB, RELIABLE, {"qos": BEST}),
+        (PUB, RELIABLE, {"qos": RELIABLE, "type": INT}),
+        (SUB, RELIABLE, {"qos": RELIABLE, "type": INT}),
+    ],
+)
+def test_who_cannot_match_is_not_counted(kind, qos, other):
+    stranger_kind = SUB if kind is PUB else PUB
+    edit = both(counts(kind, 1), stranger(stranger_kind, **other))
+    assert said(edit, pair(qos)) == []
+    # The other way round the two would match, and so would an end of any QoS.
+    fitting = stranger(stranger_kind, qos=qos)
+    assert said(both(counts(kind, 2), fitting), pair(qos)) == []
+
+
+def test_endpoints_of_other_topics_are_not_counted():
+    edit = both(counts(PUB, 1), add_endpoint(SUB, "/rviz2", "/b", gid="99", qos=BEST))
+    assert said(edit, pair()) == []

@@ -1,0 +1,435 @@
+"""QoS that is written against QoS that is there, and what is offered against what is requested."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from lifecycle.manifest.model import EndpointKind, EndpointPolicy, Policy, Run, RunKind
+from lifecycle.manifest.qos import (
+    BEST_AVAILABLE_NS,
+    INFINITE_NS,
+    Durability,
+    History,
+    Liveliness,
+    QosProfile,
+    Reliability,
+    not_written,
+)
+from lifecycle.plan import Plan
+from lifecycle.verify import Finding, Outcome, Stage, verify
+from tests.unit.plan.samples import node, planned, publisher, subscription
+from tests.unit.verify.edits import (
+    Edit,
+    add_endpoint,
+    add_node,
+    both,
+    change_announced_qos,
+    change_endpoint,
+    change_report,
+    drop_endpoint,
+)
+from tests.unit.verify.perfect import perfect
+
+PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
+ATTACH = Run(kind=RunKind.ATTACH)
+BEST_EFFORT = QosProfile(reliability=Reliability.BEST_EFFORT)
+NS = 10**9
+
+
+def pair(offered: QosProfile, requested: QosProfile = BEST_EFFORT, **rest: object) -> Plan:
+    """A publisher and a subscription of a topic, in two nodes that tell nothing of themselves."""
+    return planned(
+        node("one", publisher("a", qos=offered, line=11), run=ATTACH, managed=False),
+        node("two", subscription("a", qos=requested, line=12), run=ATTACH, managed=False),
+        **rest,
+    )
+
+
+def findings(edit: Edit, plan: Plan) -> tuple[Finding, ...]:
+    return verify(plan, edit(perfect(plan)), stage=Stage.CONNECTED).findings
+
+
+def of(rule: str, edit: Edit, plan: Plan) -> list[Finding]:
+    return [each for each in findings(edit, plan) if each.rule == rule]
+
+
+def differing(edit: Edit, plan: Plan) -> list[str]:
+    """Which policies differ from the declared ones, and from what to what."""
+    return [
+        f"{each.endpoint.noun}: {each.expected}, {each.observed}"
+        for each in of("graph.qos-differs", edit, plan)
+        if each.endpoint
+    ]
+
+
+# --- declared against actual
+
+
+def test_a_policy_that_differs_is_told_whole():
+    edit = change_announced_qos(PUB, "/a", deadline_ns=NS)
+    assert of("graph.qos-differs", edit, pair(QosProfile())) == [
+        Finding(
+            rule="graph.qos-differs",
+            outcome=Outcome.VIOLATED,
+            subject="/a",
+            expected="deadline_ns infinite",
+            observed="deadline_ns 1000000000 ns",
+            message="cannot accept the publisher of /a in /one: deadline_ns is declared infinite"
+            " and is 1000000000 ns",
+            at="robot.lifecycle.yaml:11:9",
+            node="/one",
+            endpoint=PUB,
+            hint="correct the profile in the manifest or in the node; look for an XML profile or a"
+            " qos_overrides parameter",
+        )
+    ]
+
+
+@pytest.mark.parametrize(
+    ("policies", "found"),
+    [
+        ({"history": History.KEEP_ALL}, "history KEEP_LAST, history KEEP_ALL"),
+        ({"depth": 4}, "depth 10, depth 4"),
+        (
+            {"reliability": Reliability.BEST_EFFORT},
+            "reliability RELIABLE, reliability BEST_EFFORT",
+        ),
+        (
+            {"durability": Durability.TRANSIENT_LOCAL},
+            "durability VOLATILE, durability TRANSIENT_LOCAL",
+        ),
+        ({"lifespan_ns": 3}, "lifespan_ns infinite, lifespan_ns 3 ns"),
+        (
+            {"liveliness": Liveliness.MANUAL_BY_TOPIC},
+            "liveliness AUTOMATIC, liveliness MANUAL_BY_TOPIC",
+        ),
+        (
+            {"liveliness_lease_duration_ns": 3},
+            "liveliness_lease_duration_ns infinite, liveliness_lease_duration_ns 3 ns",
+        ),
+    ],
+)
+def test_every_policy_that_is_written_is_compared(policies: dict[str, object], found: str):
+    edit = change_announced_qos(PUB, "/a", **policies)
+    assert differing(edit, pair(QosProfile())) == [f"publisher: {found}"]
+
+
+@pytest.mark.parametrize("never", [None, 0, INFINITE_NS])
+def test_every_form_of_infinite_is_one(never: int | None):
+    plan = pair(QosProfile(deadline_ns=NS))
+    edit = change_announced_qos(PUB, "/a", deadline_ns=never)
+    assert differing(edit, plan) == ["publisher: deadline_ns 1000000000 ns, deadline_ns infinite"]
+    assert differing(edit, pair(QosProfile(deadline_ns=0))) == []
+
+
+def test_a_lifespan_is_compared_at_the_publisher_alone():
+    edit = both(
+        change_announced_qos(PUB, "/a", lifespan_ns=7),
+        change_announced_qos(SUB, "/a", lifespan_ns=7, depth=3),
+    )
+    assert differing(edit, pair(QosProfile())) == [
+        "publisher: lifespan_ns infinite, lifespan_ns 7 ns",
+        "subscription: depth 10, depth 3",
+    ]
+
+
+def test_a_depth_means_something_only_where_the_last_messages_are_kept():
+    plan = pair(QosProfile(history=History.KEEP_ALL))
+    assert differing(change_announced_qos(PUB, "/a", depth=3, deadline_ns=5), plan) == [
+        "publisher: deadline_ns infinite, deadline_ns 5 ns"
+    ]
+
+
+SYSTEM = QosProfile(
+    history=History.SYSTEM_DEFAULT,
+    depth=0,
+    reliability=Reliability.SYSTEM_DEFAULT,
+    durability=Durability.SYSTEM_DEFAULT,
+    liveliness=Liveliness.SYSTEM_DEFAULT,
+)
+OTHERWISE = change_announced_qos(
+    PUB, "/a", deadline_ns=5, durability=Durability.TRANSIENT_LOCAL, lifespan_ns=6
+)
+
+
+def test_rmws_system_default_leaves_the_durations_to_the_middleware_too():
+    assert differing(OTHERWISE, pair(SYSTEM)) == []
+
+
+@pytest.mark.parametrize(
+    ("written", "found"),
+    [
+        ({"deadline_ns": 9}, ["deadline_ns 9 ns, deadline_ns 5 ns"]),
+        ({"lifespan_ns": 9}, ["deadline_ns infinite, deadline_ns 5 ns"]),
+        ({"liveliness_lease_duration_ns": 9}, ["deadline_ns infinite, deadline_ns 5 ns"]),
+        ({"history": History.KEEP_ALL}, ["deadline_ns infinite, deadline_ns 5 ns"]),
+        ({"reliability": Reliability.RELIABLE}, ["deadline_ns infinite, deadline_ns 5 ns"]),
+        ({"liveliness": Liveliness.AUTOMATIC}, ["deadline_ns infinite, deadline_ns 5 ns"]),
+        (
+            {"durability": Durability.VOLATILE},
+            [
+                "durability VOLATILE, durability TRANSIENT_LOCAL",
+                "deadline_ns infinite, deadline_ns 5 ns",
+            ],
+        ),
+    ],
+)
+def test_a_profile_that_writes_one_policy_beside_defaults_is_compared(
+    written: dict[str, object], found: list[str]
+):
+    plan = pair(dataclasses.replace(SYSTEM, **written))
+    lifespan = f"lifespan_ns {written.get('lifespan_ns', 'infinite')}"
+    lifespan += " ns" if "lifespan_ns" in written else ""
+    assert differing(OTHERWISE, plan) == [
+        f"publisher: {each}" for each in (*found, f"{lifespan}, lifespan_ns 6 ns")
+    ]
+
+
+def test_values_that_leave_the_choice_to_the_middleware_are_not_compared():
+    free = QosProfile(
+        reliability=Reliability.BEST_AVAILABLE,
+        durability=Durability.UNKNOWN,
+        liveliness=Liveliness.BEST_AVAILABLE,
+        deadline_ns=BEST_AVAILABLE_NS,
+        liveliness_lease_duration_ns=BEST_AVAILABLE_NS,
+    )
+    edit = change_announced_qos(
+        PUB,
+        "/a",
+        reliability=Reliability.BEST_EFFORT,
+        durability=Durability.TRANSIENT_LOCAL,
+        liveliness=Liveliness.MANUAL_BY_TOPIC,
+        deadline_ns=1,
+        liveliness_lease_duration_ns=2,
+        lifespan_ns=3,
+    )
+    assert differing(edit, pair(free)) == ["publisher: lifespan_ns infinite, lifespan_ns 3 ns"]
+
+
+def test_a_policy_that_is_not_written_does_not_end_the_comparison():
+    plan = planned(
+        node(
+            "one",
+            dataclasses.replace(publisher("a"), qos_defaults=not_written(["durability"])),
+            run=ATTACH,
+            managed=False,
+        )
+    )
+    edit = change_announced_qos(
+        PUB, "/a", reliability=Reliability.BEST_EFFORT, durability=Durability.TRANSIENT_LOCAL
+    )
+    assert differing(edit, plan) == ["publisher: durability VOLATILE, durability TRANSIENT_LOCAL"]
+
+
+# --- what is not known
+
+
+def test_what_nobody_announces_of_one_endpoint_is_told_whole():
+    edit = change_announced_qos(PUB, "/a", history=History.UNKNOWN, depth=0)
+    assert findings(edit, pair(QosProfile())) == (
+        Finding(
+            rule="graph.qos-unverifiable",
+            outcome=Outcome.UNVERIFIABLE,
+            subject="/one",
+            expected="/a (publisher): history KEEP_LAST, depth 10",
+            observed="not announced",
+            message="cannot verify history, depth of /one on /a (publisher): neither discovery nor"
+            " the node reports the actual value",
+            at="robot.lifecycle.yaml:11:9",
+            node="/one",
+            hint="Fast DDS does not announce history and depth: only a node that reports its"
+            " configuration can prove them; a policy that is not written is not required",
+        ),
+    )
+
+
+def test_of_an_endpoint_whose_qos_nobody_knows_every_written_policy_is_unverifiable():
+    found = of("graph.qos-unverifiable", change_endpoint(SUB, "/a", qos=None), pair(QosProfile()))
+    assert [each.expected for each in found] == [
+        (
+            "/a (subscription): history KEEP_LAST, depth 10, reliability BEST_EFFORT, durability"
+            " VOLATILE, deadline_ns infinite, liveliness AUTOMATIC, liveliness_lease_duration_ns"
+            " infinite"
+        )
+    ]
+
+
+def test_the_qos_of_an_endpoint_that_is_missing_is_not_named_besides():
+    plan = planned(node("one", publisher("a"), run=ATTACH, managed=False))
+    assert [each.rule for each in findings(drop_endpoint(PUB, "/a"), plan)] == [
+        "graph.missing-endpoint"
+    ]
+
+
+def test_the_qos_of_an_endpoint_that_only_its_node_tells_of_is_judged():
+    plan = planned(node("one", publisher("a")))
+    edit = both(drop_endpoint(PUB, "/a"), change_report(PUB, "/a", qos=QosProfile(depth=4)))
+    assert differing(edit, plan) == ["publisher: depth 10, depth 4"]
+
+
+def test_an_endpoint_that_writes_no_qos_does_not_end_the_judgement_of_its_node():
+    plan = planned(node("one", publisher("a", qos=None), publisher("b"), run=ATTACH, managed=False))
+    edit = change_announced_qos(PUB, "/b", depth=4)
+    assert differing(edit, plan) == ["publisher: depth 10, depth 4"]
+
+
+# --- offered against requested
+
+
+def incompatible(edit: Edit, plan: Plan) -> list[tuple[str, str, str]]:
+    return [
+        (each.subject, each.expected, each.observed)
+        for each in of("graph.qos-incompatible", edit, plan)
+    ]
+
+
+LESS = change_announced_qos(PUB, "/a", reliability=Reliability.BEST_EFFORT)
+
+
+def test_an_incompatible_pair_is_told_whole():
+    plan = pair(QosProfile(), QosProfile())
+    assert of("graph.qos-incompatible", LESS, plan) == [
+        Finding(
+            rule="graph.qos-incompatible",
+            outcome=Outcome.VIOLATED,
+            subject="/a: /one → /two",
+            expected="reliability of at least RELIABLE offered",
+            observed="reliability BEST_EFFORT offered",
+            message="cannot match /one → /two on /a: /one offers reliability BEST_EFFORT, /two"
+            " requests reliability RELIABLE",
+            at="robot.lifecycle.yaml:11:9",
+            hint="offer more or request less: DDS does not match them, and no data flows",
+        )
+    ]
+
+
+def test_a_pair_that_may_be_incompatible_is_unverifiable_and_told_whole():
+    edit = change_announced_qos(PUB, "/a", reliability=Reliability.UNKNOWN)
+    (found,) = of("graph.qos-incompatible", edit, pair(QosProfile(), QosProfile()))
+    assert (found.outcome, found.observed, found.message) == (
+        Outcome.UNVERIFIABLE,
+        "reliability UNKNOWN offered",
+        (
+            "cannot verify that these match: /one → /two on /a: /one offers reliability UNKNOWN,"
+            " /two requests reliability RELIABLE"
+        ),
+    )
+
+
+def open_world(*endpoints: object) -> Plan:
+    return planned(
+        node("one", *endpoints, run=ATTACH, managed=False, endpoints=EndpointPolicy.OPEN),
+        policy=Policy(undeclared_nodes=EndpointPolicy.OPEN),
+    )
+
+
+@pytest.mark.parametrize(
+    ("declared", "offers", "requests", "subject", "at"),
+    [
+        ((publisher("a"),), "/one", "/other", "/a: /one → /other", "robot.lifecycle.yaml:10:9"),
+        ((subscription("a"),), "/other", "/one", "/a: /other → /one", "robot.lifecycle.yaml:10:9"),
+        ((), "/one", "/other", "/a: /one → /other", ""),
+        ((), "/other", "/one", "/a: /other → /one", ""),
+        ((), "/one", "", "/a: /one → an unknown node", ""),
+        ((), "", "/one", "/a: an unknown node → /one", ""),
+        ((), "/other", "/another", "", ""),
+    ],
+)
+def test_a_pair_is_judged_where_one_end_at_least_is_of_a_declared_node(
+    declared, offers, requests, subject, at
+):
+    plan = open_world(*declared)
+    kinds = {each.kind for each in declared}
+    ends: list[Edit] = [add_node("/other"), add_node("/another")]
+    if PUB not in kinds or offers != "/one":
+        ends.append(add_endpoint(PUB, offers, "/a", gid="98", qos=BEST_EFFORT))
+    if SUB not in kinds or requests != "/one":
+        ends.append(add_endpoint(SUB, requests, "/a", gid="99", qos=QosProfile()))
+    if PUB in kinds and offers == "/one":
+        ends.append(LESS)
+    found = of("graph.qos-incompatible", both(*ends), plan)
+    assert [(each.subject, each.at) for each in found] == ([(subject, at)] if subject else [])
+
+
+def test_a_pair_of_strangers_or_of_two_types_does_not_end_the_judgement_of_a_topic():
+    plan = open_world(subscription("a", line=5), subscription("b"))
+    edit = both(
+        add_endpoint(PUB, "/A", "/a", gid="91", qos=BEST_EFFORT, type="std_msgs/msg/Int32"),
+        add_endpoint(PUB, "/B", "/a", gid="92", qos=BEST_EFFORT),
+        add_endpoint(SUB, "/A", "/a", gid="93", qos=QosProfile()),
+        add_endpoint(PUB, "/B", "/b", gid="94", qos=BEST_EFFORT),
+        # A topic with subscriptions alone has no pair.
+        add_endpoint(SUB, "/one", "/c", gid="95", qos=QosProfile()),
+    )
+    assert [each[0] for each in incompatible(edit, plan)] == ["/a: /B → /one", "/b: /B → /one"]
+
+
+def test_an_end_whose_qos_nobody_knows_may_match_anything():
+    plan = pair(QosProfile(), QosProfile())
+    for kind in (PUB, SUB):
+        found = of("graph.qos-incompatible", change_endpoint(kind, "/a", qos=None), plan)
+        assert {each.outcome for each in found} <= {Outcome.UNVERIFIABLE}
+    edit = change_endpoint(PUB, "/a", qos=None)
+    assert [each[1:] for each in incompatible(edit, plan)] == [
+        ("reliability of at least RELIABLE offered", "reliability UNKNOWN offered")
+    ]
+
+
+def several(offers: tuple[QosProfile, ...], requests: tuple[QosProfile, ...]) -> Edit:
+    """Endpoints of two nodes on a topic that no manifest declares."""
+    return both(
+        *(
+            add_endpoint(PUB, "/one", "/x", gid=f"8{index}", qos=each)
+            for index, each in enumerate(offers)
+        ),
+        *(
+            add_endpoint(SUB, "/two", "/x", gid=f"9{index}", qos=each)
+            for index, each in enumerate(requests)
+        ),
+    )
+
+
+def deadline(after_ns: int) -> QosProfile:
+    return QosProfile(deadline_ns=after_ns)
+
+
+@pytest.mark.parametrize(
+    ("offers", "requests", "policies"),
+    [
+        ((BEST_EFFORT, BEST_EFFORT), (QosProfile(),), ["reliability BEST_EFFORT"]),
+        ((BEST_EFFORT,), (QosProfile(), QosProfile()), ["reliability BEST_EFFORT"]),
+        (
+            (dataclasses.replace(BEST_EFFORT, deadline_ns=9),),
+            (deadline(3),),
+            ["reliability BEST_EFFORT", "deadline 9 ns"],
+        ),
+        ((deadline(9), deadline(8)), (deadline(3),), ["deadline 9 ns", "deadline 8 ns"]),
+        ((deadline(9),), (deadline(3), deadline(4)), ["deadline 9 ns", "deadline 9 ns"]),
+    ],
+)
+def test_what_is_equal_of_two_nodes_on_a_topic_is_one_finding(offers, requests, policies):
+    plan = planned(
+        *(
+            node(name, run=ATTACH, managed=False, endpoints=EndpointPolicy.OPEN)
+            for name in ("one", "two")
+        )
+    )
+    found = incompatible(several(offers, requests), plan)
+    assert [each[2] for each in found] == [f"{each} offered" for each in policies]
+
+
+def test_what_is_equal_of_other_topics_or_nodes_is_a_finding_of_its_own():
+    plan = planned(
+        node("one", publisher("a"), publisher("b"), run=ATTACH, managed=False),
+        node("two", subscription("a"), subscription("b"), run=ATTACH, managed=False),
+        node("three", publisher("a"), subscription("b"), run=ATTACH, managed=False),
+    )
+    edit = both(LESS, change_announced_qos(PUB, "/b", reliability=Reliability.BEST_EFFORT))
+    assert [each[0] for each in incompatible(edit, plan)] == [
+        "/a: /one → /two",
+        "/a: /three → /two",
+        "/b: /one → /three",
+        "/b: /one → /two",
+    ]

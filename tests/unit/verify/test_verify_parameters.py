@@ -1,0 +1,504 @@
+"""Parameters: what is expected, what the node has, and exactly the findings that follow."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from lifecycle.manifest.model import ParameterValue, Run, RunKind
+from lifecycle.plan import Plan
+from lifecycle.plan.model import ExpectedParameter
+from lifecycle.verify import RULES, Finding, NodeConfiguration, Observation, Outcome, Stage, verify
+from lifecycle.verify.observation import LONGEST_VALUE, NodeParameters, ParameterReport
+from lifecycle.verify.rules.parameters import spell
+from tests.unit.plan.samples import at, node, planned
+from tests.unit.verify.perfect import perfect
+from tests.unit.verify.told import told
+
+ATTACH = Run(kind=RunKind.ATTACH)
+NAN = float("nan")
+LONG = tuple(float(each) for each in range(LONGEST_VALUE))
+ABSENT = None
+
+
+def expected(
+    value: ParameterValue | None = 1.5, type_: str = "double", **rest: object
+) -> ExpectedParameter:
+    source = "" if value is None else "parameters"
+    fields = {"name": "gain", "type": type_, "value": value, "source": source, "at": at(60, 7)}
+    return ExpectedParameter(**{**fields, **rest})
+
+
+def has(value: ParameterValue | None, type_: str = "double", *, read_only: bool = False):
+    return ParameterReport.of("gain", type_, value, read_only=read_only)
+
+
+def plan_of(*parameters: ExpectedParameter, run: Run = ATTACH, **rest: object) -> Plan:
+    plan = planned(node("arm", run=run, managed=run is not ATTACH))
+    (only,) = plan.nodes
+    only = dataclasses.replace(only, expected_parameters=parameters, **rest)
+    return dataclasses.replace(plan, nodes=(only,))
+
+
+def served(plan: Plan, *reports: ParameterReport) -> Observation:
+    """What is seen of a foreign node that answers."""
+    seen = perfect(plan, Stage.ACTIVE)
+    return dataclasses.replace(seen, parameters=(NodeParameters(node="/arm", parameters=reports),))
+
+
+def judged(plan: Plan, seen: Observation) -> tuple[Finding, ...]:
+    return verify(plan, seen, stage=Stage.ACTIVE).findings
+
+
+CASES: dict[str, tuple[ExpectedParameter, ParameterReport | None, list[str]]] = {
+    "as given": (expected(), has(1.5), []),
+    "another value": (expected(), has(99.0), ["param.value-differs"]),
+    "an integer where a double is meant": (expected(2.0), has(2, "int"), ["param.type-differs"]),
+    "a double where an integer is meant": (
+        expected(2, "int"),
+        has(2.0),
+        ["param.type-differs"],
+    ),
+    "one is not true": (expected(True, "bool"), has(1, "int"), ["param.type-differs"]),
+    "it is not there": (expected(), ABSENT, ["param.missing"]),
+    "it is not there, and only a section for many gives it": (
+        expected(optional=True),
+        ABSENT,
+        [],
+    ),
+    "only a section for many gives it, and it is otherwise": (
+        expected(optional=True),
+        has(2.0),
+        ["param.value-differs"],
+    ),
+    "a declared type, whatever the value": (expected(None), has(7.0), []),
+    "a declared type without a value": (expected(None), has(None), []),
+    "a declared value that is not set": (expected(), has(None), ["param.value-differs"]),
+    "not set, of any type": (expected(None), has(None, ""), ["param.type-differs"]),
+    "not a number": (expected(".nan"), has(NAN), []),
+    "a number where there must be none": (expected(".nan"), has(0.0), ["param.value-differs"]),
+    "text that looks like no number": (expected(".nan", "string"), has(".nan", "string"), []),
+    "the other infinity": (expected("-.inf"), has(float("inf")), ["param.value-differs"]),
+    "both zeros": (expected(0.0), has(-0.0), []),
+    "an equal array": (
+        expected((1.0, 2.0), "double_array"),
+        has((1.0, 2.0), "double_array"),
+        [],
+    ),
+    "a longer array": (
+        expected((1, 2), "int_array"),
+        has((1, 2, 3), "int_array"),
+        ["param.value-differs"],
+    ),
+    "an empty array of any type": (expected((), "array"), has((), "string_array"), []),
+    "not even an array": (expected((), "array"), has("", "string"), ["param.type-differs"]),
+    "a value too long to be passed on": (
+        expected(LONG, "double_array"),
+        has(LONG, "double_array"),
+        [],
+    ),
+    "another value too long to be passed on": (
+        expected(LONG, "double_array"),
+        has((*LONG[:-1], 0.0), "double_array"),
+        ["param.value-differs"],
+    ),
+    "read_only as declared": (expected(read_only=True), has(1.5, read_only=True), []),
+    "declared read_only, and can be set": (
+        expected(read_only=True),
+        has(1.5),
+        ["param.read-only-differs"],
+    ),
+    "read_only, which nobody forbids": (expected(), has(1.5, read_only=True), []),
+    "two things wrong at once": (
+        expected(read_only=True),
+        has(3.0),
+        ["param.value-differs", "param.read-only-differs"],
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_parameter_is_judged(case: str):
+    wanted, actual, rules = CASES[case]
+    plan = plan_of(wanted)
+    found = judged(plan, served(plan, *(() if actual is None else (actual,))))
+    assert [(each.rule, each.outcome) for each in found] == [
+        (rule, Outcome.VIOLATED) for rule in rules
+    ]
+    assert {each.subject for each in found} <= {"/arm: gain"}
+    assert {each.at for each in found} <= {"robot.lifecycle.yaml:60:7"}
+
+
+def test_every_rule_of_parameters_has_a_case_in_which_it_fires():
+    fired = {rule for _, _, rules in CASES.values() for rule in rules} | {"param.unverifiable"}
+    assert fired == {each.id for each in RULES if each.id.startswith("param.")}
+
+
+def test_a_finding_names_both_values_and_where_the_demand_comes_from():
+    plan = plan_of(
+        expected(),
+        expected(name="limits", source="default_value"),
+        expected(None, "int", name="bogus"),
+        expected(".nan", name="unset", source="cfg/arm.yaml"),
+    )
+    seen = served(
+        plan,
+        has(99.0),
+        dataclasses.replace(has(2.0), name="limits"),
+        dataclasses.replace(has(float("inf")), name="unset"),
+    )
+    messages = "\n".join(each.message for each in judged(plan, seen))
+    assert messages == (
+        "cannot accept parameter gain of node /arm: it is 99.0, and must be 1.5 as given under "
+        "`parameters`\n"
+        "cannot accept parameter limits of node /arm: it is 2.0, and must be 1.5 as declared in "
+        "its interface, where nothing else is given\n"
+        "cannot find parameter bogus of node /arm, which is declared in its interface\n"
+        "cannot accept parameter unset of node /arm: it is .inf, and must be .nan as given in "
+        "cfg/arm.yaml"
+    )
+
+
+SAYS: dict[str, tuple[ExpectedParameter, ParameterReport | None, str]] = {
+    "a value that is given is not there": (
+        expected((1, 2), "int_array"),
+        ABSENT,
+        """\
+violated param.missing: /arm: gain
+cannot find parameter gain of node /arm, which is given under `parameters`
+expected: int_array [1, 2]
+observed: no such parameter
+at: robot.lifecycle.yaml:60:7, on /arm
+to do: correct the name, or have the node declare it; a value for none has no effect
+""",
+    ),
+    "no number is given, and nothing is there": (
+        expected(".nan"),
+        ABSENT,
+        """\
+violated param.missing: /arm: gain
+cannot find parameter gain of node /arm, which is given under `parameters`
+expected: double .nan
+observed: no such parameter
+at: robot.lifecycle.yaml:60:7, on /arm
+to do: correct the name, or have the node declare it; a value for none has no effect
+""",
+    ),
+    "a type that is declared is not there": (
+        expected(None),
+        ABSENT,
+        """\
+violated param.missing: /arm: gain
+cannot find parameter gain of node /arm, which is declared in its interface
+expected: double
+observed: no such parameter
+at: robot.lifecycle.yaml:60:7, on /arm
+to do: correct the name, or have the node declare it; a value for none has no effect
+""",
+    ),
+    "a value that the command gives is not there": (
+        expected(source="command"),
+        ABSENT,
+        """\
+violated param.missing: /arm: gain
+cannot find parameter gain of node /arm, which is given in its `command`
+expected: double 1.5
+observed: no such parameter
+at: robot.lifecycle.yaml:60:7, on /arm
+to do: correct the name, or have the node declare it; a value for none has no effect
+""",
+    ),
+    "another type": (
+        expected(2.0),
+        has(2, "int"),
+        """\
+violated param.type-differs: /arm: gain
+cannot accept parameter gain of node /arm: it is an int, 2, and must be double as given under
+  `parameters`
+expected: double
+observed: int
+at: robot.lifecycle.yaml:60:7, on /arm
+to do: correct the declaration, or the node; ROS converts nothing, 1 is no double
+""",
+    ),
+    "another type, too long to show": (
+        expected(2.0),
+        has("x" * LONGEST_VALUE, "string"),
+        """\
+violated param.type-differs: /arm: gain
+cannot accept parameter gain of node /arm: it is a string, too long to show (SHA-256
+  '7f7531f0adf93194'…), and must be double as given under `parameters`
+expected: double
+observed: string
+at: robot.lifecycle.yaml:60:7, on /arm
+to do: correct the declaration, or the node; ROS converts nothing, 1 is no double
+""",
+    ),
+    "an array of another type": (
+        expected(None, "string"),
+        has((True, False), "bool_array"),
+        """\
+violated param.type-differs: /arm: gain
+cannot accept parameter gain of node /arm: it is a bool_array, [true, false], and must be string
+  as declared in its interface
+expected: string
+observed: bool_array
+at: robot.lifecycle.yaml:60:7, on /arm
+to do: correct the declaration, or the node; ROS converts nothing, 1 is no double
+""",
+    ),
+    "not set, of any type": (
+        expected(None),
+        has(None, ""),
+        """\
+violated param.type-differs: /arm: gain
+cannot accept parameter gain of node /arm: it is not set, and must be double as declared in its
+  interface
+expected: double
+observed: not set
+at: robot.lifecycle.yaml:60:7, on /arm
+to do: correct the declaration, or the node; ROS converts nothing, 1 is no double
+""",
+    ),
+    "not set, of the type": (
+        expected(),
+        has(None),
+        """\
+violated param.value-differs: /arm: gain
+cannot accept parameter gain of node /arm: it is not set, and must be 1.5 as given under
+  `parameters`
+expected: 1.5
+observed: not set
+at: robot.lifecycle.yaml:60:7, on /arm
+to do: give the value that is meant, in the manifest or with `ros2 param set`
+""",
+    ),
+    "another value than the default": (
+        expected(source="default_value"),
+        has(2.0),
+        """\
+violated param.value-differs: /arm: gain
+cannot accept parameter gain of node /arm: it is 2.0, and must be 1.5 as declared in its
+  interface, where nothing else is given
+expected: 1.5
+observed: 2.0
+at: robot.lifecycle.yaml:60:7, on /arm
+to do: give the value that is meant under `parameters`, or correct the default
+""",
+    ),
+    "another value than is given, too long to show": (
+        expected(LONG, "double_array", source="cfg/arm.yaml"),
+        has((*LONG[:-1], 0.0), "double_array"),
+        """\
+violated param.value-differs: /arm: gain
+cannot accept parameter gain of node /arm: it is too long to show (SHA-256 '4037f6e1ef33e117'…),
+  and must be [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, … 4096 items] as given in cfg/arm.yaml
+expected: [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, … 4096 items]
+observed: too long to show (SHA-256 '4037f6e1ef33e117'…)
+at: robot.lifecycle.yaml:60:7, on /arm
+to do: give the value that is meant, in the manifest or with `ros2 param set`
+""",
+    ),
+    "read_only, and can be set": (
+        expected(read_only=True),
+        has(1.5),
+        """\
+violated param.read-only-differs: /arm: gain
+cannot accept parameter gain of node /arm: it can be set, and must be read_only as its interface
+  declares it
+expected: read_only
+observed: can be set
+at: robot.lifecycle.yaml:60:7, on /arm
+to do: have the node declare it read-only, or remove read_only from the interface
+""",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", SAYS)
+def test_a_finding_on_a_parameter_is_told_whole_where_it_is(case: str):
+    wanted, actual, text = SAYS[case]
+    plan = plan_of(wanted)
+    assert told(judged(plan, served(plan, *(() if actual is None else (actual,))))) == text
+
+
+@pytest.mark.parametrize(
+    ("error", "why"),
+    [
+        ("serves no parameters", "it serves no parameters"),
+        ("did not answer", "it did not answer"),
+    ],
+)
+def test_what_a_node_does_not_tell_is_one_unverifiable_finding(error: str, why: str):
+    plan = plan_of(*(expected(name=f"p{number}") for number in range(10)))
+    seen = dataclasses.replace(
+        perfect(plan, Stage.ACTIVE), parameters=(NodeParameters(node="/arm", error=error),)
+    )
+    (finding,) = judged(plan, seen)
+    assert (finding.rule, finding.outcome) == ("param.unverifiable", Outcome.UNVERIFIABLE)
+    assert finding.message == (
+        "cannot verify parameters p0, p1, p2, p3, p4, p5, p6, p7 and 2 more of node /arm: " + why
+    )
+    assert finding.expected.split(", ") == [f"p{number}" for number in range(10)]
+
+
+def test_a_node_that_nobody_asked_is_unverifiable_and_one_that_is_not_there_is_only_missing():
+    plan = plan_of(expected())
+    seen = perfect(plan, Stage.ACTIVE)
+    assert [each.rule for each in judged(plan, seen)] == ["param.unverifiable"]
+    gone = dataclasses.replace(seen, nodes=())
+    assert [each.rule for each in judged(plan, gone)] == ["graph.missing-node"]
+
+
+def test_nothing_is_asked_of_a_node_of_which_nothing_is_declared_or_given():
+    plan = plan_of()
+    assert judged(plan, perfect(plan, Stage.ACTIVE)) == ()
+
+
+def test_a_file_that_could_not_be_read_is_unverifiable():
+    plan = plan_of(unread_parameter_files=("arm.yaml",))
+    (finding,) = judged(plan, perfect(plan, Stage.ACTIVE))
+    assert (finding.rule, finding.subject) == ("param.unverifiable", "/arm: arm.yaml")
+
+
+def reporting(plan: Plan, parameters: tuple[ParameterReport, ...] | None) -> Observation:
+    seen = perfect(plan, Stage.ACTIVE)
+
+    def changed(each: NodeConfiguration) -> NodeConfiguration:
+        return dataclasses.replace(each, parameters=parameters)
+
+    return dataclasses.replace(
+        seen, configurations=tuple(changed(each) for each in seen.configurations)
+    )
+
+
+def test_nodes_of_ours_are_judged_by_their_report():
+    plan = plan_of(expected(), run=Run(kind=RunKind.PYTHON, python="robot:Arm"))
+    assert judged(plan, perfect(plan, Stage.ACTIVE)) == ()
+    assert [each.rule for each in judged(plan, reporting(plan, (has(2.0),)))] == [
+        "param.value-differs"
+    ]
+    assert [each.rule for each in judged(plan, reporting(plan, ()))] == ["param.missing"]
+    # One of another version reports none, and its services are asked.
+    assert [each.rule for each in judged(plan, reporting(plan, None))] == ["param.unverifiable"]
+
+
+def test_a_node_of_ours_without_a_report_has_no_second_finding():
+    plan = plan_of(expected(), run=Run(kind=RunKind.PYTHON, python="robot:Arm"))
+    seen = dataclasses.replace(perfect(plan, Stage.ACTIVE), configurations=())
+    assert [each.rule for each in judged(plan, seen)] == ["config.missing-report"]
+
+
+@pytest.mark.parametrize(
+    ("value", "type_", "text"),
+    [
+        ("\x1b[31mred\x9b\u202e", "string", r"'\x1b[31mred\x9b\u202e'"),
+        ("x" * 100, "string", "'" + "x" * 57 + "…'"),
+        ("x" * 58, "string", "'" + "x" * 58 + "'"),
+        ("x" * 59, "string", "'" + "x" * 57 + "…'"),
+        (tuple(range(20)), "int_array", "[0, 1, 2, 3, 4, 5, 6, 7, … 20 items]"),
+        (tuple(range(8)), "int_array", "[0, 1, 2, 3, 4, 5, 6, 7]"),
+        (tuple(range(9)), "int_array", "[0, 1, 2, 3, 4, 5, 6, 7, … 9 items]"),
+        ((".nan", 1.0, "-.inf"), "double_array", "[.nan, 1.0, -.inf]"),
+        ((".nan", "a"), "string_array", "['.nan', 'a']"),
+        (True, "bool", "true"),
+        (False, "bool", "false"),
+        (1.0, "double", "1.0"),
+        (".nan", "string", "'.nan'"),
+    ],
+)
+def test_what_a_node_says_is_shown_short_and_without_control_characters(
+    value: ParameterValue, type_: str, text: str
+):
+    assert spell(value, type_) == text
+
+
+def test_what_cannot_be_read_is_told_whole():
+    plan = plan_of(expected(), unread_parameter_files=("arm.yaml",))
+    assert (
+        told(judged(plan, perfect(plan, Stage.ACTIVE)))
+        == """\
+unverifiable param.unverifiable: /arm: arm.yaml
+cannot verify the parameters that arm.yaml gives node /arm: it could not be read
+expected: values of arm.yaml
+observed: unknown
+at: robot.lifecycle.yaml:3:3, on /arm
+to do: lifecycle check says what keeps it from being read
+
+unverifiable param.unverifiable: /arm
+cannot verify parameter gain of node /arm: they were not read
+expected: gain
+observed: unknown
+at: robot.lifecycle.yaml:3:3, on /arm
+to do: see whether `ros2 param list` shows the node's parameters; look at its log
+"""
+    )
+
+
+@pytest.mark.parametrize(
+    ("count", "listed"),
+    [
+        (2, "p0, p1"),
+        (8, "p0, p1, p2, p3, p4, p5, p6, p7"),
+        (9, "p0, p1, p2, p3, p4, p5, p6, p7 and 1 more"),
+    ],
+)
+def test_at_most_eight_parameters_are_named(count: int, listed: str):
+    plan = plan_of(*(expected(name=f"p{number}") for number in range(count)))
+    (finding,) = judged(plan, perfect(plan, Stage.ACTIVE))
+    assert finding.message == (
+        f"cannot verify parameters {listed} of node /arm: they were not read"
+    )
+
+
+def several(*nodes: tuple[str, tuple[ExpectedParameter, ...]], run: Run = ATTACH) -> Plan:
+    plan = planned(*(node(key, run=run, managed=False) for key, _ in nodes))
+    return dataclasses.replace(
+        plan,
+        nodes=tuple(
+            dataclasses.replace(each, expected_parameters=parameters)
+            for each, (_, parameters) in zip(plan.nodes, nodes, strict=True)
+        ),
+    )
+
+
+def test_a_node_is_judged_although_those_before_it_are_absent_or_have_nothing_to_judge():
+    plan = several(("gone", (expected(),)), ("idle", ()), ("arm", (expected(),)))
+    seen = served(plan, has(2.0))
+    seen = dataclasses.replace(
+        seen, nodes=tuple(each for each in seen.nodes if each.full_name != "/gone")
+    )
+    assert [(each.rule, each.subject) for each in judged(plan, seen)] == [
+        ("graph.missing-node", "/gone"),
+        ("param.value-differs", "/arm: gain"),
+    ]
+
+
+OURS = Run(kind=RunKind.PYTHON, python="robot:Arm")
+
+
+def asked(seen: Observation, **answer: object) -> Observation:
+    """What the parameter services say, beside what is in the report."""
+    return dataclasses.replace(seen, parameters=(NodeParameters(node="/arm", **answer),))
+
+
+def test_the_services_of_a_node_of_ours_are_believed_only_where_its_report_has_no_parameters():
+    plan = plan_of(expected(), run=OURS)
+    assert judged(plan, asked(reporting(plan, (has(1.5),)), parameters=(has(2.0),))) == ()
+    (finding,) = judged(plan, asked(reporting(plan, None), parameters=(has(2.0),)))
+    assert finding.rule == "param.value-differs"
+
+
+def test_a_node_of_ours_that_neither_reports_nor_answers_says_why():
+    plan = plan_of(expected(), run=OURS)
+    seen = dataclasses.replace(perfect(plan, Stage.ACTIVE), configurations=())
+    found = judged(plan, asked(seen, error="did not answer"))
+    assert [
+        (each.rule, each.message) for each in found if each.rule != "config.missing-report"
+    ] == [
+        (
+            "param.unverifiable",
+            "cannot verify parameter gain of node /arm: it did not answer",
+        )
+    ]
