@@ -11,6 +11,7 @@ import json
 import os
 import queue
 import re
+import signal
 import subprocess
 import sys
 import threading
@@ -102,8 +103,12 @@ class Up:
         self.events: list[Event] = []
         self.segments: set[str] = set()
         self._lines: queue.Queue[str] = queue.Queue()
+        self._said: list[str] = []
+        # What hangs is aborted, see `finish`, and says where it stood.
+        python, *verb = command("up")
+        said = (str(manifest), "--format", "json", *options)
         self.process = subprocess.Popen(
-            [*through, *command("up"), str(manifest), "--format", "json", *options],
+            [*through, python, "-X", "faulthandler", *verb, *said],
             cwd=ROOT,
             env={**environment(runtime, self.mark), **(variables or {})},
             stdout=subprocess.PIPE,
@@ -111,14 +116,22 @@ class Up:
             text=True,
             start_new_session=True,
         )
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
+        self._readers = [
+            threading.Thread(target=each, daemon=True) for each in (self._read, self._hear)
+        ]
+        for each in self._readers:
+            each.start()
 
     def _read(self) -> None:
         assert self.process.stdout is not None
         for line in self.process.stdout:
             self._lines.put(line)
         self._lines.put("")
+
+    def _hear(self) -> None:
+        assert self.process.stderr is not None
+        for line in self.process.stderr:
+            self._said.append(line)
 
     def until(self, kind: str, **fields: object) -> Event:
         """Read on until an event of this kind and with these fields came, and return it."""
@@ -197,8 +210,15 @@ class Up:
 
     def finish(self) -> int:
         """Wait for the end; return the exit code with every line read."""
-        code = self.process.wait(BOUND_S)
-        self._reader.join(BOUND_S)
+        try:
+            code = self.process.wait(BOUND_S)
+        except subprocess.TimeoutExpired:
+            self.catch_up()
+            self.process.send_signal(signal.SIGABRT)
+            late = f"not ended within {BOUND_S:g} s; the last: {self.events[-5:]}"
+            raise AssertionError(f"{late} {self._errors()}") from None
+        for each in self._readers:
+            each.join(BOUND_S)
         while line := self._lines.get(timeout=1):
             self.events.append(json.loads(line))
         return code
@@ -246,15 +266,16 @@ class Up:
         if used:
             sweep(used)
         self.process.wait(BOUND_S)
-        self._reader.join(BOUND_S)
+        for reader in self._readers:
+            reader.join(BOUND_S)
         for stream in (self.process.stdout, self.process.stderr):
             assert stream is not None
             stream.close()
 
     def _errors(self) -> str:
-        assert self.process.stderr is not None
         self.process.wait(BOUND_S)
-        return self.process.stderr.read()
+        self._readers[1].join(BOUND_S)
+        return "".join(self._said)
 
 
 def _is(event: Event, kind: str, fields: Mapping[str, object]) -> bool:
