@@ -107,18 +107,22 @@ def command(
                     treatment=_treatment(targets, mapping=mapping, flow_labels=flow_labels),
                 )
                 with output(format_) as listener, ending.noted():
+
+                    def conclude(result: UpResult) -> ExitCode:
+                        return _finished(result, listener, written)
+
                     try:
-                        result = up(
+                        return up(
                             plan,
                             options,
                             [listener],
                             forerunner=forerunner,
                             ending=ending,
                             on_start=listener.watch,
-                        )
+                            conclude=conclude,
+                        ).exit_code
                     except Ended as ended:
-                        result = ended_early(ended.reason, ended.exit_code)
-                    return _finished(result, listener, written)
+                        return conclude(ended_early(ended.reason, ended.exit_code))
             finally:
                 forerunner.close()
     except Ended as ended:
@@ -126,7 +130,7 @@ def command(
         return ended.exit_code
 
 
-def _finished(result: UpResult, listener: Output, written: Report) -> int:
+def _finished(result: UpResult, listener: Output, written: Report) -> ExitCode:
     """Write and show how a run ended; return its exit code, no success without its report."""
     try:
         written.end(result.verdict)

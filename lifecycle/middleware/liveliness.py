@@ -1,19 +1,26 @@
 """Being heard, and noticing who is not heard any more.
 
-Owns: the topics by which participants assert that they are there. DDS asserts the liveliness of an
-AUTOMATIC writer from a thread of its own: it needs no Python, ends with SIGSTOP and SIGKILL, and
-does not arrive over a link that is cut. The writer's lease says how often it is asserted, the
-reader's how long it may stay unheard (DDS 1.4 §2.2.3.11), so many assertions may be lost between.
+Owns: the topics by which participants assert that they are there. A thread of ours asserts the
+liveliness of a MANUAL_BY_TOPIC writer: it ends with SIGSTOP and SIGKILL, and does not arrive over a
+link that is cut. The reader's lease says how long it may stay unheard (DDS 1.4 §2.2.3.11), so many
+assertions may be lost between. A callback that keeps the interpreter's lock for longer is not heard
+either.
 
 Fast DDS 2.14 does not repeat an assertion that was lost on the way (measured: with one each 0.2 s,
-30 % loss and a lease of 0.9 s, five false alarms a minute), so it is asserted this often.
+30 % loss and a lease of 0.9 s, five false alarms a minute), so it is asserted this often. It would
+assert an AUTOMATIC writer by itself, and hangs with it: its event thread then waits for the
+discovery's mutex, which who takes a leaving peer's writer away holds while waiting for the event
+thread (WLP::automatic_liveliness_assertion, WriterProxy::stop; seen in 1 of about 80 take-downs of
+two hosts with six nodes each).
 """
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import json
 import logging
+import threading
 import typing
 from collections.abc import Callable, Mapping
 
@@ -24,8 +31,8 @@ from rclpy.event_handler import (
     QoSPublisherMatchedInfo,
     SubscriptionEventCallbacks,
 )
+from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
-from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Empty, String
 
@@ -37,10 +44,6 @@ UNHEARD_S = 0.85
 ASSERTED_EACH_S = 0.06
 """Fourteen fit into UNHEARD_S. At 30 % loss all of them are lost once in thousands of runs of ten
 minutes; one takes about 150 bytes to each participant that knows us."""
-
-_LEASE_PER_PERIOD = 1.5
-"""rmw_fastrtps asserts each two thirds of the lease that a writer offers."""
-
 
 _LONGEST_NOTICE = 1 << 16
 """Characters of a notice; a line for each silent node."""
@@ -65,6 +68,15 @@ _TOLD = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
+_PULSES = functools.partial(
+    QoSProfile,
+    depth=1,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.VOLATILE,
+    liveliness_lease_duration=Duration(nanoseconds=round(UNHEARD_S * 1e9)),
+)
+_ASSERTED = _PULSES(liveliness=LivelinessPolicy.MANUAL_BY_TOPIC)
+_HEARD = _PULSES(liveliness=LivelinessPolicy.AUTOMATIC)  # whatever kind the writer offers
 _no_publisher_events = functools.partial(PublisherEventCallbacks, use_default_callbacks=False)
 _no_subscription_events = functools.partial(SubscriptionEventCallbacks, use_default_callbacks=False)
 
@@ -87,7 +99,7 @@ class AlivePublisher:
         self._node = node
         self._topic = topic
         self._on_listener = on_listener
-        self._pulse: Publisher | None = None
+        self._pulse: _Pulse | None = None
         # rclpy's own methods: a managed node's would gate them.
         self._publisher = Node.create_publisher(
             node,
@@ -114,20 +126,38 @@ class AlivePublisher:
         if info.current_count == 0:
             self._still()
         elif self._pulse is None:
-            self._pulse = Node.create_publisher(
-                self._node,
-                Empty,
-                self._topic + _PULSE,
-                _asserted(ASSERTED_EACH_S * _LEASE_PER_PERIOD),
-                event_callbacks=_no_publisher_events(),
-            )
+            self._pulse = _Pulse(self._node, self._topic + _PULSE)
         if info.current_count_change > 0 and self._on_listener is not None:
             self._on_listener()
 
     def _still(self) -> None:
         if self._pulse is not None:
-            Node.destroy_publisher(self._node, self._pulse)
+            self._pulse.stop()
             self._pulse = None
+
+
+class _Pulse:
+    """Asserts the liveliness of `topic` until it is stopped."""
+
+    def __init__(self, node: Node, topic: str) -> None:
+        self._node = node
+        self._publisher = Node.create_publisher(
+            node, Empty, topic, _ASSERTED, event_callbacks=_no_publisher_events()
+        )
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._assert, name="pulse", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Leave, which is heard and is not a loss."""
+        self._stopped.set()
+        self._thread.join()
+        Node.destroy_publisher(self._node, self._publisher)
+
+    def _assert(self) -> None:
+        with contextlib.suppress(InvalidHandle):  # its node was destroyed first
+            while not self._stopped.wait(ASSERTED_EACH_S):
+                self._publisher.assert_liveliness()
 
 
 @typing.final
@@ -172,7 +202,7 @@ class AliveSubscription:
                 Empty,
                 topic + _PULSE,
                 _ignore,
-                _asserted(UNHEARD_S),
+                _ASSERTED,
                 event_callbacks=_no_subscription_events(liveliness=changed),
             ),
             node.create_subscription(
@@ -184,16 +214,6 @@ class AliveSubscription:
         """Hear no more."""
         for each in self._subscriptions:
             self._node.destroy_subscription(each)
-
-
-def _asserted(lease_s: float) -> QoSProfile:
-    return QoSProfile(
-        depth=1,
-        reliability=ReliabilityPolicy.RELIABLE,
-        durability=DurabilityPolicy.VOLATILE,
-        liveliness=LivelinessPolicy.AUTOMATIC,
-        liveliness_lease_duration=Duration(nanoseconds=round(lease_s * 1e9)),
-    )
 
 
 def _ignore(message: Empty) -> None:

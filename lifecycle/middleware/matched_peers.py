@@ -50,7 +50,7 @@ def guid_of(entity: Publisher | Subscription) -> str:
     """Return the GUID of a publisher or subscription in hex; empty where it cannot be told.
 
     Raises:
-        rclpy.handle.InvalidHandle: the entity was destroyed.
+        rclpy.exceptions.InvalidHandle: the entity was destroyed.
     """
     library = _library()
     if library is None:
@@ -72,7 +72,7 @@ def matched_with(
         None where this cannot be told: another RMW, another Fast DDS.
 
     Raises:
-        rclpy.handle.InvalidHandle: the entity was destroyed.
+        rclpy.exceptions.InvalidHandle: the entity was destroyed.
     """
     library = _library()
     if library is None:

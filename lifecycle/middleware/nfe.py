@@ -60,7 +60,7 @@ def get_network_flow_endpoints(
     Raises:
         NetworkFlowEndpointsUnsupported: this RMW has no such function.
         MiddlewareError: the call failed, or the installed rcl is not known.
-        rclpy.handle.InvalidHandle: the entity was destroyed.
+        rclpy.exceptions.InvalidHandle: the entity was destroyed.
     """
     return read_handle(
         entity.handle, "publisher" if isinstance(entity, Publisher) else "subscription"

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import dataclasses
 import os
 from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
 
@@ -57,6 +58,9 @@ LEAVE_S = 10.0
 OBSERVER_TRIES = 4
 
 
+Conclude = Callable[[UpResult], ExitCode]
+
+
 class Forerunner:
     """A zygote that is started before the manifest is read, to import while we do.
 
@@ -88,6 +92,7 @@ def up(
     forerunner: Forerunner | None = None,
     ending: Ending | None = None,
     on_start: Callable[[Callable[[], SystemStatus]], None] | None = None,
+    conclude: Conclude | None = None,
 ) -> UpResult:
     """Bring a system up, hold it, take it down. Blocks; call it from the main thread.
 
@@ -101,6 +106,9 @@ def up(
         forerunner: used and ended.
         ending: has been told of signals since before this call; entered by the caller.
         on_start: given the way to ask for the status, once there is a system.
+        conclude: given how the run ended, once nothing of the system runs any more; returns the
+            exit code. What it does not write may be lost: leaving the graph comes after it, and
+            where Fast DDS hangs in that, this process ends with that exit code after `LEAVE_S`.
 
     Raises:
         AlreadyRunningError: another supervisor has this system in this domain.
@@ -112,11 +120,23 @@ def up(
     if ending is None:
         with Ending() as ours:
             return up(
-                plan, options, listeners, forerunner=forerunner, ending=ours, on_start=on_start
+                plan,
+                options,
+                listeners,
+                forerunner=forerunner,
+                ending=ours,
+                on_start=on_start,
+                conclude=conclude,
             )
     with ending.noted():
         return _up(
-            plan, options, listeners, forerunner=forerunner, ending=ending, on_start=on_start
+            plan,
+            options,
+            listeners,
+            forerunner=forerunner,
+            ending=ending,
+            on_start=on_start,
+            conclude=conclude,
         )
 
 
@@ -128,6 +148,7 @@ def _up(
     forerunner: Forerunner | None,
     ending: Ending,
     on_start: Callable[[Callable[[], SystemStatus]], None] | None,
+    conclude: Conclude | None,
 ) -> UpResult:
     """Do what `up` says, where a signal is only noted."""
     processes = local_processes(plan, options.machine)
@@ -156,7 +177,7 @@ def _up(
         adopt_orphans()
         _enter_graph(plan, options, directory)
 
-        async def run(leaving: contextlib.ExitStack) -> UpResult:
+        async def run(leaving: contextlib.AsyncExitStack) -> UpResult:
             nonlocal records
             logs = log_directory(os.environ, plan.system)
             system = System(
@@ -187,6 +208,7 @@ def _up(
                     emit=emit,
                     ending=ending,
                 )
+                leaving.push_async_callback(session.leave)
                 if on_start is not None:
                     on_start(session.status)
                 return await session.run()
@@ -199,29 +221,42 @@ def _up(
             finally:
                 await discovery_server.end(system, asyncio.Event())
                 await zygote.close()
+                _sweep(records, emit)
 
-        result = asyncio.run(_leaving_last(run))
+        return asyncio.run(_leaving_last(run, conclude))
     finally:
         forerunner.close()
-        swept = sweep(records.segments) if records else ()
+        _sweep(records)
         directory.release()
-    if swept and result.exit_code == ExitCode.OK:
-        emit(Notice(message=f"removed shared memory left in /dev/shm: {', '.join(swept)}"))
-    return result
 
 
-async def _leaving_last(run: Callable[[contextlib.ExitStack], Awaitable[UpResult]]) -> UpResult:
+async def _leaving_last(
+    run: Callable[[contextlib.AsyncExitStack], Awaitable[UpResult]], conclude: Conclude | None
+) -> UpResult:
     """Run, and leave the graph once nothing of the system runs any more, bounded.
 
     Fast DDS can hang there with the GIL held: then the process ends with the code all the same, and
     the next `up` cleans up what it could not.
     """
-    with contextlib.ExitStack() as leaving:
+    exit_code = ExitCode.INTERNAL
+    leaving = contextlib.AsyncExitStack()
+    try:
         result = await run(leaving)
-        live_on = exit_after(LEAVE_S, result.exit_code)
-        leaving.pop_all().close()
+        if conclude is not None:
+            result = dataclasses.replace(result, exit_code=conclude(result))
+        exit_code = result.exit_code
+        return result
+    finally:
+        live_on = exit_after(LEAVE_S, exit_code)
+        await leaving.aclose()
         live_on()
-    return result
+
+
+def _sweep(records: Records | None, emit: Emitter | None = None) -> None:
+    """Remove the shared memory that processes of the run have left."""
+    swept = sweep(records.segments) if records else ()
+    if swept and emit:
+        emit(Notice(message=f"removed shared memory left in /dev/shm: {', '.join(swept)}"))
 
 
 def _serves(plan: Plan, options: UpOptions) -> bool:

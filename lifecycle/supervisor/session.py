@@ -247,13 +247,16 @@ class Session:
                     result = _hurried(result)
         finally:
             self._stale.close()
-            self._eyes.prepare_to_leave()
-            self._agreement.close()
-            await self._neighbours.close()
             await self._changes.close()
             self._emit(Stopped(exit_code=result.exit_code, elapsed_s=self._emit.elapsed_s))
             await server.close(result.exit_code)
         return result
+
+    async def leave(self) -> None:
+        """Be heard no more, after `run`; Fast DDS can hang in it."""
+        self._eyes.prepare_to_leave()
+        self._agreement.close()
+        await self._neighbours.close()
 
     async def _until_over(self) -> UpResult:
         """Run the phases; whatever ends them becomes an exit code and a verdict."""

@@ -492,3 +492,35 @@ def test_a_plain_command_is_started_verified_and_ended(tmp_path: Path, fresh_dom
         assert run.finish() == ExitCode.OK
         assert run.verdict["verdict"] in {"ok", "unverifiable"}
         run.assert_nothing_left()
+
+
+_HANGS_IN_FAST_DDS = """
+import threading
+import lifecycle.supervisor.run as run
+from lifecycle.cli import program
+from lifecycle.supervisor.eyes import Eyes
+run.LEAVE_S = 1.0
+Eyes.destroy = lambda self: threading.Event().wait()
+raise SystemExit(program())
+"""
+
+
+def test_a_run_that_hangs_on_leaving_the_graph_ends_with_its_verdict_and_report(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    report = tmp_path / "verdict.json"
+    arguments = ["up", pair(tmp_path, fresh_domain), "--stop-after", "0", "--report", report]
+    mark = uuid.uuid4().hex
+    done = subprocess.run(
+        [sys.executable, "-c", _HANGS_IN_FAST_DDS, *map(str, arguments), "--format", "json"],
+        cwd=ROOT,
+        env=environment(tmp_path, mark),
+        capture_output=True,
+        text=True,
+        timeout=BOUND_S,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (ExitCode.OK, "")
+    assert json.loads(done.stdout.splitlines()[-1])["verdict"] == "ok"
+    assert json.loads(report.read_text())["verdict"] == "ok"
+    assert left_of(mark) == []
