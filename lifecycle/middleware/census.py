@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import typing
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 from rclpy.node import Node
 
@@ -40,10 +40,31 @@ class Census:
     def __init__(self, node: Node) -> None:
         self._node = node
         self._homes: dict[str, frozenset[str]] = {}
+        self._dead: frozenset[str] = frozenset()
+
+    def ignore(self, prefixes: Iterable[str]) -> None:
+        """Count no participants whose process is dead, for as long as discovery shows them.
+
+        Args:
+            prefixes: of their GUIDs, 24 hex digits each; Fast DDS never gives one again.
+        """
+        self._dead |= frozenset(prefixes)
+
+    def ignores(self, gid: str) -> bool:
+        """Whether an endpoint or participant is one of a dead process.
+
+        Args:
+            gid: in hex, or its first 24 digits.
+        """
+        return gid[:_PREFIX_DIGITS] in self._dead
 
     def count(self) -> Counter[str]:
         """Return by full name how many nodes there are; a name that is not known yet included."""
         shown = Counter(node_names(self._node))
+        if self._dead:
+            dead = self.shown() & self._dead
+            shown.subtract({name: len(where & dead) for name, where in self._homes.items()})
+            shown = +shown
         homes = self.homes()
         if any(
             count > homes.get(name, Counter()).total() and self._homes.get(name)
@@ -58,10 +79,15 @@ class Census:
         """Return by full name the prefixes of the participants that nodes are on now."""
         homes: dict[str, Counter[str]] = {}
         for each in endpoints_of(self._node, EndpointKind.PUBLISHER, _EACH_NODE_TOPIC):
-            homes.setdefault(each.node, Counter())[each.gid[:_PREFIX_DIGITS]] += 1
+            if not self.ignores(each.gid):
+                homes.setdefault(each.node, Counter())[each.gid[:_PREFIX_DIGITS]] += 1
         return homes
 
     def participants(self) -> frozenset[str]:
+        """Return the prefixes of every participant of rmw_fastrtps that is not ignored."""
+        return self.shown() - self._dead
+
+    def shown(self) -> frozenset[str]:
         """Return the prefixes of every participant of rmw_fastrtps that discovery has."""
         return frozenset(
             each.gid[:_PREFIX_DIGITS]

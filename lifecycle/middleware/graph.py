@@ -243,18 +243,21 @@ class GraphObserver:
         }
         processes.discard(own[:PROCESS_DIGITS])
         return frozenset(
-            each for each in self._census.participants() if each[:PROCESS_DIGITS] in processes
+            each for each in self._census.shown() if each[:PROCESS_DIGITS] in processes
         )
 
     def remove_participants(self, prefixes: Iterable[str], pids: Iterable[int]) -> None:
         """Have everybody forget participants whose process is known to be dead.
 
-        Over UDP only, see `lifecycle.middleware.dead_participants`.
+        Others are told over UDP only, see `lifecycle.middleware.dead_participants`; here they do
+        not count any more, whatever discovery shows until their lease has run out.
 
         Args:
             prefixes: GUID prefixes, 24 hex digits each.
             pids: of processes on this host that run; they are reached wherever they listen.
         """
+        self._census.ignore(prefixes := tuple(prefixes))
+        self._changed()
         remove_participants(prefixes, self.domain_id, self.urls, os.environ, (os.getpid(), *pids))
 
     def destroy(self) -> None:
@@ -284,6 +287,8 @@ class GraphObserver:
         self, declared: Collection[str], names: DeclaredNames
     ) -> Iterator[ObservedEndpoint]:
         for kind, topic, info in topic_endpoints(self.node):
+            if self._census.ignores(info.gid):
+                continue
             if info.node:
                 self._known |= {info.gid[:_PREFIX_DIGITS]}
             node = known_node(info.node)
@@ -328,6 +333,8 @@ class GraphObserver:
                 for info in endpoints_of(self.node, side, topic, no_mangle=True):
                     node = known_node(info.node)
                     if node not in untold or (kind, info.gid[:_PREFIX_DIGITS]) in shown:
+                        continue
+                    if self._census.ignores(info.gid):
                         continue
                     shown.add((kind, info.gid[:_PREFIX_DIGITS]))
                     type_ = _service_type(info.type)

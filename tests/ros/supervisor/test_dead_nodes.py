@@ -127,19 +127,25 @@ def test_a_killed_process_is_gone_for_everybody_at_once_and_comes_back_at_once(
         run.assert_nothing_left()
 
 
-def test_where_ports_are_fixed_a_killed_node_is_unmatched_and_comes_back_at_once(
-    tmp_path: Path, fresh_domain: int
+@pytest.mark.parametrize("mode", ["static", "server"])
+def test_where_ports_are_fixed_a_killed_node_is_gone_and_comes_back_at_once(
+    mode: str, tmp_path: Path, fresh_domain: int
 ) -> None:
+    """By UDP everybody is told; over TCP, mode "server", the supervisor knows better than DDS."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         first_port = 20000 + server.getsockname()[1] % 10000
-    how = {"domain_id": fresh_domain, "mode": "static", "first_port": first_port}
+    how = {"domain_id": fresh_domain, "mode": mode, "first_port": first_port}
     manifest = pair(tmp_path, fresh_domain, edit={"discovery": how})
     with up(manifest, "--keep-going", runtime=tmp_path) as run:
         run.until("system", reached="active")
         at = kill(run, "talker")
         run.until("failure", rule="run.process-died")
-        gone_s = until(lambda: status(tmp_path)["/listener"]["matched"] == 0, at)
+        run.until_found("graph.missing-node", "/talker")
+        gone_s = time.monotonic() - at
+        assert gone_s < AT_ONCE_S
+        if mode == "static":
+            gone_s = until(lambda: status(tmp_path)["/listener"]["matched"] == 0, at)
         back_s = restarts_at_once(run, tmp_path)
-        print(f"unmatched after {gone_s:.3f} s, back after {back_s:.1f} s")
+        print(f"gone after {gone_s:.3f} s, back after {back_s:.1f} s")
         assert verb("down", "pair", runtime=tmp_path).returncode == ExitCode.OK
         assert run.finish() == ExitCode.OK
