@@ -61,11 +61,9 @@ class Census:
     def count(self) -> Counter[str]:
         """Return by full name how many nodes there are; a name that is not known yet included."""
         shown = Counter(node_names(self._node))
-        if self._dead:
-            dead = self.shown() & self._dead
-            shown.subtract({name: len(where & dead) for name, where in self._homes.items()})
-            shown = +shown
         homes = self.homes()
+        if dead := self.shown() & self._dead if self._dead else frozenset():
+            shown = without_dead(shown, homes, self._homes, dead)
         if any(
             count > homes.get(name, Counter()).total() and self._homes.get(name)
             for name, count in shown.items()
@@ -95,6 +93,31 @@ class Census:
                 self._node, EndpointKind.PUBLISHER, _NODES_TOPIC, no_mangle=True
             )
         )
+
+
+def without_dead(
+    shown: Mapping[str, int],
+    homes: Homes,
+    before: Mapping[str, frozenset[str]],
+    dead: frozenset[str],
+) -> Counter[str]:
+    """Return `shown` without the nodes of participants whose process is dead.
+
+    Args:
+        shown: how many nodes of each name rmw_dds_common has.
+        homes: where the living ones are now, as far as that can be seen.
+        before: the prefixes of every participant that a node of this name was ever seen on.
+        dead: the prefixes of the participants of dead processes that discovery still has.
+    """
+    return +Counter(
+        {
+            name: max(
+                homes.get(name, Counter()).total(),
+                count - len(before.get(name, frozenset()) & dead),
+            )
+            for name, count in shown.items()
+        }
+    )
 
 
 def without_ghosts(

@@ -92,8 +92,8 @@ def remove_participants(
 
     It is sent to whom an observer with these URLs could meet by UDP, and to the UDP sockets of some
     processes, whose participants may be connected by ports that only they know. Nothing is said to
-    those who are reached over shared memory or TCP alone: for them the lease has to run out. Our own
-    observer does not count what is dead (`Census.ignore`).
+    those who are reached over shared memory or TCP alone: for them the lease has to run out. Our
+    own observer does not count what is dead (`Census.ignore`).
 
     Args:
         prefixes: GUID prefixes, 24 hex digits each.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 
-from lifecycle.middleware.census import without_ghosts
+from lifecycle.middleware.census import without_dead, without_ghosts
 
 OLD, NEW, OTHER = "0" * 24, "1" * 24, "2" * 24
 
@@ -49,3 +49,19 @@ def test_a_node_that_is_still_where_it_was_is_never_taken_away() -> None:
     before = {"/listener": frozenset({OLD, NEW}), "/talker": frozenset({OTHER, NEW})}
     shown = {"/listener": 1, "/talker": 1}
     assert without_ghosts(shown, homes, before, frozenset({NEW})) == shown
+
+
+def test_a_dead_node_is_nobody_although_discovery_shows_it() -> None:
+    homes = {"/talker": Counter({OTHER: 1})}
+    before = {"/listener": frozenset({OLD}), "/talker": frozenset({OTHER})}
+    shown = {"/listener": 1, "/talker": 1}
+    assert without_dead(shown, homes, before, frozenset({OLD})) == {"/talker": 1}
+
+
+def test_the_node_that_came_again_beside_a_dead_one_is_one() -> None:
+    before = {"/listener": frozenset({OLD, NEW})}
+    dead = frozenset({OLD})
+    homes = {"/listener": Counter({NEW: 1})}
+    assert without_dead({"/listener": 2}, homes, before, dead) == {"/listener": 1}
+    # Names and endpoints of the dead one go one after the other.
+    assert without_dead({"/listener": 1}, homes, before, dead) == {"/listener": 1}
