@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import click
 
 from lifecycle.cli.common import format_option, timeout_option
+from lifecycle.cli.standard_streams import echo_while_read
 from lifecycle.cli.target import target_arguments
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.printable import json_text
@@ -134,7 +135,7 @@ def _drawing(format_: str, output: Path | None, *, watch: bool) -> Callable[[Pic
         if output is not None:
             _replace(output, text)
         else:
-            click.echo(clear + text.rstrip("\n"))
+            echo_while_read(clear + text.rstrip("\n"))
 
     return draw
 

@@ -167,7 +167,7 @@ def _up(
                 variables=_graph_variables(os.environ),
             )
             zygote = Zygote(forerunner.process)
-            records = leaving.enter_context(noting(directory, system, zygote.pid))
+            records = leaving.enter_context(noting(directory, system, zygote.pid, emit))
             try:
                 # Before any participant: who asks a server that is not there waits to ask again.
                 with ending.raised():

@@ -20,7 +20,7 @@ from lifecycle.errors import BringUpError
 from lifecycle.manifest.model import Run, RunKind
 from lifecycle.plan.model import PlannedProcess
 from lifecycle.supervisor.events import Emitter, LogLine
-from lifecycle.supervisor.logs import LONGEST_LINE, LineReader, ros_log_root
+from lifecycle.supervisor.logs import LONGEST_LINE, LineReader, LogDirectory, ros_log_root
 from lifecycle.supervisor.orphans import end_run
 from lifecycle.supervisor.process import COMMAND_ESCALATION, ManagedProcess
 from lifecycle.supervisor.rundir import RUN_VARIABLE, ChildRecord, RunRecord, boot_id, start_ticks
@@ -45,6 +45,7 @@ class _Bench:
         self.emit = Emitter()
         self.emit.listen(self._hear)
         self._logs = tmp_path
+        self.said: list[str] = []
         self._processes: list[ManagedProcess] = []
 
     def _hear(self, event: object) -> None:
@@ -67,7 +68,7 @@ class _Bench:
                 argv=argv,
                 environment=environment,
             ),
-            logs=self._logs,
+            logs=LogDirectory(self._logs, self.said.append),
             emit=self.emit,
         )
         self._processes.append(process)
