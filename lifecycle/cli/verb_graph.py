@@ -153,6 +153,7 @@ def render(picture: Picture, format_: str) -> str:
 
 def _replace(path: Path, text: str) -> None:
     """Write a file so that whoever reads it sees the old one or the new one, whole."""
+    part = None
     try:
         with tempfile.NamedTemporaryFile(
             "w", dir=path.parent, prefix=f".{path.name}.", encoding="utf-8", delete=False
@@ -161,4 +162,6 @@ def _replace(path: Path, text: str) -> None:
         Path(part.name).chmod(0o644)
         Path(part.name).replace(path)
     except OSError as error:
+        if part is not None:
+            Path(part.name).unlink(missing_ok=True)
         raise UsageError(f"cannot write {str(path)!r}: {error.strerror}") from error

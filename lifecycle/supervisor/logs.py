@@ -23,6 +23,9 @@ LONGEST_LINE = 64 * 1024
 LARGEST_LOG = 16 * 2**20
 """Bytes of a log file; of each process there is one, and one older."""
 
+_LARGEST_PIPE = 2**20
+"""Bytes; /proc/sys/fs/pipe-max-size by default, pipe(7)."""
+
 _TAIL_LINES = 20
 _TRIED_AGAIN_S = 1.0
 """How often a log is tried that could not be written."""
@@ -86,14 +89,17 @@ class LineReader:
         self._on_line(line.rstrip(b"\r").decode("utf-8", errors="replace"))
 
     def close(self) -> None:
-        """Read what is there, give up the descriptor and hand out an unfinished last line."""
+        """Read what is there, give up the descriptor and hand out an unfinished last line.
+
+        No more than a pipe holds: somebody who was left behind may write faster than we read.
+        """
         if not self._open:
             return
         self._open = False
         self._loop.remove_reader(self._descriptor)
         with contextlib.suppress(BlockingIOError):
-            while data := os.read(self._descriptor, LONGEST_LINE):
-                self._rest += data
+            for _ in range(_LARGEST_PIPE // LONGEST_LINE):
+                self._rest += os.read(self._descriptor, LONGEST_LINE)
         os.close(self._descriptor)
         for line in self._rest.split(b"\n"):
             if line:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
+import traceback
 from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
 
 from lifecycle.errors import ExitCode, LifecycleError
@@ -22,7 +23,7 @@ from lifecycle.plan.contacts import reached_hosts
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor import discovery_server
 from lifecycle.supervisor.ending import Ending
-from lifecycle.supervisor.events import Emitter, Listener, Notice, RunStarted
+from lifecycle.supervisor.events import Emitter, Event, Listener, Notice, RunStarted
 from lifecycle.supervisor.eyes import Eyes
 from lifecycle.supervisor.failure import StepFailedError, never_connected, with_failure
 from lifecycle.supervisor.logs import log_directory
@@ -97,7 +98,8 @@ def up(
     Args:
         plan: what to bring up.
         options: how.
-        listeners: told every event, in this thread.
+        listeners: told every event, in this thread. One that raises is told nothing more; the run
+            goes on to its end, and then what it raised is raised.
         forerunner: used and ended.
         ending: has been told of signals since before this call; entered by the caller.
         on_start: given the way to ask for the status, once there is a system.
@@ -114,10 +116,31 @@ def up(
             return up(
                 plan, options, listeners, forerunner=forerunner, ending=ours, on_start=on_start
             )
+    guarded = tuple(_Guarded(each) for each in listeners)
     with ending.noted():
-        return _up(
-            plan, options, listeners, forerunner=forerunner, ending=ending, on_start=on_start
+        result = _up(
+            plan, options, guarded, forerunner=forerunner, ending=ending, on_start=on_start
         )
+    for each in guarded:
+        if each.error is not None:
+            raise each.error
+    return result
+
+
+class _Guarded:
+    """A listener whose exception ends no more than itself, see `up`."""
+
+    def __init__(self, listener: Listener) -> None:
+        self._listener = listener
+        self.error: Exception | None = None
+
+    def __call__(self, event: Event) -> None:
+        if self.error is None:
+            try:
+                self._listener(event)
+            except Exception as error:  # noqa: BLE001 - it is not ours, and raised in the end
+                traceback.print_exc()
+                self.error = error
 
 
 def _up(

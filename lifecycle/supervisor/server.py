@@ -14,6 +14,7 @@ from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 
 from lifecycle.codec import from_json, to_json
+from lifecycle.errors import UsageError
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.orders import Done, Order, OrderKind
 from lifecycle.supervisor.rundir import connect, short_path
@@ -131,12 +132,16 @@ class ControlServer:
         """Listen.
 
         Raises:
-            OSError: the socket cannot be made.
+            UsageError: the socket cannot be made, on a full disk say.
         """
-        self._path.unlink(missing_ok=True)
         sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        with short_path(self._path) as name:
-            sock.bind(name)
+        try:
+            self._path.unlink(missing_ok=True)
+            with short_path(self._path) as name:
+                sock.bind(name)
+        except OSError as error:
+            sock.close()
+            raise UsageError(f"cannot listen at {str(self._path)!r}: {error.strerror}") from error
         self._server = await asyncio.start_unix_server(
             self._serve, sock=sock, limit=_LARGEST_QUESTION
         )
