@@ -54,11 +54,6 @@ def _until(holds: Callable[[], object]) -> None:
         time.sleep(0.005)
 
 
-def _read(descriptor: int) -> bytes:
-    with os.fdopen(descriptor, "rb") as stream:
-        return stream.read()
-
-
 def test_log_lines_that_nobody_reads_are_dropped_and_counted_and_events_are_kept() -> None:
     read, write = os.pipe()
     fcntl.fcntl(write, fcntl.F_SETPIPE_SZ, 4096)
@@ -138,3 +133,19 @@ def test_a_disk_that_is_full_for_a_while_loses_and_counts_what_came_meanwhile(
     assert len(told) == 1
     for each in (file, full, there):
         os.close(each)
+
+
+def test_standard_error_that_nobody_reads_blocks_neither_us_nor_a_library() -> None:
+    program = (
+        "import os, sys\n"
+        "from lifecycle.cli.standard_streams import own_streams\n"
+        "streams = own_streams(waits=False)\n"
+        "for _ in range(1000):\n"
+        "    sys.stderr.write('x' * 1000 + '\\n')\n"
+        "try:\n"
+        "    while os.write(2, b'as C++ does' * 100): pass\n"
+        "except BlockingIOError:\n"
+        "    raise SystemExit(streams.settled(4)) from None\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", program], stderr=subprocess.PIPE) as run:
+        assert run.wait(BOUND_S) == 4
