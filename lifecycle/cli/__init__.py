@@ -14,7 +14,7 @@ import traceback
 
 import click
 
-from lifecycle.cli.own_stdout import keep_stdout
+from lifecycle.cli.standard_streams import own_streams
 from lifecycle.errors import ExitCode, LifecycleError
 from lifecycle.printable import lines
 
@@ -86,9 +86,10 @@ def cli() -> None:
 
 def program() -> int:
     """Run `lifecycle` as a process of its own."""
-    if sys.argv[1:2] != ["run"]:  # whose standard output is the user's node's
-        keep_stdout()
-    return main()
+    verb = sys.argv[1:2]
+    if verb == ["run"]:  # whose streams are the user's node's
+        return main()
+    return own_streams(waits=verb != ["up"]).settled(main())
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -107,9 +108,6 @@ def main(arguments: list[str] | None = None) -> int:
     except LifecycleError as error:
         click.echo(lines(str(error)), err=True)
         return error.exit_code
-    except BrokenPipeError:
-        sys.stderr.close()
-        return ExitCode.OK
     except Exception:  # noqa: BLE001 - the boundary: report our bug, whatever it is
         traceback.print_exc()
         click.echo("this is a bug in lifecycle: please report it with the trace above", err=True)

@@ -6,6 +6,8 @@ shows each node's process, state, matched endpoints and flows, and is drawn agai
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import time
 from collections.abc import Callable
 
@@ -15,6 +17,7 @@ from rich.live import Live as RichLive
 from rich.table import Table
 from rich.text import Text
 
+from lifecycle.cli.standard_streams import Writer
 from lifecycle.cli.up_output import Rollback, describe, verdict_line
 from lifecycle.printable import log_line, one_line
 from lifecycle.supervisor.events import (
@@ -43,10 +46,22 @@ _PROCESS_COLOURS = ("cyan", "magenta", "blue", "green", "yellow", "bright_black"
 
 
 class Live:
-    """A listener that draws; use it in a `with`."""
+    """A listener that draws; use it in a `with`.
 
-    def __init__(self, console: Console | None = None) -> None:
-        self._console = console or Console(highlight=False)
+    Nothing is drawn while the terminal is stopped (Ctrl-S): log lines are counted then, and the
+    table is drawn as it is once there is room again.
+
+    Args:
+        console: None for one on `writer`.
+        writer: of the terminal; None where nothing stops.
+    """
+
+    def __init__(self, console: Console | None = None, *, writer: Writer | None = None) -> None:
+        self._writer = writer
+        file = None if writer is None else writer.stream()
+        self._console = console or Console(file=file, highlight=False)
+        self._missed = 0
+        self._skipped = False
         self._live = RichLive(console=self._console, auto_refresh=False, transient=False)
         self._status: Callable[[], SystemStatus] | None = None
         self._verdict = ""
@@ -64,6 +79,9 @@ class Live:
     def watch(self, status: Callable[[], SystemStatus]) -> None:
         """Take the way to ask for what the table shows."""
         self._status = status
+        if self._writer is not None:
+            loop = asyncio.get_running_loop()
+            self._writer.on_room = lambda: _soon(loop, self._catch_up)
         self._draw()
 
     def __call__(self, event: Event) -> None:
@@ -72,7 +90,9 @@ class Live:
         if isinstance(event, VerdictChanged):
             self._verdict = verdict_line(event.verdict)
         elif isinstance(event, LogLine):
-            if not hidden:
+            if self._is_behind:
+                self._missed += 1
+            elif not hidden:
                 self._console.print(self._log_line(event))
         elif not isinstance(event, NodeChanged | ProcessChanged) and (line := describe(event)):
             style = "red" if isinstance(event, Failure) else "dim"
@@ -94,8 +114,26 @@ class Live:
         self._console.print(Text(head, style=f"bold {style}"))
         if rest.strip():
             self._console.print(Text(rest.rstrip("\n")))
+        if self._writer is not None:
+            self._writer.close()
+
+    @property
+    def _is_behind(self) -> bool:
+        return self._writer is not None and self._writer.is_behind
+
+    def _catch_up(self) -> None:
+        """Draw what was not drawn while nobody saw it."""
+        if self._skipped or self._missed:
+            self._draw()
 
     def _draw(self) -> None:
+        self._skipped = self._is_behind
+        if self._skipped:
+            return
+        missed, self._missed = self._missed, 0
+        if missed:
+            text = f"{missed} log lines are missing here: the terminal was stopped"
+            self._console.print(Text(text, style="dim"))
         if self._status is not None:
             self._live.update(self._picture(self._status()), refresh=True)
 
@@ -113,6 +151,11 @@ class Live:
             self._processes.append(event.process)
         index = self._processes.index(event.process) % len(_PROCESS_COLOURS)
         return Text.assemble((f"[{event.process}] ", _PROCESS_COLOURS[index]), log_line(event.line))
+
+
+def _soon(loop: asyncio.AbstractEventLoop, call: Callable[[], None]) -> None:
+    with contextlib.suppress(RuntimeError):  # closed: the last is drawn without it
+        loop.call_soon_threadsafe(call)
 
 
 def _head(status: SystemStatus) -> Text:

@@ -73,10 +73,35 @@ def write_report(path: Path, text: str) -> None:
     Raises:
         UsageError: it cannot be written any more.
     """
+    data = (text.rstrip("\n") + "\n").encode()
     try:
-        path.write_text(text.rstrip("\n") + "\n", encoding="utf-8")
+        file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        try:
+            _replace(file, data)
+        finally:
+            os.close(file)
     except OSError as error:
         raise _unwritable(path, error) from error
+
+
+def _replace(file: int, data: bytes) -> None:
+    """Replace what is in a file: all of it, or where a disk is full none of it.
+
+    Half a report might read as a success; what stands there says that the command never ended.
+    """
+    is_file = stat.S_ISREG(os.fstat(file).st_mode)
+    if is_file:
+        os.posix_fallocate(file, 0, len(data))
+    try:
+        left = memoryview(data)
+        while left:
+            left = left[os.write(file, left) :]
+    except OSError:
+        if is_file:
+            os.ftruncate(file, 0)
+        raise
+    if is_file:
+        os.ftruncate(file, len(data))
 
 
 def report_option(function: F) -> F:

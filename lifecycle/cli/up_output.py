@@ -9,12 +9,13 @@ from __future__ import annotations
 import contextlib
 import functools
 import json
-import os
-import signal
 import sys
 from collections.abc import Callable, Iterator
-from typing import Protocol, TextIO
+from typing import Protocol
 
+import click
+
+from lifecycle.cli.standard_streams import Writer
 from lifecycle.node.control import Operation
 from lifecycle.printable import json_text, log_line, one_line
 from lifecycle.supervisor.events import (
@@ -54,64 +55,73 @@ class Output(Protocol):
         """Take the way to ask for the status, once there is something to tell."""
 
     def finish(self, result: UpResult) -> None:
-        """Show the result."""
+        """Show the result, and return once that is written or nobody takes it."""
+
+
+class Sink(Protocol):
+    """Where lines go; it never blocks and never fails."""
+
+    def put(self, text: str, *, kept: bool = True) -> None:
+        """Take whole lines; those that are not `kept` may be dropped where nobody reads."""
+
+    def close(self) -> None:
+        """Write what is left, bounded; again is harmless."""
 
 
 @contextlib.contextmanager
 def output(format_: str) -> Iterator[Output]:
-    """Give the output for `format_`, and for text what suits the terminal."""
-    if format_ == "json":
-        yield JsonLines(sys.stdout)
-    elif sys.stdout.isatty():
-        from lifecycle.cli.live import Live
+    """Give the output for `format_`, and for text what suits the terminal.
 
-        with Live() as live:
-            yield live
-    else:
-        yield PlainLines(sys.stdout)
-
-
-class _Lines:
-    """Writes lines at once.
-
-    A reader that goes away, as `head` does, ends the run like a terminal that is closed: nobody
-    could see any more what happens. What it comes to is then in the exit code and the report.
+    A run neither waits for who reads it nor ends with him: what happens is in the control socket,
+    the log files, the exit code and the report, too.
     """
+    writer = Writer(
+        sys.stdout.fileno(),
+        "standard output",
+        marker=_json_notice if format_ == "json" else lambda text: f"{text}\n",
+        say=functools.partial(click.echo, err=True),
+        encoding=sys.stdout.encoding,
+    )
+    try:
+        if format_ == "json":
+            yield JsonLines(writer)
+        elif sys.stdout.isatty():
+            from lifecycle.cli.live import Live
 
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
+            with Live(writer=writer) as live:
+                yield live
+        else:
+            yield PlainLines(writer)
+    finally:
+        writer.close()
 
-    def __call__(self, text: str) -> None:
-        try:
-            self._stream.write(text)
-            self._stream.flush()
-        except BrokenPipeError:
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, self._stream.fileno())
-            os.close(nowhere)
-            signal.raise_signal(signal.SIGHUP)
+
+def _json_line(event: Event) -> str:
+    record = json.dumps(to_record(event), ensure_ascii=False, separators=(",", ":"))
+    return json_text(record) + "\n"
+
+
+def _json_notice(text: str) -> str:
+    return _json_line(Notice(message=text))
 
 
 class JsonLines:
     """One JSON object per line; `event` names its kind, and the last one is the verdict."""
 
-    def __init__(self, stream: TextIO) -> None:
-        self._lines = _Lines(stream)
+    def __init__(self, sink: Sink) -> None:
+        self._sink = sink
 
     def watch(self, status: Callable[[], SystemStatus]) -> None:
         """Need nothing more than the events."""
 
     def __call__(self, event: Event) -> None:
         """Write one event."""
-        record = json.dumps(to_record(event), ensure_ascii=False, separators=(",", ":"))
-        self._write(json_text(record))
+        self._sink.put(_json_line(event), kept=not isinstance(event, LogLine))
 
     def finish(self, result: UpResult) -> None:
         """Write the verdict."""
-        self._write(to_json(result.verdict))
-
-    def _write(self, line: str) -> None:
-        self._lines(line + "\n")
+        self._sink.put(to_json(result.verdict) + "\n")
+        self._sink.close()
 
 
 class Rollback:
@@ -140,8 +150,8 @@ class Rollback:
 class PlainLines:
     """One line per event, for logs and pipes."""
 
-    def __init__(self, stream: TextIO) -> None:
-        self._lines = _Lines(stream)
+    def __init__(self, sink: Sink) -> None:
+        self._sink = sink
         self._reached: dict[str, Reach] = {}
         self._stopping = False
         self._judged: str | None = None
@@ -169,7 +179,7 @@ class PlainLines:
                 return
             self._judged = line
         if line is not None:
-            self._lines(line + "\n")
+            self._sink.put(line + "\n", kept=not isinstance(event, LogLine))
 
     def _is_on_the_way(self, event: NodeChanged) -> bool:
         """Whether a change is one of the many between two steps, which a log need not hold."""
@@ -181,7 +191,8 @@ class PlainLines:
     def finish(self, result: UpResult) -> None:
         """Write the verdict, in full where it is not ok."""
         flows = result.verdict.verdict is not Outcome.VIOLATED
-        self._lines(render_text(result.verdict, flows=flows))
+        self._sink.put(render_text(result.verdict, flows=flows))
+        self._sink.close()
 
 
 def describe(event: Event) -> str | None:

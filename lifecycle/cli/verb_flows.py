@@ -12,6 +12,7 @@ import click
 from lifecycle.cli.common import format_option, load_manifest, manifest_arguments, timeout_option
 from lifecycle.cli.flows_export import NAMES, Export
 from lifecycle.cli.flows_program import network_options, treatment_options, with_subcommands
+from lifecycle.cli.standard_streams import echo_while_read
 from lifecycle.errors import UsageError
 from lifecycle.printable import lines
 
@@ -65,7 +66,7 @@ def _show(
         click.echo(render_flows(verdict.flows, format_))
 
     if watch:
-        follow_running(plan, show)
+        follow_running(plan, lambda seen: echo_while_read(render_flows(seen.flows, format_)))
     seen = judge_running(plan, timeout_s=timeout, strict=False)
     if seen.where:
         click.echo(lines(seen.where), err=True)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import click
 
 from lifecycle.cli.common import format_option, timeout_option
+from lifecycle.cli.standard_streams import echo_while_read
 from lifecycle.cli.target import target_arguments
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.printable import json_text
@@ -134,7 +135,7 @@ def _drawing(format_: str, output: Path | None, *, watch: bool) -> Callable[[Pic
         if output is not None:
             _replace(output, text)
         else:
-            click.echo(clear + text.rstrip("\n"))
+            echo_while_read(clear + text.rstrip("\n"))
 
     return draw
 
@@ -152,6 +153,7 @@ def render(picture: Picture, format_: str) -> str:
 
 def _replace(path: Path, text: str) -> None:
     """Write a file so that whoever reads it sees the old one or the new one, whole."""
+    part = None
     try:
         with tempfile.NamedTemporaryFile(
             "w", dir=path.parent, prefix=f".{path.name}.", encoding="utf-8", delete=False
@@ -160,4 +162,6 @@ def _replace(path: Path, text: str) -> None:
         Path(part.name).chmod(0o644)
         Path(part.name).replace(path)
     except OSError as error:
+        if part is not None:
+            Path(part.name).unlink(missing_ok=True)
         raise UsageError(f"cannot write {str(path)!r}: {error.strerror}") from error

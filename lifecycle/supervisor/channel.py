@@ -21,6 +21,9 @@ from lifecycle.supervisor.gate import Permit
 _LONGEST_LINE = 1 << 24
 """Bytes; a node configuration with thousands of endpoints is one line."""
 
+_CLOSE_S = 0.5
+"""For a host to read what it was sent before."""
+
 _UNASKED = frozenset({"state", "configuration"})
 """Events by which a host tells of a node without having been asked."""
 
@@ -204,10 +207,13 @@ class ControlChannel:
             self._sign.close()
             self._sign = None
         if self._writer is not None:
-            self._writer.close()
-            with contextlib.suppress(OSError):
-                await self._writer.wait_closed()
-            self._writer = None
+            writer, self._writer = self._writer, None
+            writer.close()
+            closed = asyncio.ensure_future(writer.wait_closed())
+            await asyncio.wait({closed}, timeout=_CLOSE_S)
+            writer.transport.abort()
+            # A host that was stopped, and has not read all it was sent, is ended by signals.
+            await asyncio.gather(closed, return_exceptions=True)
         if self._task is not None:
             self._task.cancel()
             with contextlib.suppress(asyncio.CancelledError):

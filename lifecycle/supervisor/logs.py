@@ -1,7 +1,8 @@
 """What the processes of a system print: split into lines, kept, written to files.
 
-Owns: `LineReader` (pipe → lines), `ProcessLog` (last lines of one process and its file) and where
-files go (`log_directory`, the ROS log directory convention). Must not import rclpy.
+Owns: `LineReader` (pipe → lines), `ProcessLog` (last lines of one process and its file, which is
+rotated), `LogDirectory` (what of a run's logs is missing) and where files go (`log_directory`, the
+ROS log directory convention). Must not import rclpy.
 """
 
 from __future__ import annotations
@@ -12,14 +13,25 @@ import contextlib
 import datetime as dt
 import os
 import socket
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import IO
 
 LONGEST_LINE = 64 * 1024
 """Bytes; a longer line is cut into pieces, so that a process cannot fill our memory."""
 
+LARGEST_LOG = 16 * 2**20
+"""Bytes of a log file; of each process there is one, and one older."""
+
+_LARGEST_PIPE = 2**20
+"""Bytes; /proc/sys/fs/pipe-max-size by default, pipe(7)."""
+
 _TAIL_LINES = 20
+_TRIED_AGAIN_S = 1.0
+"""How often a log is tried that could not be written."""
+
+_SAID_AGAIN_S = 60.0
+"""How often that is said, where it is so again and again."""
 
 
 def ros_log_root(environment: Mapping[str, str]) -> Path:
@@ -77,14 +89,17 @@ class LineReader:
         self._on_line(line.rstrip(b"\r").decode("utf-8", errors="replace"))
 
     def close(self) -> None:
-        """Read what is there, give up the descriptor and hand out an unfinished last line."""
+        """Read what is there, give up the descriptor and hand out an unfinished last line.
+
+        No more than a pipe holds: somebody who was left behind may write faster than we read.
+        """
         if not self._open:
             return
         self._open = False
         self._loop.remove_reader(self._descriptor)
         with contextlib.suppress(BlockingIOError):
-            while data := os.read(self._descriptor, LONGEST_LINE):
-                self._rest += data
+            for _ in range(_LARGEST_PIPE // LONGEST_LINE):
+                self._rest += os.read(self._descriptor, LONGEST_LINE)
         os.close(self._descriptor)
         for line in self._rest.split(b"\n"):
             if line:
@@ -94,28 +109,143 @@ class LineReader:
             self.ended.set_result(None)
 
 
-class ProcessLog:
-    """The output of one process: the last lines in memory, all of them in a file."""
+class LogDirectory:
+    """Where the logs of one run are, and what of them could not be written.
 
-    def __init__(self, directory: Path, process: str) -> None:
+    A log that cannot be written ends nothing: that is said once, what is missing is counted, in
+    the file where it is missing, and said again once all of it can be written.
+
+    Args:
+        path: of the directory; it is made with the first log.
+        say: takes what a person should know.
+
+    Attributes:
+        path: as given.
+    """
+
+    def __init__(self, path: Path, say: Callable[[str], None]) -> None:
+        self.path = path
+        self._say = say
+        self._said_s: float | None = None
+        self._why = ""
+        self._failing: set[str] = set()
+        self._lost = 0
+
+    def fails(self, process: str, error: OSError, *, lines: int) -> None:
+        """Note that so many lines of a process could not be written."""
+        self._failing.add(process)
+        self._lost += lines
+        self._why = error.strerror or str(error)
+        now_s = time.monotonic()
+        if self._said_s is None or now_s - self._said_s > _SAID_AGAIN_S:
+            self._said_s = now_s
+            self._say(
+                f"cannot write the log of process {process!r} in {str(self.path)!r}: {self._why}; "
+                "the run goes on, and what is lost is counted"
+            )
+
+    def recovers(self, process: str) -> None:
+        """Note that the log of a process can be written again."""
+        self._failing.discard(process)
+        if not self._failing:
+            self.tell_lost()
+
+    def tell_lost(self) -> None:
+        """Say what is missing, if that was not said."""
+        lost, self._lost = self._lost, 0
+        if lost:
+            self._say(f"{_missing(lost)} missing in {str(self.path)!r}: {self._why}")
+
+
+class ProcessLog:
+    """The output of one process: the last lines in memory, LARGEST_LOG of them in a file twice.
+
+    A file that is full becomes `NAME.log.1`, and replaces the one before.
+
+    Args:
+        directory: of the run.
+        process: its name.
+
+    Attributes:
+        path: of the file.
+    """
+
+    def __init__(self, directory: LogDirectory, process: str) -> None:
         self._tail: collections.deque[str] = collections.deque(maxlen=_TAIL_LINES)
-        self.path = directory / f"{process.replace('/', '.')}.log"
-        self._file: IO[str] | None = None
+        self._directory = directory
+        self._process = process
+        self.path = directory.path / f"{process.replace('/', '.')}.log"
+        self._file: int | None = None
+        self._bytes = 0
+        self._torn = False
+        self._failed_s = 0.0
+        self._error: OSError | None = None
+        self._lost = 0
+        self._open = False
 
     def open(self) -> None:
-        """Create the file, and its directory where it is missing.
-
-        Raises:
-            OSError: the directory cannot be written.
-        """
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._file = self.path.open("a", encoding="utf-8", buffering=1)
+        """Create the file, and its directory where it is missing."""
+        self._open = True
+        try:
+            self._descriptor()
+        except OSError as error:
+            self._fails(error, lines=0)
 
     def add(self, line: str) -> None:
         """Keep one line."""
         self._tail.append(line)
-        if self._file is not None:
-            self._file.write(line + "\n")
+        if self._open:
+            self._keep(line)
+
+    def _keep(self, line: str) -> None:
+        """Write one line, and before it how many are missing there."""
+        now_s = time.monotonic()
+        if self._error is not None and now_s - self._failed_s < _TRIED_AGAIN_S:
+            self._lost += 1
+            self._directory.fails(self._process, self._error, lines=1)
+            return
+        try:
+            if self._lost:
+                assert self._error is not None
+                self._write(f"{_missing(self._lost)} missing here: {self._error.strerror}")
+                self._lost = 0
+            self._write(line)
+        except OSError as error:
+            self._fails(error, lines=1)
+            return
+        if self._error is not None:
+            self._error = None
+            self._directory.recovers(self._process)
+
+    def _fails(self, error: OSError, *, lines: int) -> None:
+        self._error = error
+        self._failed_s = time.monotonic()
+        self._lost += lines
+        self._directory.fails(self._process, error, lines=lines)
+
+    def _write(self, line: str) -> None:
+        left = memoryview(("\n" * self._torn + line + "\n").encode(errors="backslashreplace"))
+        if self._bytes + len(left) > LARGEST_LOG and self._bytes:
+            self._rotate()
+        file = self._descriptor()
+        while left:
+            written = os.write(file, left)
+            self._bytes += written
+            left = left[written:]
+            self._torn = bool(left)
+
+    def _rotate(self) -> None:
+        self.path.replace(self.path.with_name(f"{self.path.name}.1"))
+        self._shut()
+        self._torn = False
+
+    def _descriptor(self) -> int:
+        if self._file is None:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC
+            self._file = os.open(self.path, flags, 0o666)
+            self._bytes = os.fstat(self._file).st_size
+        return self._file
 
     @property
     def tail(self) -> tuple[str, ...]:
@@ -124,6 +254,14 @@ class ProcessLog:
 
     def close(self) -> None:
         """Close the file."""
+        self._open = False
+        self._shut()
+
+    def _shut(self) -> None:
         if self._file is not None:
-            self._file.close()
+            os.close(self._file)
             self._file = None
+
+
+def _missing(lines: int) -> str:
+    return "1 log line is" if lines == 1 else f"{lines} log lines are"

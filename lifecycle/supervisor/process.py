@@ -11,12 +11,11 @@ import functools
 import os
 import signal
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 from lifecycle.plan.model import PlannedProcess
 from lifecycle.supervisor.channel import ControlChannel
 from lifecycle.supervisor.events import Emitter, LogLine, ProcessChanged
-from lifecycle.supervisor.logs import LineReader, ProcessLog
+from lifecycle.supervisor.logs import LineReader, LogDirectory, ProcessLog
 from lifecycle.supervisor.spawn import Child, Spawner, SpawnRequest
 from lifecycle.supervisor.states import ProcessExit, ProcessState, change
 
@@ -67,7 +66,7 @@ class ManagedProcess:
         self,
         planned: PlannedProcess,
         *,
-        logs: Path,
+        logs: LogDirectory,
         emit: Emitter,
         variables: tuple[tuple[str, str], ...] = (),
     ) -> None:
@@ -98,7 +97,7 @@ class ManagedProcess:
 
         Raises:
             BringUpError: it cannot be started.
-            OSError: its log file cannot be made.
+            OSError: the system is out of descriptors.
         """
         self.log.open()
         self._emit(ProcessChanged(process=self.name, state=self.state))

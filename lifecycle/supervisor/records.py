@@ -12,9 +12,13 @@ import os
 from collections.abc import Iterator
 
 from lifecycle.middleware.shm import Creations, segments_of
+from lifecycle.supervisor.events import Emitter, Notice
 from lifecycle.supervisor.orphans import descendants
 from lifecycle.supervisor.rundir import ChildRecord, RunDirectory, start_ticks
 from lifecycle.supervisor.system import System
+
+_AGAIN_S = 2.0
+"""How often a record is tried that could not be written."""
 
 
 class Records:
@@ -24,14 +28,46 @@ class Records:
         segments: shared memory files that our processes were seen to own.
     """
 
-    def __init__(self, directory: RunDirectory, system: System, zygote_pid: int) -> None:
+    def __init__(
+        self, directory: RunDirectory, system: System, zygote_pid: int, emit: Emitter
+    ) -> None:
+        self._emit = emit
+        self._again: asyncio.TimerHandle | None = None
+        self._said = False
         self._directory = directory
         self._system = system
         self._zygote_pid = zygote_pid
         self.segments: frozenset[str] = frozenset()
 
     def write(self) -> None:
-        """Write down which processes run."""
+        """Write down which processes run; where that fails it is said once, and tried again."""
+        try:
+            self._write()
+        except OSError as error:
+            if not self._said:
+                self._said = True
+                self._emit(
+                    Notice(
+                        message=f"cannot write {str(self._directory.path / 'record.json')!r}: "
+                        f"{error.strerror}; the run goes on, but should this supervisor be killed, "
+                        "the next one may not find all that it leaves"
+                    )
+                )
+            if self._again is None:
+                self._again = asyncio.get_running_loop().call_later(_AGAIN_S, self._try_again)
+        else:
+            self._said = False
+
+    def _try_again(self) -> None:
+        self._again = None
+        self.write()
+
+    def close(self) -> None:
+        """Write nothing any more."""
+        if self._again is not None:
+            self._again.cancel()
+
+    def _write(self) -> None:
         pids = {"zygote": self._zygote_pid}
         pids.update({each.name: each.pid for each in self._system.living})
         self._directory.record(
@@ -64,17 +100,22 @@ class Records:
 
 
 @contextlib.contextmanager
-def noting(directory: RunDirectory, system: System, zygote_pid: int) -> Iterator[Records]:
+def noting(
+    directory: RunDirectory, system: System, zygote_pid: int, emit: Emitter
+) -> Iterator[Records]:
     """Keep records that note shared memory once it is made: its owner may be killed at any time.
 
     Where the kernel does not announce it, it is noted when `note_segments` is called.
     """
-    records = Records(directory, system, zygote_pid)
+    records = Records(directory, system, zygote_pid, emit)
     records.write()
     try:
         creations = Creations()
     except OSError:
-        yield records
+        try:
+            yield records
+        finally:
+            records.close()
         return
     loop = asyncio.get_running_loop()
     created = asyncio.Event()
@@ -91,3 +132,4 @@ def noting(directory: RunDirectory, system: System, zygote_pid: int) -> Iterator
         loop.remove_reader(creations.descriptor)
         creations.close()
         noted.cancel()
+        records.close()

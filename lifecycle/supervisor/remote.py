@@ -116,7 +116,7 @@ def _asked(path: Path, question: Question, timeout_s: float) -> Answer | None:
     """Return the answer of a supervisor; None if it is not there any more."""
     try:
         return ask(path / "control", question, timeout_s)
-    except (FileNotFoundError, ConnectionRefusedError):
+    except (FileNotFoundError, ConnectionError):
         return None
 
 

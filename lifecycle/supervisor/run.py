@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import dataclasses
 import os
+import traceback
 from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
 
 from lifecycle.errors import ExitCode, LifecycleError
@@ -23,7 +24,7 @@ from lifecycle.plan.contacts import reached_hosts
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor import discovery_server
 from lifecycle.supervisor.ending import Ending
-from lifecycle.supervisor.events import Emitter, Listener, Notice, RunStarted
+from lifecycle.supervisor.events import Emitter, Event, Listener, Notice, RunStarted
 from lifecycle.supervisor.eyes import Eyes
 from lifecycle.supervisor.failure import StepFailedError, never_connected, with_failure
 from lifecycle.supervisor.logs import log_directory
@@ -102,7 +103,8 @@ def up(
     Args:
         plan: what to bring up.
         options: how.
-        listeners: told every event, in this thread.
+        listeners: told every event, in this thread. One that raises is told nothing more; the run
+            goes on to its end, and then what it raised is raised.
         forerunner: used and ended.
         ending: has been told of signals since before this call; entered by the caller.
         on_start: given the way to ask for the status, once there is a system.
@@ -128,16 +130,37 @@ def up(
                 on_start=on_start,
                 conclude=conclude,
             )
+    guarded = tuple(_Guarded(each) for each in listeners)
     with ending.noted():
-        return _up(
+        result = _up(
             plan,
             options,
-            listeners,
+            guarded,
             forerunner=forerunner,
             ending=ending,
             on_start=on_start,
             conclude=conclude,
         )
+    for each in guarded:
+        if each.error is not None:
+            raise each.error
+    return result
+
+
+class _Guarded:
+    """A listener whose exception ends no more than itself, see `up`."""
+
+    def __init__(self, listener: Listener) -> None:
+        self._listener = listener
+        self.error: Exception | None = None
+
+    def __call__(self, event: Event) -> None:
+        if self.error is None:
+            try:
+                self._listener(event)
+            except Exception as error:  # noqa: BLE001 - it is not ours, and raised in the end
+                traceback.print_exc()
+                self.error = error
 
 
 def _up(
@@ -188,7 +211,7 @@ def _up(
                 variables=_graph_variables(os.environ),
             )
             zygote = Zygote(forerunner.process)
-            records = leaving.enter_context(noting(directory, system, zygote.pid))
+            records = leaving.enter_context(noting(directory, system, zygote.pid, emit))
             try:
                 # Before any participant: who asks a server that is not there waits to ask again.
                 with ending.raised():

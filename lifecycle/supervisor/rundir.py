@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import errno
 import fcntl
 import os
 import re
@@ -156,6 +157,11 @@ class RunDirectory:
             ) from None
         except OSError as error:
             directory._let_go()
+            if error.errno in (errno.ENOSPC, errno.EDQUOT):
+                raise UsageError(
+                    f"cannot write in run directory {str(directory.path)!r}: {error.strerror}",
+                    hint="make room there, or set XDG_RUNTIME_DIR to another directory",
+                ) from error
             raise _unusable(error.filename or directory.path, str(error.strerror)) from error
         return directory
 

@@ -14,6 +14,7 @@ from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 
 from lifecycle.codec import from_json, to_json
+from lifecycle.errors import UsageError
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.orders import Done, Order, OrderKind
 from lifecycle.supervisor.rundir import connect, short_path
@@ -22,6 +23,8 @@ from lifecycle.verify.observation import Observation
 from lifecycle.verify.verdict import Verdict
 
 _BURST_S = 0.05
+_CLOSE_S = 1.0
+"""In the end, a client that reads nothing for so long loses what it was not sent."""
 _LARGEST_QUESTION = 64 * 2**20
 """Bytes of a line; a question may hold a whole plan."""
 _ORDERS = {each.value: each for each in OrderKind}
@@ -129,12 +132,16 @@ class ControlServer:
         """Listen.
 
         Raises:
-            OSError: the socket cannot be made.
+            UsageError: the socket cannot be made, on a full disk say.
         """
-        self._path.unlink(missing_ok=True)
         sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        with short_path(self._path) as name:
-            sock.bind(name)
+        try:
+            self._path.unlink(missing_ok=True)
+            with short_path(self._path) as name:
+                sock.bind(name)
+        except OSError as error:
+            sock.close()
+            raise UsageError(f"cannot listen at {str(self._path)!r}: {error.strerror}") from error
         self._server = await asyncio.start_unix_server(
             self._serve, sock=sock, limit=_LARGEST_QUESTION
         )
@@ -196,18 +203,22 @@ class ControlServer:
             gone.cancel()
 
     async def close(self, exit_code: int) -> None:
-        """Tell those who asked for it that all is over, and stop listening."""
+        """Tell those who asked for it that all is over, and stop listening; bounded."""
         if self._server is None:
             return
         self._server.close()
         for writer in self._waiting:
             with contextlib.suppress(ConnectionError):
                 writer.write(to_json(Answer(exit_code=exit_code)) + b"\n")
-                await writer.drain()
-        for writer in tuple(self._open):
+        for writer in self._open:
             writer.close()
-            with contextlib.suppress(ConnectionError):
-                await writer.wait_closed()
+        left = {asyncio.ensure_future(each.wait_closed()): each for each in self._open}
+        if left:
+            _, late = await asyncio.wait(left, timeout=_CLOSE_S)
+            for each in late:
+                left[each].transport.abort()
+            # A connection that was cut counts as closed.
+            await asyncio.gather(*left, return_exceptions=True)
         self._server = None
 
 

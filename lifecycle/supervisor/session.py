@@ -448,6 +448,7 @@ class Session:
         )
         if left:
             self._emit(Notice(message=f"ended processes that were left behind: {_listed(left)}"))
+        self._system.logs.tell_lost()
         if not self._stop.done():
             self._stop.cancel()
         elif not self._stop.cancelled():

@@ -20,9 +20,10 @@ from lifecycle.node.control import Operation
 from lifecycle.plan.model import Plan, PlannedNode, PlannedProcess
 from lifecycle.supervisor.driver import NodeDriver, Standing
 from lifecycle.supervisor.elsewhere import RemoteNode
-from lifecycle.supervisor.events import Emitter, NodeChanged, Reach, RequestSent
+from lifecycle.supervisor.events import Emitter, NodeChanged, Notice, Reach, RequestSent
 from lifecycle.supervisor.gate import Permit
 from lifecycle.supervisor.liveliness import Liveliness
+from lifecycle.supervisor.logs import LogDirectory
 from lifecycle.supervisor.process import ManagedProcess
 from lifecycle.supervisor.states import ProcessState
 from lifecycle.verify.observation import NodeConfiguration, Observation
@@ -172,8 +173,10 @@ class System:
     Args:
         processes: those of the plan that this supervisor is responsible for.
         variables: set in every process, below what the plan sets.
+        logs: the directory of the processes' log files.
 
     Attributes:
+        logs: likewise, with what could not be written there.
         machines: those whose nodes it brings up; None if that is all of them.
         remote: the plan's other nodes, which another supervisor brings up.
         touched: set whenever a node told something of itself: time to judge again.
@@ -200,7 +203,10 @@ class System:
         self.server: ManagedProcess | None = None
         self.emit = emit
         own = tuple(processes)
-        self._process = functools.partial(ManagedProcess, logs=logs, emit=emit, variables=variables)
+        self.logs = LogDirectory(logs, lambda text: emit(Notice(message=text)))
+        self._process = functools.partial(
+            ManagedProcess, logs=self.logs, emit=emit, variables=variables
+        )
         self.processes = {
             each.name: self._process(each) for each in own if each.run.kind is not RunKind.ATTACH
         }

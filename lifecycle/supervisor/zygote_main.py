@@ -216,6 +216,8 @@ def _run(argv: tuple[str, ...], control: int | None) -> int:
         argv = tuple(word.replace("{control}", str(control)) for word in argv)
     else:
         die_with_parent(signal.SIGTERM)
+    for number in (signal.SIGPIPE, signal.SIGXFSZ):  # which Python ignores, and exec would hand on
+        signal.signal(number, signal.SIG_DFL)
     try:
         os.execvp(argv[0], argv)  # noqa: S606 - what a spawner is for
     except OSError as error:

@@ -198,16 +198,21 @@ class Ledger:
             pid = os.getpid()
             owner = ChildRecord(name="supervisor", pid=pid, start_ticks=start_ticks(pid) or 0)
         part = self._path.with_name(f".{FILE_NAME}")
-        with part.open("wb") as file:
-            file.write(
-                to_json(
-                    LedgerFile(system=self.system, owner=owner, boot_id=boot_id(), targets=targets)
-                )
-            )
-            file.flush()
-            # What it lists costs money at some operators: it must survive a power cut.
-            os.fsync(file.fileno())
-        part.replace(self._path)
+        text = to_json(
+            LedgerFile(system=self.system, owner=owner, boot_id=boot_id(), targets=targets)
+        )
+        try:
+            with part.open("wb") as file:
+                file.write(text)
+                file.flush()
+                # What it lists costs money at some operators: it must survive a power cut.
+                os.fsync(file.fileno())
+            part.replace(self._path)
+        except OSError as error:
+            raise ProgrammingError(
+                f"cannot write ledger {str(self._path)!r}: {error.strerror}",
+                hint="make room there: nothing is programmed that is not written down first",
+            ) from error
 
 
 def has_ledger(directory: Path) -> bool:

@@ -70,6 +70,31 @@ class Talker(LifecycleNode):
         self.publisher("chatter").publish(String(data="hello"))
 
 
+class Chatty(Talker):
+    """Prints a megabyte a second, says how it is taken down, and has a child that nothing ends."""
+
+    _child: subprocess.Popen[bytes] | None = None
+
+    def on_configure(self, state):
+        super().on_configure(state)
+        if self._child is None:
+            stubborn = "trap '' INT TERM HUP; sleep 300 & while :; do wait; sleep 1; done"
+            self._child = subprocess.Popen(["sh", "-c", stubborn], start_new_session=True)
+
+    def on_deactivate(self, state):
+        print("deactivated", flush=True)
+
+    def on_cleanup(self, state):
+        print("cleaned up", flush=True)
+
+    def on_shutdown(self, state):
+        print("shut down", flush=True)
+
+    def _tick(self) -> None:
+        super()._tick()
+        print("\n".join(["x" * 5000] * 4), flush=True)
+
+
 class Listener(LifecycleNode):
     _heard = False
 

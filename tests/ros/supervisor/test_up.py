@@ -23,7 +23,6 @@ from tests.ros.supervisor.running import (
     BOUND_S,
     ROOT,
     Up,
-    command,
     environment,
     left_of,
     marked,
@@ -269,27 +268,6 @@ def test_a_process_that_dies_while_a_run_must_hold_is_no_success_although_it_kee
         found = [each["rule"] for each in json.loads(report.read_text())["findings"]]
         assert found.count("run.process-died") == 1
         run.assert_nothing_left()
-
-
-def test_a_reader_that_goes_away_before_the_system_is_verified_makes_no_success(
-    tmp_path: Path, fresh_domain: int
-) -> None:
-    report = tmp_path / "report.xml"
-    words = [str(pair(tmp_path, fresh_domain)), "--stop-after", "0", "--report", str(report)]
-    mark = uuid.uuid4().hex
-    run = subprocess.Popen(
-        [*command("up"), *words],
-        cwd=ROOT,
-        env=environment(tmp_path, mark),
-        stdout=subprocess.PIPE,
-        start_new_session=True,
-    )
-    assert run.stdout is not None
-    assert run.stdout.readline().startswith(b"pair: 2 nodes")
-    run.stdout.close()
-    assert run.wait(BOUND_S) == ExitCode.HUNG_UP
-    assert _cases(report)["run: end"] == "failure"
-    assert left_of(mark) == []
 
 
 _IMPORTING = "import time\nprint('importing', flush=True)\ntime.sleep(300)"

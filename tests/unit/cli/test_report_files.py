@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import signal
@@ -101,6 +102,23 @@ def test_a_report_that_cannot_be_written_is_one_clear_error(
     with pytest.raises(UsageError) as caught:
         open_report(path)
     assert str(caught.value) == f"cannot write report {str(path)!r}: {reason}"
+
+
+def test_a_full_disk_leaves_a_report_whole_and_red(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    path = tmp_path / "report.txt"
+    with Report(path) as report:
+        report.begin(PLAN)
+        before = path.read_text()
+        monkeypatch.setattr(os, "posix_fallocate", full)
+        with pytest.raises(UsageError, match="No space left on device"):
+            report.end(violated())
+    assert path.read_text() == before
+    assert "it never came to its end" in before
 
 
 def test_nothing_old_outlives_a_run_that_is_killed(tmp_path: Path) -> None:

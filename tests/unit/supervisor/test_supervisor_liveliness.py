@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
-import io
 import os
 import signal
 import socket
@@ -13,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.cli.up_output import PlainLines
+from lifecycle.cli.up_output import describe
 from lifecycle.codec import from_json, to_json
 from lifecycle.manifest.model import DiscoveryRange, Machine, Run, RunKind, Timeouts
 from lifecycle.middleware.busy_sign import BusySign, Overdue
@@ -32,6 +31,7 @@ from lifecycle.supervisor.events import (
 )
 from lifecycle.supervisor.judge import without_nodes
 from lifecycle.supervisor.liveliness import Cause, Liveliness, Presence
+from lifecycle.supervisor.logs import LogDirectory
 from lifecycle.supervisor.neighbours import CALL_EACH_S, Listener, Neighbours
 from lifecycle.supervisor.process import ManagedProcess
 from lifecycle.supervisor.system import System
@@ -93,14 +93,11 @@ def test_a_node_is_not_called_alive_that_has_not_started_or_is_not_in_the_graph(
             "/viewer": False,
             "/lamp": True,
         }
-        stream = io.StringIO()
-        for each in alive:
-            PlainLines(stream)(dataclasses.replace(each, silent_s=2.0))
-        assert stream.getvalue() == (
-            "/camera: not silent any more after 2.0 s, but not there yet\n"
-            "/viewer: not silent any more after 2.0 s, but not there yet\n"
-            "/lamp: alive again after 2.0 s\n"
-        )
+        assert [describe(dataclasses.replace(each, silent_s=2.0)) for each in alive] == [
+            "/camera: not silent any more after 2.0 s, but not there yet",
+            "/viewer: not silent any more after 2.0 s, but not there yet",
+            "/lamp: alive again after 2.0 s",
+        ]
         await desk.neighbours.close()
 
     run(test())
@@ -496,7 +493,7 @@ def test_a_fork_server_tells_that_a_process_was_stopped_and_continues(tmp_path: 
             nodes=("it",),
             argv=argv,
         )
-        process = ManagedProcess(planned, logs=tmp_path, emit=Emitter())
+        process = ManagedProcess(planned, logs=LogDirectory(tmp_path, print), emit=Emitter())
         process.on_stop = told.put_nowait
         await process.spawn(zygote, None)
         for number, expected in ((signal.SIGSTOP, True), (signal.SIGCONT, False)) * 2:

@@ -6,8 +6,6 @@ import csv
 import dataclasses
 import io
 import json
-import os
-import signal
 
 import pytest
 from rich.console import Console
@@ -25,7 +23,6 @@ from lifecycle.network.nfe import (
     UniqueRequirement,
 )
 from lifecycle.node.control import Operation
-from lifecycle.supervisor.ending import Ending
 from lifecycle.supervisor.events import (
     Event,
     Failure,
@@ -93,7 +90,7 @@ STATUS = SystemStatus(
 
 def test_plain_lines_tell_a_person_what_happens() -> None:
     stream = io.StringIO()
-    output = PlainLines(stream)
+    output = PlainLines(_Into(stream))
     for event in EVENTS:
         output(event)
     output.finish(RESULT)
@@ -113,17 +110,30 @@ def test_a_death_that_the_run_outlives_is_told_in_full_at_once() -> None:
     stream = io.StringIO()
     failure = EVENTS[-1]
     assert isinstance(failure, Failure)
-    PlainLines(stream)(dataclasses.replace(failure, ends_run=False))
+    PlainLines(_Into(stream))(dataclasses.replace(failure, ends_run=False))
     assert stream.getvalue() == (
         "failed: /camera (run.process-died): "
         "cannot keep '/camera' running: pid 7 died: killed by SIGSEGV\n"
     )
 
 
+class _Into:
+    """A sink that takes everything at once."""
+
+    def __init__(self, stream: io.StringIO) -> None:
+        self._stream = stream
+
+    def put(self, text: str, *, kept: bool = True) -> None:
+        self._stream.write(text)
+
+    def close(self) -> None:
+        """Nothing is left."""
+
+
 def _said(*events: Event) -> list[str]:
     stream = io.StringIO()
     console = Console(file=stream, width=100, force_terminal=False)
-    for output in (PlainLines(stream), Live(console)):
+    for output in (PlainLines(_Into(stream)), Live(console)):
         for event in events:
             output(event)
     lines = [each for each in stream.getvalue().splitlines() if each.startswith("[")]
@@ -147,23 +157,9 @@ def test_what_the_others_print_while_a_failed_run_is_rolled_back_does_not_bury_t
     assert _said(*after) == ["[viewer] Traceback", "[camera] shutter is stuck"]
 
 
-@pytest.mark.parametrize("make", [PlainLines, JsonLines])
-def test_a_reader_that_goes_away_ends_the_run_like_a_terminal_that_is_closed(
-    make: type[PlainLines | JsonLines],
-) -> None:
-    read, write = os.pipe()
-    os.close(read)
-    with Ending() as ending, ending.noted(), os.fdopen(write, "w") as stream:
-        output = make(stream)
-        for event in EVENTS:
-            output(event)
-        output.finish(RESULT)
-        assert ending.number == signal.SIGHUP
-
-
 def test_a_verdict_that_reads_as_the_last_one_did_is_not_told_again() -> None:
     stream = io.StringIO()
-    output = PlainLines(stream)
+    output = PlainLines(_Into(stream))
     ok = VerdictChanged(stage=Stage.ACTIVE, verdict=RESULT.verdict)
     wrong = VerdictChanged(
         stage=Stage.ACTIVE,
@@ -182,7 +178,9 @@ def test_a_verdict_that_reads_as_the_last_one_did_is_not_told_again() -> None:
 def test_a_gate_that_takes_something_on_trust_says_what() -> None:
     stream = io.StringIO()
     trusted = "rate_hz 500 of /video (flow.not-measured)"
-    PlainLines(stream)(GateOpened(outcome="unverifiable", nodes=("/camera",), trusted=trusted))
+    PlainLines(_Into(stream))(
+        GateOpened(outcome="unverifiable", nodes=("/camera",), trusted=trusted)
+    )
     assert stream.getvalue() == (
         "gate open on verdict unverifiable: activating 1 node; taken on trust: rate_hz 500 of"
         " /video (flow.not-measured)\n"
@@ -192,7 +190,7 @@ def test_a_gate_that_takes_something_on_trust_says_what() -> None:
 def test_a_verdict_that_is_unverifiable_names_what_is_unknown() -> None:
     stream = io.StringIO()
     verdict = verdict_of(Outcome.UNVERIFIABLE, "graph.unattributed-endpoint")
-    PlainLines(stream)(VerdictChanged(stage=Stage.ACTIVE, verdict=verdict))
+    PlainLines(_Into(stream))(VerdictChanged(stage=Stage.ACTIVE, verdict=verdict))
     assert stream.getvalue() == (
         "active: verdict unverifiable; unknown: /camera (graph.unattributed-endpoint)\n"
     )
@@ -200,7 +198,7 @@ def test_a_verdict_that_is_unverifiable_names_what_is_unknown() -> None:
 
 def test_a_node_on_its_way_to_active_is_waited_for_and_one_that_leaves_it_violates() -> None:
     stream = io.StringIO()
-    lines = PlainLines(stream)
+    lines = PlainLines(_Into(stream))
     wrong = VerdictChanged(
         stage=Stage.ACTIVE, verdict=verdict_of(Outcome.VIOLATED, "state.wrong-state")
     )
@@ -215,7 +213,7 @@ def test_a_node_on_its_way_to_active_is_waited_for_and_one_that_leaves_it_violat
 
 def test_json_lines_are_one_object_each_and_the_last_is_the_verdict() -> None:
     stream = io.StringIO()
-    output = JsonLines(stream)
+    output = JsonLines(_Into(stream))
     for event in EVENTS:
         output(event)
     output.finish(RESULT)
@@ -412,7 +410,7 @@ def test_ends_that_form_no_ip_flow_are_shown_as_what_they_tell() -> None:
 )
 def test_a_step_of_wiring_is_one_line(event: Event, line: str) -> None:
     stream = io.StringIO()
-    PlainLines(stream)(event)
+    PlainLines(_Into(stream))(event)
     assert stream.getvalue() == f"{line}\n"
 
 

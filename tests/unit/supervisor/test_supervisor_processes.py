@@ -18,14 +18,25 @@ import pytest
 
 from lifecycle.errors import BringUpError
 from lifecycle.manifest.model import Run, RunKind
+from lifecycle.node.control import HostSpec
+from lifecycle.plan import build_plan
 from lifecycle.plan.model import PlannedProcess
+from lifecycle.supervisor import logs
+from lifecycle.supervisor.channel import ControlChannel
 from lifecycle.supervisor.events import Emitter, LogLine
-from lifecycle.supervisor.logs import LONGEST_LINE, LineReader, ros_log_root
+from lifecycle.supervisor.logs import (
+    LONGEST_LINE,
+    LineReader,
+    LogDirectory,
+    ProcessLog,
+    ros_log_root,
+)
 from lifecycle.supervisor.orphans import end_run
 from lifecycle.supervisor.process import COMMAND_ESCALATION, ManagedProcess
 from lifecycle.supervisor.rundir import RUN_VARIABLE, ChildRecord, RunRecord, boot_id, start_ticks
 from lifecycle.supervisor.states import ProcessExit, ProcessState, change
 from lifecycle.supervisor.zygote import Zygote, ZygoteProcess
+from tests.unit.plan.samples import teleop
 
 PYTHON = sys.executable
 BOUND_S = 20.0
@@ -45,6 +56,7 @@ class _Bench:
         self.emit = Emitter()
         self.emit.listen(self._hear)
         self._logs = tmp_path
+        self.said: list[str] = []
         self._processes: list[ManagedProcess] = []
 
     def _hear(self, event: object) -> None:
@@ -67,7 +79,7 @@ class _Bench:
                 argv=argv,
                 environment=environment,
             ),
-            logs=self._logs,
+            logs=LogDirectory(self._logs, self.said.append),
             emit=self.emit,
         )
         self._processes.append(process)
@@ -197,6 +209,118 @@ def test_lines_are_split_and_a_line_without_end_cannot_fill_the_memory() -> None
         assert lines[-1] == "last"
 
     _run(test())
+
+
+def test_whoever_writes_faster_than_we_read_does_not_keep_a_pipe_from_being_closed() -> None:
+    async def test() -> None:
+        read, write = os.pipe()
+        spoke = asyncio.Event()
+        reader = LineReader(read, lambda _: spoke.set())
+        with subprocess.Popen(  # noqa: ASYNC220 - an end that is waited for blocks nobody here
+            ["yes"], stdout=write, stderr=subprocess.DEVNULL
+        ) as left_behind:
+            os.close(write)
+            try:
+                await spoke.wait()
+                reader.close()
+                assert left_behind.wait(BOUND_S) != 0  # it has no reader any more
+            finally:
+                left_behind.kill()
+
+    _run(test())
+
+
+def test_a_command_that_nobody_reads_any_more_ends_as_in_a_shell(tmp_path: Path) -> None:
+    async def test() -> None:
+        async with _bench(tmp_path) as bench:
+            process = await bench.start("grep", "SigIgn", "/proc/self/status")
+            await process.ended
+            await process.end(COMMAND_ESCALATION, asyncio.Event())
+            (line,) = bench.lines
+            assert not int(line.split()[1], 16) & 1 << signal.SIGPIPE - 1
+
+    _run(test())
+
+
+def test_a_host_that_reads_nothing_any_more_does_not_keep_its_channel_from_closing() -> None:
+    async def test() -> None:
+        plan = build_plan(teleop())
+        spec = HostSpec(
+            system="s" * 2**22,
+            process="p",
+            domain_id=0,
+            discovery_range=plan.discovery_range,
+            nodes=plan.nodes,
+        )
+        channel = ControlChannel(spec, lambda _: None)
+        with await channel.open():
+            await channel.close()
+
+    _run(test())
+
+
+def test_a_log_that_is_full_is_rotated_and_keeps_one_older(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(logs, "LARGEST_LOG", 20)
+    said: list[str] = []
+    log = ProcessLog(LogDirectory(tmp_path / "run", said.append), "ns/it")
+    log.open()
+    for number in range(9):
+        log.add(f"line {number}")
+    log.close()
+    written = {each.name: each.read_text() for each in (tmp_path / "run").iterdir()}
+    assert written == {
+        "ns.it.log": "line 8\n",
+        "ns.it.log.1": "line 6\nline 7\n",
+    }
+    assert said == []
+
+
+def test_what_a_log_misses_is_said_once_counted_and_written_where_it_is_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(logs, "_TRIED_AGAIN_S", 0.0)
+    said: list[str] = []
+    directory = LogDirectory(tmp_path, said.append)
+    log, other = (ProcessLog(directory, name) for name in ("it", "other"))
+    full = os.open("/dev/full", os.O_WRONLY)
+    for each in (log, other):
+        each.open()
+        each.add("before")
+    files = [(each, os.dup(each._file)) for each in (log, other)]
+    for each, _ in files:
+        os.dup2(full, each._file)
+        each.add("lost")
+        each.add("lost")
+    (line,) = said
+    assert line == (
+        f"cannot write the log of process 'it' in {str(tmp_path)!r}: No space left on device; the "
+        "run goes on, and what is lost is counted"
+    )
+    for each, file in files:
+        os.dup2(file, each._file)
+        each.add("after")
+        each.close()
+        os.close(file)
+        assert each.path.read_text() == (
+            "before\n2 log lines are missing here: No space left on device\nafter\n"
+        )
+    os.close(full)
+    directory.tell_lost()
+    assert said[1:] == [f"4 log lines are missing in {str(tmp_path)!r}: No space left on device"]
+
+
+def test_a_log_directory_that_cannot_be_made_is_said_and_fails_nothing(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    said: list[str] = []
+    log = ProcessLog(LogDirectory(tmp_path / "file", said.append), "it")
+    log.open()
+    log.add("still the last line of it")
+    log.close()
+    assert log.tail == ("still the last line of it",)
+    (line,) = said
+    assert "File exists" in line or "Not a directory" in line
 
 
 def test_every_state_change_is_legal_or_refused_with_the_legal_ones() -> None:

@@ -1,0 +1,420 @@
+"""Standard output and standard error that are closed, full or not read, and what then is lost.
+
+Owns: `own_streams`, which keeps standard output for what a verb prints (Fast DDS 2.14 prints errors
+of TCP connections there, where they would stand among JSON lines or in a CSV file), and after which
+writing to either stream never raises; and `Writer`, by which a supervisor never waits for a reader.
+"""
+
+from __future__ import annotations
+
+import collections
+import contextlib
+import errno
+import io
+import os
+import select
+import stat
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple, TextIO, cast
+
+import click
+
+from lifecycle.errors import ExitCode
+
+if TYPE_CHECKING:
+    from _typeshed import ReadableBuffer
+
+_STDIN, _STDOUT, _STDERR = 0, 1, 2
+
+LINE_BYTES = 2**20
+"""Log lines are dropped while so much is unread, until half of it was read."""
+
+EVENT_BYTES = 2**24
+"""Of everything else so much waits for a reader; beyond it the oldest goes."""
+
+DRAIN_S = 2.0
+"""In the end, a reader that takes nothing for so long is not waited for."""
+
+_LONGEST_DRAIN_S = 20.0
+_AGAIN_S = 1.0
+"""How often a full disk is tried with log lines; with everything else each time."""
+
+_CHUNK_BYTES = 2**16
+_BEHIND_BYTES = 2**16
+_FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+"""Errors of a disk that may have room again; after any other a stream has ended."""
+
+
+class _Tolerant(io.RawIOBase):
+    """Writes to a descriptor until that fails, and nothing from then on.
+
+    Attributes:
+        error: why it failed.
+    """
+
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor = descriptor
+        self.error: OSError | None = None
+
+    def writable(self) -> bool:
+        return True
+
+    def fileno(self) -> int:
+        return self._descriptor
+
+    def isatty(self) -> bool:
+        return os.isatty(self._descriptor)
+
+    def write(self, data: ReadableBuffer) -> int:
+        left = memoryview(data).cast("B")
+        size = len(left)
+        try:
+            while left and self.error is None:
+                left = left[_write_some(self._descriptor, left) :]
+        except OSError as error:
+            self.error = error
+        return size
+
+
+class Streams:
+    """The standard streams of this process, see `own_streams`."""
+
+    def __init__(self, stdout: _Tolerant, stderr: Writer | None) -> None:
+        self._stdout = stdout
+        self._stderr = stderr
+
+    def settled(self, code: int) -> int:
+        """Write what is left and return the exit code: no success if its result was lost.
+
+        A reader that went away, as `head` does, has read what it wanted.
+
+        Args:
+            code: of the verb.
+        """
+        sys.stdout.flush()
+        error = self._stdout.error
+        if error is not None and error.errno in _FULL:
+            sys.stderr.write(f"cannot write standard output: {error.strerror}\n")
+            code = code or ExitCode.USAGE
+        sys.stderr.flush()
+        if self._stderr is not None:
+            self._stderr.close()
+        return code
+
+
+def own_streams(*, waits: bool = True) -> Streams:
+    """Have only `sys.stdout` write to standard output, and no failure of it or stderr raise.
+
+    What writes to descriptor 1 itself, as C++ does, comes out on standard error; so does what child
+    processes print that are given no other. A stream that is closed becomes one to nowhere.
+
+    Args:
+        waits: for readers of standard error; else what they do not read in time is dropped.
+    """
+    _open_closed()
+    stdout = _Tolerant(os.dup(_STDOUT))
+    _replace("stdout", io.BufferedWriter(stdout))
+    stderr = os.dup(_STDERR)
+    writer = None
+    if waits:
+        _replace("stderr", _Tolerant(stderr))
+    else:
+        writer = Writer(stderr, "standard error", marker=lambda text: f"{text}\n")
+        _replace("stderr", _Queued(writer, kept=False))
+        _never_wait(_STDERR)
+    os.dup2(_STDERR, _STDOUT)
+    return Streams(stdout, writer)
+
+
+def echo_while_read(text: str) -> None:
+    """Print one text of many that follow changes; end the verb once nobody reads them any more.
+
+    Raises:
+        Exit: standard output has ended.
+    """
+    click.echo(text)
+    raw = getattr(getattr(sys.stdout, "buffer", None), "raw", None)
+    if isinstance(raw, _Tolerant) and raw.error is not None:
+        raise click.exceptions.Exit(ExitCode.OK)
+
+
+def _replace(name: str, under: io.RawIOBase | io.BufferedWriter) -> None:
+    now = cast("TextIO | None", getattr(sys, name))
+    if now is not None:
+        now.flush()
+    stream = io.TextIOWrapper(
+        cast("io.BufferedWriter", under),
+        encoding=now.encoding if now is not None else "utf-8",
+        errors="backslashreplace",
+        line_buffering=now is not None and bool(getattr(now, "line_buffering", False)),
+        write_through=not isinstance(under, io.BufferedWriter),
+    )
+    setattr(sys, name, stream)
+
+
+def _open_closed() -> None:
+    """Have no file that is opened later become one of the standard streams."""
+    null = os.open(os.devnull, os.O_RDWR)
+    for number in range(null, _STDERR + 1):  # the lowest that was free, and those above it
+        if number == null or not Path(f"/proc/self/fd/{number}").exists():
+            os.dup2(null, number)
+            os.set_inheritable(number, True)
+    if null > _STDERR:
+        os.close(null)
+
+
+def _never_wait(descriptor: int) -> None:
+    """Have C++ lose what it writes to a full pipe or a stopped terminal, instead of waiting.
+
+    Only here: who shares the descriptor keeps a description, and so flags, of its own (open(2)).
+    A file has no reader to wait for; a socket cannot be opened anew.
+    """
+    mode = os.fstat(descriptor).st_mode
+    if not stat.S_ISFIFO(mode) and not os.isatty(descriptor):
+        return
+    with contextlib.suppress(OSError):
+        flags = os.O_WRONLY | os.O_NONBLOCK | os.O_NOCTTY
+        again = os.open(f"/proc/self/fd/{descriptor}", flags)
+        os.dup2(again, descriptor)
+        os.close(again)
+
+
+def _write_some(descriptor: int, data: memoryview) -> int:
+    """Write something, also where somebody made the descriptor non-blocking."""
+    while True:
+        try:
+            return os.write(descriptor, data)
+        except BlockingIOError:  # noqa: PERF203 - rare
+            poll = select.poll()
+            poll.register(descriptor, select.POLLOUT)
+            poll.poll()
+
+
+class Writer:
+    """Writes texts in a thread of its own: who prints never waits, and never fails.
+
+    What is not read in time is lost as LINE_BYTES and EVENT_BYTES say, what a full disk does not
+    take is lost, and both are counted and said in the stream where they are missing.
+
+    Args:
+        descriptor: where to.
+        name: of the stream, for messages.
+        marker: makes what stands in the stream of a message about it.
+        say: takes messages that the stream itself cannot take, from any thread.
+        encoding: of the texts.
+    """
+
+    def __init__(
+        self,
+        descriptor: int,
+        name: str,
+        *,
+        marker: Callable[[str], str],
+        say: Callable[[str], object] = lambda _: None,
+        encoding: str = "utf-8",
+    ) -> None:
+        self._descriptor = descriptor
+        self._name = name
+        self._marker = marker
+        self._say = say
+        self._encoding = encoding
+        self.on_room: Callable[[], object] = lambda: None
+        self._changed = threading.Condition()
+        self._queue: collections.deque[tuple[bytes, _Lost]] = collections.deque()
+        self._bytes = 0
+        self._dropped = _NOTHING  # behind the last of the queue
+        self._lost = _NOTHING  # before its first
+        self._why = ""
+        self._told = False
+        self._full = False
+        self._torn = False
+        self._gone = False
+        self._closing = False
+        self._ended = False
+        self._progress = 0
+        self._tried_s = 0.0
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def put(self, text: str, *, kept: bool = True) -> None:
+        """Write a text, whole lines, once there is room for it.
+
+        Args:
+            text: what to write.
+            kept: False for a log line.
+        """
+        data = text.encode(self._encoding, "backslashreplace")
+        with self._changed:
+            if self._gone or self._closing:
+                return
+            if not kept and (self._dropped.lines or self._bytes + len(data) > LINE_BYTES):
+                self._dropped += _Lost(lines=1)
+                return
+            self._append(data, _Lost(events=1) if kept else _Lost(lines=1))
+            while self._bytes > EVENT_BYTES and len(self._queue) > 1:
+                self._why = self._unread
+                self._lost += self._take()[1]
+            self._changed.notify_all()
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether a reader has stopped, is too slow, or has gone."""
+        return self._gone or self._bytes > _BEHIND_BYTES
+
+    def stream(self) -> TextIO:
+        """Return a text stream of which every write is kept."""
+        return io.TextIOWrapper(
+            cast("io.BufferedWriter", _Queued(self, kept=True)),
+            encoding=self._encoding,
+            errors="backslashreplace",
+            write_through=True,
+        )
+
+    def fileno(self) -> int:
+        """Return the descriptor."""
+        return self._descriptor
+
+    def close(self) -> None:
+        """Write what is left, for as long as it is taken; say what is lost in the end.
+
+        Again is harmless.
+        """
+        deadline = time.monotonic() + _LONGEST_DRAIN_S
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()
+            while not self._ended and time.monotonic() < deadline:
+                seen = self._progress
+                if not self._changed.wait_for(
+                    lambda seen=seen: self._ended or self._progress != seen,  # type: ignore[misc]
+                    DRAIN_S,
+                ):
+                    break
+            gone, self._gone = self._gone, True
+            why = self._why if self._full else self._unread
+            lost = sum((each for _, each in self._queue), self._lost + self._dropped)
+        if any(lost) and not gone:
+            self._say(f"{lost} missing at the end of {self._name}: {why}")
+
+    @property
+    def _unread(self) -> str:
+        return f"nobody read {self._name} in time"
+
+    def _append(self, data: bytes, weight: _Lost) -> None:
+        self._queue.append((data, weight))
+        self._bytes += len(data)
+
+    def _take(self) -> tuple[bytes, _Lost]:
+        data, weight = self._queue.popleft()
+        self._bytes -= len(data)
+        return data, weight
+
+    def _run(self) -> None:
+        while self._wait():
+            self._step()
+        with self._changed:
+            self._ended = True
+            self._changed.notify_all()
+
+    def _wait(self) -> bool:
+        """Wait until there is something to write; False once there will be nothing more."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._gone or self._closing or self._queue)
+            return not self._gone and bool(self._queue)
+
+    def _step(self) -> None:
+        """Write the first text of the queue, and before it what is missing there."""
+        with self._changed:
+            text, weight = self._take()
+            if any(self._dropped) and self._bytes <= LINE_BYTES // 2:
+                dropped, self._dropped = self._dropped, _NOTHING
+                self._append(self._marked(dropped, self._unread), dropped)
+            now_s = time.monotonic()
+            if self._full and not weight.events and now_s - self._tried_s < _AGAIN_S:
+                self._lost += weight
+                return
+            self._tried_s = now_s
+            before, self._lost = self._lost, _NOTHING
+            if any(before):
+                text = self._marked(before, self._why) + text
+            left = memoryview(b"\n" + text if self._torn else text)
+        try:
+            while left:
+                left = left[_write_some(self._descriptor, left[:_CHUNK_BYTES]) :]
+                with self._changed:
+                    self._torn = bool(left)
+                    self._progress += 1
+                    self._changed.notify_all()
+        except OSError as error:
+            self._failed(error, before + weight)
+            return
+        self._full = False
+        if not self._queue:
+            self.on_room()
+
+    def _failed(self, error: OSError, lost: _Lost) -> None:
+        message = f"{self._name} was closed by its reader; the run goes on without it"
+        told, self._told = self._told, True
+        with self._changed:
+            if error.errno in _FULL:
+                self._full, self._why = True, error.strerror or "the disk is full"
+                self._lost = lost + self._lost
+                message = (
+                    f"cannot write {self._name}: {self._why}; the run goes on, and what is lost "
+                    "is counted"
+                )
+            else:
+                told, self._gone = False, True
+                self._queue.clear()
+                self._bytes = 0
+        if not told:
+            self._say(message)
+
+    def _marked(self, lost: _Lost, why: str) -> bytes:
+        text = self._marker(f"{lost} missing here: {why}")
+        return text.encode(self._encoding, "backslashreplace")
+
+
+class _Lost(NamedTuple):
+    lines: int = 0
+    events: int = 0
+
+    def __add__(self, other: tuple[int, ...]) -> _Lost:  # type: ignore[override]
+        return _Lost(self.lines + other[0], self.events + other[1])
+
+    def __str__(self) -> str:
+        parts = [
+            f"{number} {noun}{'' if number == 1 else 's'}"
+            for number, noun in ((self.lines, "log line"), (self.events, "event"))
+            if number
+        ]
+        return f"{' and '.join(parts)} {'is' if sum(self) == 1 else 'are'}"
+
+
+_NOTHING = _Lost()
+
+
+class _Queued(io.RawIOBase):
+    """The raw end of a stream that a Writer writes."""
+
+    def __init__(self, writer: Writer, *, kept: bool) -> None:
+        self._writer = writer
+        self._kept = kept
+
+    def writable(self) -> bool:
+        return True
+
+    def fileno(self) -> int:
+        return self._writer.fileno()
+
+    def isatty(self) -> bool:
+        return os.isatty(self._writer.fileno())
+
+    def write(self, data: ReadableBuffer) -> int:
+        whole = bytes(data)
+        self._writer.put(whole.decode(errors="replace"), kept=self._kept)
+        return len(whole)
