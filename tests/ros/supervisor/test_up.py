@@ -117,10 +117,11 @@ def test_a_violation_that_healed_while_the_system_was_held_still_counts(
         run.until_found("graph.undeclared-node", since=begun)
         # It counts once it stood for so long without any change: there is no event to wait for.
         time.sleep(3 * SETTLED_S)
+        before = run.catch_up()
         intruder.destroy_node()
         context.try_shutdown()
         context.destroy()
-        run.until_not_found("graph.undeclared-node", since=run.catch_up())
+        run.until_not_found("graph.undeclared-node", since=before)
         assert run.finish() == ExitCode.VIOLATED
         assert run.verdict["verdict"] == "ok"
         assert run.verdict["run"]["reason"].startswith("done, but violated meanwhile, ")
