@@ -12,7 +12,7 @@ import os
 from collections.abc import Iterator
 
 from lifecycle.middleware.shm import Creations, segments_of
-from lifecycle.supervisor.orphans import descendants
+from lifecycle.supervisor.orphans import Family
 from lifecycle.supervisor.rundir import ChildRecord, RunDirectory, start_ticks
 from lifecycle.supervisor.system import System
 
@@ -24,15 +24,15 @@ class Records:
         segments: shared memory files that our processes were seen to own.
     """
 
-    def __init__(self, directory: RunDirectory, system: System, zygote_pid: int) -> None:
+    def __init__(self, directory: RunDirectory, system: System, zygote: Family) -> None:
         self._directory = directory
         self._system = system
-        self._zygote_pid = zygote_pid
+        self._zygote = zygote
         self.segments: frozenset[str] = frozenset()
 
     def write(self) -> None:
         """Write down which processes run."""
-        pids = {"zygote": self._zygote_pid}
+        pids = {"zygote": self._zygote.pid}
         pids.update({each.name: each.pid for each in self._system.living})
         self._directory.record(
             tuple(
@@ -53,7 +53,7 @@ class Records:
 
     def _owned(self) -> frozenset[str]:
         """Return what is owned now, also by what our processes started: `ros2 run` does."""
-        return segments_of((os.getpid(), *descendants(self._zygote_pid)))
+        return segments_of((os.getpid(), self._zygote.pid, *self._zygote.family()))
 
     async def note_each(self, created: asyncio.Event) -> None:
         """Note the shared memory of our processes each time that the event is set, for ever."""
@@ -64,12 +64,12 @@ class Records:
 
 
 @contextlib.contextmanager
-def noting(directory: RunDirectory, system: System, zygote_pid: int) -> Iterator[Records]:
+def noting(directory: RunDirectory, system: System, zygote: Family) -> Iterator[Records]:
     """Keep records that note shared memory once it is made: its owner may be killed at any time.
 
     Where the kernel does not announce it, it is noted when `note_segments` is called.
     """
-    records = Records(directory, system, zygote_pid)
+    records = Records(directory, system, zygote)
     records.write()
     try:
         creations = Creations()

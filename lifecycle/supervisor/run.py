@@ -166,8 +166,8 @@ def _up(
                 processes=processes,
                 variables=_graph_variables(os.environ),
             )
-            zygote = Zygote(forerunner.process)
-            records = leaving.enter_context(noting(directory, system, zygote.pid))
+            zygote = Zygote(forerunner.process, emit)
+            records = leaving.enter_context(noting(directory, system, zygote))
             try:
                 # Before any participant: who asks a server that is not there waits to ask again.
                 with ending.raised():

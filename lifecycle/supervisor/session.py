@@ -174,6 +174,7 @@ class Session:
             vanishes=sightings.vanishes,
             replanned=self._replanned,
             program=networks.begin,
+            spawner=zygote,
             hurry=self._hurry,
             timeout_s=options.timeout_s,
         )
@@ -440,9 +441,7 @@ class Session:
             await self._networks.close(self._hurry)
             await discovery_server.end(self._system, self._hurry)
         loop = asyncio.get_running_loop()
-        left = await loop.run_in_executor(
-            None, end_strays, self._zygote.pid, self._directory.run_id
-        )
+        left = await loop.run_in_executor(None, end_strays, self._directory.run_id, self._zygote)
         if left:
             self._emit(Notice(message=f"ended processes that were left behind: {_listed(left)}"))
         if not self._stop.done():
@@ -456,7 +455,7 @@ class Session:
         ends = self._ending.numbers
         for number in ends:
             loop.add_signal_handler(number, self._ended_by, number)
-        loop.add_signal_handler(signal.SIGCHLD, lambda: reap_adopted((self._zygote.pid,)))
+        loop.add_signal_handler(signal.SIGCHLD, self._child_changed)
         if self._ending.number is not None:
             self._ended_by(self._ending.number)
         try:
@@ -465,6 +464,10 @@ class Session:
             for number in (*ends, signal.SIGCHLD):
                 loop.remove_signal_handler(number)
             self._ending.resume()
+
+    def _child_changed(self) -> None:
+        self._zygote.note_stops()
+        reap_adopted(self._zygote.waited_for)
 
     def _ended_by(self, number: int) -> None:
         self.stop(*ENDED_BY[number])

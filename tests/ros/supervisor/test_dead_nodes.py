@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 import rclpy
 from rclpy.node import Node
@@ -66,11 +67,11 @@ def status(runtime: Path) -> dict[str, dict[str, Any]]:
     return {each["node"]: each for each in json.loads(told.stdout)["nodes"]}
 
 
-def restarts_at_once(run: Up, runtime: Path) -> float:
-    """Restart the talker; return how many seconds the whole command took."""
+def restarts_at_once(run: Up, runtime: Path, node: str = "talker") -> float:
+    """Restart a node; return how many seconds the whole command took."""
     begun = len(run.events)
     began = time.monotonic()
-    done = verb("restart", "pair", "talker", runtime=runtime)
+    done = verb("restart", "pair", node, runtime=runtime)
     took_s = time.monotonic() - began
     assert (done.returncode, done.stderr) == (ExitCode.OK, "")
     run.until("system", reached="active")
@@ -143,3 +144,67 @@ def test_where_ports_are_fixed_a_killed_node_is_unmatched_and_comes_back_at_once
         print(f"unmatched after {gone_s:.3f} s, back after {back_s:.1f} s")
         assert verb("down", "pair", runtime=tmp_path).returncode == ExitCode.OK
         assert run.finish() == ExitCode.OK
+
+
+def fork_server(run: Up) -> psutil.Process:
+    """Return the process that forks the system's, and itself is no fork."""
+    forks = {each["pid"] for each in run.of_kind("process")}
+    return next(
+        each
+        for each in psutil.Process(run.process.pid).children()
+        if "lifecycle.supervisor.zygote_main" in each.cmdline() and each.pid not in forks
+    )
+
+
+def test_a_killed_fork_server_is_replaced_and_its_nodes_stay_up_and_supervised(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    with up(pair(tmp_path, fresh_domain), "--keep-going", runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        old = fork_server(run)
+        nodes = {name: run.pid_of(name) for name in ("talker", "listener")}
+        # It has run long enough to be started again at once; see _SOON_S of zygote.py.
+        until(lambda: time.time() - old.create_time() > 2.5, time.monotonic())
+        old.kill()
+        said = run.until("notice")["message"]
+        new = fork_server(run)
+        assert said == (
+            f"the fork server (pid {old.pid}) ended unasked (killed by SIGKILL); what it started "
+            f"runs on, and another one (pid {new.pid}) is started"
+        )
+        assert [run.pid_of(name) for name in nodes] == [*nodes.values()]
+        assert psutil.Process(nodes["talker"]).ppid() == run.process.pid
+
+        # Stopped: told to the supervisor as the parent that it is now.
+        os.kill(nodes["listener"], signal.SIGSTOP)
+        run.until_found("run.silent-node", "/listener")
+        os.kill(nodes["listener"], signal.SIGCONT)
+        since = run.catch_up()
+        run.until_not_found("run.silent-node", since=since - 1)
+
+        done = verb("restart", "pair", "talker", runtime=tmp_path)
+        assert (done.returncode, done.stderr) == (ExitCode.OK, "")
+        run.catch_up()
+        assert psutil.Process(run.pid_of("talker")).ppid() == new.pid
+        assert run.pid_of("listener") == nodes["listener"]
+
+        # Killed: with the status that only a parent gets.
+        kill(run, "listener")
+        died = run.until("failure", rule="run.process-died")
+        assert died["message"].endswith(f"pid {nodes['listener']} died: killed by SIGKILL")
+        restarts_at_once(run, tmp_path, "listener")
+
+        # Twice, the second time soon: then only what needs it has it started.
+        new.kill()
+        run.until("notice")
+        third = fork_server(run)
+        third.kill()
+        assert run.until("notice")["message"] == (
+            f"the fork server (pid {third.pid}) ended unasked (killed by SIGKILL); what it "
+            "started runs on, and another one is started when it is needed"
+        )
+        run.note_segments()
+        assert verb("restart", "pair", runtime=tmp_path).returncode == ExitCode.OK
+        assert verb("down", "pair", runtime=tmp_path).returncode == ExitCode.OK
+        assert run.finish() == ExitCode.OK
+        run.assert_nothing_left()
