@@ -15,6 +15,7 @@ from lifecycle.middleware.shm import Creations, segments_of
 from lifecycle.supervisor.orphans import Family
 from lifecycle.supervisor.rundir import ChildRecord, RunDirectory, start_ticks
 from lifecycle.supervisor.system import System
+from lifecycle.supervisor.together import Worker
 
 
 class Records:
@@ -24,7 +25,10 @@ class Records:
         segments: shared memory files that our processes were seen to own.
     """
 
-    def __init__(self, directory: RunDirectory, system: System, zygote: Family) -> None:
+    def __init__(
+        self, directory: RunDirectory, system: System, zygote: Family, worker: Worker
+    ) -> None:
+        self._worker = worker
         self._directory = directory
         self._system = system
         self._zygote = zygote
@@ -45,8 +49,7 @@ class Records:
 
     async def note_segments(self) -> None:
         """Note the shared memory of our processes: one that is killed cannot remove its own."""
-        loop = asyncio.get_running_loop()
-        found = await loop.run_in_executor(None, self._owned)
+        found = await self._worker.run(self._owned)
         if not found <= self.segments:
             self.segments |= found
             self.write()
@@ -64,12 +67,14 @@ class Records:
 
 
 @contextlib.contextmanager
-def noting(directory: RunDirectory, system: System, zygote: Family) -> Iterator[Records]:
+def noting(
+    directory: RunDirectory, system: System, zygote: Family, worker: Worker
+) -> Iterator[Records]:
     """Keep records that note shared memory once it is made: its owner may be killed at any time.
 
     Where the kernel does not announce it, it is noted when `note_segments` is called.
     """
-    records = Records(directory, system, zygote)
+    records = Records(directory, system, zygote, worker)
     records.write()
     try:
         creations = Creations()

@@ -9,12 +9,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
-from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
+from collections.abc import Awaitable, Callable, Collection, Iterable, Iterator, Mapping
 
 from lifecycle.errors import ExitCode, LifecycleError
 from lifecycle.manifest.model import Authority, DataLayerSource, EndpointPolicy, RunKind
 from lifecycle.middleware.doors import discovery_peers, peers_environment
-from lifecycle.middleware.process import adopt_orphans, exit_after
+from lifecycle.middleware.process import adopt_orphans, check_threads, exit_after
 from lifecycle.middleware.profiles import discovery_environment
 from lifecycle.middleware.shm import sweep
 from lifecycle.plan import moved_observer
@@ -47,12 +47,18 @@ from lifecycle.supervisor.rundir import (
 from lifecycle.supervisor.session import Session
 from lifecycle.supervisor.status import SystemStatus
 from lifecycle.supervisor.system import System
+from lifecycle.supervisor.together import Worker
 from lifecycle.supervisor.zygote import Zygote, ZygoteProcess
 from lifecycle.verify.verdict import NOT_JUDGED
 
 LEAVE_S = 10.0
-"""A participant leaves within 0.2 s, over connections that nobody answers within 4 s."""
+"""A participant leaves within 0.2 s, over connections that nobody answers within 4 s.
 
+Where it is made, Fast DDS may wait for ever for threads that it cannot have."""
+
+
+THREADS = 24
+"""A supervisor has up to 16, most of them its participant's."""
 
 OBSERVER_TRIES = 4
 
@@ -153,7 +159,6 @@ def _up(
         # Servers may be asked to remove what dead runs left: that must not outlast a signal.
         with ending.raised() if options.program else contextlib.nullcontext():
             networks = open_networks(plan, options, directory, emit, environment=os.environ)
-        adopt_orphans()
         _enter_graph(plan, options, directory)
 
         async def run(leaving: contextlib.ExitStack) -> UpResult:
@@ -167,7 +172,8 @@ def _up(
                 variables=_graph_variables(os.environ),
             )
             zygote = Zygote(forerunner.process, emit)
-            records = leaving.enter_context(noting(directory, system, zygote))
+            worker = leaving.enter_context(contextlib.closing(Worker("lifecycle")))
+            records = leaving.enter_context(noting(directory, system, zygote, worker))
             try:
                 # Before any participant: who asks a server that is not there waits to ask again.
                 with ending.raised():
@@ -186,6 +192,7 @@ def _up(
                     networks=networks,
                     emit=emit,
                     ending=ending,
+                    worker=worker,
                 )
                 if on_start is not None:
                     on_start(session.status)
@@ -218,10 +225,19 @@ async def _leaving_last(run: Callable[[contextlib.ExitStack], Awaitable[UpResult
     """
     with contextlib.ExitStack() as leaving:
         result = await run(leaving)
-        live_on = exit_after(LEAVE_S, result.exit_code)
-        leaving.pop_all().close()
-        live_on()
+        with _ends_within(LEAVE_S, result.exit_code):
+            leaving.pop_all().close()
     return result
+
+
+@contextlib.contextmanager
+def _ends_within(seconds: float, code: int) -> Iterator[None]:
+    """End this process with `code` if what is done inside takes longer: Fast DDS can hang."""
+    live_on = exit_after(seconds, code)
+    try:
+        yield
+    finally:
+        live_on()
 
 
 def _serves(plan: Plan, options: UpOptions) -> bool:
@@ -239,12 +255,13 @@ def _eyes(plan: Plan, options: UpOptions, emit: Emitter) -> Eyes:
     wires = layer.authority is Authority.SUPERVISOR
     planned = connections = observer_connections(plan, options.machine)
     for number in range(OBSERVER_TRIES):
-        eyes = Eyes.open(
-            plan.domain_id,
-            connections,
-            guests=wires and dynamic and plan.policy.undeclared_nodes is EndpointPolicy.OPEN,
-            events=wires and (dynamic or layer.events),
-        )
+        with _ends_within(options.timeout_s + LEAVE_S, ExitCode.BRING_UP_FAILED):
+            eyes = Eyes.open(
+                plan.domain_id,
+                connections,
+                guests=wires and dynamic and plan.policy.undeclared_nodes is EndpointPolicy.OPEN,
+                events=wires and (dynamic or layer.events),
+            )
         if number + 1 == OBSERVER_TRIES or eyes.reaches_servers():
             break
         eyes.prepare_to_leave()
@@ -281,7 +298,14 @@ _GRAPH_VARIABLES = (
 
 
 def _enter_graph(plan: Plan, options: UpOptions, directory: RunDirectory) -> None:
-    """Place this process where the plan's nodes will be, and have participants found quickly."""
+    """Place this process where the plan's nodes will be, and have participants found quickly.
+
+    Raises:
+        MiddlewareError: it cannot have the threads of a participant. Fast DDS would end the process
+            then, or wait for ever.
+    """
+    adopt_orphans()
+    check_threads(THREADS)
     os.environ["ROS_DOMAIN_ID"] = str(plan.domain_id)
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = plan.discovery_range.name
     hosts = reached_hosts(plan, own_machines(plan, options.machine))

@@ -50,7 +50,7 @@ from lifecycle.supervisor.sightings import Sightings
 from lifecycle.supervisor.stale import StaleNodes
 from lifecycle.supervisor.status import SystemStatus, system_status
 from lifecycle.supervisor.system import System
-from lifecycle.supervisor.together import ended
+from lifecycle.supervisor.together import Worker, ended
 from lifecycle.supervisor.vigil import Vigil
 from lifecycle.supervisor.wiring import authority_of
 from lifecycle.supervisor.zygote import Zygote
@@ -102,6 +102,7 @@ class Session:
         networks: programmed while the system is active.
         emit: where events go.
         ending: knows of signals that came before.
+        worker: for what blocks.
     """
 
     def __init__(
@@ -116,7 +117,9 @@ class Session:
         networks: Networks,
         emit: Emitter,
         ending: Ending,
+        worker: Worker,
     ) -> None:
+        self._worker = worker
         self._system = system
         self._options = options
         self._directory = directory
@@ -440,8 +443,7 @@ class Session:
             # After the last message has left, and before what runs below us is ended.
             await self._networks.close(self._hurry)
             await discovery_server.end(self._system, self._hurry)
-        loop = asyncio.get_running_loop()
-        left = await loop.run_in_executor(None, end_strays, self._directory.run_id, self._zygote)
+        left = await self._worker.run(end_strays, self._directory.run_id, self._zygote)
         if left:
             self._emit(Notice(message=f"ended processes that were left behind: {_listed(left)}"))
         if not self._stop.done():

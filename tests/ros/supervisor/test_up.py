@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -12,6 +13,7 @@ import uuid
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
+import psutil
 import pytest
 import rclpy
 from rclpy.node import Node
@@ -492,3 +494,62 @@ def test_a_plain_command_is_started_verified_and_ended(tmp_path: Path, fresh_dom
         assert run.finish() == ExitCode.OK
         assert run.verdict["verdict"] in {"ok", "unverifiable"}
         run.assert_nothing_left()
+
+
+_NOBODY = "54321"
+"""A user without any other process: limits of processes are counted per user."""
+
+_READS_ALL = "+dac_read_search,+dac_override"
+"""Capabilities to use this installation all the same; the limit holds without CAP_SYS_RESOURCE."""
+
+
+def limited(*options: str) -> tuple[str, ...]:
+    """Return the beginning of a command line for whom a limit of processes holds: not root."""
+    if os.getuid() != 0:
+        return ("prlimit", *options)
+    if shutil.which("setpriv") is None:
+        pytest.skip("root has no limit of processes, and setpriv is not installed")
+    user = ("setpriv", "--reuid", _NOBODY, "--clear-groups", "--inh-caps", _READS_ALL)
+    return (*user, "--ambient-caps", _READS_ALL, "prlimit", *options)
+
+
+@pytest.mark.parametrize("processes", [1, 3, 12])
+def test_without_room_for_its_threads_a_system_is_not_begun_and_says_so(
+    tmp_path: Path, fresh_domain: int, processes: int
+) -> None:
+    through = limited(f"--nproc={processes}")
+    run = Up(pair(tmp_path, fresh_domain), runtime=tmp_path, through=through)
+    try:
+        _, said = run.process.communicate(timeout=BOUND_S)
+        assert run.process.returncode == ExitCode.BRING_UP_FAILED
+        last = said.splitlines()[-1]
+        assert "cannot start the fork server: " in last or (
+            "cannot start the 24 threads that this needs: the limit of processes and threads is "
+            f"reached ({processes} for this user" in last
+        )
+        assert left_of(run.mark) == []
+        assert list((tmp_path / "lifecycle").glob("*")) == []
+    finally:
+        run.close()
+
+
+@pytest.mark.parametrize("whom", ["supervisor", "all"])
+def test_at_the_limit_of_processes_a_system_is_taken_down_all_the_same(
+    tmp_path: Path, fresh_domain: int, whom: str
+) -> None:
+    run = Up(pair(tmp_path, fresh_domain), runtime=tmp_path, through=limited("--nproc=4096"))
+    try:
+        run.until("system", reached="active")
+        run.note_segments()
+        processes = marked(run.mark) if whom == "all" else [psutil.Process(run.process.pid)]
+        for each in processes:
+            subprocess.run([*limited("--nproc=1:1", "--pid"), str(each.pid)], check=True)
+        began = time.monotonic()
+        run.signal(signal.SIGTERM)
+        assert run.finish() == ExitCode.OK
+        assert time.monotonic() - began < 5.0
+        assert run.of_kind("notice") == []
+        run.assert_nothing_left()
+        assert list((tmp_path / "lifecycle").glob("*")) == []
+    finally:
+        run.close()
