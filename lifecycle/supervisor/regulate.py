@@ -11,6 +11,7 @@ from collections.abc import Callable, Coroutine, Iterable
 from typing import Any
 
 from lifecycle.errors import BringUpError
+from lifecycle.node.control import Operation
 from lifecycle.plan import Plan, PlanError, moving_nodes, restarted
 from lifecycle.supervisor.bring_up import BringUp
 from lifecycle.supervisor.events import Emitter, GateOpened, Notice, Reach, SystemReached
@@ -103,8 +104,9 @@ class Regulator:
 
         Raises:
             NotBegunError: no process can be started now; the system is as it was.
-            VerificationError: the gate stays closed. In phase PAUSED or HELD the system stays as
-                it is and can be asked again; in any other the run is over.
+            VerificationError: the gate stays closed, or closed again before every node was sent its
+                request, and what had become active is inactive again. In phase PAUSED or HELD the
+                system stays as it is and can be asked again; in any other the run is over.
             StepFailedError: a step failed, or a network could not be programmed; the run is over.
         """
         if order.kind is OrderKind.PAUSE:
@@ -294,12 +296,29 @@ class Regulator:
                 outcome=permit.verdict.verdict.value, nodes=tuple(each.name for each in waiting)
             )
         )
-        await self._alive(self._bring_up.activate(permit, deadline - loop.time(), waiting))
+        try:
+            await self._alive(self._bring_up.activate(permit, deadline - loop.time(), waiting))
+        except VerificationError:
+            await self._withdraw(permit, waiting)
+            self.phase = before
+            raise
         self._judge.ahead = frozenset()
         await self._alive(self._judge.until_clear(Stage.ACTIVE, deadline - loop.time()))
         # The same question as at the gate: what became active must be what was verified.
         self._gate.judge(self._judge.latest)
         self._reached(ACTIVE)
+
+    async def _withdraw(self, permit: Permit, waiting: Iterable[NodeRun]) -> None:
+        """Deactivate again what was activated since the gate opened: the rest may not follow."""
+        begun = tuple(each for each in waiting if each.name in permit.sent)
+        for each in waiting:
+            if each not in begun:
+                each.undo = [one for one in each.undo if one is not Operation.ACTIVATE]
+        if begun:
+            names = ", ".join(each.name for each in begun)
+            self._emit(Notice(message=f"the gate closed again: {names} is deactivated"))
+        await self._alive(self._bring_up.deactivate(begun))
+        self._judge.ahead = self._active()
 
     async def program(self, permit: Permit, timeout_s: float) -> None:
         """Program networks with the flows of the verdict that nodes are activated on.
