@@ -72,6 +72,27 @@ def test_a_paused_system_stays_inactive_whoever_activates_its_nodes(
         assert run.finish() == ExitCode.OK
 
 
+def test_a_node_whose_own_code_activates_it_is_refused_while_the_gate_is_closed(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    edit = {"nodes/talker/run/python": "tests.ros.supervisor.systems:Eager"}
+    options = ("--until", "verified", "--stop-after", "60")
+    with up(pair(tmp_path, fresh_domain, edit=edit), *options, runtime=tmp_path) as run:
+        run.until("system", reached="verified")
+        for whence in ("timer", "thread"):
+            run.met(
+                "log",
+                line=f"{whence}: cannot activate /talker: the gate of its supervisor is closed; "
+                "it is activated once 'pair' is verified; a paused system: lifecycle resume pair",
+            )
+        status = json.loads(verb("status", "pair", "--format", "json", runtime=tmp_path).stdout)
+        assert {each["state"] for each in status["nodes"]} == {"inactive"}
+        assert verb("down", "pair", runtime=tmp_path).returncode == ExitCode.OK
+        run.finish()
+        assert "active" not in {each["state"] for each in run.of_kind("node")}
+        run.assert_nothing_left()
+
+
 class Publishers:
     """Publishers that nobody declared."""
 
