@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 import uuid
+from collections.abc import Callable
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -553,3 +554,59 @@ def test_at_the_limit_of_processes_a_system_is_taken_down_all_the_same(
         assert list((tmp_path / "lifecycle").glob("*")) == []
     finally:
         run.close()
+
+
+def _foreign(path: Path) -> None:
+    if os.getuid() != 0:
+        pytest.skip("only root can give a directory away")
+    path.mkdir(mode=0o700)
+    os.chown(path, int(_NOBODY), -1)
+
+
+def _with_a_file(path: Path) -> None:
+    path.mkdir(mode=0o700)
+    (path / "control").mkdir()
+
+
+_IN_PLACE: dict[str, Callable[[Path], None]] = {
+    "it is a symbolic link": lambda path: path.symlink_to(path.parent),
+    "it is not a directory": Path.touch,
+    f"it belongs to user {_NOBODY}, and this is user {os.getuid()}": _foreign,
+    "it holds 'control', and was no run's": _with_a_file,
+}
+
+
+@pytest.mark.parametrize("what", _IN_PLACE)
+def test_what_is_in_the_place_of_the_run_directory_is_named_and_left_alone(
+    tmp_path: Path, fresh_domain: int, what: str
+) -> None:
+    root = tmp_path / "lifecycle"
+    root.mkdir(mode=0o700)
+    path = root / f"pair@{fresh_domain}"
+    _IN_PLACE[what](path)
+    before = path.lstat()
+    report = tmp_path / "verdict.json"
+    done = verb("up", str(pair(tmp_path, fresh_domain)), "--report", str(report), runtime=tmp_path)
+    said = (
+        f"cannot use {str(path)!r} as run directory: {what}; it must be a directory of this user "
+        "that others cannot write; remove it, or set XDG_RUNTIME_DIR to such a directory"
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (ExitCode.USAGE, "", f"{said}\n")
+    assert json.loads(report.read_text())["run"]["reason"] == said
+    after = path.lstat()
+    assert (after.st_ino, after.st_mode, after.st_mtime) == (
+        before.st_ino,
+        before.st_mode,
+        before.st_mtime,
+    )
+
+
+def test_a_run_directory_and_its_socket_are_there_while_a_system_is_and_not_longer(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    path = tmp_path / "lifecycle" / f"pair@{fresh_domain}"
+    with up(pair(tmp_path, fresh_domain), "--until", "connected", runtime=tmp_path) as run:
+        run.until("run")
+        assert path.is_dir()
+        assert run.finish() == ExitCode.OK
+        assert list(path.parent.iterdir()) == []
