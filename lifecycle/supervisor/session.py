@@ -294,7 +294,7 @@ class Session:
             trusted=self._trusted,
         )
         verdict = dataclasses.replace(end.verdict or self._judge.latest or NOT_JUDGED, run=run)
-        return UpResult(exit_code=end.exit_code, verdict=verdict)
+        return UpResult(exit_code=end.exit_code, verdict=verdict, plan=self._system.first)
 
     def _cut_short(self, exit_code: ExitCode) -> _End:
         """Return what a run comes to that is asked to end.
@@ -492,7 +492,7 @@ def _hurried(result: UpResult) -> UpResult:
     reason = f"{run.reason}; interrupted while it was taken down"
     run = dataclasses.replace(run, reason=reason, exit_code=ExitCode.INTERRUPTED)
     verdict = dataclasses.replace(result.verdict, run=run)
-    return UpResult(exit_code=ExitCode.INTERRUPTED, verdict=verdict)
+    return dataclasses.replace(result, exit_code=ExitCode.INTERRUPTED, verdict=verdict)
 
 
 def _listed(pids: tuple[int, ...]) -> str:
