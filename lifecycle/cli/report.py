@@ -179,9 +179,15 @@ class Report:
             reason = "it never came to its end: the process was killed"
             self._write(_unjudged(reason, ExitCode.INTERNAL))
 
-    def end(self, verdict: Verdict) -> None:
-        """Write how it ended."""
+    def end(self, verdict: Verdict, plan: Plan | None = None) -> None:
+        """Write how it ended.
+
+        Args:
+            verdict: the last one.
+            plan: what it is of, where another manifest was taken since `begin`.
+        """
         self._ended = True
+        self._plan = plan or self._plan
         self._write(verdict)
 
     def __exit__(

@@ -133,7 +133,7 @@ def command(
 def _finished(result: UpResult, listener: Output, written: Report) -> ExitCode:
     """Write and show how a run ended; return its exit code, no success without its report."""
     try:
-        written.end(result.verdict)
+        written.end(result.verdict, result.plan)
     except UsageError as error:
         click.echo(lines(str(error)), err=True)
         return result.exit_code or ExitCode.USAGE

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from lifecycle.middleware.parameters import parameter_value, type_word
     from lifecycle.middleware.participant import FlowParticipant
     from lifecycle.middleware.participant_profile import ParticipantSettings
-    from lifecycle.middleware.process import adopt_orphans, die_with_parent, exit_after
+    from lifecycle.middleware.process import adopt_orphans, exit_after
     from lifecycle.middleware.profiles import discovery_environment
     from lifecycle.middleware.qos import from_rclpy, to_rclpy
     from lifecycle.middleware.server_watch import ServerWatch, is_server_matched
@@ -59,7 +59,6 @@ __all__ = [
     "adopt_orphans",
     "create_publisher",
     "create_subscription",
-    "die_with_parent",
     "discovery_environment",
     "discovery_server_command",
     "discovery_server_listens",
@@ -99,7 +98,6 @@ _HOME = {
     "adopt_orphans": "process",
     "create_publisher": "unique",
     "create_subscription": "unique",
-    "die_with_parent": "process",
     "discovery_environment": "profiles",
     "discovery_server_command": "discovery_server",
     "discovery_server_listens": "discovery_server",

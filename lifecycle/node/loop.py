@@ -95,9 +95,12 @@ class NodeLoop:
             self._code = code
         managed = [node for node in self._nodes if isinstance(node, LifecycleNode)]
         bound_s = sum(node.lifecycle.spec.timeouts.shutdown_s for node in managed) + _LEAVE_S
-        threading.Thread(
+        guard = threading.Thread(
             target=self._give_up, args=(bound_s, reason), name="give-up", daemon=True
-        ).start()
+        )
+        # At the limit of threads it goes without: a supervisor ends what does not end by itself.
+        with contextlib.suppress(RuntimeError):
+            guard.start()
         self.call_soon(self._shut_down, reason)
 
     def spin_and_exit(self) -> None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Awaitable, Callable, Coroutine, Iterable, Iterator
+from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterable, Iterator
 from typing import Any, Protocol, TypeVar
 
 from lifecycle.errors import BringUpError
@@ -136,17 +136,21 @@ class BringUp:
         except asyncio.TimeoutError:
             raise self._failure() or self._late(timeout_s) from None
 
-    async def deactivate(self) -> None:
+    async def deactivate(self, nodes: Iterable[NodeRun] | None = None) -> None:
         """Deactivate every active node, those first that stand on others.
+
+        Args:
+            nodes: only these, which were asked to activate; None for all that are active.
 
         Raises:
             StepFailedError: those that failed.
         """
-        await self._side_by_side(
-            self._deactivate(node)
-            for node in self._system.nodes.values()
-            if node.planned.managed and node.reach is Reach.ACTIVE
+        active = tuple(
+            node
+            for node in self._some(nodes)
+            if node.planned.managed and (nodes is not None or node.reach is Reach.ACTIVE)
         )
+        await self._side_by_side(self._deactivate(node, active) for node in active)
 
     def _some(self, nodes: Iterable[NodeRun] | None) -> tuple[NodeRun, ...]:
         return tuple(self._system.nodes.values() if nodes is None else nodes)
@@ -298,12 +302,13 @@ class BringUp:
             await permit.renewed()
         await self._operate(node, Operation.ACTIVATE, Reach.ACTIVE, permit)
 
-    async def _deactivate(self, node: NodeRun) -> None:
+    async def _deactivate(self, node: NodeRun, others: Collection[NodeRun]) -> None:
         for dependent in self._system.dependents(node.planned.key):
-            while dependent.planned.managed and dependent.reach is Reach.ACTIVE:
+            while dependent in others and Operation.ACTIVATE in dependent.undo:
                 await dependent.changed.wait()
         await self._operate(node, Operation.DEACTIVATE, Reach.CONNECTED)
         node.undo = [each for each in node.undo if each in _TO_UNDO]
+        node.stuck = False
 
     async def _operate(
         self, node: NodeRun, operation: Operation, reach: Reach, permit: Permit | None = None

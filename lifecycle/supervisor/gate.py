@@ -58,13 +58,14 @@ class Permit:
 
     Attributes:
         verdict: the one that it stands on; a newer one, once it was renewed.
+        sent: names of the nodes that were sent their requests.
     """
 
     def __init__(self, gate: Gate, verdict: Verdict) -> None:
         if gate.permit is not None or closes(verdict, strict=gate.strict):
             raise BringUpError("cannot make a permit without an open gate; ask Gate.judge for one")
         self._gate = gate
-        self._sent: set[str] = set()
+        self.sent: set[str] = set()
         self._refused: Verdict | None = None
         self._renewal: asyncio.Future[None] | None = None
         self.verdict = verdict
@@ -89,7 +90,7 @@ class Permit:
             BringUpError: likewise.
         """
         await self.renewed()
-        self._sent.add(node)
+        self.sent.add(node)
 
     async def renewed(self) -> None:
         """Return once the verdict is that of the present moment.
@@ -112,7 +113,7 @@ class Permit:
             renewal.result()
 
     async def _renew(self) -> None:
-        verdict = await self._gate.judged_again(frozenset(self._sent))
+        verdict = await self._gate.judged_again(frozenset(self.sent))
         if self._gate.permit is not self:
             return
         if closes(verdict, strict=self._gate.strict):

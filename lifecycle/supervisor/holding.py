@@ -16,7 +16,16 @@ from lifecycle.supervisor.events import Emitter, Notice
 from lifecycle.supervisor.failure import StepFailedError
 from lifecycle.supervisor.gate import VerificationError
 from lifecycle.supervisor.judge import Changes, Judge
-from lifecycle.supervisor.orders import HELD, PAUSED, Done, Mailbox, Order, Pending, check_order
+from lifecycle.supervisor.orders import (
+    HELD,
+    PAUSED,
+    Done,
+    Mailbox,
+    NotBegunError,
+    Order,
+    Pending,
+    check_order,
+)
 from lifecycle.supervisor.regulate import Regulator
 from lifecycle.supervisor.revision import Revisions
 from lifecycle.supervisor.system import System
@@ -123,15 +132,14 @@ class Holding:
                 pending.order = dataclasses.replace(pending.order, plan=None, reload=False)
             await self._regulator.carry_out(pending.order)
             await self._note_segments()
-        except (UsageError, VerificationError, StepFailedError) as error:
+        except (UsageError, NotBegunError) as error:
+            pending.finish(Done(exit_code=error.exit_code, error=str(error)))
+        except (VerificationError, StepFailedError) as error:
             pending.finish(Done(exit_code=error.exit_code, error=str(error)))
             held = self._regulator.phase in (PAUSED, HELD)
-            if not isinstance(error, UsageError) and not (
-                held and isinstance(error, VerificationError)
-            ):
+            if not held or not isinstance(error, VerificationError):
                 raise
-            if isinstance(error, VerificationError):
-                self._emit(Notice(message=str(error)))
+            self._emit(Notice(message=str(error)))
         else:
             pending.finish(Done())
 

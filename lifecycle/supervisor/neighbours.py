@@ -108,6 +108,7 @@ class Neighbours:
         self._air = air
         self._loop = asyncio.get_running_loop()
         self._closed = False
+        self._known: list[_Neighbour] = []
         self._machines: list[_Neighbour] = []
         self._ears: list[Ear] = []
         self._attached: tuple[str, ...] = ()
@@ -148,6 +149,11 @@ class Neighbours:
         self._voices.clear()
         self._machines.clear()
         self._missing.clear()
+        for neighbour in self._known:
+            # Of who is not planned any more nobody tells that it came back.
+            for cause in (Cause.LOST, Cause.TOLD):
+                self._system.liveliness.came_back(neighbour.nodes, cause)
+        self._known.clear()
         self.open()
 
     def _attached_nodes(self) -> tuple[str, ...]:
@@ -173,10 +179,17 @@ class Neighbours:
         self._voices.clear()
 
     def _listener(self, neighbour: _Neighbour) -> Listener:
+        self._known.append(neighbour)
+
         def soon(do: Callable[..., None]) -> Callable[..., None]:
+            def in_loop(*arguments: object) -> None:
+                # An ear that was destroyed may have had its say on the way here.
+                if any(each is neighbour for each in self._known):
+                    do(neighbour, *arguments)
+
             def call(*arguments: object) -> None:
                 with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
-                    self._loop.call_soon_threadsafe(do, neighbour, *arguments)
+                    self._loop.call_soon_threadsafe(in_loop, *arguments)
 
             return call
 

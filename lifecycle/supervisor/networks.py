@@ -18,6 +18,7 @@ from lifecycle.supervisor.events import Emitter, Event, Notice, VerdictChanged
 from lifecycle.supervisor.failure import NOT_PROGRAMMED, StepFailedError
 from lifecycle.supervisor.options import UpOptions
 from lifecycle.supervisor.rundir import LEDGER_NAME, RunDirectory
+from lifecycle.supervisor.together import Worker
 from lifecycle.verify.verdict import Verdict
 
 if TYPE_CHECKING:
@@ -47,10 +48,12 @@ class Networks:
         self._emit = emit
         self._keeper: Keeper | None = None
         self._begun = False
+        # Made here: in the end it may be too late to start a thread.
+        self._worker = Worker("networks")
         if programmer is not None:
             from lifecycle.supervisor.programming.keeper import Keeper
 
-            self._keeper = Keeper(programmer, self._tell)
+            self._keeper = Keeper(programmer, self._tell, self._worker)
             emit.listen(self._hear)
 
     async def begin(self, verdict: Verdict, timeout_s: float | None = None) -> None:
@@ -91,7 +94,7 @@ class Networks:
             from lifecycle.supervisor.programming.keeper import remove
             from lifecycle.supervisor.programming.orphans import Removal
 
-            await remove(Removal(self._directory), self._tell, hurry)
+            await remove(Removal(self._directory), self._tell, hurry, self._worker)
 
     def _hear(self, event: Event) -> None:
         if self._begun and self._keeper is not None and isinstance(event, VerdictChanged):

@@ -63,10 +63,15 @@ class UpOptions:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class UpResult:
-    """How a run ended."""
+    """How a run ended.
+
+    Attributes:
+        plan: what the verdict is of; None for the plan that the run began with.
+    """
 
     exit_code: ExitCode
     verdict: Verdict
+    plan: Plan | None = None
 
 
 def own_machines(plan: Plan | Manifest, machine: str) -> frozenset[str]:

@@ -10,7 +10,7 @@ import asyncio
 import dataclasses
 import enum
 
-from lifecycle.errors import ExitCode, UsageError
+from lifecycle.errors import BringUpError, ExitCode, UsageError
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.states import ProcessState
 from lifecycle.supervisor.system import NodeRun, System
@@ -43,6 +43,10 @@ class Order:
     node: str = ""
     plan: Plan | None = None
     reload: bool = False
+
+
+class NotBegunError(BringUpError):
+    """An order that could not be begun: the system is as it was."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

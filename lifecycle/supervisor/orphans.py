@@ -17,6 +17,7 @@ import threading
 import time
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Protocol
 
 import psutil
 
@@ -28,6 +29,8 @@ GRACE_S = 3.0
 
 KILL_S = 5.0
 """How long the kernel may take to end a killed process, before it is reported."""
+
+_TASKS = Path("/proc/self/task")
 
 _ROUNDS = 3
 """How often what was started while others were ended is looked for."""
@@ -49,26 +52,41 @@ class _Orphan:
             signal.pidfd_send_signal(self.pidfd, number)
 
 
-def end_strays(zygote_pid: int, run_id: str, grace_s: float = 0.5) -> tuple[int, ...]:
-    """End everything that still belongs to this process's run, but for the zygote itself.
+class Family(Protocol):
+    """What knows the processes of a run by their descent, see zygote.Zygote."""
+
+    @property
+    def pid(self) -> int:
+        """The fork server."""
+
+    def family(self) -> frozenset[int]:
+        """Return the pids of all that was started, without the fork server itself."""
+
+
+def end_strays(run_id: str, zygote: Family | None = None, grace_s: float = 0.5) -> tuple[int, ...]:
+    """End everything that still belongs to a run, but for this process and the zygote itself.
 
     Args:
-        zygote_pid: it may have ended; then only the run's id finds what it left.
-        run_id: of this run.
+        run_id: of the run; empty for none.
+        zygote: what this process started them by; None if only the run's id tells.
         grace_s: seconds between SIGTERM and SIGKILL.
 
     Returns:
         The pids that had to be ended.
     """
     ended: list[int] = []
+    spared = {os.getpid()} if zygote is None else {os.getpid(), zygote.pid}
     # Again for what they started meanwhile.
     for _ in range(_ROUNDS):
-        strays = {*descendants(zygote_pid), *_carrying(run_id)} - {zygote_pid, os.getpid()}
-        found = _end(strays, grace_s)
+        strays = set(_carrying(run_id)) if run_id else set()
+        if zygote is not None:
+            strays |= zygote.family()
+        found = _end(strays - spared, grace_s)
         if not found:
             break
         ended += found
-    reap_adopted((zygote_pid,))
+    if zygote is not None:
+        reap_adopted((zygote.pid,))
     return tuple(sorted(ended))
 
 
@@ -81,10 +99,9 @@ def reap_adopted(spare: Iterable[int]) -> None:
         return
     try:
         spared = set(spare)
-        for child in psutil.Process().children():
-            if child.pid not in spared:
-                with contextlib.suppress(ChildProcessError):
-                    os.waitpid(child.pid, os.WNOHANG)
+        for pid in children() - spared:
+            with contextlib.suppress(ChildProcessError):
+                os.waitpid(pid, os.WNOHANG)
     finally:
         OWN_CHILD.release()
 
@@ -106,6 +123,17 @@ def end_run(record: RunRecord) -> tuple[tuple[int, ...], frozenset[str]]:
     # What they own now may be newer than the record.
     owned = segments_of(pids)
     return _end(pids, GRACE_S), recorded | owned
+
+
+def children() -> frozenset[int]:
+    """Return the pids of the children of this process, adopted ones included."""
+    try:
+        found = [each.read_text(encoding="ascii") for each in _TASKS.glob("*/children")]
+    except OSError:
+        found = []  # a thread that has just ended
+    if not found:  # or a kernel without CONFIG_PROC_CHILDREN
+        return frozenset(each.pid for each in psutil.Process().children())
+    return frozenset(int(pid) for text in found for pid in text.split())
 
 
 def descendants(pid: int) -> tuple[int, ...]:

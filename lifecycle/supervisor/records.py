@@ -13,9 +13,10 @@ from collections.abc import Iterator
 
 from lifecycle.middleware.shm import Creations, segments_of
 from lifecycle.supervisor.events import Emitter, Notice
-from lifecycle.supervisor.orphans import descendants
+from lifecycle.supervisor.orphans import Family
 from lifecycle.supervisor.rundir import ChildRecord, RunDirectory, start_ticks
 from lifecycle.supervisor.system import System
+from lifecycle.supervisor.together import Worker
 
 _AGAIN_S = 2.0
 """How often a record is tried that could not be written."""
@@ -29,14 +30,20 @@ class Records:
     """
 
     def __init__(
-        self, directory: RunDirectory, system: System, zygote_pid: int, emit: Emitter
+        self,
+        directory: RunDirectory,
+        system: System,
+        zygote: Family,
+        worker: Worker,
+        emit: Emitter,
     ) -> None:
+        self._worker = worker
         self._emit = emit
         self._again: asyncio.TimerHandle | None = None
         self._said = False
         self._directory = directory
         self._system = system
-        self._zygote_pid = zygote_pid
+        self._zygote = zygote
         self.segments: frozenset[str] = frozenset()
 
     def write(self) -> None:
@@ -68,7 +75,7 @@ class Records:
             self._again.cancel()
 
     def _write(self) -> None:
-        pids = {"zygote": self._zygote_pid}
+        pids = {"zygote": self._zygote.pid}
         pids.update({each.name: each.pid for each in self._system.living})
         self._directory.record(
             tuple(
@@ -81,15 +88,14 @@ class Records:
 
     async def note_segments(self) -> None:
         """Note the shared memory of our processes: one that is killed cannot remove its own."""
-        loop = asyncio.get_running_loop()
-        found = await loop.run_in_executor(None, self._owned)
+        found = await self._worker.run(self._owned)
         if not found <= self.segments:
             self.segments |= found
             self.write()
 
     def _owned(self) -> frozenset[str]:
         """Return what is owned now, also by what our processes started: `ros2 run` does."""
-        return segments_of((os.getpid(), *descendants(self._zygote_pid)))
+        return segments_of((os.getpid(), self._zygote.pid, *self._zygote.family()))
 
     async def note_each(self, created: asyncio.Event) -> None:
         """Note the shared memory of our processes each time that the event is set, for ever."""
@@ -101,13 +107,13 @@ class Records:
 
 @contextlib.contextmanager
 def noting(
-    directory: RunDirectory, system: System, zygote_pid: int, emit: Emitter
+    directory: RunDirectory, system: System, zygote: Family, worker: Worker, emit: Emitter
 ) -> Iterator[Records]:
     """Keep records that note shared memory once it is made: its owner may be killed at any time.
 
     Where the kernel does not announce it, it is noted when `note_segments` is called.
     """
-    records = Records(directory, system, zygote_pid, emit)
+    records = Records(directory, system, zygote, worker, emit)
     records.write()
     try:
         creations = Creations()

@@ -10,6 +10,8 @@ import asyncio
 from collections.abc import Callable, Coroutine, Iterable
 from typing import Any
 
+from lifecycle.errors import BringUpError
+from lifecycle.node.control import Operation
 from lifecycle.plan import Plan, PlanError, moving_nodes, restarted
 from lifecycle.supervisor.bring_up import BringUp
 from lifecycle.supervisor.events import Emitter, GateOpened, Notice, Reach, SystemReached
@@ -17,8 +19,17 @@ from lifecycle.supervisor.failure import START_FAILED, StepFailedError
 from lifecycle.supervisor.first_contact import TRIES, UNCHANGED_S, undiscovered
 from lifecycle.supervisor.gate import Gate, Permit, VerificationError, closes
 from lifecycle.supervisor.judge import Judge
-from lifecycle.supervisor.orders import ACTIVE, HELD, PAUSED, Order, OrderKind, node_of
+from lifecycle.supervisor.orders import (
+    ACTIVE,
+    HELD,
+    PAUSED,
+    NotBegunError,
+    Order,
+    OrderKind,
+    node_of,
+)
 from lifecycle.supervisor.shutdown import TakeDown
+from lifecycle.supervisor.spawn import Spawner
 from lifecycle.supervisor.states import ProcessState
 from lifecycle.supervisor.system import NodeRun, System
 from lifecycle.supervisor.together import together
@@ -40,6 +51,7 @@ class Regulator:
         vanishes: waits, bounded, until the graph shows no node of this name.
         replanned: told the names of nodes that the plan connects otherwise from now on.
         program: programs networks with the flows of a verdict within seconds, done when it returns.
+        spawner: must be able to start processes before any is ended to be started anew.
         timeout_s: for bringing up again what an order took down.
 
     Attributes:
@@ -61,9 +73,11 @@ class Regulator:
         vanishes: Callable[[str], Coroutine[Any, Any, None]],
         replanned: Callable[[Iterable[str]], None],
         program: Callable[[Verdict, float], Coroutine[Any, Any, None]],
+        spawner: Spawner,
         hurry: asyncio.Event,
         timeout_s: float,
     ) -> None:
+        self._spawner = spawner
         self._system = system
         self._bring_up = bring_up
         self._judge = judge
@@ -89,8 +103,10 @@ class Regulator:
         """Carry out one order that fits the phase.
 
         Raises:
-            VerificationError: the gate stays closed. In phase PAUSED or HELD the system stays as
-                it is and can be asked again; in any other the run is over.
+            NotBegunError: no process can be started now; the system is as it was.
+            VerificationError: the gate stays closed, or closed again before every node was sent its
+                request, and what had become active is inactive again. In phase PAUSED or HELD the
+                system stays as it is and can be asked again; in any other the run is over.
             StepFailedError: a step failed, or a network could not be programmed; the run is over.
         """
         if order.kind is OrderKind.PAUSE:
@@ -113,6 +129,13 @@ class Regulator:
         nodes = tuple(self._system.nodes.values())
         if order.node:
             nodes = self._with_process_of(node_of(order, self._system))
+        try:
+            await self._spawner.ready()
+        except BringUpError as error:
+            raise NotBegunError(
+                f"cannot restart {order.node or self._system.plan.system!r}: {error.message}; "
+                "everything stays as it is"
+            ) from error
         self._gate.close()
         self.phase = "restarting"
         await self._again(nodes, self._timeout_s, order.plan if order.reload else None)
@@ -273,12 +296,29 @@ class Regulator:
                 outcome=permit.verdict.verdict.value, nodes=tuple(each.name for each in waiting)
             )
         )
-        await self._alive(self._bring_up.activate(permit, deadline - loop.time(), waiting))
+        try:
+            await self._alive(self._bring_up.activate(permit, deadline - loop.time(), waiting))
+        except VerificationError:
+            await self._withdraw(permit, waiting)
+            self.phase = before
+            raise
         self._judge.ahead = frozenset()
         await self._alive(self._judge.until_clear(Stage.ACTIVE, deadline - loop.time()))
         # The same question as at the gate: what became active must be what was verified.
         self._gate.judge(self._judge.latest)
         self._reached(ACTIVE)
+
+    async def _withdraw(self, permit: Permit, waiting: Iterable[NodeRun]) -> None:
+        """Deactivate again what was activated since the gate opened: the rest may not follow."""
+        begun = tuple(each for each in waiting if each.name in permit.sent)
+        for each in waiting:
+            if each not in begun:
+                each.undo = [one for one in each.undo if one is not Operation.ACTIVATE]
+        if begun:
+            names = ", ".join(each.name for each in begun)
+            self._emit(Notice(message=f"the gate closed again: {names} is deactivated"))
+        await self._alive(self._bring_up.deactivate(begun))
+        self._judge.ahead = self._active()
 
     async def program(self, permit: Permit, timeout_s: float) -> None:
         """Program networks with the flows of the verdict that nodes are activated on.

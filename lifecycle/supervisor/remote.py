@@ -14,10 +14,11 @@ from lifecycle.plan.model import Plan
 from lifecycle.supervisor.networks import remove_programmed
 from lifecycle.supervisor.orphans import end_run
 from lifecycle.supervisor.rundir import RunDirectory, is_held, new_run_id, read_record
-from lifecycle.supervisor.server import Answer, Ask, Look, Question, ask
+from lifecycle.supervisor.server import Answer, Ask, Look, Question, ask, strange
 from lifecycle.supervisor.status import SystemStatus
 
 STATUS_S = 5.0
+_SOCKET = "control"
 
 
 def running(root: Path) -> tuple[str, ...]:
@@ -64,8 +65,10 @@ def status(path: Path) -> SystemStatus:
         TimeoutError: it does not answer.
     """
     answer = _asked(path, Question(ask=Ask.STATUS), STATUS_S)
-    if answer is None or answer.status is None:
+    if answer is None:
         raise _killed(path)
+    if answer.status is None:
+        raise strange(path / _SOCKET, "it has no status")
     return answer.status
 
 
@@ -77,8 +80,10 @@ def look(path: Path) -> Look:
         TimeoutError: it does not answer.
     """
     answer = _asked(path, Question(ask=Ask.LOOK), STATUS_S)
-    if answer is None or answer.look is None:
+    if answer is None:
         raise _killed(path)
+    if answer.look is None:
+        raise strange(path / _SOCKET, "it shows nothing")
     return answer.look
 
 
@@ -107,15 +112,17 @@ def order(path: Path, question: Question, timeout_s: float) -> Answer:
         TimeoutError: it is not done after `timeout_s`; it goes on all the same.
     """
     answer = _asked(path, question, timeout_s)
-    if answer is None or answer.exit_code is None:
+    if answer is None:
         raise _killed(path)
+    if answer.exit_code is None:
+        raise strange(path / _SOCKET, "it has no exit code")
     return answer
 
 
 def _asked(path: Path, question: Question, timeout_s: float) -> Answer | None:
     """Return the answer of a supervisor; None if it is not there any more."""
     try:
-        return ask(path / "control", question, timeout_s)
+        return ask(path / _SOCKET, question, timeout_s)
     except (FileNotFoundError, ConnectionError):
         return None
 
@@ -135,10 +142,13 @@ def down(path: Path, timeout_s: float) -> ExitCode:
 
     Raises:
         TimeoutError: it still runs after `timeout_s`.
+        UsageError: what answers is no supervisor of this version.
         ProgrammingError: nothing runs, but something of it could not be removed from a network.
     """
     deadline = time.monotonic() + timeout_s
     answer = _asked(path, Question(ask=Ask.DOWN), timeout_s)
+    if answer is not None and answer.exit_code is None:
+        raise strange(path / _SOCKET, "it has no exit code")
     if answer is not None and _released(path, deadline):
         return ExitCode.OK
     directory = RunDirectory.acquire(path.parent, path.name, new_run_id())

@@ -11,12 +11,12 @@ import contextlib
 import dataclasses
 import os
 import traceback
-from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
+from collections.abc import Awaitable, Callable, Collection, Iterable, Iterator, Mapping
 
 from lifecycle.errors import ExitCode, LifecycleError
 from lifecycle.manifest.model import Authority, DataLayerSource, EndpointPolicy, RunKind
 from lifecycle.middleware.doors import discovery_peers, peers_environment
-from lifecycle.middleware.process import adopt_orphans, exit_after
+from lifecycle.middleware.process import adopt_orphans, check_threads, exit_after
 from lifecycle.middleware.profiles import discovery_environment
 from lifecycle.middleware.shm import sweep
 from lifecycle.plan import moved_observer
@@ -49,12 +49,18 @@ from lifecycle.supervisor.rundir import (
 from lifecycle.supervisor.session import Session
 from lifecycle.supervisor.status import SystemStatus
 from lifecycle.supervisor.system import System
+from lifecycle.supervisor.together import Worker
 from lifecycle.supervisor.zygote import Zygote, ZygoteProcess
 from lifecycle.verify.verdict import NOT_JUDGED
 
 LEAVE_S = 10.0
-"""A participant leaves within 0.2 s, over connections that nobody answers within 4 s."""
+"""A participant leaves within 0.2 s, over connections that nobody answers within 4 s.
 
+Where it is made, Fast DDS may wait for ever for threads that it cannot have."""
+
+
+THREADS = 24
+"""A supervisor has up to 16, most of them its participant's."""
 
 OBSERVER_TRIES = 4
 
@@ -197,7 +203,6 @@ def _up(
         # Servers may be asked to remove what dead runs left: that must not outlast a signal.
         with ending.raised() if options.program else contextlib.nullcontext():
             networks = open_networks(plan, options, directory, emit, environment=os.environ)
-        adopt_orphans()
         _enter_graph(plan, options, directory)
 
         async def run(leaving: contextlib.AsyncExitStack) -> UpResult:
@@ -210,8 +215,9 @@ def _up(
                 processes=processes,
                 variables=_graph_variables(os.environ),
             )
-            zygote = Zygote(forerunner.process)
-            records = leaving.enter_context(noting(directory, system, zygote.pid, emit))
+            zygote = Zygote(forerunner.process, emit)
+            worker = leaving.enter_context(contextlib.closing(Worker("lifecycle")))
+            records = leaving.enter_context(noting(directory, system, zygote, worker, emit))
             try:
                 # Before any participant: who asks a server that is not there waits to ask again.
                 with ending.raised():
@@ -230,6 +236,7 @@ def _up(
                     networks=networks,
                     emit=emit,
                     ending=ending,
+                    worker=worker,
                 )
                 leaving.push_async_callback(session.leave)
                 if on_start is not None:
@@ -270,9 +277,8 @@ async def _leaving_last(
         exit_code = result.exit_code
         return result
     finally:
-        live_on = exit_after(LEAVE_S, exit_code)
-        await leaving.aclose()
-        live_on()
+        with _ends_within(LEAVE_S, exit_code):
+            await leaving.aclose()
 
 
 def _sweep(records: Records | None, emit: Emitter | None = None) -> None:
@@ -280,6 +286,16 @@ def _sweep(records: Records | None, emit: Emitter | None = None) -> None:
     swept = sweep(records.segments) if records else ()
     if swept and emit:
         emit(Notice(message=f"removed shared memory left in /dev/shm: {', '.join(swept)}"))
+
+
+@contextlib.contextmanager
+def _ends_within(seconds: float, code: int) -> Iterator[None]:
+    """End this process with `code` if what is done inside takes longer: Fast DDS can hang."""
+    live_on = exit_after(seconds, code)
+    try:
+        yield
+    finally:
+        live_on()
 
 
 def _serves(plan: Plan, options: UpOptions) -> bool:
@@ -297,12 +313,13 @@ def _eyes(plan: Plan, options: UpOptions, emit: Emitter) -> Eyes:
     wires = layer.authority is Authority.SUPERVISOR
     planned = connections = observer_connections(plan, options.machine)
     for number in range(OBSERVER_TRIES):
-        eyes = Eyes.open(
-            plan.domain_id,
-            connections,
-            guests=wires and dynamic and plan.policy.undeclared_nodes is EndpointPolicy.OPEN,
-            events=wires and (dynamic or layer.events),
-        )
+        with _ends_within(options.timeout_s + LEAVE_S, ExitCode.BRING_UP_FAILED):
+            eyes = Eyes.open(
+                plan.domain_id,
+                connections,
+                guests=wires and dynamic and plan.policy.undeclared_nodes is EndpointPolicy.OPEN,
+                events=wires and (dynamic or layer.events),
+            )
         if number + 1 == OBSERVER_TRIES or eyes.reaches_servers():
             break
         eyes.prepare_to_leave()
@@ -339,7 +356,14 @@ _GRAPH_VARIABLES = (
 
 
 def _enter_graph(plan: Plan, options: UpOptions, directory: RunDirectory) -> None:
-    """Place this process where the plan's nodes will be, and have participants found quickly."""
+    """Place this process where the plan's nodes will be, and have participants found quickly.
+
+    Raises:
+        MiddlewareError: it cannot have the threads of a participant. Fast DDS would end the process
+            then, or wait for ever.
+    """
+    adopt_orphans()
+    check_threads(THREADS)
     os.environ["ROS_DOMAIN_ID"] = str(plan.domain_id)
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = plan.discovery_range.name
     hosts = reached_hosts(plan, own_machines(plan, options.machine))

@@ -29,8 +29,14 @@ RUN_VARIABLE = "LIFECYCLE_RUN"
 
 _OURS = os.O_CLOEXEC | os.O_NOFOLLOW
 
+_LONGEST_RECORD = 16 * 2**20
+"""Bytes; a record names processes and shared memory, a few kB."""
+
 LEDGER_NAME = "programmed.json"
 """File in a run directory that lists what is ours in networks, see programming/ledger.py."""
+
+LEDGER_LOCK_NAME = "programmed.lock"
+"""File beside it, locked by whoever changes it."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -147,6 +153,7 @@ class RunDirectory:
         try:
             directory._take()
             directory.previous = read_record(directory.path)
+            directory.socket_path.unlink(missing_ok=True)
             directory.record(())
         except BlockingIOError:
             record = read_record(directory.path)
@@ -178,6 +185,7 @@ class RunDirectory:
         while True:
             _private_directory(self.path.parent)
             _private_directory(self.path)
+            _refuse_unless_run(self.path)
             try:
                 lock = os.open(path, os.O_RDWR | os.O_CREAT | _OURS, 0o600)
             except FileNotFoundError:
@@ -246,8 +254,13 @@ class RunDirectory:
 def read_record(path: Path) -> RunRecord | None:
     """Return the record in a run directory; None if there is none that can be read."""
     try:
-        return from_json((path / "record.json").read_bytes(), RunRecord)
-    except (FileNotFoundError, NotADirectoryError, ValueError):
+        # Not blocking: of a pipe in its place nobody might write the other end.
+        record = os.open(path / "record.json", os.O_RDONLY | os.O_NONBLOCK | _OURS)
+        with os.fdopen(record, "rb") as file:
+            if not stat.S_ISREG(os.fstat(record).st_mode):
+                return None
+            return from_json(file.read(_LONGEST_RECORD + 1), RunRecord, longest=_LONGEST_RECORD)
+    except (OSError, ValueError):
         return None
 
 
@@ -276,16 +289,18 @@ def short_path(path: Path) -> Iterator[str]:
         os.close(descriptor)
 
 
-def connect(path: Path) -> socket.socket:
-    """Connect to a control socket.
+def connect(path: Path, timeout_s: float) -> socket.socket:
+    """Connect to a control socket, with that limit for whatever is done on it.
 
     Raises:
+        TimeoutError: whoever listens there takes nobody.
         ConnectionRefusedError: nobody listens there any more.
         FileNotFoundError: nobody ever did.
     """
     sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         with short_path(path) as name:
+            sock.settimeout(timeout_s)
             sock.connect(name)
     except OSError:
         sock.close()
@@ -320,6 +335,22 @@ def _refuse_unless_private(path: Path) -> None:
         what = "others can write it"
     if what:
         raise _unusable(path, what)
+
+
+def _refuse_unless_run(path: Path) -> None:
+    """Insist that a directory is a run's, or empty: at the end all that is in it is removed.
+
+    Raises:
+        UsageError: it holds something else.
+    """
+    try:
+        names = {each.name for each in path.iterdir()}
+    except FileNotFoundError:
+        return  # just removed by the run that had it
+    # A run that ends removes its lock last, and leaves what is programmed still.
+    marks = ("lock", LEDGER_NAME, LEDGER_LOCK_NAME)
+    if names and names.isdisjoint(marks) and read_record(path) is None:
+        raise _unusable(path, f"it holds {min(names)!r}, and was no run's")
 
 
 def _refuse_unsafe_parents(root: Path) -> None:

@@ -10,6 +10,7 @@ import contextlib
 import dataclasses
 import enum
 import socket
+import time
 from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 
@@ -27,6 +28,11 @@ _CLOSE_S = 1.0
 """In the end, a client that reads nothing for so long loses what it was not sent."""
 _LARGEST_QUESTION = 64 * 2**20
 """Bytes of a line; a question may hold a whole plan."""
+_LARGEST_ANSWER = 64 * 2**20
+"""Bytes of a line; a look holds a whole plan and all that was seen."""
+_ANSWER_S = 10.0
+"""For the rest of an answer that has begun."""
+_READ = 2**18
 _ORDERS = {each.value: each for each in OrderKind}
 
 
@@ -234,15 +240,14 @@ def ask(path: Path, question: Question, timeout_s: float) -> Answer | None:
         Its answer; None if it ended without one.
 
     Raises:
-        TimeoutError: no answer within `timeout_s`.
+        TimeoutError: no whole answer within `timeout_s`.
+        UsageError: what answers is no supervisor of this version.
         OSError: nobody listens there.
     """
-    with connect(path) as sock:
-        sock.settimeout(timeout_s)
+    deadline = time.monotonic() + timeout_s
+    with connect(path, timeout_s) as sock:
         sock.sendall(to_json(question) + b"\n")
-        with sock.makefile("rb") as stream:
-            line = stream.readline()
-    return from_json(line, Answer) if line else None
+        return _answer(path, sock, bytearray(), deadline)
 
 
 def follow(path: Path) -> Iterator[Look]:
@@ -251,12 +256,56 @@ def follow(path: Path) -> Iterator[Look]:
     It ends with the supervisor.
 
     Raises:
+        TimeoutError: an answer was begun, and does not end.
+        UsageError: what answers is no supervisor of this version.
         OSError: nobody listens there.
     """
-    with connect(path) as sock:
+    with connect(path, _ANSWER_S) as sock:
         sock.sendall(to_json(Question(ask=Ask.FOLLOW)) + b"\n")
-        with sock.makefile("rb") as stream:
-            for line in stream:
-                look = from_json(line, Answer).look
-                if look is not None:
-                    yield look
+        rest = bytearray()
+        while (answer := _answer(path, sock, rest, None)) is not None:
+            if answer.look is not None:
+                yield answer.look
+
+
+def _answer(
+    path: Path, sock: socket.socket, rest: bytearray, deadline_s: float | None
+) -> Answer | None:
+    """Read one answer, bounded in time and size; None if there is none any more.
+
+    Args:
+        path: of the socket.
+        sock: connected to it.
+        rest: what was read beyond the answer before.
+        deadline_s: monotonic; None to wait for ever until one begins, and not long for its end.
+    """
+    searched = 0
+    while (end := rest.find(b"\n", searched)) < 0:
+        searched = len(rest)
+        if searched > _LARGEST_ANSWER:
+            raise strange(path, f"{searched} bytes without an end")
+        left_s = None if deadline_s is None else deadline_s - time.monotonic()
+        if left_s is not None and left_s <= 0:
+            raise TimeoutError
+        sock.settimeout(left_s)
+        data = sock.recv(_READ)
+        if not data:
+            return None
+        if deadline_s is None:
+            deadline_s = time.monotonic() + _ANSWER_S
+        rest += data
+    line = bytes(rest[:end])
+    del rest[: end + 1]
+    try:
+        return from_json(line, Answer)
+    except ValueError as error:
+        raise strange(path, str(error)) from error
+
+
+def strange(path: Path, why: str) -> UsageError:
+    """Return the error that an answer is which no supervisor of this version gives."""
+    return UsageError(
+        f"cannot understand the answer of {path.parent.name!r}: {why}",
+        hint="use the version of lifecycle that started it, or end the process that listens at "
+        f"{path}",
+    )

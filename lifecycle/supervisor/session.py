@@ -50,7 +50,7 @@ from lifecycle.supervisor.sightings import Sightings
 from lifecycle.supervisor.stale import StaleNodes
 from lifecycle.supervisor.status import SystemStatus, system_status
 from lifecycle.supervisor.system import System
-from lifecycle.supervisor.together import ended
+from lifecycle.supervisor.together import Worker, ended
 from lifecycle.supervisor.vigil import Vigil
 from lifecycle.supervisor.wiring import authority_of
 from lifecycle.supervisor.zygote import Zygote
@@ -102,6 +102,7 @@ class Session:
         networks: programmed while the system is active.
         emit: where events go.
         ending: knows of signals that came before.
+        worker: for what blocks.
     """
 
     def __init__(
@@ -116,7 +117,9 @@ class Session:
         networks: Networks,
         emit: Emitter,
         ending: Ending,
+        worker: Worker,
     ) -> None:
+        self._worker = worker
         self._system = system
         self._options = options
         self._directory = directory
@@ -174,6 +177,7 @@ class Session:
             vanishes=sightings.vanishes,
             replanned=self._replanned,
             program=networks.begin,
+            spawner=zygote,
             hurry=self._hurry,
             timeout_s=options.timeout_s,
         )
@@ -293,7 +297,7 @@ class Session:
             trusted=self._trusted,
         )
         verdict = dataclasses.replace(end.verdict or self._judge.latest or NOT_JUDGED, run=run)
-        return UpResult(exit_code=end.exit_code, verdict=verdict)
+        return UpResult(exit_code=end.exit_code, verdict=verdict, plan=self._system.first)
 
     def _cut_short(self, exit_code: ExitCode) -> _End:
         """Return what a run comes to that is asked to end.
@@ -442,10 +446,7 @@ class Session:
             # After the last message has left, and before what runs below us is ended.
             await self._networks.close(self._hurry)
             await discovery_server.end(self._system, self._hurry)
-        loop = asyncio.get_running_loop()
-        left = await loop.run_in_executor(
-            None, end_strays, self._zygote.pid, self._directory.run_id
-        )
+        left = await self._worker.run(end_strays, self._directory.run_id, self._zygote)
         if left:
             self._emit(Notice(message=f"ended processes that were left behind: {_listed(left)}"))
         self._system.logs.tell_lost()
@@ -460,7 +461,7 @@ class Session:
         ends = self._ending.numbers
         for number in ends:
             loop.add_signal_handler(number, self._ended_by, number)
-        loop.add_signal_handler(signal.SIGCHLD, lambda: reap_adopted((self._zygote.pid,)))
+        loop.add_signal_handler(signal.SIGCHLD, self._child_changed)
         if self._ending.number is not None:
             self._ended_by(self._ending.number)
         try:
@@ -469,6 +470,10 @@ class Session:
             for number in (*ends, signal.SIGCHLD):
                 loop.remove_signal_handler(number)
             self._ending.resume()
+
+    def _child_changed(self) -> None:
+        self._zygote.note_stops()
+        reap_adopted(self._zygote.waited_for)
 
     def _ended_by(self, number: int) -> None:
         self.stop(*ENDED_BY[number])
@@ -491,7 +496,7 @@ def _hurried(result: UpResult) -> UpResult:
     reason = f"{run.reason}; interrupted while it was taken down"
     run = dataclasses.replace(run, reason=reason, exit_code=ExitCode.INTERRUPTED)
     verdict = dataclasses.replace(result.verdict, run=run)
-    return UpResult(exit_code=ExitCode.INTERRUPTED, verdict=verdict)
+    return dataclasses.replace(result, exit_code=ExitCode.INTERRUPTED, verdict=verdict)
 
 
 def _listed(pids: tuple[int, ...]) -> str:

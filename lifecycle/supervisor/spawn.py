@@ -62,6 +62,13 @@ class Child(Protocol):
 class Spawner(Protocol):
     """Starts processes."""
 
+    async def ready(self) -> None:
+        """Wait, bounded, until processes can be started.
+
+        Raises:
+            BringUpError: they cannot.
+        """
+
     async def spawn(self, request: SpawnRequest) -> Child:
         """Start one process.
 

@@ -1,13 +1,19 @@
 """Running things side by side so that the first failure ends them all.
 
-Owns: `together`, what asyncio.TaskGroup does, which Python 3.10 does not have, and `ended`. Pure.
+Owns: `together`, what asyncio.TaskGroup does, which Python 3.10 does not have, `ended`, and
+`Worker`, a thread for what blocks. Pure.
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Coroutine, Iterable
-from typing import Any
+from collections.abc import Callable, Coroutine, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, TypeVar
+
+from lifecycle.errors import BringUpError
+
+T = TypeVar("T")
 
 _AGAIN_S = 1.0
 """Far longer than any task takes to notice that it was cancelled."""
@@ -44,3 +50,33 @@ async def together(coroutines: Iterable[Coroutine[Any, Any, None]]) -> None:
     for task in tasks:
         if task in done and not task.cancelled() and (error := task.exception()) is not None:
             raise error
+
+
+class Worker:
+    """A thread for what blocks, one thing after the other.
+
+    It is started at once: a system that has reached its limit of processes and threads must still
+    be taken down (asyncio's own executor starts a thread when it is used, and one to end).
+
+    Raises:
+        BringUpError: no thread can be started.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._executor = ThreadPoolExecutor(1, thread_name_prefix=name)
+        try:
+            self._executor.submit(int)
+        except RuntimeError as error:
+            raise BringUpError(
+                "cannot start a thread: the limit of processes and threads is reached",
+                hint="raise it (ulimit -u, TasksMax= or pids.max), or end other processes",
+            ) from error
+
+    async def run(self, work: Callable[..., T], *arguments: object) -> T:
+        """Do `work` in the thread, and return what it returns."""
+        loop = asyncio.get_running_loop()
+        return await loop.run_in_executor(self._executor, work, *arguments)
+
+    def close(self) -> None:
+        """Finish what is under way, and end the thread."""
+        self._executor.shutdown()

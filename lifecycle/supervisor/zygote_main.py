@@ -1,11 +1,12 @@
 """The zygote's own process: forks the processes of a system, and guards them.
 
-Owns: what runs in `python -m lifecycle.supervisor.zygote_main SOCKET_FD [--preload]`. It stays
+Owns: what runs in `python -m lifecycle.supervisor.zygote_main SOCKET_FD [--preload]
+[--again]`. It stays
 single-threaded and never calls rclpy.init, so that forking is safe and every child is a
 participant of its own; with `--preload` a forked host skips ~130 ms of imports. Each child leads a
 session of its own. It adopts what its children leave behind (PR_SET_CHILD_SUBREAPER), so as long as
 it lives, what descends from it is what the run started. If the supervisor vanishes the zygote ends
-what is left of its children, bounded.
+what is left of its children, bounded, and of those of a zygote before it that was killed.
 """
 
 from __future__ import annotations
@@ -24,10 +25,11 @@ import warnings
 from typing import NoReturn
 
 from lifecycle.codec import from_json, to_json
-from lifecycle.middleware.process import adopt_orphans, die_with_parent
+from lifecycle.middleware.process import adopt_orphans
 from lifecycle.supervisor.zygote_protocol import (
     LARGEST_MESSAGE,
     MSG_CMSG_CLOEXEC,
+    SERVES,
     ForkRequest,
     Report,
 )
@@ -42,8 +44,9 @@ _PIPE_BYTES = 65536
 
 
 class _Zygote:
-    def __init__(self, sock: socket.socket) -> None:
+    def __init__(self, sock: socket.socket, *, again: bool) -> None:
         self._sock = sock
+        self._again = again
         self._selector = selectors.DefaultSelector()
         self._selector.register(sock, selectors.EVENT_READ, None)
         self._children: dict[int, tuple[int, int]] = {}  # pid → (request id, pidfd)
@@ -77,6 +80,9 @@ class _Zygote:
         if not data:
             return False
         request = from_json(data, ForkRequest)
+        if request == SERVES:
+            self._tell(Report(id=request.id))
+            return True
         try:
             with warnings.catch_warnings():
                 # Python 3.12 warns of any other thread. Those here belong to the libraries that
@@ -146,6 +152,11 @@ class _Zygote:
         self._signal(signal.SIGKILL)
         for pid in tuple(self._children):
             self._reap(pid)
+        if self._again:
+            from lifecycle.supervisor.orphans import end_strays
+            from lifecycle.supervisor.rundir import RUN_VARIABLE
+
+            end_strays(os.environ.get(RUN_VARIABLE, ""))
 
     def _signal(self, number: int) -> None:
         for pid in self._children:
@@ -202,8 +213,8 @@ def _take_streams(stdout: int, stderr: int) -> None:
 def _run(argv: tuple[str, ...], control: int | None) -> int:
     """Serve as our host, or become another program.
 
-    A host ends by itself when its control channel does; a command has none, so it is told by
-    the kernel if its parent, the zygote, is gone.
+    A host ends by itself when its control channel does. A command has none: it outlives a zygote
+    that is killed, as hosts do, and is ended by the supervisor, the next zygote or the next `up`.
     """
     if not argv:
         assert control is not None
@@ -214,8 +225,6 @@ def _run(argv: tuple[str, ...], control: int | None) -> int:
     if control is not None:
         os.set_inheritable(control, True)
         argv = tuple(word.replace("{control}", str(control)) for word in argv)
-    else:
-        die_with_parent(signal.SIGTERM)
     for number in (signal.SIGPIPE, signal.SIGXFSZ):  # which Python ignores, and exec would hand on
         signal.signal(number, signal.SIG_DFL)
     try:
@@ -237,6 +246,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m lifecycle.supervisor.zygote_main")
     parser.add_argument("socket_fd", type=int)
     parser.add_argument("--preload", action="store_true")
+    parser.add_argument("--again", action="store_true", help="another one before it was killed")
     options = parser.parse_args()
     # Ctrl-C is the supervisor's to handle, and its end is what ends us.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -249,7 +259,7 @@ def main() -> int:
         # Keep the shared pages shared: a child's first collection would touch them all.
         gc.collect()
         gc.freeze()
-    _Zygote(socket.socket(fileno=options.socket_fd)).serve()
+    _Zygote(socket.socket(fileno=options.socket_fd), again=options.again).serve()
     return 0
 
 

@@ -17,13 +17,21 @@ MSG_CMSG_CLOEXEC = 0x40000000
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class ForkRequest:
-    """Supervisor → zygote, with descriptors stdout, stderr and, if `control`, the channel."""
+    """Supervisor → zygote, with descriptors stdout, stderr and, if `control`, the channel.
+
+    Attributes:
+        id: ≥ 1; 0 only asks whether the zygote serves, which answers with the same id.
+    """
 
     id: int
     argv: tuple[str, ...]
     environment: tuple[tuple[str, str], ...]
     working_directory: str
     control: bool
+
+
+SERVES = ForkRequest(id=0, argv=(), environment=(), working_directory="", control=False)
+"""Forks nothing, see ForkRequest.id."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import time
 from collections.abc import Callable, Coroutine, Iterator, Sequence
 from typing import Any, Protocol, TypeVar
@@ -15,7 +16,7 @@ from typing import Any, Protocol, TypeVar
 from lifecycle.errors import LifecycleError
 from lifecycle.graph.waiting import set_within
 from lifecycle.supervisor.programming.changes import Changes
-from lifecycle.supervisor.together import ended
+from lifecycle.supervisor.together import Worker, ended
 from lifecycle.verify.verdict import FlowReport
 
 _T = TypeVar("_T")
@@ -71,9 +72,13 @@ class Keeper:
     Args:
         programmer: see Programs.
         tell: takes what was done and what failed, as text for people; called from the loop.
+        worker: the thread; None makes one.
     """
 
-    def __init__(self, programmer: Programs, tell: Callable[[str], None]) -> None:
+    def __init__(
+        self, programmer: Programs, tell: Callable[[str], None], worker: Worker | None = None
+    ) -> None:
+        self._worker = worker or Worker("networks")
         self._programmer = programmer
         self._tell = tell
         self._flows: tuple[FlowReport, ...] | None = None
@@ -114,7 +119,7 @@ class Keeper:
         try:
             await self._stop()
         finally:
-            await remove(self._programmer, self._tell, hurry)
+            await remove(self._programmer, self._tell, hurry, self._worker)
 
     async def _stop(self) -> None:
         """Follow no verdicts until `take`."""
@@ -145,7 +150,7 @@ class Keeper:
             loop.call_soon_threadsafe(self._tell, text)
 
         async with self._one_at_a_time:
-            return await self._whole(asyncio.to_thread(self._once, within_s, say))
+            return await self._whole(self._worker.run(self._once, within_s, say))
 
     def _once(self, within_s: float | None, say: Callable[[str], None]) -> float | None:
         assert self._flows is not None
@@ -177,7 +182,10 @@ class Keeper:
 
 
 async def remove(
-    removes: Removes, tell: Callable[[str], None], hurry: asyncio.Event | None = None
+    removes: Removes,
+    tell: Callable[[str], None],
+    hurry: asyncio.Event | None,
+    worker: Worker,
 ) -> None:
     """Remove everything of one run, in a thread and within CLOSE_S for all servers together.
 
@@ -185,11 +193,14 @@ async def remove(
         removes: see Removes.
         tell: takes what was done or failed, as text for people.
         hurry: once set, no server is waited for any more.
+        worker: the thread.
     """
     hurry = hurry or asyncio.Event()
     is_late = hurry.is_set()
     within_s = _HURRIED_S if is_late else CLOSE_S
-    removing = asyncio.ensure_future(asyncio.to_thread(removes.close, within_s=within_s))
+    removing = asyncio.ensure_future(
+        worker.run(functools.partial(removes.close, within_s=within_s))
+    )
     if not is_late:
         hurried = asyncio.ensure_future(hurry.wait())
         await asyncio.wait({removing, hurried}, return_when=asyncio.FIRST_COMPLETED)

@@ -21,10 +21,16 @@ from pathlib import Path
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import LifecycleError, UsageError
 from lifecycle.supervisor.programming.errors import ProgrammingError
-from lifecycle.supervisor.rundir import LEDGER_NAME, ChildRecord, boot_id, start_ticks
+from lifecycle.supervisor.rundir import (
+    LEDGER_LOCK_NAME,
+    LEDGER_NAME,
+    ChildRecord,
+    boot_id,
+    start_ticks,
+)
 
 FILE_NAME = LEDGER_NAME
-LOCK_NAME = "programmed.lock"
+LOCK_NAME = LEDGER_LOCK_NAME
 
 _LOCK_S = 30.0
 """How long another process may keep the ledger: it talks to servers meanwhile."""

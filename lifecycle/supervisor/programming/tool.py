@@ -98,6 +98,8 @@ class HostTool:
             raise ProgrammingError(
                 f"cannot finish {shlex.join(argv)!r}: it still ran after {_TIMEOUT_S:g} s"
             ) from error
+        except OSError as error:
+            raise ProgrammingError(f"cannot run {shlex.join(argv)!r}: {error.strerror}") from error
         return Output(returncode=done.returncode, stdout=done.stdout, stderr=done.stderr)
 
 

@@ -5,6 +5,7 @@ The environment variable of the process, MISBEHAVE=step:way, names the callback 
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import os
 import signal
@@ -14,9 +15,11 @@ import threading
 import time
 from pathlib import Path
 
+from rclpy.node import Node
 from std_msgs.msg import String
 
 from lifecycle import LifecycleNode, on_message
+from lifecycle.errors import LifecycleError
 
 
 def misbehave(step: str) -> None:
@@ -115,3 +118,29 @@ class Stubborn(Talker):
     def __init__(self) -> None:
         super().__init__()
         self.declare_parameter("rate", 99.0)
+
+
+class Eager(Talker):
+    """Once it is connected its own code activates it: from a timer and from a thread."""
+
+    def on_connect(self, state):
+        # rclpy's own: those of the node are gated as its data are.
+        self._own_timer = Node.create_timer(self, 0.05, self._from_timer)
+        threading.Thread(target=self._from_thread, daemon=True).start()
+
+    async def _from_timer(self) -> None:
+        if self.lifecycle.state.connected:
+            Node.destroy_timer(self, self._own_timer)
+            await self._activate("timer")
+
+    def _from_thread(self) -> None:
+        end = time.monotonic() + 10.0
+        while not self.lifecycle.state.connected and time.monotonic() < end:
+            time.sleep(0.02)
+        asyncio.run(self._activate("thread"))
+
+    async def _activate(self, whence: str) -> None:
+        try:
+            await self.lifecycle.change("activate")
+        except LifecycleError as refused:
+            print(f"{whence}: {refused}", flush=True)

@@ -5,8 +5,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import gc
+import json
+import os
+import subprocess
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -16,7 +20,7 @@ from std_msgs.msg import String
 
 from lifecycle.errors import ExitCode
 from lifecycle.middleware import GraphObserver, NodeClients
-from tests.ros.supervisor.running import Up, pair, up, verb
+from tests.ros.supervisor.running import BOUND_S, ROOT, Up, command, environment, pair, up, verb
 
 _ELSEWHERE = str(Path(__file__).with_name("managed_elsewhere.py"))
 _LIMITS = {"start_s": 8, "configure_s": 8, "connect_s": 8, "activate_s": 8, "silent_s": 8}
@@ -68,26 +72,57 @@ def test_a_paused_system_stays_inactive_whoever_activates_its_nodes(
         assert run.finish() == ExitCode.OK
 
 
+def test_a_node_whose_own_code_activates_it_is_refused_while_the_gate_is_closed(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    edit = {"nodes/talker/run/python": "tests.ros.supervisor.systems:Eager"}
+    options = ("--until", "verified", "--stop-after", "60")
+    with up(pair(tmp_path, fresh_domain, edit=edit), *options, runtime=tmp_path) as run:
+        run.until("system", reached="verified")
+        for whence in ("timer", "thread"):
+            run.met(
+                "log",
+                line=f"{whence}: cannot activate /talker: the gate of its supervisor is closed; "
+                "it is activated once 'pair' is verified; a paused system: lifecycle resume pair",
+            )
+        status = json.loads(verb("status", "pair", "--format", "json", runtime=tmp_path).stdout)
+        assert {each["state"] for each in status["nodes"]} == {"inactive"}
+        assert verb("down", "pair", runtime=tmp_path).returncode == ExitCode.OK
+        run.finish()
+        assert "active" not in {each["state"] for each in run.of_kind("node")}
+        run.assert_nothing_left()
+
+
+class Publishers:
+    """Publishers that nobody declared."""
+
+    def __init__(self) -> None:
+        self._all = contextlib.ExitStack()
+
+    def __call__(self, domain_id: int) -> Node:
+        context = rclpy.Context()
+        context.init(args=[], domain_id=domain_id)
+        self._all.callback(gc.collect)
+        self._all.callback(context.destroy)
+        self._all.callback(context.try_shutdown)
+        node = Node("intruder", context=context, enable_rosout=False)
+        self._all.callback(node.destroy_node)
+        node.create_publisher(String, "chatter", 10)
+        return node
+
+    def leave(self) -> None:
+        self._all.close()
+
+
 @pytest.fixture
-def make_publisher() -> Iterator[object]:
-    """A publisher that nobody declared."""
-    with contextlib.ExitStack() as whole:
-
-        def make(domain_id: int) -> None:
-            context = rclpy.Context()
-            context.init(args=[], domain_id=domain_id)
-            whole.callback(gc.collect)
-            whole.callback(context.destroy)
-            whole.callback(context.try_shutdown)
-            node = Node("intruder", context=context, enable_rosout=False)
-            whole.callback(node.destroy_node)
-            node.create_publisher(String, "chatter", 10)
-
-        yield make
+def make_publisher() -> Iterator[Publishers]:
+    publishers = Publishers()
+    yield publishers
+    publishers.leave()
 
 
 def test_who_appears_while_a_chain_is_activated_keeps_its_last_node_inactive(
-    tmp_path: Path, fresh_domain: int, make_publisher
+    tmp_path: Path, fresh_domain: int, make_publisher: Publishers
 ) -> None:
     """The last one would be activated on a verdict that is seconds old."""
     edit = {
@@ -107,3 +142,111 @@ def test_who_appears_while_a_chain_is_activated_keeps_its_last_node_inactive(
         assert reason.startswith("the system changed before every node was activated; ")
         assert "/intruder (graph.undeclared-node)" in reason
         run.assert_nothing_left()
+
+
+def test_who_appears_while_a_network_is_programmed_keeps_every_node_inactive(
+    tmp_path: Path, fresh_domain: int, make_publisher: Publishers
+) -> None:
+    """Programming takes seconds: the verdict that it was begun on is none of now."""
+    begun, go = tmp_path / "begun", tmp_path / "go"
+    tool = tmp_path / "nft"
+    tool.write_text(
+        f"#!/bin/sh\ntouch {begun}\nfor each in $(seq 200); do\n"
+        f"  test -e {go} && break; sleep 0.05\ndone\n"
+        "echo 'Error: No such file or directory' >&2; exit 1\n"
+    )
+    tool.chmod(0o755)
+    variables = {"PATH": f"{tmp_path}:{os.environ['PATH']}"}
+    manifest = pair(tmp_path, fresh_domain)
+    run = Up(manifest, "--program", "nft", runtime=tmp_path, variables=variables)
+    try:
+        run.until("system", reached="verified")
+        until(begun.exists)
+        assert run.of_kind("verdict")[-1]["verdict"]["verdict"] == "ok"
+        node = make_publisher(fresh_domain)
+        # They have found each other both ways, or are about to.
+        until(lambda: node.count_subscribers("chatter") == 1)
+        until(lambda: any("lifecycle_observer" in each for each in node.get_node_names()))
+        time.sleep(0.3)
+        go.touch()
+        assert run.finish() == ExitCode.VIOLATED
+        assert activated(run) == []
+        assert run.of_kind("gate") == []
+        assert "active" not in {each["state"] for each in run.of_kind("node")}
+        reason = run.verdict["run"]["reason"]
+        assert reason.startswith("the system changed before every node was activated; ")
+        assert "/intruder (graph.undeclared-node)" in reason
+        run.assert_nothing_left()
+    finally:
+        run.close()
+
+
+@pytest.mark.parametrize("order", ["resume", "restart"])
+def test_who_appears_while_a_system_is_activated_again_has_it_held_and_not_ended(
+    tmp_path: Path, fresh_domain: int, make_publisher: Publishers, order: str
+) -> None:
+    go = tmp_path / "go"
+    go.touch()
+    edit = {
+        "nodes/listener/after": {"talker": "active"},
+        "nodes/talker/run/environment": {"MISBEHAVE": "activate:wait", "MISBEHAVE_IF": str(go)},
+    }
+    with up(pair(tmp_path, fresh_domain, edit=edit), runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        if order == "resume":
+            assert verb("pause", "pair", runtime=tmp_path).returncode == ExitCode.OK
+            run.until("system", reached="paused")
+        since = run.catch_up()
+        go.unlink()
+        with ordered(order, tmp_path) as told:
+            run.met("log", since=since, line="about to wait in activate")
+            node = make_publisher(fresh_domain)
+            until(lambda: any("lifecycle_observer" in each for each in node.get_node_names()))
+            time.sleep(0.3)
+            go.touch()
+            _, said = told.communicate(timeout=BOUND_S)
+        assert told.returncode == ExitCode.VIOLATED
+        assert said.startswith(
+            "cannot activate: the system changed before every node was activated"
+        )
+        assert "graph.undeclared-node" in said
+        run.met("notice", since=since, message="the gate closed again: /talker is deactivated")
+        status = json.loads(verb("status", "pair", "--format", "json", runtime=tmp_path).stdout)
+        assert status["phase"] == ("paused" if order == "resume" else "held")
+        assert {each["state"] for each in status["nodes"]} == {"inactive"}
+        run.catch_up()
+        sent = [each["node"] for each in run.events[since:] if each.get("operation") == "activate"]
+        assert sent == ["/talker"]
+
+        # As for one that is violated at once, the run goes on: it can be resumed later.
+        make_publisher.leave()
+        until(lambda: verb("resume", "pair", runtime=tmp_path).returncode == ExitCode.OK)
+        run.until("system", reached="active")
+        assert verb("down", "pair", runtime=tmp_path).returncode == ExitCode.OK
+        assert run.finish() == ExitCode.OK
+        run.assert_nothing_left()
+
+
+def until(holds: Callable[[], object]) -> None:
+    """Wait, bounded, until something holds that no event tells of."""
+    deadline = time.monotonic() + BOUND_S
+    while not holds():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+@contextlib.contextmanager
+def ordered(order: str, runtime: Path) -> Iterator[subprocess.Popen[str]]:
+    """Give an order, and do something else while it is carried out."""
+    with subprocess.Popen(
+        [*command(order), "pair"],
+        cwd=ROOT,
+        env=environment(runtime, ""),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as told:
+        try:
+            yield told
+        finally:
+            told.kill()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import json
+import socket
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -360,6 +361,55 @@ def test_a_changed_manifest_is_neither_restarted_nor_resumed_in_silence(
 def line_of(manifest: Path, start: str) -> int:
     lines = manifest.read_text().splitlines()
     return next(number for number, line in enumerate(lines, 1) if line.startswith(start))
+
+
+def test_a_node_is_not_reloaded_alone_where_others_would_notice(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    running = {"data_layer/authority": "supervisor"}
+    manifest = pair(tmp_path, fresh_domain, edit=running)
+    with up(manifest, runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        begun = len(run.events)
+        refusals: dict[str, dict[str, object]] = {
+            "it would run in another process": {"nodes/talker/process": "other"},
+            "'/listener' would be connected otherwise": {
+                "nodes/talker/flows": {"publishers": {"chatter": {"transport": "multicast"}}}
+            },
+        }
+        for why, edit in refusals.items():
+            pair(tmp_path, fresh_domain, edit={**running, **edit})
+            refused = verb("restart", str(manifest), "talker", "--reload", runtime=tmp_path)
+            assert refused.returncode == ExitCode.USAGE
+            assert refused.stderr == (
+                f"cannot reload 'talker' alone: {why}; restart the whole system: "
+                f"lifecycle restart {manifest} --reload\n"
+            )
+        run.catch_up()
+        assert requests(run, begun) == []
+        assert phases(tmp_path)[0] == "active"
+
+
+def test_a_manifest_that_moves_the_supervisor_itself_is_not_reloaded(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        first_port = 20000 + server.getsockname()[1] % 10000
+    how = {"discovery": {"domain_id": fresh_domain, "mode": "static", "first_port": first_port}}
+    manifest = pair(tmp_path, fresh_domain, edit=how)
+    with up(manifest, runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        # One more participant, whose ports come before those of others.
+        unique = {"publishers": {"chatter": {"unique": "strictly_required"}}}
+        pair(tmp_path, fresh_domain, edit={**how, "nodes/talker/flows": unique})
+        for words in ((), ("talker",)):
+            refused = verb("restart", str(manifest), *words, "--reload", runtime=tmp_path)
+            assert refused.returncode == ExitCode.USAGE
+            assert refused.stderr == (
+                "cannot reload the manifest of 'pair' while it runs: its supervisor would be "
+                "connected otherwise; end it and start it anew: lifecycle down, then lifecycle up\n"
+            )
+        assert phases(tmp_path)[0] == "active"
 
 
 def test_a_reloaded_system_has_the_nodes_of_the_new_manifest(

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
 import uuid
+from collections.abc import Callable
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
+import psutil
 import pytest
 import rclpy
 from rclpy.node import Node
@@ -503,3 +506,118 @@ def test_a_run_that_hangs_on_leaving_the_graph_ends_with_its_verdict_and_report(
     assert json.loads(done.stdout.splitlines()[-1])["verdict"] == "ok"
     assert json.loads(report.read_text())["verdict"] == "ok"
     assert left_of(mark) == []
+
+
+_NOBODY = "54321"
+"""A user without any other process: limits of processes are counted per user."""
+
+_READS_ALL = "+dac_read_search,+dac_override"
+"""Capabilities to use this installation all the same; the limit holds without CAP_SYS_RESOURCE."""
+
+
+def limited(*options: str) -> tuple[str, ...]:
+    """Return the beginning of a command line for whom a limit of processes holds: not root."""
+    if os.getuid() != 0:
+        return ("prlimit", *options)
+    if shutil.which("setpriv") is None:
+        pytest.skip("root has no limit of processes, and setpriv is not installed")
+    user = ("setpriv", "--reuid", _NOBODY, "--clear-groups", "--inh-caps", _READS_ALL)
+    return (*user, "--ambient-caps", _READS_ALL, "prlimit", *options)
+
+
+@pytest.mark.parametrize("processes", [1, 3, 12])
+def test_without_room_for_its_threads_a_system_is_not_begun_and_says_so(
+    tmp_path: Path, fresh_domain: int, processes: int
+) -> None:
+    through = limited(f"--nproc={processes}")
+    run = Up(pair(tmp_path, fresh_domain), runtime=tmp_path, through=through)
+    try:
+        _, said = run.process.communicate(timeout=BOUND_S)
+        assert run.process.returncode == ExitCode.BRING_UP_FAILED
+        last = said.splitlines()[-1]
+        assert "cannot start the fork server: " in last or (
+            "cannot start the 24 threads that this needs: the limit of processes and threads is "
+            f"reached ({processes} for this user" in last
+        )
+        assert left_of(run.mark) == []
+        assert list((tmp_path / "lifecycle").glob("*")) == []
+    finally:
+        run.close()
+
+
+@pytest.mark.parametrize("whom", ["supervisor", "all"])
+def test_at_the_limit_of_processes_a_system_is_taken_down_all_the_same(
+    tmp_path: Path, fresh_domain: int, whom: str
+) -> None:
+    run = Up(pair(tmp_path, fresh_domain), runtime=tmp_path, through=limited("--nproc=4096"))
+    try:
+        run.until("system", reached="active")
+        run.note_segments()
+        processes = marked(run.mark) if whom == "all" else [psutil.Process(run.process.pid)]
+        for each in processes:
+            subprocess.run([*limited("--nproc=1:1", "--pid"), str(each.pid)], check=True)
+        began = time.monotonic()
+        run.signal(signal.SIGTERM)
+        assert run.finish() == ExitCode.OK
+        assert time.monotonic() - began < 5.0
+        assert run.of_kind("notice") == []
+        run.assert_nothing_left()
+        assert list((tmp_path / "lifecycle").glob("*")) == []
+    finally:
+        run.close()
+
+
+def _foreign(path: Path) -> None:
+    if os.getuid() != 0:
+        pytest.skip("only root can give a directory away")
+    path.mkdir(mode=0o700)
+    os.chown(path, int(_NOBODY), -1)
+
+
+def _with_a_file(path: Path) -> None:
+    path.mkdir(mode=0o700)
+    (path / "control").mkdir()
+
+
+_IN_PLACE: dict[str, Callable[[Path], None]] = {
+    "it is a symbolic link": lambda path: path.symlink_to(path.parent),
+    "it is not a directory": Path.touch,
+    f"it belongs to user {_NOBODY}, and this is user {os.getuid()}": _foreign,
+    "it holds 'control', and was no run's": _with_a_file,
+}
+
+
+@pytest.mark.parametrize("what", _IN_PLACE)
+def test_what_is_in_the_place_of_the_run_directory_is_named_and_left_alone(
+    tmp_path: Path, fresh_domain: int, what: str
+) -> None:
+    root = tmp_path / "lifecycle"
+    root.mkdir(mode=0o700)
+    path = root / f"pair@{fresh_domain}"
+    _IN_PLACE[what](path)
+    before = path.lstat()
+    report = tmp_path / "verdict.json"
+    done = verb("up", str(pair(tmp_path, fresh_domain)), "--report", str(report), runtime=tmp_path)
+    said = (
+        f"cannot use {str(path)!r} as run directory: {what}; it must be a directory of this user "
+        "that others cannot write; remove it, or set XDG_RUNTIME_DIR to such a directory"
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (ExitCode.USAGE, "", f"{said}\n")
+    assert json.loads(report.read_text())["run"]["reason"] == said
+    after = path.lstat()
+    assert (after.st_ino, after.st_mode, after.st_mtime) == (
+        before.st_ino,
+        before.st_mode,
+        before.st_mtime,
+    )
+
+
+def test_a_run_directory_and_its_socket_are_there_while_a_system_is_and_not_longer(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    path = tmp_path / "lifecycle" / f"pair@{fresh_domain}"
+    with up(pair(tmp_path, fresh_domain), "--until", "connected", runtime=tmp_path) as run:
+        run.until("run")
+        assert path.is_dir()
+        assert run.finish() == ExitCode.OK
+        assert list(path.parent.iterdir()) == []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import errno
 import json
 import os
@@ -14,10 +15,13 @@ import click
 import pytest
 
 from lifecycle.cli.report import Report, open_report
-from lifecycle.errors import MiddlewareError, UsageError
+from lifecycle.cli.up_output import output
+from lifecycle.cli.verb_up import _finished
+from lifecycle.errors import ExitCode, MiddlewareError, UsageError
 from lifecycle.manifest import Diagnostic, ManifestError, Position, Severity
 from lifecycle.plan import build_plan
 from lifecycle.supervisor.ending import Ended
+from lifecycle.supervisor.options import UpResult
 from lifecycle.verify import Outcome, Stage, Verdict, verify
 from tests.unit.plan.samples import teleop
 from tests.unit.verify.edits import drop_node
@@ -228,3 +232,29 @@ def test_a_report_that_cannot_be_written_in_the_end_is_no_success(tmp_path: Path
         directory.rmdir()
         with pytest.raises(UsageError, match="cannot write report"):
             report.end(violated())
+
+
+def test_a_run_that_took_another_manifest_is_reported_by_that_one(tmp_path: Path) -> None:
+    """Whether what is unverifiable is a failure in JUnit is the policy's to say."""
+    found = [
+        dataclasses.replace(each, outcome=Outcome.UNVERIFIABLE) for each in violated().findings
+    ]
+    verdict = dataclasses.replace(
+        violated(), verdict=Outcome.UNVERIFIABLE, findings=tuple(found), blocking=False
+    )
+    policy = dataclasses.replace(PLAN.policy, unverifiable_blocks=True)
+    result = UpResult(
+        exit_code=ExitCode.UNVERIFIABLE,
+        verdict=verdict,
+        plan=dataclasses.replace(PLAN, policy=policy),
+    )
+    failed = []
+    for taken in (dataclasses.replace(result, plan=None), result):
+        path = tmp_path / "report.xml"
+        open_report(path)
+        with Report(path) as report, output("json") as listener:
+            report.begin(PLAN)
+            assert _finished(taken, listener, report) == ExitCode.UNVERIFIABLE
+        failed.append(sum(1 for _ in ET.parse(path).iter("failure")))
+    assert failed[0] == 0
+    assert failed[1] > 0

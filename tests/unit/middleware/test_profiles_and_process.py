@@ -6,7 +6,6 @@ import subprocess
 import sys
 import time
 import xml.etree.ElementTree as ET
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -20,7 +19,7 @@ VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 
 def test_the_door_opens_without_importing_rclpy() -> None:
     look = (
-        "import sys; from lifecycle.middleware import sweep, die_with_parent, exit_after, "
+        "import sys; from lifecycle.middleware import sweep, exit_after, "
         "discovery_environment, leave_and_exit; print('rclpy' in sys.modules)"
     )
     done = subprocess.run(
@@ -101,32 +100,6 @@ def test_the_deadman_ends_a_process_that_holds_the_gil() -> None:
     assert time.monotonic() - began < 10
 
 
-def test_a_child_dies_with_its_parent(wait_for: Callable[[Callable[[], object]], None]) -> None:
-    child = (
-        "from lifecycle.middleware import die_with_parent; die_with_parent(); "
-        "print('on', flush=True); input()"
-    )
-    parent = (
-        "import os, subprocess, sys\n"
-        f"child = subprocess.Popen([sys.executable, '-c', {child!r}], stdin=subprocess.PIPE,\n"
-        "                          stdout=subprocess.PIPE)\n"
-        "child.stdout.readline()\n"
-        "print(child.pid, flush=True)\n"
-        "input()\n"
-    )
-    with subprocess.Popen(
-        [sys.executable, "-c", parent],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    ) as process:
-        assert process.stdout is not None
-        pid = int(process.stdout.readline())
-        assert Path(f"/proc/{pid}").exists()
-        process.kill()
-    wait_for(lambda: _ended(pid))
-
-
 def test_an_orphan_is_adopted_by_the_subreaper() -> None:
     reaper = (
         "import os, subprocess, sys, time\n"
@@ -145,21 +118,3 @@ def test_an_orphan_is_adopted_by_the_subreaper() -> None:
     )
     orphan, adopted = done.stdout.split()
     assert orphan == adopted
-
-
-@pytest.fixture
-def wait_for() -> Callable[[Callable[[], object]], None]:
-    def wait(holds: Callable[[], object]) -> None:
-        deadline = time.monotonic() + 10
-        while not holds():
-            assert time.monotonic() < deadline
-            time.sleep(0.005)
-
-    return wait
-
-
-def _ended(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] in "ZX"
-    except (FileNotFoundError, ProcessLookupError):
-        return True

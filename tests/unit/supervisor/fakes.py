@@ -354,6 +354,9 @@ class FakeSpawner:
         self.interfaces[command.node] = interface
         return interface
 
+    async def ready(self) -> None:
+        """Always."""
+
     async def spawn(self, request: SpawnRequest) -> FakeProcess:
         process = self.processes[request.name] = FakeProcess(self, request)
         return process

@@ -169,11 +169,12 @@ def test_a_silent_node_is_not_asked_for_anything() -> None:
 
 
 class FakeEar:
-    def __init__(self, listener: Listener) -> None:
+    def __init__(self, listener: Listener, air: FakeAir) -> None:
         self.listener = listener
+        self._air = air
 
     def destroy(self) -> None:
-        """Nothing to destroy."""
+        self._air.destroyed += 1
 
 
 class FakeVoice:
@@ -195,15 +196,16 @@ class FakeAir:
         self.voices: dict[str, FakeVoice] = {}
         self.calls: list[list[str]] = []
         self.done: list[str] = []
+        self.destroyed = 0
 
     def machine_voice(self, system: str, machine: str) -> FakeVoice:
         return self.voices.setdefault(f"{system}/{machine}", FakeVoice())
 
     def machine_ear(self, system: str, machine: str, to: Listener) -> FakeEar:
-        return self.ears.setdefault(f"{system}/{machine}", FakeEar(to))
+        return self.ears.setdefault(f"{system}/{machine}", FakeEar(to, self))
 
     def node_ear(self, node: str, to: Listener) -> FakeEar:
-        return self.ears.setdefault(node, FakeEar(to))
+        return self.ears.setdefault(node, FakeEar(to, self))
 
     def call_out(self, addresses: Iterable[str]) -> None:
         self.calls.append(list(addresses))
@@ -385,6 +387,60 @@ def test_a_system_of_one_machine_neither_speaks_nor_listens(tmp_path: Path) -> N
         neighbours = Neighbours(system, air)
         neighbours.open()
         assert (air.ears, air.voices) == ({}, {})
+        await neighbours.close()
+
+    run(test())
+
+
+def attached(*keys: str) -> Plan:
+    """A camera of ours, and nodes that others run."""
+    others = [
+        dataclasses.replace(planned_node(each), run=Run(kind=RunKind.ATTACH)) for each in keys
+    ]
+    plan = plan_of(planned_node("camera"), *others)
+    processes = tuple(
+        dataclasses.replace(each, run=Run(kind=RunKind.ATTACH)) if each.name in keys else each
+        for each in plan.processes
+    )
+    return dataclasses.replace(plan, processes=processes)
+
+
+def test_a_reloaded_plan_has_its_own_attached_nodes_followed_and_no_others(tmp_path: Path) -> None:
+    async def test() -> None:
+        plan = attached("lidar", "radar")
+        system = System(plan, emit=Emitter(), logs=tmp_path, processes=plan.processes)
+        air = FakeAir()
+        neighbours = Neighbours(system, air)
+        neighbours.open()
+        assert set(air.ears) == {"/lidar", "/radar"}
+        old = dict(air.ears)
+        for each in old.values():
+            each.listener.heard(True)
+        neighbours.renew()
+        assert air.destroyed == 0  # the same nodes: nobody is heard anew
+        old["/lidar"].listener.heard(False)
+        await settle()
+        assert set(system.liveliness.silent) == {"/lidar"}
+        await asyncio.sleep(1)
+        assert air.calls
+
+        plan = attached("radar", "sonar")
+        system.reload(plan, plan.processes, tuple(system.nodes.values()))
+        air.ears.clear()
+        neighbours.renew()
+        assert air.destroyed == 2
+        assert set(air.ears) == {"/radar", "/sonar"}
+        # Who is not planned any more is neither missed nor called, whatever was on the way.
+        old["/radar"].listener.heard(False)
+        await settle()
+        assert dict(system.liveliness.silent) == {}
+        air.calls.clear()
+        await asyncio.sleep(1)
+        assert air.calls == []
+        air.ears["/sonar"].listener.heard(True)
+        air.ears["/sonar"].listener.heard(False)
+        await settle()
+        assert set(system.liveliness.silent) == {"/sonar"}
         await neighbours.close()
 
     run(test())

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+import uuid
 from collections.abc import Coroutine, Iterator
 from pathlib import Path
 from typing import Any
@@ -160,15 +161,48 @@ def test_a_process_that_ignores_sigint_and_sigterm_is_killed_with_its_group(
     _run(test())
 
 
-def test_a_zygote_that_was_killed_says_that_nothing_can_be_started(tmp_path: Path) -> None:
+def test_a_zygote_that_was_killed_is_replaced_and_what_it_started_runs_on(tmp_path: Path) -> None:
+    async def test() -> None:
+        environment = {**os.environ, RUN_VARIABLE: uuid.uuid4().hex}
+        process = ZygoteProcess(preload=False, environment=environment)
+        zygote = Zygote(process)
+        bench = _Bench(tmp_path, zygote)
+        first = await bench.start("sleep", "60")
+        process.popen.kill()
+        await zygote.ready()
+        second = await bench.start("sleep", "60")
+        assert zygote.pid != process.popen.pid
+        assert not first.ended.done()
+        os.kill(first.pid, signal.SIGKILL)
+        await first.ended
+
+        third = await bench.start("sleep", "60")
+        os.kill(zygote.pid, signal.SIGKILL)
+        await zygote.ready()
+        # Another zygote guards what those before it started, should the supervisor vanish.
+        zygote._process.socket.shutdown(2)
+        await asyncio.gather(second.ended, third.ended)
+        await bench.close()
+
+    _run(test())
+
+
+def test_without_any_zygote_nothing_can_be_started(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     async def test() -> None:
         process = ZygoteProcess(preload=False, environment=os.environ)
         zygote = Zygote(process)
         process.popen.kill()
         process.popen.wait()
+        monkeypatch.setattr(sys, "executable", "/no/such/python")
         bench = _Bench(tmp_path, zygote)
-        with pytest.raises(BringUpError, match="cannot start process 'it': "):
+        expected = (
+            "cannot start process 'it': cannot start the fork server: No such file or directory"
+        )
+        with pytest.raises(BringUpError) as caught:
             await bench.start("true")
+        assert str(caught.value) == expected
         await bench.close()
 
     _run(test())

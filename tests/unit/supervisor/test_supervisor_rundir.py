@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
+import socket
+import threading
+import time
 from pathlib import Path
 
 import pytest
 
-from lifecycle.errors import UsageError
+from lifecycle.cli import main
+from lifecycle.errors import ExitCode, UsageError
+from lifecycle.supervisor import server
 from lifecycle.supervisor.remote import find_run, running
 from lifecycle.supervisor.rundir import (
     LEDGER_NAME,
@@ -18,8 +24,9 @@ from lifecycle.supervisor.rundir import (
     read_record,
     run_name,
     runtime_root,
+    short_path,
 )
-from lifecycle.supervisor.server import Ask, ControlServer, Question, ask
+from lifecycle.supervisor.server import Ask, ControlServer, Question, ask, follow
 from lifecycle.supervisor.status import SystemStatus
 from tests.unit.supervisor.fakes import plan_of, planned_node
 
@@ -207,3 +214,107 @@ def test_the_control_socket_answers_and_tells_of_the_end_however_deep_it_lies(
         assert answer.exit_code == 0
 
     asyncio.run(test())
+
+
+class _Stranger:
+    """Listens where a supervisor would, and answers each question in its own way.
+
+    Args:
+        answer: sent again and again, until the client goes away.
+        pause_s: after each time; None closes the connection after the first.
+    """
+
+    def __init__(self, root: Path, answer: bytes, pause_s: float | None) -> None:
+        self.directory = RunDirectory.acquire(root, "pair@7", "abc")
+        self._answer = answer
+        self._pause_s = pause_s
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        with short_path(self.directory.socket_path) as name:
+            self._socket.bind(name)
+        self._socket.listen()
+        self._thread = threading.Thread(target=self._serve)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        while True:
+            try:
+                client, _ = self._socket.accept()
+            except OSError:
+                return
+            with client, contextlib.suppress(OSError):
+                client.recv(1 << 16)
+                client.sendall(self._answer)
+                while self._pause_s is not None:
+                    time.sleep(self._pause_s)
+                    client.sendall(self._answer)
+
+    def __enter__(self) -> None:
+        """It listens already."""
+
+    def __exit__(self, *_: object) -> None:
+        self._socket.shutdown(socket.SHUT_RDWR)
+        self._socket.close()
+        self._thread.join()
+        self.directory.release()
+
+
+_STRANGE = {
+    "no JSON": (b"220 mail.example.org ESMTP\n", None, "Expected `object`, got `int`"),
+    "deep": (b"[" * 100000 + b"\n", None, ""),
+    "no text": (b"\xff\xfe\n", None, "JSON is malformed"),
+    "of another type": (b'{"status": 3, "exit_code": "x"}\n', None, "Expected"),
+    "empty": (b"{}\n", None, "it has no "),
+    "endless": (b"x" * 65536, 0.0, "bytes without an end"),
+}
+
+
+@pytest.mark.parametrize("which", _STRANGE)
+@pytest.mark.parametrize("verb", ["status", "pause", "down"])
+def test_a_strange_answer_on_the_control_socket_is_one_clear_error(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    which: str,
+    verb: str,
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setattr(server, "_LARGEST_ANSWER", 1 << 20)
+    answer, pause_s, why = _STRANGE[which]
+    with _Stranger(tmp_path / "lifecycle", answer, pause_s):
+        assert main([verb, "pair"]) == ExitCode.USAGE
+    said = capsys.readouterr().err
+    assert said.startswith("cannot understand the answer of 'pair@7': ")
+    assert why in said
+    assert said.endswith(
+        "; use the version of lifecycle that started it, or end the process that listens at "
+        f"{tmp_path}/lifecycle/pair@7/control\n"
+    )
+
+
+def test_an_answer_that_never_ends_is_not_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(server, "_ANSWER_S", 0.3)
+    with _Stranger(tmp_path, b"[", 0.02):
+        path = tmp_path / "pair@7" / "control"
+        with pytest.raises(TimeoutError):
+            ask(path, Question(ask=Ask.STATUS), 0.3)
+        with pytest.raises(TimeoutError):
+            next(follow(path))
+
+
+def test_a_directory_that_was_no_runs_is_left_as_it_is(tmp_path: Path) -> None:
+    path = tmp_path / "arm@1"
+    path.mkdir(mode=0o700)
+    (path / "thesis.tex").touch()
+    with pytest.raises(UsageError, match=r"it holds 'thesis\.tex', and was no run's; it must be"):
+        RunDirectory.acquire(tmp_path, "arm@1", "abc")
+    assert [each.name for each in path.iterdir()] == ["thesis.tex"]
+
+
+def test_a_record_that_is_no_file_is_none(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "record.json")
+    assert read_record(tmp_path) is None
+    (tmp_path / "record.json").unlink()
+    (tmp_path / "record.json").symlink_to("/dev/zero")
+    assert read_record(tmp_path) is None
