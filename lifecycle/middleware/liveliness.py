@@ -33,6 +33,7 @@ from rclpy.event_handler import (
 )
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Empty, String
 
@@ -85,7 +86,7 @@ _no_subscription_events = functools.partial(SubscriptionEventCallbacks, use_defa
 class AlivePublisher:
     """Makes the participant of `node` heard, for as long as it lives, by whoever listens.
 
-    Nothing is asserted while nobody does: an assertion goes to every participant of the domain.
+    Nothing is asserted while nobody listens.
 
     Args:
         node: an executor spins it.
@@ -99,7 +100,7 @@ class AlivePublisher:
         self._node = node
         self._topic = topic
         self._on_listener = on_listener
-        self._pulse: _Pulse | None = None
+        self._pulse = _Pulse(node, topic + _PULSE)
         # rclpy's own methods: a managed node's would gate them.
         self._publisher = Node.create_publisher(
             node,
@@ -119,45 +120,68 @@ class AlivePublisher:
 
     def destroy(self) -> None:
         """Leave, which is heard and is not a loss."""
-        self._still()
+        self._pulse.end()
         Node.destroy_publisher(self._node, self._publisher)
 
     def _matched(self, info: QoSPublisherMatchedInfo) -> None:
         if info.current_count == 0:
-            self._still()
-        elif self._pulse is None:
-            self._pulse = _Pulse(self._node, self._topic + _PULSE)
+            self._pulse.still()
+        else:
+            self._pulse.beat()
         if info.current_count_change > 0 and self._on_listener is not None:
             self._on_listener()
 
-    def _still(self) -> None:
-        if self._pulse is not None:
-            self._pulse.stop()
-            self._pulse = None
-
 
 class _Pulse:
-    """Asserts the liveliness of `topic` until it is stopped."""
+    """Asserts the liveliness of `topic` while it is on, in a thread that is there from the start.
+
+    There may be no room for another thread later.
+    """
 
     def __init__(self, node: Node, topic: str) -> None:
         self._node = node
-        self._publisher = Node.create_publisher(
-            node, Empty, topic, _ASSERTED, event_callbacks=_no_publisher_events()
-        )
-        self._stopped = threading.Event()
-        self._thread = threading.Thread(target=self._assert, name="pulse", daemon=True)
+        self._topic = topic
+        self._publisher: Publisher | None = None
+        self._changed = threading.Condition()
+        self._ended = False
+        self._thread = threading.Thread(target=self._run, name="pulse", daemon=True)
         self._thread.start()
 
-    def stop(self) -> None:
-        """Leave, which is heard and is not a loss."""
-        self._stopped.set()
-        self._thread.join()
-        Node.destroy_publisher(self._node, self._publisher)
+    def beat(self) -> None:
+        """Begin; again is harmless."""
+        with self._changed:
+            if self._publisher is None and not self._ended:
+                self._publisher = Node.create_publisher(
+                    self._node,
+                    Empty,
+                    self._topic,
+                    _ASSERTED,
+                    event_callbacks=_no_publisher_events(),
+                )
+                self._changed.notify()
 
-    def _assert(self) -> None:
-        with contextlib.suppress(InvalidHandle):  # its node was destroyed first
-            while not self._stopped.wait(ASSERTED_EACH_S):
-                self._publisher.assert_liveliness()
+    def still(self) -> None:
+        """Leave, which is heard and is not a loss; harmless if it has not begun."""
+        with self._changed:
+            publisher, self._publisher = self._publisher, None
+            if publisher is not None:
+                Node.destroy_publisher(self._node, publisher)
+
+    def end(self) -> None:
+        """Leave for good."""
+        self.still()
+        with self._changed:
+            self._ended = True
+            self._changed.notify()
+        self._thread.join()
+
+    def _run(self) -> None:
+        with self._changed:
+            while not self._ended:
+                if self._publisher is not None:
+                    with contextlib.suppress(InvalidHandle):  # its node was destroyed first
+                        self._publisher.assert_liveliness()
+                self._changed.wait(None if self._publisher is None else ASSERTED_EACH_S)
 
 
 @typing.final
