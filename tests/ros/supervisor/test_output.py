@@ -316,9 +316,17 @@ def test_a_report_on_a_full_disk_is_one_clear_error_and_no_success(
     report = tmp_path / "report.json"
     report.symlink_to("/dev/full")
     words = (str(pair(tmp_path, fresh_domain)), "--until", "connected", "--report", str(report))
+    said = f"cannot write report {str(report)!r}: No space left on device\n"
     done = verb("up", *words, runtime=tmp_path)
-    assert done.returncode == ExitCode.USAGE
-    assert done.stderr == f"cannot write report {str(report)!r}: No space left on device\n"
+    assert (done.returncode, done.stderr) == (ExitCode.USAGE, said)
+    done = verb("check", words[0], "--report", str(report), runtime=tmp_path)
+    assert (done.returncode, done.stderr) == (ExitCode.USAGE, said)
+    # What the command found out is not lost over it.
+    options = ("--timeout", "0.1", "--report", str(report))
+    done = verb("verify", words[0], *options, runtime=tmp_path)
+    assert done.returncode == ExitCode.VIOLATED
+    assert done.stderr.startswith(said)
+    assert done.stdout.startswith("verdict: violated")
 
 
 def test_the_exit_code_of_a_verb_does_not_depend_on_who_reads_it(tmp_path: Path) -> None:
