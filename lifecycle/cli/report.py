@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from lifecycle.errors import ExitCode, LifecycleError, UsageError
+from lifecycle.printable import lines
 
 if TYPE_CHECKING:
     from lifecycle.plan import Plan
@@ -102,6 +103,20 @@ def _replace(file: int, data: bytes) -> None:
         raise
     if is_file:
         os.ftruncate(file, len(data))
+
+
+def written_or_said(write: Callable[[], None]) -> ExitCode:
+    """Write a report of what is known by now, whose exit code must not be lost over it.
+
+    Returns:
+        USAGE where it cannot be written, which then has been said: no success.
+    """
+    try:
+        write()
+    except UsageError as error:
+        click.echo(lines(str(error)), err=True)
+        return ExitCode.USAGE
+    return ExitCode.OK
 
 
 def report_option(function: F) -> F:

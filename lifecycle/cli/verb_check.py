@@ -9,8 +9,13 @@ import click
 
 from lifecycle.cli.check_report import CheckReport, write_check
 from lifecycle.cli.common import format_option, manifest_arguments, parse_assignments, resolve
-from lifecycle.cli.report import report_format, report_option, write_report
-from lifecycle.errors import LifecycleError
+from lifecycle.cli.report import (
+    report_format,
+    report_option,
+    write_report,
+    written_or_said,
+)
+from lifecycle.errors import ExitCode, LifecycleError
 from lifecycle.manifest import Diagnostic, Manifest, ManifestError, Severity, load
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.plan import check_plan, effective_domain
@@ -49,14 +54,16 @@ def command(
         found = check(manifest, assignments, strict=strict, machine=machine)
     except LifecycleError as error:
         if report is not None:
-            write_report(
-                report, write_check(_refused(manifest, error), report_format(report), strict=strict)
-            )
+            _write(report, _refused(manifest, error), strict=strict)
         raise
-    if report is not None:
-        write_report(report, write_check(found, report_format(report), strict=strict))
+    unwritten = ExitCode.OK if report is None else _write(report, found, strict=strict)
     click.echo(write_check(found, format_, strict=strict))
-    return found.exit_code(strict=strict)
+    return found.exit_code(strict=strict) or unwritten
+
+
+def _write(report: Path, found: CheckReport, *, strict: bool) -> ExitCode:
+    text = write_check(found, report_format(report), strict=strict)
+    return written_or_said(lambda: write_report(report, text))
 
 
 def _refused(path: str, error: LifecycleError) -> CheckReport:

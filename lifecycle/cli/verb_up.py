@@ -8,9 +8,8 @@ import click
 
 from lifecycle.cli.common import format_option, load_manifest, manifest_arguments, timeout_option
 from lifecycle.cli.flows_program import chosen, program_options, treatment_of, treatment_options
-from lifecycle.cli.report import Report, report_option
-from lifecycle.errors import ExitCode, UsageError
-from lifecycle.printable import lines
+from lifecycle.cli.report import Report, report_option, written_or_said
+from lifecycle.errors import UsageError
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -132,14 +131,9 @@ def command(
 
 def _finished(result: UpResult, listener: Output, written: Report) -> ExitCode:
     """Write and show how a run ended; return its exit code, no success without its report."""
-    try:
-        written.end(result.verdict, result.plan)
-    except UsageError as error:
-        click.echo(lines(str(error)), err=True)
-        return result.exit_code or ExitCode.USAGE
-    finally:
-        listener.finish(result)
-    return result.exit_code
+    unwritten = written_or_said(lambda: written.end(result.verdict, result.plan))
+    listener.finish(result)
+    return result.exit_code or unwritten
 
 
 def _networks(targets: tuple[str, ...], **given: Any) -> tuple[TargetOptions, ...]:

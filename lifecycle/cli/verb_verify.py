@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from lifecycle.cli.common import format_option, load_manifest, manifest_arguments, timeout_option
-from lifecycle.cli.report import Report, format_verdict, report_option
+from lifecycle.cli.report import Report, format_verdict, report_option, written_or_said
 from lifecycle.errors import ExitCode
 from lifecycle.printable import lines
 
@@ -43,16 +43,17 @@ def command(  # noqa: PLR0917 - click passes options by name
             written.begin(plan)
             seen = judge_running(plan, timeout_s=timeout, strict=strict)
             with ending.noted():
-                written.end(seen.verdict)
-                if seen.where:
-                    click.echo(lines(seen.where), err=True)
-                colour = format_ == "text" and sys.stdout.isatty()
-                text = format_verdict(seen.verdict, plan, format_, colour=colour, strict=strict)
-                click.echo(text.rstrip("\n"))
-                return exit_code(seen.verdict, strict=strict)
+                unwritten = written_or_said(lambda: written.end(seen.verdict))
     except Ended as ended:
         click.echo(f"ended before it was judged: {ended.reason}", err=True)
         return ended.exit_code
+    # From here on a signal ends what waits for somebody to read.
+    if seen.where:
+        click.echo(lines(seen.where), err=True)
+    colour = format_ == "text" and sys.stdout.isatty()
+    text = format_verdict(seen.verdict, plan, format_, colour=colour, strict=strict)
+    click.echo(text.rstrip("\n"))
+    return exit_code(seen.verdict, strict=strict) or unwritten
 
 
 def exit_code(verdict: object, *, strict: bool) -> ExitCode:
