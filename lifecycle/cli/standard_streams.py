@@ -228,6 +228,7 @@ class Writer:
         self._bytes = 0
         self._dropped = _NOTHING  # behind the last of the queue
         self._lost = _NOTHING  # before its first
+        self._telling = _NOTHING  # what a text that is being written says of them
         self._why = ""
         self._told = False
         self._full = False
@@ -296,7 +297,8 @@ class Writer:
                     break
             gone, self._gone = self._gone, True
             why = self._why if self._full else self._unread
-            lost = sum((each for _, each in self._queue), self._lost + self._dropped)
+            missing = self._telling + self._lost + self._dropped
+            lost = sum((each for _, each in self._queue), missing)
         if any(lost) and not gone:
             self._say(f"{lost} missing at the end of {self._name}: {why}")
 
@@ -339,6 +341,7 @@ class Writer:
                 return
             self._tried_s = now_s
             before, self._lost = self._lost, _NOTHING
+            self._telling = before
             if any(before):
                 text = self._marked(before, self._why) + text
             left = memoryview(b"\n" + text if self._torn else text)
@@ -350,8 +353,10 @@ class Writer:
                     self._progress += 1
                     self._changed.notify_all()
         except OSError as error:
+            self._telling = _NOTHING
             self._failed(error, before + weight)
             return
+        self._telling = _NOTHING
         self._full = False
         if not self._queue:
             self.on_room()

@@ -9,7 +9,7 @@ import click
 from lifecycle.cli.common import format_option, load_manifest, manifest_arguments, timeout_option
 from lifecycle.cli.flows_program import chosen, program_options, treatment_of, treatment_options
 from lifecycle.cli.report import Report, report_option, written_or_said
-from lifecycle.errors import UsageError
+from lifecycle.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
     from pathlib import Path
