@@ -56,7 +56,11 @@ def quiet_node(
         hint = error.hint if isinstance(error, MiddlewareError) else _security_hint()
         raise MiddlewareError(
             f"cannot make a participant for {namespace.rstrip('/')}/{name} in domain {domain_id}: "
-            f"{error.message if isinstance(error, MiddlewareError) else ' '.join(str(error).split())}",
+            + (
+                error.message
+                if isinstance(error, MiddlewareError)
+                else " ".join(str(error).split())
+            ),
             hint=hint,
         ) from error
     _hidden.add(node)
