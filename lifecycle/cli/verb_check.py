@@ -15,6 +15,7 @@ from lifecycle.manifest import Diagnostic, Manifest, ManifestError, Severity, lo
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.plan import check_plan, effective_domain
 from lifecycle.plan.programs import Resolution
+from lifecycle.printable import json_text, lines
 
 
 @click.command()
@@ -55,7 +56,10 @@ def command(
         raise
     if report is not None:
         write_report(report, write_check(found, report_format(report), strict=strict))
-    click.echo(write_check(found, format_, strict=strict))
+    text = write_check(found, format_, strict=strict)
+    # Names of files are anybody's.
+    shown = {"text": lines, "json": json_text, "sarif": json_text}.get(format_, str)
+    click.echo(shown(text))
     return found.exit_code(strict=strict)
 
 

@@ -38,6 +38,9 @@ NAMES = (
 )
 """Modules of this package, the slow ones first; each has its HostileClass as `CLASS`."""
 
+SLOW_S = 3.0
+"""What takes longer is said with `--here`: all of it must be over in ten minutes."""
+
 ROOT = Path(__file__).parents[2]
 
 
@@ -66,15 +69,20 @@ def main() -> int:
             failed = [each for each in lines if each["why"]]
             tried += len(lines)
             handled += len(lines) - len(failed)
-            print(f"{name:10} {len(lines):4} tried {len(lines) - len(failed):4} handled"
-                  f" {took_s:6.1f} s", flush=True)
+            print(
+                f"{name:10} {len(lines):4} tried {len(lines) - len(failed):4} handled"
+                f" {took_s:6.1f} s",
+                flush=True,
+            )
             for each in failed:
                 words = ("--seed", options.seed, "--class", name, "--only", each["attack"])
                 again = shlex.join(map(str, words))
                 print(f"  NOT HANDLED {each['attack']!r}: {each['why']}")
                 print(f"    again: {Path(sys.executable).name} -m tests.hostile {again}")
-    print(f"seed {options.seed}: {tried} attacks, {handled} handled, {tried - handled} not,"
-          f" {time.monotonic() - began_s:.0f} s")
+    print(
+        f"seed {options.seed}: {tried} attacks, {handled} handled, {tried - handled} not,"
+        f" {time.monotonic() - began_s:.0f} s"
+    )
     return 0 if tried and tried == handled else 1
 
 
@@ -93,7 +101,10 @@ def _run_apart(name: str, options: argparse.Namespace) -> tuple[list[dict[str, s
     with tempfile.TemporaryFile("w+") as errors:
         process = subprocess.Popen(
             [sys.executable, "-m", "tests.hostile", *words],
-            cwd=ROOT, stdout=subprocess.PIPE, stderr=errors, text=True,
+            cwd=ROOT,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            text=True,
         )
         late = False
         try:
@@ -122,12 +133,15 @@ def _run_here(options: argparse.Namespace) -> int:
             _say("the stage", error)
             return 0
         for each in attacks:
+            began_s = time.monotonic()
             try:
                 each.run(stage)
             except Exception as error:  # noqa: BLE001 - likewise
                 _say(each.name, error)
             else:
                 _say(each.name, None)
+            if (took_s := time.monotonic() - began_s) > SLOW_S:
+                print(f"{each.name!r} took {took_s:.1f} s", file=sys.stderr)
         try:
             stack.close()
         except Exception as error:  # noqa: BLE001 - likewise

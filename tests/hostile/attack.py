@@ -128,7 +128,7 @@ class _TooLate(BaseException):
 
 
 def in_process(
-    *words: str, variables: Mapping[str, str] | None = None, limit_s: float = 10.0
+    *words: str, variables: Mapping[str, str] | None = None, limit_s: float = 6.0
 ) -> Done:
     """Run a verb that needs no ROS in this process, in the main thread."""
     out, err = io.StringIO(), io.StringIO()
@@ -202,9 +202,7 @@ def ended(process: subprocess.Popen[bytes], mark: str, runtime: Path, *, limit_s
     )
 
 
-def in_a_process(
-    *words: str, runtime: Path, limit_s: float = BOUND_S, **options: Any
-) -> Done:
+def in_a_process(*words: str, runtime: Path, limit_s: float = BOUND_S, **options: Any) -> Done:
     """Run a verb to its end in a process of its own; it leaves nothing."""
     with started(*words, runtime=runtime, **options) as (process, mark):
         done = ended(process, mark, runtime, limit_s=limit_s)
