@@ -15,6 +15,7 @@ import importlib
 import json
 import os
 import random
+import resource
 import shlex
 import subprocess
 import sys
@@ -37,6 +38,8 @@ NAMES = (
     "parsers",
 )
 """Modules of this package, the slow ones first; each has its HostileClass as `CLASS`."""
+
+MEMORY_BYTES = 8 * 2**30
 
 SLOW_S = 3.0
 """What takes longer is said with `--here`: all of it must be over in ten minutes."""
@@ -123,6 +126,8 @@ def _run_apart(name: str, options: argparse.Namespace) -> tuple[list[dict[str, s
 
 
 def _run_here(options: argparse.Namespace) -> int:
+    # Whoever reads without a bound must not take the machine's memory with it.
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
     (name,) = options.classes
     found = importlib.import_module(f"tests.hostile.{name}").CLASS
     attacks = _chosen(name, options.seed, options.only)
@@ -166,10 +171,9 @@ def place(seed: int) -> Iterator:
     """Yield a place for attacks: a folder, and a domain that the environment names."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
+        from lifecycle.middleware import discovery_environment
         from tests.hostile.attack import Place
         from tests.ros.conftest import _claimed_domain
-
-        from lifecycle.middleware import discovery_environment
 
     before = dict(os.environ)
     with tempfile.TemporaryDirectory(prefix="hostile-") as folder, _claimed_domain() as domain:
