@@ -40,6 +40,7 @@ def _play(node: Node, way: str) -> None:
             success = way != "no success"
             from rcl_interfaces.srv import SetParameters
 
+            node.create_subscription(String, "~/heard", lambda _: None, 10)
             node.create_service(Trigger, "~/get_configuration", _answer(answer, success=success))
             node.create_service(SetParameters, "~/map_to", lambda _, response: response)
 
@@ -62,7 +63,7 @@ def main() -> None:
             _say(nodes, executor, topic, int(index))
         else:
             nodes.append(Node(name, enable_rosout=False))
-            _play(nodes[-1], way.replace("_", " ") if way not in {"change_state"} else way)
+            _play(nodes[-1], way if way == "change_state" else way.replace("_", " "))
             executor.add_node(nodes[-1])
         print("done", flush=True)
 
