@@ -1,7 +1,7 @@
 """What an attack is, and what it means that it was handled.
 
-Owns: `Attack`, `HostileClass`, `Unhandled`, and the checks that every class shares. Handled means: a
-documented exit code, never 70; where it failed, a reason in words; no traceback and no control
+Owns: `Attack`, `HostileClass`, `Unhandled`, and the checks that every class shares. Handled means:
+a documented exit code, never 70; where it failed, a reason in words; no traceback and no control
 characters in any output; ended within its bound; no process, shared memory or run directory left.
 """
 

@@ -1,7 +1,7 @@
 """Names of topics and nodes that ROS would refuse, announced by a bare DDS participant.
 
-One active system sees them all; every verb that looks at it runs once, and each name must be in what
-the supervisor finds, escaped.
+One active system sees them all; every verb that looks at it runs once, and each name must be in
+what the supervisor finds, escaped.
 """
 
 from __future__ import annotations
@@ -185,9 +185,8 @@ def attacks(rng: random.Random) -> list[Attack]:
     topics = dict.fromkeys((*TOPICS, *(_name(rng) for _ in range(MANY))))
     spaces = (b"/", b"", b"//", b"/a-b", b"bad", b"/ok", b"/\x1b[31m")
     nodes = dict.fromkeys((*NODES, *((rng.choice(spaces), _name(rng)) for _ in range(MANY // 2))))
-    found = []
-    for names in (*((each,) for each in topics), *nodes):
-        found.append(Attack(name=f"{names!r}", run=Named(names)))
+    every = (*((each,) for each in topics), *nodes)
+    found = [Attack(name=f"{names!r}", run=Named(names)) for names in every]
     found += [Attack(name=each, run=functools.partial(_looks, each)) for each in VERBS]
     return found
 

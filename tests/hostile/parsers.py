@@ -6,6 +6,7 @@ Owns: `READERS`, the one list of them: property tests go through it too
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import json
@@ -219,11 +220,8 @@ def attacks(rng: random.Random) -> list[Attack]:
 
 def _read(reader: Reader, data: bytes, place: Place) -> None:
     del place
-    with tempfile.TemporaryDirectory() as folder:
-        try:
-            reader.read(data, Path(folder))
-        except reader.errors:
-            pass
+    with tempfile.TemporaryDirectory() as folder, contextlib.suppress(*reader.errors):
+        reader.read(data, Path(folder))
 
 
 CLASS = HostileClass(name="parsers", attacks=attacks)

@@ -1,7 +1,7 @@
 """Peers that answer `~/get_configuration` with anything, and say anything on the graph's topics.
 
-Every liar is a declared, attached node: `verify`, `flows`, `graph`, `capture` and `up` ask them all.
-Then each message is said beside a running supervisor, which must live on.
+Every liar is a declared, attached node: `verify`, `flows`, `graph`, `capture` and `up` ask them
+all. Then each message is said beside a running supervisor, which must live on.
 """
 
 from __future__ import annotations

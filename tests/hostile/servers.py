@@ -53,8 +53,8 @@ END_S = 20.0
 _GOOD = {
     "nef": b"HTTP/1.1 201 Created\r\ncontent-type: application/json\r\nlocation: /subscriptions/1"
     b'\r\ncontent-length: 40\r\n\r\n{"self":"/subscriptions/1","flowInfo":[]}',
-    "camara": b"HTTP/1.1 201 Created\r\ncontent-type: application/json\r\ncontent-length: 64\r\n\r\n"
-    + json.dumps(SESSION).encode(),
+    "camara": b"HTTP/1.1 201 Created\r\ncontent-type: application/json\r\ncontent-length: 64\r\n"
+    b"\r\n" + json.dumps(SESSION).encode(),
 }
 
 SLOW: dict[str, Behave] = {
@@ -174,10 +174,6 @@ def attacks(rng: random.Random) -> list[Attack]:
         )
         found.append(Attack(name=name, run=run))
 
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        add(f"up and {number.name}: the server drips", _up, SLOW["drips its status"], number)
-    add("up and SIGINT: its body drips", _up, SLOW["drips its body"], signal.SIGINT)
-    add("flows apply and remove: the server drips", _applied, SLOW["drips its status"])
     for name, (kind, behave, _) in HOSTILE.items():
         add(f"{kind}: {name}", _adapter, kind, behave, may_succeed=False)
     for index in range(60):
@@ -187,6 +183,11 @@ def attacks(rng: random.Random) -> list[Attack]:
     for index in range(40):
         body = mutated(json.dumps(SESSION).encode(), rng)
         add(f"session changed {index}", _adapter, "camara", answers(body), may_succeed=True)
+    # The long ones last.
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        add(f"up and {number.name}: the server drips", _up, SLOW["drips its status"], number)
+    add("up and SIGINT: its body drips", _up, SLOW["drips its body"], signal.SIGINT)
+    add("flows apply and remove: the server drips", _applied, SLOW["drips its status"])
     return found
 
 

@@ -7,7 +7,6 @@ import random
 import signal
 import subprocess
 import threading
-from collections.abc import Callable
 
 from lifecycle.errors import ExitCode
 from tests.hostile.attack import (
@@ -74,8 +73,7 @@ def attacks(rng: random.Random) -> list[Attack]:
     found = []
 
     def add(name: str, *arguments: object) -> None:
-        run: Callable[[Place], None] = functools.partial(_signalled, *arguments)  # type: ignore
-        found.append(Attack(name=name, run=run))
+        found.append(Attack(name=name, run=functools.partial(_signalled, *arguments)))
 
     for stage, mark in STAGES.items():
         for number in (INT, TERM, HUP):

@@ -1,7 +1,7 @@
-"""Nodes named as tools beside an active system: harmless while they listen, violated when they feed.
+"""Nodes named as tools beside an active system: harmless to listen, violated to feed.
 
-One system, one process that plays all tools. What listens is judged by the verdict that a node which
-is no tool brings about, after it.
+One system, one process that plays all tools. What listens is judged by the verdict that a node
+which is no tool brings about, after it.
 """
 
 from __future__ import annotations
