@@ -20,12 +20,13 @@ from tests.hostile.attack import (
     Unhandled,
     check,
     in_a_process,
+    in_process,
 )
 from tests.ros.supervisor.running import pair
 
 LIMITS = (
-    *("ulimit -n 3", "ulimit -n 8", "ulimit -n 16", "ulimit -n 24", "ulimit -n 32", "ulimit -n 48"),
-    *("ulimit -n 64", "ulimit -n 128", "ulimit -v 100000", "ulimit -v 200000", "ulimit -v 400000"),
+    *("ulimit -n 3", "ulimit -n 8", "ulimit -n 16", "ulimit -n 32", "ulimit -n 64"),
+    *("ulimit -n 128", "ulimit -v 100000", "ulimit -v 200000", "ulimit -v 400000"),
     *("ulimit -v 800000", "ulimit -v 1500000", "ulimit -f 0", "ulimit -f 8", "ulimit -s 256"),
     *("ulimit -c 0", "umask 777", "umask 000"),
 )
@@ -132,7 +133,10 @@ def _mounted(mount: str, verb: str, place: Place) -> None:
 def _with(variables: dict[str, str], verb: str, place: Place) -> None:
     folder = place.folder()
     words = _words(verb, folder, place)
-    check(in_a_process(*words, runtime=folder, variables=variables, limit_s=BOUND_S))
+    if verb == "up":
+        check(in_a_process(*words, runtime=folder, variables=variables, limit_s=BOUND_S))
+    else:
+        check(in_process(*words, variables={"XDG_RUNTIME_DIR": str(folder), **variables}))
 
 
 def may_mount() -> bool:

@@ -54,8 +54,8 @@ def _signalled(
         for number in numbers:
             process.send_signal(number)
         done = ended(process, mark, folder, limit_s=BOUND_S)
-    # Before the handlers are there a signal ends any program.
-    if done.code < 0 and isinstance(after, float) and after < 0.3:
+    # Before the handlers are there a signal ends any program, without a word of ours.
+    if done.code < 0 and isinstance(after, float) and after < 1.0 and not done.out + done.err:
         return
     check(done, *map(int, ENDS))
     if done.code == 0 and INT in numbers:
