@@ -94,7 +94,7 @@ def _system(place: Place, folder: Path, **edit: Any) -> Path:
 
 
 def _config(folder: Path, url: str, timeout_s: float) -> str:
-    settings = nef_settings(url, devices=["127.0.0.1"], timeout_s=timeout_s)
+    settings = nef_settings(url, devices=["0.0.0.0/0"], timeout_s=timeout_s)
     return settings_file(folder, nef=settings)
 
 
@@ -107,7 +107,8 @@ def _up(slow: Behave, number: int, place: Place) -> None:
             *words, "--timeout", "60", runtime=folder, variables={"TEST_TOKEN": TOKEN}
         ) as (process, mark):
             if not server.came.wait(40.0):
-                raise Unhandled(f"the server was never asked: {process.communicate()}")
+                process.kill()
+                raise Unhandled(f"the server was never asked: {process.communicate(timeout=5)}")
             _check_no_token(mark, process.pid)
             process.send_signal(number)
             done = ended_with_ledger(process, mark, folder)
