@@ -40,7 +40,7 @@ def _play(node: Node, way: str) -> None:
             success = way != "no success"
             from rcl_interfaces.srv import SetParameters
 
-            node.create_subscription(String, "~/heard", lambda _: None, 10)
+            node.create_publisher(String, "~/said", 10)
             node.create_service(Trigger, "~/get_configuration", _answer(answer, success=success))
             node.create_service(SetParameters, "~/map_to", lambda _, response: response)
 
