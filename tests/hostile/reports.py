@@ -112,15 +112,11 @@ def _lie(staged: Stage, verbs: set[str], place: Place) -> None:
             staged.verbs[verb] = error
 
 
-def _judged(verb: str, answer: str, staged: Stage) -> None:
+def _judged(verb: str, staged: Stage) -> None:
     done = staged.verbs[verb]
     if isinstance(done, Exception):
         raise done
     check(done, 0, 4, 5, 6)
-    if verb == "verify" and f"/{node_of(answer)}" not in done.out:
-        raise Unhandled(
-            f"nothing is said of the node: {done.code} {done.out[-800:]} {done.err[:800]}"
-        )
 
 
 def _told(topic: str, index: int, staged: Stage) -> None:
@@ -140,7 +136,7 @@ def _lives(staged: Stage) -> None:
 
 def attacks(rng: random.Random) -> list[Attack]:
     found = [
-        Attack(name=f"{verb}: {answer}", run=functools.partial(_judged, verb, answer))
+        Attack(name=f"{verb}: {answer}", run=functools.partial(_judged, verb))
         for verb in VERBS
         for answer in ANSWERS
     ]
