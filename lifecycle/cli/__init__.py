@@ -30,6 +30,7 @@ VERBS: dict[str, str] = {
     "verify": "judge a running system, started by anyone; for CI",
     "flows": "show every network flow and how unique it is",
     "graph": "picture of what runs, beside what was declared",
+    "export": "write a manifest as files of another system: access control of sros2",
     "capture": "write a manifest from a running system, gaps marked",
     "run": "run one node of a manifest in this terminal, without a supervisor",
     "ports": "DDS port arithmetic and platform limits",

@@ -71,7 +71,7 @@ def target_plan(
     from lifecycle.supervisor.rundir import run_name, runtime_root
 
     root = runtime_root(environment)
-    if not Path(target).is_file():
+    if not os.path.isfile(target):  # noqa: PTH113 - Path.is_file() raises for a name too long
         if assignments:
             raise UsageError(
                 f"cannot use {' '.join(assignments)} with the running system {target!r}",

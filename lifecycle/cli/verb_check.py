@@ -20,6 +20,7 @@ from lifecycle.manifest import Diagnostic, Manifest, ManifestError, Severity, lo
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.plan import check_plan, effective_domain
 from lifecycle.plan.programs import Resolution
+from lifecycle.printable import json_text, lines
 
 
 @click.command()
@@ -57,7 +58,10 @@ def command(
             _write(report, _refused(manifest, error), strict=strict)
         raise
     unwritten = ExitCode.OK if report is None else _write(report, found, strict=strict)
-    click.echo(write_check(found, format_, strict=strict))
+    text = write_check(found, format_, strict=strict)
+    # Names of files are anybody's.
+    shown = {"text": lines, "json": json_text, "sarif": json_text}.get(format_, str)
+    click.echo(shown(text))
     return found.exit_code(strict=strict) or unwritten
 
 

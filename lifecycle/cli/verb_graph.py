@@ -89,7 +89,7 @@ def _found(
     """Return the run of a supervisor, or the plan to look for without one."""
     from lifecycle.cli.target import target_run
 
-    if not Path(target).is_file():
+    if not os.path.isfile(target):  # noqa: PTH113 - Path.is_file() raises for a name too long
         return target_run(os.environ, target, assignments, machine), None
     from lifecycle.cli.common import load_manifest
     from lifecycle.plan import build_plan

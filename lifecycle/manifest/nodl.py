@@ -8,6 +8,7 @@ it is an error. Writing NoDL (`to_nodl`) is left for later and belongs here as w
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -108,7 +109,7 @@ class _Reading:
         scheme, _, body = reference.partition("://")
         if scheme == "local" and body:
             path = base / body
-            if not path.exists():
+            if not os.path.exists(path):  # noqa: PTH110 - Path.exists() raises for a name too long
                 message = f"cannot find {reference!r}: there is no file {str(path)!r}"
                 hint = nearest_file(path)
                 self._error("not-found", at, message, hint)

@@ -62,5 +62,5 @@ def _hashes(path: Path) -> Mapping[str, str]:
     try:
         listed = json.loads(path.read_text(encoding="utf-8"))["type_hashes"]
         return {str(each["type_name"]): str(each["hash_string"]) for each in listed}
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return {}

@@ -5,6 +5,7 @@ Owns: how such a node and its context are made, and which of them this process h
 
 from __future__ import annotations
 
+import os
 import weakref
 from collections.abc import Sequence
 
@@ -52,14 +53,28 @@ def quiet_node(
             node.destroy_node()
         context.try_shutdown()
         context.destroy()
-        hint = error.hint if isinstance(error, MiddlewareError) else ""
+        hint = error.hint if isinstance(error, MiddlewareError) else _security_hint()
         raise MiddlewareError(
             f"cannot make a participant for {namespace.rstrip('/')}/{name} in domain {domain_id}: "
-            f"{error.message if isinstance(error, MiddlewareError) else error}",
+            + (
+                error.message
+                if isinstance(error, MiddlewareError)
+                else " ".join(str(error).split())
+            ),
             hint=hint,
         ) from error
     _hidden.add(node)
     return context, node
+
+
+def _security_hint() -> str:
+    """Return where to look if ROS 2 security is on: rcl's reason may be `error not set`."""
+    if os.environ.get("ROS_SECURITY_ENABLE") != "true":
+        return ""
+    return (
+        "ROS_SECURITY_ENABLE is set: look at ROS_SECURITY_KEYSTORE and the enclave, and whether "
+        "the installed RMW has security at all (docs/security.md), or unset it"
+    )
 
 
 def hidden_nodes() -> tuple[Node, ...]:

@@ -90,7 +90,7 @@ def runtime_root(environment: Mapping[str, str]) -> Path:
         UsageError: another user can put things there, or it is no directory.
     """
     base = environment.get("XDG_RUNTIME_DIR")
-    if base and Path(base).is_dir():
+    if base and os.path.isdir(base):  # noqa: PTH112 - Path.is_dir() raises for a name too long
         root = Path(base) / "lifecycle"
     else:
         root = Path(tempfile.gettempdir()) / f"lifecycle-{os.getuid()}"

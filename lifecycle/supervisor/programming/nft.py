@@ -5,7 +5,6 @@ Owns: when the table is written, and whose it is. What stands in it is `export.n
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Sequence
 
@@ -26,13 +25,12 @@ from lifecycle.supervisor.programming.changes import (
     describe_rule,
 )
 from lifecycle.supervisor.programming.errors import (
-    MissingFeatureError,
     NotOursError,
     PrivilegeError,
     ProgrammingError,
 )
 from lifecycle.supervisor.programming.ledger import Entry, Ledger, TargetRecord, digest_of
-from lifecycle.supervisor.programming.tool import HostTool, Tool, demand, failure
+from lifecycle.supervisor.programming.tool import HostTool, Tool, demand, failure, qdiscs_of
 
 KIND = "nft"
 
@@ -231,15 +229,16 @@ class NftTarget:
 
 
 def root_qdiscs(tool: Tool) -> tuple[tuple[str, str], ...]:
-    """Return (device, kind) of every root queueing discipline; empty where tc is missing."""
+    """Return (device, kind) of every root queueing discipline; empty where tc does not tell."""
+    argv = ["tc", "-j", "qdisc", "show"]
     try:
-        output = tool.run(["tc", "-j", "qdisc", "show"])
-    except MissingFeatureError:
+        output = tool.run(argv)
+        found = qdiscs_of(output.stdout, argv, doing="list queueing disciplines")
+    except ProgrammingError:
         return ()
-    if output.returncode != 0 or not output.stdout.strip():
+    if output.returncode != 0:
         return ()
-    found = json.loads(output.stdout)
-    return tuple((each["dev"], each["kind"]) for each in found if each.get("root"))
+    return tuple((each.dev, each.kind) for each in found if each.root)
 
 
 def _effect(kind: str) -> str:

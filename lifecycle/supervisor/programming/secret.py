@@ -6,7 +6,9 @@ rotated one is taken up, and no object here holds one that a log or a traceback 
 
 from __future__ import annotations
 
+import errno
 import os
+import stat
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -15,6 +17,19 @@ import msgspec
 from lifecycle.supervisor.programming.errors import SettingsError
 
 _MAX_BYTES = 64 * 1024
+
+
+def read_file(path: str | Path, most: int) -> bytes:
+    """Return the first `most` bytes of a regular file, without ever waiting for a writer.
+
+    Raises:
+        OSError: it cannot be read, or is a pipe, a device or anything else that is no file.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    with os.fdopen(descriptor, "rb") as file:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise OSError(errno.EINVAL, "it is not a regular file")
+        return file.read(most)
 
 
 class Token(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -44,8 +59,7 @@ class Token(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         else:
             where = f"file {self.file!r}"
             try:
-                with Path(self.file).open("rb") as file:
-                    text = file.read(_MAX_BYTES).decode("ascii")
+                text = read_file(self.file, _MAX_BYTES).decode("ascii")
             except (OSError, UnicodeDecodeError) as error:
                 reason = error.strerror if isinstance(error, OSError) else "it is not ASCII text"
                 # The cause is left out on purpose: a decoding error quotes the bytes.

@@ -31,7 +31,7 @@ from lifecycle.export.camara import CamaraSettings
 from lifecycle.export.nef import NefSettings, UplinkFilter
 from lifecycle.network.address import is_loopback
 from lifecycle.supervisor.programming.errors import SettingsError
-from lifecycle.supervisor.programming.secret import Token
+from lifecycle.supervisor.programming.secret import Token, read_file
 
 _MAX_BYTES = 256 * 1024
 
@@ -156,8 +156,7 @@ def load_settings(path: str | Path) -> Settings:
     """
     file = Path(path)
     try:
-        with file.open("rb") as opened:
-            data = opened.read(_MAX_BYTES + 1)
+        data = read_file(file, _MAX_BYTES + 1)
     except OSError as error:
         raise SettingsError(f"cannot read settings {str(path)!r}: {error.strerror}") from error
     if len(data) > _MAX_BYTES:
@@ -173,6 +172,12 @@ def load_settings(path: str | Path) -> Settings:
         raise SettingsError(f"cannot read settings {str(path)!r}: no YAML{where}") from None
     except msgspec.ValidationError as error:
         raise SettingsError(f"cannot use settings {str(path)!r}: {_readable(error)}") from error
+    except (ValueError, OverflowError, RecursionError):
+        # Dates and numbers that are none, and what is nested deeper than Python goes.
+        raise SettingsError(
+            f"cannot read settings {str(path)!r}: it is nested too deep, or has a number or date "
+            "that is none"
+        ) from None
     return msgspec.structs.replace(
         found,
         nef=_beside(found.nef, file),

@@ -8,7 +8,6 @@ left alone.
 from __future__ import annotations
 
 import dataclasses
-import json
 import re
 from collections.abc import Iterable, Sequence
 
@@ -38,7 +37,14 @@ from lifecycle.supervisor.programming.errors import (
     ProgrammingError,
 )
 from lifecycle.supervisor.programming.ledger import Entry, Ledger, TargetRecord, digest_of
-from lifecycle.supervisor.programming.tool import HostTool, Tool, demand, failure, refused
+from lifecycle.supervisor.programming.tool import (
+    HostTool,
+    Tool,
+    demand,
+    failure,
+    qdiscs_of,
+    refused,
+)
 
 KIND = "tc"
 
@@ -365,8 +371,9 @@ class TcTarget:
             if _NO_DEVICE.search(output.stderr):
                 return None
             raise failure(output, argv, doing=f"read {self.name}")
-        found = [each for each in json.loads(output.stdout or "[]") if each.get("root")]
-        return (found[0]["kind"], found[0]["handle"]) if found else ("noqueue", "0:")
+        listed = qdiscs_of(output.stdout, argv, doing=f"read {self.name}")
+        found = next((each for each in listed if each.root), None)
+        return (found.kind, found.handle) if found else ("noqueue", "0:")
 
     def _own_root(self, record: TargetRecord) -> str:
         """The kind of our root qdisc; empty if the device has only what the kernel gave it."""

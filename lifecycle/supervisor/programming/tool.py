@@ -14,6 +14,7 @@ import subprocess
 from collections.abc import Sequence
 from typing import Protocol
 
+from lifecycle.codec import from_json
 from lifecycle.supervisor.orphans import OWN_CHILD
 from lifecycle.supervisor.programming.errors import (
     MissingFeatureError,
@@ -83,6 +84,7 @@ class HostTool:
                     input=stdin,
                     capture_output=True,
                     text=True,
+                    errors="backslashreplace",
                     timeout=_TIMEOUT_S,
                     check=False,
                     env={**os.environ, "LC_ALL": "C", "PATH": path},
@@ -121,6 +123,36 @@ def demand(tool: Tool, argv: Sequence[str], *, doing: str, stdin: str = "") -> s
     if output.returncode == 0:
         return output.stdout
     raise failure(output, argv, doing=doing)
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Qdisc:
+    """What is read of a queueing discipline in the list of `tc -j qdisc show`."""
+
+    kind: str
+    dev: str = ""
+    handle: str = "0:"
+    root: bool = False
+
+
+def qdiscs_of(text: str, argv: Sequence[str], *, doing: str) -> tuple[Qdisc, ...]:
+    """Return the queueing disciplines that `tc -j qdisc show` printed.
+
+    Args:
+        text: what it printed; nothing is an empty list.
+        argv: the command line.
+        doing: what fails if it is no such list, to follow "cannot".
+
+    Raises:
+        ProgrammingError: it is none.
+    """
+    try:
+        return from_json(text.strip() or "[]", tuple[Qdisc, ...])
+    except ValueError as error:
+        raise ProgrammingError(
+            f"cannot {doing}: what {shlex.join(argv)!r} prints is no list of qdiscs: {error}",
+            hint="look at what it prints, and which program that is",
+        ) from error
 
 
 def refused(output: Output, *, by: str) -> bool:

@@ -1,0 +1,194 @@
+"""Names of topics and nodes that ROS would refuse, announced by a bare DDS participant.
+
+One active system sees them all; every verb that looks at it runs once, and each name must be in
+what the supervisor finds, escaped.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+
+from lifecycle.errors import ExitCode
+from tests.hostile.attack import (
+    CODES,
+    Attack,
+    HostileClass,
+    Place,
+    Unhandled,
+    check,
+    check_text,
+    in_a_process,
+)
+from tests.ros.faults.system import BARE_DDS
+from tests.ros.faults.test_hostile_names import NODES, STRING, TOPICS, raw
+from tests.ros.supervisor.running import Up, pair
+
+MANY = 60
+"""Generated names of topics; half as many of nodes."""
+
+PER_PARTICIPANT = 30
+WAIT_S = 40.0
+
+VERBS = ("verify", "flows", "graph", "status", "capture")
+
+
+def _name(rng: random.Random) -> bytes:
+    """Return a name that differs from others, without NUL: it would end an argument."""
+    pieces = (
+        *(
+            b"foo",
+            b"/",
+            b"//",
+            b"~",
+            b"{",
+            b"}",
+            b" ",
+            b"\n",
+            b"\r",
+            b"\t",
+            b"\x1b[2J",
+            b"\x9b",
+            b"\x7f",
+        ),
+        *("\u202e".encode(), "é".encode(), b"\xff", b"\xc0\x80", b"\xed\xa0\x80", b"$(id)", b"%s"),
+        *(
+            b"'; DROP",
+            b"<b>",
+            b"]]>",
+            b"&amp;",
+            b"verdict: ok",
+            b"-",
+            b"..",
+            b"x" * 100,
+            b'"',
+            b"\\",
+        ),
+    )
+    return b"".join(rng.choice(pieces) for _ in range(rng.randint(1, 6)))
+
+
+def _of_topic(name: bytes) -> str:
+    return "/" + raw(name)
+
+
+def _of_node(space: bytes, name: bytes) -> str:
+    return f"{raw(space).rstrip('/')}/{raw(name)}"
+
+
+class Named:
+    """An attack by one name: of a topic, or a node's namespace and name."""
+
+    def __init__(self, name: tuple[bytes, ...]) -> None:
+        self.name = name
+
+    @property
+    def shown(self) -> str:
+        """How a finding names it."""
+        return _of_topic(*self.name) if len(self.name) == 1 else _of_node(*self.name)
+
+    def __call__(self, seen: Seen) -> None:
+        if self.shown not in seen.subjects:
+            raise Unhandled(f"no finding names {self.shown!r}")
+
+
+class Seen:
+    """What a supervisor found, and how verbs ended, beside all of the names."""
+
+    def __init__(self) -> None:
+        self.subjects: set[str] = set()
+        self.verbs: dict[str, BaseException | None] = {}
+
+
+@contextlib.contextmanager
+def stage(place: Place, attacks: Sequence[Attack]) -> Iterator[Seen]:
+    folder = place.folder()
+    seen = Seen()
+    manifest = pair(folder, place.domain)
+    run = Up(manifest, runtime=folder)
+    intruders = []
+    try:
+        run.until("system", reached="active")
+        names = [each.run.name for each in attacks if isinstance(each.run, Named)]
+        topics = [topic for (topic,) in (e for e in names if len(e) == 1)]
+        nodes = [each for each in names if len(each) == 2]
+        program = [os.fsencode(each) for each in (sys.executable, BARE_DDS)]
+        for at in range(0, max(len(topics), len(nodes)), PER_PARTICIPANT):
+            words = []
+            for topic in topics[at : at + PER_PARTICIPANT]:
+                words += [b"--write", b"rt/" + topic + STRING]
+            if words:
+                intruders.append(subprocess.Popen([*program, *words], stdout=subprocess.DEVNULL))
+            words = [b"--write", b"rt/foo-baz%d" % at + STRING]
+            for space, name in nodes[at : at + PER_PARTICIPANT]:
+                words += [b"--node", space, name]
+            intruders.append(subprocess.Popen([*program, *words], stdout=subprocess.DEVNULL))
+        wanted = {each.run.shown for each in attacks if isinstance(each.run, Named)}
+        deadline = time.monotonic() + WAIT_S
+        while wanted - seen.subjects and time.monotonic() < deadline:
+            run.catch_up()
+            for each in run.of_kind("verdict"):
+                seen.subjects |= {found["subject"] for found in each["verdict"]["findings"]}
+            time.sleep(0.2)
+        for verb in VERBS:
+            seen.verbs[verb] = _ended(verb, str(manifest), place)
+        if run.process.poll() is not None:
+            raise Unhandled(f"the supervisor ended: {run.events[-2:]}")
+        for each in intruders:
+            each.kill()
+            each.wait()
+        yield seen
+        run.signal(signal.SIGINT)
+        if (code := run.finish()) != ExitCode.INTERRUPTED:
+            raise Unhandled(f"the supervisor ended with {code}")
+        run.assert_nothing_left()
+        assert run.process.stderr is not None
+        check_text(run.process.stderr.read())
+    finally:
+        for each in intruders:
+            each.kill()
+            each.wait()
+        run.close()
+
+
+def _ended(verb: str, manifest: str, place: Place) -> BaseException | None:
+    words = {
+        "capture": ("capture", "--domain", str(place.domain), "--wait", "1"),
+        "graph": ("graph", manifest),
+        "status": ("status", manifest),
+    }.get(verb, (verb, manifest, "--timeout", "1"))
+    try:
+        check(in_a_process_beside(*words, place=place), *CODES)
+    except Exception as error:  # noqa: BLE001 - it is what the attack did
+        return error
+    return None
+
+
+def in_a_process_beside(*words: str, place: Place):
+    """Run a verb in a runtime directory of its own: it sees the run by DDS alone."""
+    return in_a_process(*words, runtime=place.folder(), limit_s=40.0)
+
+
+def _looks(verb: str, seen: Seen) -> None:
+    if error := seen.verbs[verb]:
+        raise error
+
+
+def attacks(rng: random.Random) -> list[Attack]:
+    topics = dict.fromkeys((*TOPICS, *(_name(rng) for _ in range(MANY))))
+    spaces = (b"/", b"", b"//", b"/a-b", b"bad", b"/ok", b"/\x1b[31m")
+    nodes = dict.fromkeys((*NODES, *((rng.choice(spaces), _name(rng)) for _ in range(MANY // 2))))
+    every = (*((each,) for each in topics), *nodes)
+    found = [Attack(name=f"{names!r}", run=Named(names)) for names in every]
+    found += [Attack(name=each, run=functools.partial(_looks, each)) for each in VERBS]
+    return found
+
+
+CLASS = HostileClass(name="names", attacks=attacks, stage=stage)

@@ -1,0 +1,227 @@
+"""Every reader of data that others write, on a good document with pieces of it changed.
+
+Owns: `READERS`, the one list of them: property tests go through it too
+(tests/unit/test_foreign_data.py).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import json
+import random
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+from lifecycle import codec
+from lifecycle.codec import from_json, to_json
+from lifecycle.errors import LifecycleError
+from lifecycle.export.nftables import parse_managed_comment
+from lifecycle.graph.messages import GraphMessageError, Joined, encode
+from lifecycle.graph.messages import decode as decode_message
+from lifecycle.manifest import ManifestError, load
+from lifecycle.manifest.diagnostics import Position
+from lifecycle.manifest.idl import IdlError, parse_struct
+from lifecycle.manifest.nodl import read_interface
+from lifecycle.manifest.type_hash import _hashes
+from lifecycle.node.control import Event
+from lifecycle.plan.notice import PlanNoticeError, announced_plan, notice_of
+from lifecycle.plan.notice import decode as decode_notice
+from lifecycle.plan.notice import encode as encode_notice
+from lifecycle.supervisor.programming.errors import ProgrammingError
+from lifecycle.supervisor.programming.ledger import Ledger
+from lifecycle.supervisor.programming.nft import root_qdiscs
+from lifecycle.supervisor.programming.settings import load_settings
+from lifecycle.supervisor.programming.tool import HostTool, Output
+from lifecycle.supervisor.rundir import read_record
+from lifecycle.supervisor.server import Answer, Question
+from lifecycle.verify import Stage
+from lifecycle.verify.observation import ConfigurationError, decode_configuration
+from tests.hostile.attack import Attack, HostileClass, Place, mutated
+from tests.unit.supervisor.programming.fakes import FakeTool
+from tests.unit.supervisor.programming.samples import nef_settings
+from tests.unit.verify.perfect import perfect
+from tests.unit.verify.test_verify_rules import PLAN
+
+SHARE = 25
+"""Attacks on each reader."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Reader:
+    """One reader of foreign data.
+
+    Attributes:
+        good: what it is made for.
+        read: reads bytes; a folder of its own is there to put them into a file.
+        errors: what it may raise; anything else is unhandled.
+    """
+
+    good: bytes
+    read: Callable[[bytes, Path], object]
+    errors: tuple[type[Exception], ...]
+
+
+def _text(data: bytes) -> str:
+    return data.decode(errors="replace")
+
+
+def _file(name: str, read: Callable[[Path], object]) -> Callable[[bytes, Path], object]:
+    def in_file(data: bytes, folder: Path) -> object:
+        path = folder / name
+        path.write_bytes(data)
+        return read(path)
+
+    return in_file
+
+
+def _hash(path: Path) -> object:
+    _hashes.cache_clear()
+    return _hashes(path)
+
+
+def _nodl(path: Path) -> object:
+    at = Position(file="m.lifecycle.yaml", line=1, column=1)
+    return read_interface(f"local://{path.name}", base=path.parent, at=at)
+
+
+def _ledger(path: Path) -> object:
+    return Ledger(path.parent, "robot").read()
+
+
+def _qdiscs(data: bytes, _: Path) -> object:
+    return root_qdiscs(FakeTool(("tc", Output(returncode=0, stdout=_text(data), stderr=""))))
+
+
+def _printed(data: bytes, folder: Path) -> object:
+    (folder / "out").write_bytes(data)
+    return HostTool().run(["cat", str(folder / "out")])
+
+
+def _tc(data: bytes, folder: Path) -> object:
+    from lifecycle.export.tc_settings import TcSettings
+    from lifecycle.supervisor.programming.tc import TcTarget
+
+    tool = FakeTool(("tc", Output(returncode=0, stdout=_text(data), stderr="")))
+    settings = TcSettings(device="eth0", link_kbit=20_000)
+    return TcTarget("robot", settings, Ledger(folder, "robot"), tool).plan([])
+
+
+_SEEN = perfect(PLAN, Stage.ACTIVE)
+_CONFIGURATION = codec.to_json(_SEEN.configurations[0])
+_NAME = json.loads(_CONFIGURATION)["name"]
+_QDISCS = json.dumps(
+    [{"dev": "eth0", "kind": "htb", "handle": "1f10:", "root": True, "options": {"r2q": 10}}]
+).encode()
+_NODL = b"""nodl_version: 2
+node:
+  name: talker
+publishers:
+  - {name: chatter, type: std_msgs/msg/String, qos: {history: KEEP_LAST, depth: 1}}
+parameters:
+  rate: {type: double, default_value: 1.0}
+"""
+_IDL = b"""module a { module msg { typedef long x[3];
+  struct B { @default(value=1) sequence<double, 4> c; string<9> d; x e; }; }; };"""
+_HASHES = json.dumps(
+    {"type_hashes": [{"type_name": "a/msg/B", "hash_string": "RIHS01_ab"}]}
+).encode()
+_MANIFEST = b"""manifest_version: 1
+system: robot
+nodes:
+  talker:
+    run: {python: "x:Talker"}
+    interface:
+      publishers: [{name: chatter, type: std_msgs/msg/String, qos: {depth: 3}}]
+    flows: {publishers: {chatter: {unique: strictly_required, dscp: EF}}}
+links: []
+"""
+
+READERS: dict[str, Reader] = {
+    "graph message": Reader(
+        good=encode(Joined(node="/a", incarnation="1", sequence=3, state="active", checksum="ab")),
+        read=lambda data, _: decode_message(data),
+        errors=(GraphMessageError,),
+    ),
+    "configuration report": Reader(
+        good=_CONFIGURATION,
+        read=lambda data, _: decode_configuration(_text(data), _NAME),
+        errors=(ConfigurationError,),
+    ),
+    "plan notice": Reader(
+        good=encode_notice(notice_of(PLAN, run="r", host="h", machines=("local",))).encode(),
+        read=lambda data, _: announced_plan(decode_notice(_text(data))),
+        errors=(PlanNoticeError,),
+    ),
+    "control question": Reader(
+        good=b'{"ask":"restart","node":"talker","plan":null,"reload":false}',
+        read=lambda data, _: from_json(data, Question),
+        errors=(ValueError,),
+    ),
+    "control answer": Reader(
+        good=to_json(Answer(exit_code=0, error="x", differences=("a",))),
+        read=lambda data, _: from_json(data, Answer),
+        errors=(ValueError,),
+    ),
+    "host event": Reader(
+        good=b'{"id":1,"kind":"state","node":"/a","state":"active","connected":true}',
+        read=lambda data, _: from_json(data, Event),
+        errors=(ValueError,),
+    ),
+    "run record": Reader(
+        good=b'{"run_id":"a","boot_id":"b","began_s":1.0,"supervisor":'
+        b'{"name":"supervisor","pid":1,"start_ticks":1}}',
+        read=_file("record.json", lambda path: read_record(path.parent)),
+        errors=(),
+    ),
+    "ledger": Reader(
+        good=b'{"version":1,"system":"robot","targets":[{"target":"nft","scope":"t"}]}',
+        read=_file("programmed.json", _ledger),
+        errors=(ProgrammingError,),
+    ),
+    "settings of a server": Reader(
+        good=json.dumps({"nef": nef_settings("https://nef.test")}).encode(),
+        read=_file("targets.json", lambda path: load_settings(str(path))),
+        errors=(LifecycleError,),
+    ),
+    "nft listing": Reader(
+        good=b'table inet flowqos_a {\n comment "managed by lifecycle digest 0123456789abcdef"\n}',
+        read=lambda data, _: parse_managed_comment(_text(data)),
+        errors=(),
+    ),
+    "qdiscs of tc": Reader(good=_QDISCS, read=_qdiscs, errors=(ProgrammingError,)),
+    "root qdisc of a device": Reader(
+        good=_QDISCS.replace(b"1f10:", b"0:"), read=_tc, errors=(LifecycleError,)
+    ),
+    "output of a tool": Reader(good=b"qdisc htb 1f10:", read=_printed, errors=()),
+    "NoDL document": Reader(good=_NODL, read=_file("a.nodl.yaml", _nodl), errors=(ManifestError,)),
+    "installed IDL": Reader(
+        good=_IDL, read=lambda data, _: parse_struct(_text(data), "B"), errors=(IdlError,)
+    ),
+    "installed type hashes": Reader(good=_HASHES, read=_file("B.json", _hash), errors=()),
+    "manifest": Reader(
+        good=_MANIFEST, read=_file("m.lifecycle.yaml", load), errors=(ManifestError,)
+    ),
+}
+
+
+def attacks(rng: random.Random) -> list[Attack]:
+    found = []
+    for name, reader in READERS.items():
+        for number in range(SHARE):
+            data = mutated(reader.good, rng)
+            found.append(
+                Attack(name=f"{name} {number}", run=functools.partial(_read, reader, data))
+            )
+    return found
+
+
+def _read(reader: Reader, data: bytes, place: Place) -> None:
+    del place
+    with tempfile.TemporaryDirectory() as folder, contextlib.suppress(*reader.errors):
+        reader.read(data, Path(folder))
+
+
+CLASS = HostileClass(name="parsers", attacks=attacks)

@@ -1,0 +1,89 @@
+"""Plays nodes of any name, one DDS participant for all: reads `WAY NAME` lines, answers `done`."""
+
+from __future__ import annotations
+
+import sys
+import threading
+
+import rclpy
+from lifecycle_msgs.srv import ChangeState
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from tests.hostile.answers import ANSWERS
+
+
+def _answer(text: str, *, success: bool = True):
+    def serve(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success, response.message = success, text
+        return response
+
+    return serve
+
+
+def _play(node: Node, way: str) -> None:
+    match way:
+        case "publish":
+            node.create_publisher(String, "/chatter", 10)
+        case "listen":
+            node.create_subscription(String, "/chatter", lambda _: None, 10)
+        case "serve":
+            node.create_service(Trigger, "/listener/ping", lambda _, response: response)
+        case "call":
+            node.create_client(Trigger, "/listener/ping")
+        case "change_state":
+            node.create_service(ChangeState, "/talker/change_state", lambda _, response: response)
+        case _:
+            answer = ANSWERS[way]
+            success = way != "no success"
+            from rcl_interfaces.srv import SetParameters
+
+            node.create_publisher(String, "~/said", 10)
+            node.create_service(Trigger, "~/get_configuration", _answer(answer, success=success))
+            node.create_service(SetParameters, "~/map_to", lambda _, response: response)
+
+
+def main() -> None:
+    rclpy.init()
+    nodes: list[Node] = []
+    executor = SingleThreadedExecutor()
+    thread = threading.Thread(target=executor.spin, daemon=True)
+    thread.start()
+    for line in sys.stdin:
+        way, _, name = line.strip().rpartition(" ")
+        if name == "leave":
+            for each in nodes:
+                executor.remove_node(each)
+                each.destroy_node()
+            nodes.clear()
+        elif way.startswith("say "):
+            _, topic, index = f"{way} {name}".split(" ")
+            _say(nodes, executor, topic, int(index))
+        else:
+            nodes.append(Node(name, enable_rosout=False))
+            _play(nodes[-1], way if way == "change_state" else way.replace("_", " "))
+            executor.add_node(nodes[-1])
+        print("done", flush=True)
+
+
+def _say(nodes: list[Node], executor: SingleThreadedExecutor, topic: str, index: int) -> None:
+    from lifecycle.graph.dds import GRAPH_QOS
+    from lifecycle.middleware.plan_notices import _qos
+    from tests.hostile.answers import MESSAGES
+
+    node = Node("_ros2cli_teller", enable_rosout=False)
+    nodes.append(node)
+    qos = GRAPH_QOS if topic.endswith("graph") else _qos(64)
+    publisher = node.create_publisher(String, topic, qos)
+    for _ in range(200):
+        if publisher.get_subscription_count():
+            break
+        threading.Event().wait(0.02)
+    for text in MESSAGES[index : index + 1] or MESSAGES:
+        publisher.publish(String(data=text))
+
+
+if __name__ == "__main__":
+    main()
