@@ -319,6 +319,26 @@ def test_a_nameless_report_of_the_declared_type_is_chosen_before_one_of_another(
     assert [each.observed for each in view.actual] == list(seen.endpoints)
 
 
+def test_a_nameless_report_of_the_declared_type_is_chosen_where_discovery_shows_none() -> None:
+    plan = connected("udpv4://10.0.0.1:7911")
+    report = perfect(plan).configurations[0].endpoints[0]
+    right = dataclasses.replace(report, name="")
+    wrong = dataclasses.replace(right, type="std_msgs/msg/Int32", gid="99")
+    edit = both(drop_endpoint(PUB, "/a"), change_configuration("/one", endpoints=(wrong, right)))
+    view = view_after(edit, plan)
+    assert actual(view, PUB, "/a").report == right
+    assert actual(view, PUB, "/a").observed.type == STRING
+    assert [each.type for each in view.undeclared] == ["std_msgs/msg/Int32"]
+
+
+def test_a_report_of_another_type_is_not_taken_from_the_endpoint_that_it_is_on() -> None:
+    plan = planned(node("one", publisher("a"), publisher("/a", "std_msgs/msg/Int32")))
+    second = perfect(plan).configurations[0].endpoints[1]
+    nameless = dataclasses.replace(second, name="")
+    edit = both(drop_endpoint(PUB, "/a"), change_configuration("/one", endpoints=(nameless,)))
+    assert [each.report for each in view_after(edit, plan).actual] == [None, nameless]
+
+
 def test_of_several_endpoints_of_one_name_the_one_with_the_reported_gid_is_the_declared() -> None:
     seen = perfect(PLAN)
     gid = next(each.gid for each in seen.endpoints if (each.kind, each.name) == (PUB, STATUS))
