@@ -2,7 +2,7 @@
 
 mutmut starts pytest in every fork; to collect a few hundred tests takes longer than to run them
 until one fails. Here the parent collects them, and each fork runs those that reach its mutant:
-first the ones that have killed most mutants of the same function.
+first the ones that have killed most mutants of the same function, or of its module.
 
 Usage: python -m tests.mutation.run [PATTERN...], as `mutmut run`.
 """
@@ -40,7 +40,7 @@ class _Collected(PytestRunner):
 
     def __init__(self) -> None:
         super().__init__()
-        self.kills: dict[str, collections.Counter[str]] = {}
+        self._kills: dict[str, collections.Counter[str]] = {}
         self._session: pytest.Session | None = None
         self._items: dict[str, pytest.Item] = {}
         self._read, self._write = os.pipe()
@@ -72,21 +72,34 @@ class _Collected(PytestRunner):
     def _run_collected(self, mutant_name: str, tests: Iterable[str]) -> int:
         assert self._session is not None
         function = mangled_name_from_mutant_name(mutant_name) if mutant_name else ""
-        kills = self.kills.get(function, collections.Counter())
-        chosen = sorted((each for each in tests if each in self._items), key=lambda t: -kills[t])
         session = self._session
-        session.items = [self._items[each] for each in chosen]
+        session.items = [self._items[each] for each in self._ordered(function, tests)]
         session.config.pluginmanager.register(_Killer(function, self._write))
         with change_cwd("mutants"):
             session.config.hook.pytest_runtestloop(session=session)
         return 0
+
+    def _ordered(self, function: str, tests: Iterable[str]) -> list[str]:
+        """Put those first that are most likely to fail, else those that take the least time."""
+        module = function.rpartition(".")[0]
+        by_test = self._kills.get(function, collections.Counter())
+        by_file = self._kills.get(module, collections.Counter())
+
+        def place(test: str) -> tuple[int, bool, int]:
+            file = test.partition("::")[0]
+            named = module.rpartition(".")[2] in file
+            return -by_test[test], not named, -by_file[file]
+
+        return sorted((each for each in tests if each in self._items), key=place)
 
     def note_kills(self) -> None:
         """Take in which tests have failed since the last time."""
         with contextlib.suppress(BlockingIOError):
             for line in os.read(self._read, 1 << 20).decode().splitlines():
                 function, _, test = line.partition("\t")
-                self.kills.setdefault(function, collections.Counter())[test] += 1
+                module, file = function.rpartition(".")[0], test.partition("::")[0]
+                self._kills.setdefault(function, collections.Counter())[test] += 1
+                self._kills.setdefault(module, collections.Counter())[file] += 1
 
 
 class _Killer:
@@ -115,6 +128,9 @@ class _Runner(ForkRunner):
         if clean != 0:
             sys.exit(f"cannot try mutants: the tests fail without any ({clean})")
         super().startup()
+
+    def run_clean_tests(self, tests: Iterable[str]) -> int:
+        return 0  # at startup, as every mutant's are
 
     def wait_for_result(self, timeout: float | None = None) -> MutantResult:
         result = super().wait_for_result(timeout)
