@@ -6,7 +6,7 @@ import dataclasses
 
 import pytest
 
-from lifecycle.manifest.model import EndpointKind, Run, RunKind
+from lifecycle.manifest.model import EndpointKind, Policy, Run, RunKind
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.plan import Plan, build_plan
 from lifecycle.plan.model import ParticipantConnections
@@ -123,6 +123,18 @@ def test_nodes_are_sorted_without_tools_hidden_participants_and_placeholders() -
     )
     assert list(view.observed) == ["/an_arm", "/robot/camera", "/viewer", "/zed"]
     assert view.tools == {"/rviz2": "rviz2"}
+
+
+def test_what_the_policy_tolerates_by_a_hidden_name_is_a_tool_and_no_participant() -> None:
+    plan = planned(node("cam", publisher("a")))
+    recorder = both(
+        add_node("/_cam_recorder_1"), add_endpoint(SUB, "/_cam_recorder_1", "/a", gid="99")
+    )
+    assert view_after(recorder, plan).tools == {}
+    tolerant = dataclasses.replace(plan, policy=Policy(tolerated_nodes=("_cam_recorder_*",)))
+    view = view_after(recorder, tolerant)
+    assert view.tools == {"/_cam_recorder_1": "_cam_recorder_*"}
+    assert (view.undeclared, [each.name for each in view.of_tools]) == ((), ["/a"])
 
 
 def test_a_declared_node_that_is_named_like_a_tool_or_a_hidden_one_is_no_tool() -> None:
