@@ -268,6 +268,17 @@ def test_a_part_of_an_action_of_no_node_is_that_of_the_node_that_declares_the_ac
     assert [each.name for each in view.unattributed] == ["/other/_action/send_goal"]
 
 
+def test_housekeeping_of_a_stranger_is_left_in_where_it_serves_what_is_declared() -> None:
+    of_parameters = "rcl_interfaces/srv/GetParameters"
+    serves = both(
+        add_endpoint(SERVER, "/guest", "/guest/get_parameters", type=of_parameters),
+        add_endpoint(SERVER, "/other", "/other/get_parameters", type=of_parameters),
+    )
+    asks = endpoint(CLIENT, "/guest/get_parameters", of_parameters, None)
+    view = view_after(serves, planned(node("one", asks)))
+    assert [each.name for each in view.foreign] == ["/guest/get_parameters"]
+
+
 def test_a_topic_of_no_node_is_nobodys_although_its_participant_is_known() -> None:
     view = view_after(nameless_service(STATUS, PUB, STRING))
     assert [(each.node, each.name) for each in view.unattributed] == [("", STATUS)]
