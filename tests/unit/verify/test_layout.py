@@ -421,9 +421,22 @@ def test_what_client_libraries_bring_along_is_not_left_over_of_a_report_either()
         resolved="/robot/camera/remap",
         type="rcl_interfaces/srv/SetParameters",
     )
+    own = dataclasses.replace(remap, type=TRIGGER)
     camera = perfect(PLAN).configurations[0]
-    edit = change_configuration("/robot/camera", endpoints=(*camera.endpoints, rosout, remap))
-    assert view_after(edit).undeclared == ()
+    for told, left_over in (((rosout, remap), []), ((rosout, own), [own.resolved])):
+        edit = change_configuration("/robot/camera", endpoints=(*camera.endpoints, *told))
+        assert [each.name for each in view_after(edit).undeclared] == left_over
+
+
+def test_what_client_libraries_bring_along_hides_nothing_that_is_seen_after_it() -> None:
+    seen = perfect(PLAN)
+    rosout = ObservedEndpoint(
+        kind=PUB, node="/robot/camera", name="/rosout", type="rcl_interfaces/msg/Log", gid="99"
+    )
+    seen = dataclasses.replace(seen, endpoints=(rosout, *seen.endpoints))
+    view = lay_out(PLAN, seen, Stage.CONNECTED)
+    assert all(each.observed for each in view.actual)
+    assert view.undeclared == ()
 
 
 def test_further_names_of_a_declared_endpoint_are_left_over() -> None:
