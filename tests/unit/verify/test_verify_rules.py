@@ -40,6 +40,7 @@ from lifecycle.verify import (
     Stage,
     verify,
 )
+from lifecycle.verify.rules.definitions import differ
 from tests.unit.plan.samples import (
     IMAGE,
     at,
@@ -962,6 +963,13 @@ def test_without_any_hash_there_is_nothing_to_compare():
 
 def test_hashes_of_two_hash_versions_are_not_compared():
     assert findings_after(hashes(NEWER, HERE), plan=defined(HERE)) == []
+
+
+def test_a_hash_that_is_none_but_begins_with_the_version_is_another_definition():
+    odd = "RIHS01_a_b"
+    assert differ(odd, HERE)
+    assert differ(HERE, odd)
+    assert not differ(odd, odd)
 
 
 def test_a_service_of_another_definition_is_violated():
