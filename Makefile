@@ -44,11 +44,12 @@ HOSTILE ?=
 hostile: $(STAMP)
 	$(BIN)/python -m tests.hostile $(HOSTILE)
 
-# Half an hour and more. MUTANTS='lifecycle.verify.rules.qos*' tries some only; `make clean` forgets results.
+# MUTANTS='lifecycle.verify.rules.qos*' tries some only. What no test has killed is tried again each time; `make clean`
+# forgets all results.
 MUTANTS ?=
 mutate: $(STAMP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[mutate]'
-	CI=1 $(BIN)/mutmut run $(MUTANTS) > mutants.log 2>&1 || { tail -n 40 mutants.log; exit 1; }
+	CI=1 $(BIN)/python -m tests.mutation.run $(MUTANTS) > mutants.log 2>&1 || { tail -n 40 mutants.log; exit 1; }
 	$(BIN)/python -m tests.mutation.report --at-least 95
 
 clean:

@@ -10,6 +10,7 @@ import contextlib
 import dataclasses
 import difflib
 import enum
+import functools
 import ipaddress
 import re
 from collections.abc import Callable, Iterable
@@ -56,15 +57,12 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     return f"did you mean {close[0]!r}?" if close else ""
 
 
-def _number(allowed: range) -> Callable[[str, str], int]:
-    def read(name: str, value: str) -> int:
-        if not value.isascii() or not value.isdigit() or int(value) not in allowed:
-            raise ConnectionUrlError(
-                f"{name}={value!r} is not a number of {allowed.start}–{allowed.stop - 1}"
-            )
-        return int(value)
-
-    return read
+def _number(allowed: range, name: str, value: str) -> int:
+    if not value.isascii() or not value.isdigit() or int(value) not in allowed:
+        raise ConnectionUrlError(
+            f"{name}={value!r} is not a number of {allowed.start}–{allowed.stop - 1}"
+        )
+    return int(value)
 
 
 def _switch(name: str, value: str) -> bool:
@@ -127,7 +125,7 @@ class Option:
         return tuple(str(each) for each in (value if self.repeated else (value,)))
 
 
-_PORT = _number(_PORTS)
+_PORT = functools.partial(_number, _PORTS)
 OPTIONS = {
     "metatraffic_port": Option(attribute="metatraffic_port", read=_PORT, transports=_UDP),
     "output_port": Option(attribute="output_port", read=_PORT, transports=_UDP),
@@ -135,11 +133,13 @@ OPTIONS = {
     "multicast": Option(attribute="multicast", read=_switch, transports=_UDP),
     "server": Option(attribute="server", read=_peer, transports=_IP, repeated=True),
     "server_prefix": Option(attribute="server_prefix", read=_prefix, transports=_IP),
-    "ttl": Option(attribute="ttl", read=_number(_TTLS), transports=_UDP),
+    "ttl": Option(attribute="ttl", read=functools.partial(_number, _TTLS), transports=_UDP),
     "interface": Option(attribute="interfaces", read=_word, transports=_UDP, repeated=True),
-    "dscp": Option(attribute="dscp", read=_number(range(64)), transports=_UDP),
+    "dscp": Option(attribute="dscp", read=functools.partial(_number, range(64)), transports=_UDP),
     "max_datagram_bytes": Option(
-        attribute="max_datagram_bytes", read=_number(range(500, 65501)), transports=_UDP
+        attribute="max_datagram_bytes",
+        read=functools.partial(_number, range(500, 65501)),
+        transports=_UDP,
     ),
     "non_blocking_send": Option(attribute="non_blocking_send", read=_switch, transports=_UDP),
 }

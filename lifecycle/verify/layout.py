@@ -41,6 +41,11 @@ from lifecycle.verify.view import (
 _Pools = dict[tuple[EndpointKind, str], list[ObservedEndpoint]]
 """One node's endpoints by kind and name."""
 
+_TURNS = ((True, True), (True, False), (False, False))
+"""Who chooses first among a node's endpoints: those whose type discovery shows as declared, those
+whose node reports it so, the rest. So one wrong type does not take another one's place. Each says
+whether the report, and what discovery shows, must have the declared type."""
+
 _PREFIX_DIGITS = 24
 """A GUID begins with its participant's prefix of 12 bytes (DDSI-RTPS §9.3.1)."""
 
@@ -215,16 +220,15 @@ def _match_node(
     pools = {place: list(endpoints) for place, endpoints in places.items()}
     matched: dict[int, Actual] = {}
     used: set[tuple[EndpointKind, str]] = set()
-    # Exact types choose first, so that one wrong type does not take another one's place.
-    for exact in (True, False):
+    for exact_report, exact_observed in _TURNS:
         for index, planned in enumerate(node.endpoints):
             if index in matched:
                 continue
             place = (planned.kind, planned.resolved)
-            report = _pick_report(planned, reports, exact=exact)
-            observed = _pick_observed(planned, report, pools.get(place, []), exact=exact)
-            if exact and observed is None:
-                continue
+            report = _pick_report(planned, reports, exact=exact_report)
+            observed = _pick_observed(planned, report, pools.get(place, []), exact=exact_observed)
+            if exact_report and (observed if exact_observed else report) is None:
+                continue  # its turn comes
             unseen = observed is None and may_hide(node, planned)
             if observed is not None and observed.gid:
                 pools[place].remove(observed)

@@ -12,20 +12,28 @@ from __future__ import annotations
 import argparse
 import ast
 import collections
+import contextlib
 import dataclasses
 import difflib
 import functools
 import json
 import re
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import yaml
 
 _ROOT = Path(__file__).parents[2]
+_KILLED = (1, 3)
+"""mutmut's exit codes: a test failed, or could not be collected."""
+
+_TIMED_OUT = (24, 36, 152, 255, -24)
+"""Killed too, if the mutant waits for ever; on a busy machine one may only have been slow."""
+
 _SURVIVED = (0, 33)
-"""mutmut's exit codes: every test passed; no test reaches the function."""
+"""Every test passed; no test reaches the function. All other codes decide nothing."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,13 +44,30 @@ class Mutant:
         module: the mutated module, which holds all its mutants.
         key: mutmut's name of it, for `mutmut show`.
         place: `lifecycle.verify.judge._blocks`, `lifecycle.supervisor.gate.Gate.judge`.
-        survived: no test noticed.
+        exit_code: what mutmut noted; None if it was not tried.
     """
 
     module: Path
     key: str
     place: str
-    survived: bool
+    exit_code: int | None
+
+    @property
+    def killed(self) -> bool:
+        """Whether a test noticed."""
+        return self.exit_code in (*_KILLED, *_TIMED_OUT)
+
+    @property
+    def survived(self) -> bool:
+        """Whether all tests passed; what was broken off is neither killed nor survived."""
+        return self.exit_code in _SURVIVED
+
+    @property
+    def outcome(self) -> str:
+        """What became of it, in a word."""
+        if self.killed:
+            return "timed out" if self.exit_code in _TIMED_OUT else "killed"
+        return "survived" if self.survived else f"undecided ({self.exit_code})"
 
     def change(self) -> str:
         """Return the lines that it removes and adds, each with `-` or `+`, stripped."""
@@ -53,6 +78,15 @@ class Mutant:
         lines = difflib.unified_diff(before.splitlines(), after.splitlines(), n=0, lineterm="")
         changed = [line for line in lines if not line.startswith(("---", "+++", "@@"))]
         return "\n".join(f"{line[0]} {line[1:].strip()}" for line in changed)
+
+    def reasons(self, allowed: Mapping[str, Sequence[str]]) -> list[str]:
+        """Return which entries of `justified` are of the lines that it adds, or else removes."""
+        change = self.change().splitlines()
+        for sign in "+-":
+            lines = " ".join(line[1:] for line in change if line.startswith(sign)).split()
+            if lines:
+                return [each for each in allowed.get(self.place, ()) if each in " ".join(lines)]
+        return []
 
 
 @functools.cache
@@ -68,19 +102,27 @@ def _functions(module: Path) -> dict[str, str]:
 
 
 def mutants() -> Iterator[Mutant]:
-    """Yield every mutant that was tried in the last run."""
+    """Yield every mutant, tried or not."""
     for meta in sorted((_ROOT / "mutants").rglob("*.meta")):
-        results = json.loads(meta.read_text(encoding="utf-8"))["exit_code_by_key"]
-        for key, exit_code in results.items():
-            if exit_code is not None:
-                place = re.sub(r"__mutmut_\d+$", "", key)
-                place = re.sub(r"\.xǁ(\w+?)ǁ", r".\1.", place).replace(".x_", ".")
-                module = meta.with_suffix("")
-                yield Mutant(module=module, key=key, place=place, survived=exit_code in _SURVIVED)
+        for key, exit_code in _results(meta).items():
+            place = re.sub(r"__mutmut_\d+$", "", key)
+            place = re.sub(r"\.xǁ(\w+?)ǁ", r".\1.", place).replace(".x_", ".")
+            yield Mutant(module=meta.with_suffix(""), key=key, place=place, exit_code=exit_code)
+
+
+def _results(meta: Path) -> dict[str, int | None]:
+    """Read what mutmut noted of a module; while it runs it writes the file in place."""
+    for _ in range(20):
+        with contextlib.suppress(json.JSONDecodeError):
+            results: dict[str, int | None] = json.loads(meta.read_text("utf-8"))["exit_code_by_key"]
+            return results
+        time.sleep(0.1)
+    print(f"skipped: {meta} is being written; ask again once mutmut has ended")
+    return {}
 
 
 def justified() -> dict[str, list[str]]:
-    """Return what may survive: for each place the texts that a change's added lines may contain."""
+    """Return what may survive: for each place the texts that a changed line may contain."""
     allowed: dict[str, list[str]] = collections.defaultdict(list)
     for path in sorted((Path(__file__).parent / "justified").glob("*.yaml")):
         for entry in yaml.safe_load(path.read_text("utf-8")):
@@ -95,36 +137,46 @@ def main() -> int:
     parser.add_argument("--at-least", type=float, default=0.0, metavar="PERCENT")
     options = parser.parse_args()
     allowed = justified()
-    tried: collections.Counter[str] = collections.Counter()
-    killed: collections.Counter[str] = collections.Counter()
-    excused: collections.Counter[str] = collections.Counter()
-    left: list[tuple[Mutant, str]] = []
+    needed: set[tuple[str, str]] = set()
+    unsure: set[str] = set()
+    modules: dict[str, collections.Counter[str]] = {}
+    left = 0
     for mutant in mutants():
-        room = ".".join(mutant.place.split(".")[: 3 if "supervisor" in mutant.place else 2])
-        tried[room] += 1
-        if not mutant.survived:
-            killed[room] += 1
+        name = ".".join(mutant.module.relative_to(_ROOT / "mutants").with_suffix("").parts)
+        counts = modules.setdefault(name, collections.Counter())
+        if mutant.exit_code is None:
+            counts["not tried"] += 1
+            unsure.add(mutant.place)
             continue
-        change = mutant.change()
-        added = " ".join(line[1:].strip() for line in change.splitlines() if line.startswith("+"))
-        if any(each in " ".join(added.split()) for each in allowed[mutant.place]):
-            excused[room] += 1
+        counts["tried"] += 1
+        if mutant.killed:
+            counts["killed"] += 1
+            counts["timed out"] += mutant.outcome == "timed out"
+            continue
+        reasons = mutant.reasons(allowed)
+        if reasons and mutant.survived:
+            needed |= {(mutant.place, each) for each in reasons}
+            counts["justified"] += 1
         else:
-            left.append((mutant, change))
-    for mutant, change in left:
-        print(f"survived: {mutant.key}\n{change}\n")
-    for room in sorted(tried):
-        print(
-            f"{room}: {killed[room]} of {tried[room]} killed ({killed[room] / tried[room]:.1%}),"
-            f" {excused[room]} justified"
-        )
-    if not tried:
-        print("nothing was tried: run `mutmut run` first")
+            left += 1
+            print(f"{mutant.outcome}: {mutant.key}\n{mutant.change()}\n")
+    for place, reasons in allowed.items():
+        for each in reasons:
+            if place not in unsure and (place, each) not in needed:
+                print(f"justified for nothing: {place}: {each}")
+    total = sum(modules.values(), collections.Counter())
+    if not total["tried"]:
+        print("nothing was tried: run `make mutate` first")
         return 1
-    score = 100 * sum(killed.values()) / sum(tried.values())
-    print(
-        f"score: {score:.1f} % of {sum(tried.values())} mutants killed, {len(left)} not justified"
-    )
+    for name, counts in (*sorted(modules.items()), ("all", total)):
+        if counts["tried"]:
+            print(
+                f"{name}: {counts['killed'] / counts['tried']:.1%} of {counts['tried']} killed,"
+                f" {counts['timed out']} of them by time; {counts['justified']} justified"
+                + (f"; {counts['not tried']} not tried" if counts["not tried"] else "")
+            )
+    score = 100 * total["killed"] / total["tried"]
+    print(f"score: {score:.1f} %, {left} not justified")
     return int(bool(left) or score < options.at_least)
 
 

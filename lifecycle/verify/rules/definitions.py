@@ -59,7 +59,9 @@ def check(view: View) -> Iterator[Finding]:
         expected = installed[place]
         source = "the definition installed here"
         if not expected:
-            first = next(((end.type_hash, end.node) for end in ends if end.type_hash), None)
+            # A stranger that differs is at fault itself, so declared ends come first.
+            by_right = sorted(ends, key=lambda end: end.at is None)
+            first = next(((end.type_hash, end.node) for end in by_right if end.type_hash), None)
             if first is None:
                 continue  # nothing to compare with
             expected, source = first[0], first[1] or "an unknown node"

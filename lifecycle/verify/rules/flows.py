@@ -144,7 +144,7 @@ def _strict(actual: Actual, uniqueness: Uniqueness) -> Iterator[Finding]:
             f" cannot be proven: {_why_unproven(actual)}",
         )
     elif unique is False:
-        shared = spell_nfes(uniqueness.nfes((actual,)))
+        shared = _spell_all(uniqueness.nfes((actual,)))
         yield NOT_UNIQUE.on_endpoint(
             Outcome.VIOLATED,
             actual,
@@ -196,9 +196,9 @@ def _answer(unique: bool | None) -> str:
     return {True: "unique", False: "not unique", None: "unknown"}[unique]
 
 
-def spell_nfes(nfes: tuple[NetworkFlowEndpoint, ...]) -> str:
-    """Spell NFEs for people: `udp 10.0.0.1:7412, shm`; `none` without any."""
-    return ", ".join(dict.fromkeys(_spell(each) for each in nfes)) or "none"
+def _spell_all(nfes: tuple[NetworkFlowEndpoint, ...]) -> str:
+    """Spell NFEs for people: `udp 10.0.0.1:7412, shm`."""
+    return ", ".join(dict.fromkeys(_spell(each) for each in nfes))
 
 
 def _spell(nfe: NetworkFlowEndpoint) -> str:

@@ -88,13 +88,13 @@ def _cause(flow: FlowView) -> str:
 
 
 def _judge(flow: FlowView, topics: Mapping[tuple[str, EndpointKind], Sequence[Seen]]) -> _Answer:
-    """Return the worst that is known of any of the flow's pairs."""
+    """Return the worst that is known of any of the flow's pairs, whose ends are all seen."""
     answers = [
         _pair(
             publisher,
             subscription,
-            topics.get((flow.planned.topic, EndpointKind.PUBLISHER), ()),
-            topics.get((flow.planned.topic, EndpointKind.SUBSCRIPTION), ()),
+            topics[flow.planned.topic, EndpointKind.PUBLISHER],
+            topics[flow.planned.topic, EndpointKind.SUBSCRIPTION],
         )
         for publisher in flow.publishers
         for subscription in flow.subscriptions

@@ -43,7 +43,8 @@ def check(view: View) -> Iterator[Finding]:
 def _judge(view: View, name: str, node: PlannedNode) -> Iterator[Finding]:
     wanted = _STATES[view.stage]
     allowed = {wanted}
-    if view.stage is Stage.CONNECTED and (name in view.ahead or not view.brings_up(node)):
+    ahead = view.stage is Stage.CONNECTED and name in view.ahead
+    if ahead or (view.stage is Stage.CONNECTED and not view.brings_up(node)):
         # Another supervisor brings it up, and its gate opens on the same proof, maybe before ours;
         # or an earlier gate let it through, and only others have to pass again.
         allowed.add("active")
@@ -56,7 +57,7 @@ def _judge(view: View, name: str, node: PlannedNode) -> Iterator[Finding]:
         if state
     )
     # On the way to what is allowed; `activating` is nobody's aim, so no message names it.
-    passing = {"activating"} if name in view.ahead and "active" in allowed else set()
+    passing = {"activating"} if ahead else set()
     wrong = [state for state in states if state not in allowed | passing]
     expected = wanted
     if view.stage is Stage.CONNECTED and view.ours(node):

@@ -36,7 +36,13 @@ def test_an_unknown_mapping_is_refused_with_what_there_is() -> None:
 
 
 def test_a_user_writes_his_own_with_names_or_numbers() -> None:
-    own = parse_mapping('{"name": "lab", "source": "our core", "values": {"85": "EF", "9": 0}}')
+    own = parse_mapping(
+        '{"name": "lab", "source": "our core", "status": "tried", "notes": ["one", "two"],'
+        ' "values": {"85": "EF", "9": 0}}'
+    )
+    assert (own.status, own.notes) == ("tried", ("one", "two"))
+    plain = parse_mapping('{"name": "lab", "source": "our core", "values": {}}')
+    assert (plain.status, plain.notes) == ("", ())
     assert (own.name, own.source, own.values) == ("lab", "our core", ((9, 0), (85, 46)))
 
 

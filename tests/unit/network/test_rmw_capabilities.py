@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 
 from lifecycle.network.nfe import UniqueRequirement
@@ -80,6 +82,20 @@ def test_of_an_rmw_outside_the_table_nothing_can_be_told() -> None:
         "use RMW_IMPLEMENTATION=rmw_fastrtps_cpp",
     )
     assert dscp_feasibility("rmw_other").feasible is None
+
+
+def test_whoever_asks_an_rmw_that_cannot_is_told_of_all_that_can(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    able, *others = rmw_table()
+    table = (able, dataclasses.replace(able, family="rmw_newdds"), *others)
+    monkeypatch.setattr("lifecycle.network.rmw_capabilities.rmw_table", lambda: table)
+    for answer in (
+        feasibility("rmw_zenoh_cpp", FlowSide.SUBSCRIPTION, STRICTLY),
+        dscp_feasibility("rmw_zenoh_cpp"),
+    ):
+        _, _, to_do = answer.why.rpartition("; ")
+        assert to_do == "use RMW_IMPLEMENTATION=rmw_fastrtps_cpp, rmw_newdds_cpp"
 
 
 def test_only_fast_dds_lets_us_mark_one_publisher() -> None:

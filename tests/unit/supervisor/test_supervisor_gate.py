@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable
+import gc
+from collections.abc import Awaitable, Callable, Coroutine
 
 import pytest
 
@@ -145,31 +146,73 @@ def test_no_permit_can_be_made_past_a_gate_that_would_refuse_it_or_has_given_one
 
 
 class Changing:
-    """A system that changes, and verdicts for each time that it is judged again."""
+    """A system that changes: its verdict, and those for each time that it is judged again."""
 
-    def __init__(self, *verdicts: Verdict) -> None:
+    def __init__(self, verdict: Verdict, *later: Verdict) -> None:
+        self.latest = verdict
         self.changed = False
         self.begun = asyncio.Event()
         self.asked: list[frozenset[str]] = []
-        self._verdicts = list(verdicts)
+        self.error: Exception | None = None
+        self.given_up = False
+        self._later = list(later)
 
     def is_current(self, verdict: Verdict) -> bool:
-        return not self.changed
+        return verdict is self.latest and not self.changed
 
     async def again(self, ahead: frozenset[str]) -> Verdict:
         self.asked.append(ahead)
         self.begun.set()
-        await asyncio.sleep(0.01)
+        try:
+            await asyncio.sleep(0.01)
+        except asyncio.CancelledError:
+            self.given_up = True
+            raise
+        if self.error is not None:
+            raise self.error
         self.changed = False
-        return self._verdicts.pop(0)
+        self.latest = self._later.pop(0)
+        return self.latest
+
+    def gate(self, *, strict: bool = False) -> Gate:
+        return Gate(strict=strict, judging=self)
+
+
+def unverifiable() -> Verdict:
+    return verdict_of(Outcome.UNVERIFIABLE, "state.unverifiable")
+
+
+def run_quietly(main: Callable[[], Coroutine[object, object, None]]) -> None:
+    """Run a test in which no task ends with an error that nobody took in."""
+    reported: list[dict[str, object]] = []
+
+    async def watched() -> None:
+        asyncio.get_running_loop().set_exception_handler(lambda _, each: reported.append(each))
+        await main()
+        await asyncio.sleep(0)
+        gc.collect()
+        assert reported == []
+
+    asyncio.run(watched())
 
 
 def test_a_verdict_of_the_moment_is_not_judged_again() -> None:
     async def main() -> None:
-        system = Changing()
-        permit = Gate(strict=False, judging=system).judge(verdict_of(Outcome.OK))
+        system = Changing(verdict_of(Outcome.OK))
+        permit = system.gate().judge(system.latest)
         await permit.use("/camera")
         assert system.asked == []
+
+    asyncio.run(main())
+
+
+def test_a_verdict_that_is_no_longer_the_latest_is_judged_again() -> None:
+    async def main() -> None:
+        system = Changing(verdict_of(Outcome.OK), newer := verdict_of(Outcome.OK))
+        permit = system.gate().judge(verdict_of(Outcome.OK))
+        await permit.use("/camera")
+        assert system.asked == [frozenset()]
+        assert permit.verdict is newer
 
     asyncio.run(main())
 
@@ -179,8 +222,8 @@ def test_whoever_asks_after_a_change_waits_for_one_judgement_that_knows_who_was_
 ):
     async def main() -> None:
         newer = verdict_of(Outcome.OK)
-        system = Changing(newer)
-        permit = Gate(strict=False, judging=system).judge(verdict_of(Outcome.OK))
+        system = Changing(verdict_of(Outcome.OK), newer)
+        permit = system.gate().judge(system.latest)
         await permit.use("/camera")
         system.changed = True
         await asyncio.gather(*(permit.use(f"/viewer_{index}") for index in range(20)))
@@ -192,9 +235,11 @@ def test_whoever_asks_after_a_change_waits_for_one_judgement_that_knows_who_was_
 
 def test_a_change_that_is_not_allowed_closes_the_gate_for_all_that_were_not_sent() -> None:
     async def main() -> None:
-        system = Changing(verdict_of(Outcome.VIOLATED, "graph.undeclared-publisher"))
-        gate = Gate(strict=False, judging=system)
-        permit = gate.judge(verdict_of(Outcome.OK))
+        system = Changing(
+            verdict_of(Outcome.OK), verdict_of(Outcome.VIOLATED, "graph.undeclared-publisher")
+        )
+        gate = system.gate()
+        permit = gate.judge(system.latest)
         system.changed = True
         refused = await asyncio.gather(
             permit.use("/camera"), permit.use("/viewer"), return_exceptions=True
@@ -213,14 +258,35 @@ def test_a_change_that_is_not_allowed_closes_the_gate_for_all_that_were_not_sent
         assert gate.permit is None
         assert len(system.asked) == 1
 
-    asyncio.run(main())
+    run_quietly(main)
+
+
+@pytest.mark.parametrize("strict", [True, False])
+def test_what_became_unverifiable_closes_a_gate_again_that_would_not_have_opened(
+    strict: bool,
+) -> None:
+    async def main() -> None:
+        system = Changing(verdict_of(Outcome.OK), unverifiable())
+        gate = system.gate(strict=strict)
+        permit = gate.judge(system.latest)
+        system.changed = True
+        if not strict:
+            await permit.use("/camera")
+            assert gate.permit is permit
+            return
+        with pytest.raises(VerificationError) as caught:
+            await permit.use("/camera")
+        assert caught.value.exit_code is ExitCode.UNVERIFIABLE
+        assert gate.permit is None
+
+    run_quietly(main)
 
 
 def test_a_gate_that_is_closed_while_it_is_judged_again_lets_nobody_through() -> None:
     async def main() -> None:
-        system = Changing(verdict_of(Outcome.OK))
-        gate = Gate(strict=False, judging=system)
-        permit = gate.judge(verdict_of(Outcome.OK))
+        system = Changing(verdict_of(Outcome.OK), verdict_of(Outcome.OK))
+        gate = system.gate()
+        permit = gate.judge(system.latest)
         system.changed = True
         waits = asyncio.ensure_future(permit.use("/camera"))
         await system.begun.wait()
@@ -229,5 +295,43 @@ def test_a_gate_that_is_closed_while_it_is_judged_again_lets_nobody_through() ->
             await waits
         with pytest.raises(BringUpError, match="the gate was closed again"):
             await permit.use("/camera")
+        assert system.given_up
 
-    asyncio.run(main())
+    run_quietly(main)
+
+
+def test_a_judgement_that_fails_fails_whoever_waits_for_it_and_may_be_tried_again() -> None:
+    async def main() -> None:
+        system = Changing(verdict_of(Outcome.OK), verdict_of(Outcome.OK))
+        permit = system.gate().judge(system.latest)
+        system.changed = True
+        system.error = RuntimeError("cannot look")
+        with pytest.raises(RuntimeError, match="cannot look"):
+            await permit.use("/camera")
+        system.error = None
+        await permit.use("/camera")
+
+    run_quietly(main)
+
+
+def test_a_judgement_that_fails_when_nobody_waits_any_more_is_no_error_of_the_loop() -> None:
+    async def main() -> None:
+        system = Changing(verdict_of(Outcome.OK))
+        permit = system.gate().judge(system.latest)
+        system.changed = True
+        system.error = RuntimeError("cannot look")
+        waits = asyncio.ensure_future(permit.use("/camera"))
+        await system.begun.wait()
+        waits.cancel()
+        await asyncio.sleep(0.02)
+        del permit, waits
+
+    run_quietly(main)
+
+
+def test_to_close_a_gate_twice_changes_nothing() -> None:
+    gate = Gate(strict=False)
+    gate.judge(verdict_of(Outcome.OK))
+    gate.close()
+    gate.close()
+    assert gate.permit is None

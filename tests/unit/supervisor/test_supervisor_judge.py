@@ -320,13 +320,13 @@ def test_a_dead_node_is_gone_although_discovery_shows_it_for_the_whole_lease() -
     kept = dataclasses.replace(endpoint, node="/twice")
     parameter = NodeParameters(node="/dead")
     seen = Observation(
-        nodes=(of("/dead"), of("/other"), of("/twice", 3)),
+        nodes=(of("/dead"), of("/other"), of("/twice", 2)),
         endpoints=(endpoint, kept),
         configurations=(interface_of("/dead"), interface_of("/other")),
         parameters=(parameter, dataclasses.replace(parameter, node="/twice")),
     )
     assert without(seen, frozenset({"/dead", "/twice"})) == Observation(
-        nodes=(of("/other"), of("/twice", 2)),
+        nodes=(of("/other"), of("/twice")),
         endpoints=(kept,),
         configurations=(interface_of("/other"),),
         parameters=(dataclasses.replace(parameter, node="/twice"),),
@@ -392,7 +392,8 @@ class _Agreement:
 def test_what_is_seen_is_judged_against_what_is_expected_with_what_others_find(
     tmp_path: Path,
 ) -> None:
-    looker, agreement = _Looker(), _Agreement()
+    looker, guard, agreement = _Looker(), _Looker(), _Agreement()
+    guard.wrong = verdict_of(Outcome.VIOLATED, "state.activated-at-closed-gate").findings
 
     async def test(bench: _Bench) -> None:
         system, judge = bench.world.system, bench.judge
@@ -412,12 +413,12 @@ def test_what_is_seen_is_judged_against_what_is_expected_with_what_others_find(
                 "ahead": frozenset({"/first"}),
             }
         ]
-        assert looker.seen == agreement.seen == [judge.seen] == [seen]
+        assert looker.seen == guard.seen == agreement.seen == [judge.seen] == [seen]
         assert system.present == frozenset({"/camera"})
         assert [each.node for each in bench.world.heard(NodeJoined)] == ["/camera"]
         told = tuple(
             dataclasses.replace(each, observed="explained")
-            for each in (*looker.wrong, *UNATTRIBUTED.findings)
+            for each in (*guard.wrong, *looker.wrong, *UNATTRIBUTED.findings)
         )
         assert verdict == Verdict(
             verdict=Outcome.VIOLATED, blocking=True, findings=(*agreement.unknown, *told), flows=()
@@ -426,7 +427,7 @@ def test_what_is_seen_is_judged_against_what_is_expected_with_what_others_find(
         (changed,) = bench.world.heard(VerdictChanged)
         assert (changed.stage, changed.verdict) == (Stage.CONNECTED, verdict)
 
-    _run(tmp_path, test, UNATTRIBUTED, looker=looker, agreement=agreement)
+    _run(tmp_path, test, UNATTRIBUTED, looker=looker, agreement=agreement, guard=guard)
 
 
 def test_what_the_supervisor_finds_comes_first_and_makes_a_verdict_worse_never_better() -> None:
@@ -535,6 +536,50 @@ def test_changes_are_counted_and_waited_for_within_a_time(tmp_path: Path) -> Non
         assert (bench.changes.count, bench.now) == (2, pytest.approx(4.0))
 
     _run(tmp_path, test, OK)
+
+
+def test_a_verdict_is_current_until_something_is_noticed_after_its_look_began(
+    tmp_path: Path,
+) -> None:
+    async def test(bench: _Bench) -> None:
+        judge = bench.judge
+        assert not judge.is_current(OK)
+        verdict = await judge.once(Stage.CONNECTED)
+        assert judge.is_current(verdict)
+        assert not judge.is_current(dataclasses.replace(verdict))
+        for notice in 2 * (bench.graph.changed.set, bench.world.system.touched.set):
+            notice()
+            noticed = bench.changes.mark
+            assert not judge.is_current(verdict)
+            await asyncio.sleep(1.0)
+            assert bench.changes.mark == noticed
+            assert not judge.is_current(verdict)
+            await judge.once(Stage.CONNECTED)
+            assert judge.is_current(verdict)
+
+        async def observe(plan: Plan) -> Observation:
+            bench.graph.changed.set()
+            return Observation()
+
+        bench.graph.observe = observe  # type: ignore[method-assign]
+        await judge.once(Stage.CONNECTED)
+        assert not judge.is_current(verdict)
+
+    _run(tmp_path, test, OK)
+
+
+def test_behind_an_open_gate_it_is_judged_for_5_s_who_was_let_through_being_ahead(
+    tmp_path: Path,
+) -> None:
+    async def test(bench: _Bench) -> None:
+        bench.judge.ahead = frozenset({"/radar"})
+        assert await bench.judge.again(frozenset({"/camera"})) is bench.judge.latest
+        assert bench.judge.latest == MISSING
+        assert bench.now == pytest.approx(5.0, abs=0.1)
+        assert {each["stage"] for each in bench.judged} == {Stage.CONNECTED}
+        assert {each["ahead"] for each in bench.judged} == {frozenset({"/radar", "/camera"})}
+
+    _run(tmp_path, test, MISSING)
 
 
 def test_an_observer_that_fails_fails_whoever_waits_for_a_change(tmp_path: Path) -> None:

@@ -1017,7 +1017,7 @@ at: robot.lifecycle.yaml:19:9, on /viewer (service client)
 to do: build both ends from one version of the interface package, and install the same here
 """,
     ),
-    "a publisher of nobody known is the first of two definitions": (
+    "a publisher of nobody known has another definition than the declared end": (
         Case(
             "graph.type-definition-differs",
             both(
@@ -1028,12 +1028,31 @@ to do: build both ends from one version of the interface package, and install th
         ),
         """\
 violated graph.type-definition-differs: /robot/status
-cannot accept the publisher of /robot/status in /robot/camera: its std_msgs/msg/String is not
-  that of an unknown node; both have the name, so the topic is matched and the data are not
+cannot accept the publisher of /robot/status in an unknown node: its std_msgs/msg/String is not
+  that of /robot/camera; both have the name, so the topic is matched and the data are not
   understood
+expected: std_msgs/msg/String as RIHS01_aaaaaaaa
+observed: std_msgs/msg/String as RIHS01_bbbbbbbb
+at: nowhere, on no node (publisher)
+to do: build both ends from one version of the interface package, and install the same here
+""",
+    ),
+    "of two strangers with two definitions the first is known by no name": (
+        Case(
+            "graph.type-definition-differs",
+            both(
+                add_endpoint(PUB, "", STATUS, gid="99", type_hash=OTHER, qos=QosProfile()),
+                add_endpoint(PUB, "/guest", STATUS, gid="98", type_hash=HERE, qos=QosProfile()),
+            ),
+            defined(OPEN, ""),
+        ),
+        """\
+violated graph.type-definition-differs: /robot/status
+cannot accept the publisher of /robot/status in /guest: its std_msgs/msg/String is not that of
+  an unknown node; both have the name, so the topic is matched and the data are not understood
 expected: std_msgs/msg/String as RIHS01_bbbbbbbb
 observed: std_msgs/msg/String as RIHS01_aaaaaaaa
-at: robot.lifecycle.yaml:13:9, on /robot/camera (publisher)
+at: nowhere, on /guest (publisher)
 to do: build both ends from one version of the interface package, and install the same here
 """,
     ),

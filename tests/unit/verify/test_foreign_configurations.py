@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import threading
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -87,6 +88,88 @@ def test_what_is_no_configuration_is_refused_in_a_sentence(text: str) -> None:
     with pytest.raises(ConfigurationError) as caught:
         decode_configuration(text, NAME)
     assert 0 < len(str(caught.value)) < 300
+
+
+def second(**changes: object) -> str:
+    """The first endpoint is as it should be."""
+    first = GOOD["endpoints"][0]
+    return edited(endpoints=[first, {**first, **changes}])
+
+
+def with_parameter(value: object) -> str:
+    return edited(parameters=[{"name": "p" * 200, "type": "int", "value": value}])
+
+
+LARGEST = 2**63 - 1
+BOUNDS: dict[str, tuple[Callable[[int], str], int, int]] = {
+    "identity.process_id": (
+        lambda value: edited(identity={**GOOD["identity"], "process_id": value}),
+        0,
+        LARGEST,
+    ),
+    "endpoints[1].matched": (lambda value: second(matched=value), 0, LARGEST),
+    "endpoints[1].size_bytes": (lambda value: second(size_bytes=value), 0, LARGEST),
+    "endpoints[1].dscp": (lambda value: second(dscp=value), 0, 63),
+    **{
+        f"endpoints[1].qos.{field}": (
+            lambda value, field=field: second(qos={field: value}),
+            0,
+            LARGEST,
+        )
+        for field in ("depth", "deadline_ns", "lifespan_ns", "liveliness_lease_duration_ns")
+    },
+    **{
+        f"endpoints[1].nfes.{field}": (
+            lambda value, field=field: second(nfes=[{**NFE, field: value}]),
+            0,
+            most,
+        )
+        for field, most in (("transport_port", 65535), ("flow_label", 0xFFFFF), ("dscp", 63))
+    },
+    "parameters." + "p" * 100: (with_parameter, -LARGEST - 1, LARGEST),
+}
+
+
+@pytest.mark.parametrize("what", BOUNDS)
+def test_of_every_number_what_it_can_be_is_read_and_all_else_refused_with_what_is_allowed(
+    what: str,
+) -> None:
+    write, least, most = BOUNDS[what]
+    for value in (least, most):
+        assert decode_configuration(write(value), NAME).name == NAME
+    for value in (least - 1, most + 1):
+        with pytest.raises(ConfigurationError) as caught:
+            decode_configuration(write(value), NAME)
+        assert str(caught.value) == f"{what} is '{value}'; allowed: {least}–{most}"
+
+
+def test_of_a_text_that_no_schema_allows_it_is_said_where_it_is_wrong() -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        decode_configuration(edited(name=7), NAME)
+    assert str(caught.value) == "Expected `str`, got `int` - at `$.name`"
+
+
+def test_what_is_refused_is_quoted_no_longer_than_a_line() -> None:
+    for text, message in (
+        (
+            second(gid="zz" * 100),
+            f"endpoints[1].gid or .peers is '{'z' * 100}'; allowed: 32 hex digits",
+        ),
+        (
+            second(nfes=[{**NFE, "internet_address": "y" * 200}]),
+            f"endpoints[1].nfes.internet_address is '{'y' * 100}'; allowed: an IP address",
+        ),
+        (edited(name="x" * 200), f"it is that of node '{'x' * 100}'"),
+    ):
+        with pytest.raises(ConfigurationError) as caught:
+            decode_configuration(text, NAME)
+        assert str(caught.value) == message
+
+
+def test_of_several_values_of_a_parameter_each_must_be_one_that_it_can_have() -> None:
+    assert decode_configuration(with_parameter([0, LARGEST]), NAME).name == NAME
+    with pytest.raises(ConfigurationError, match=str(LARGEST + 1)):
+        decode_configuration(with_parameter([0, LARGEST + 1]), NAME)
 
 
 def test_deep_text_is_refused_in_a_thread_with_little_stack_too() -> None:

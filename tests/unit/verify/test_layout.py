@@ -6,7 +6,7 @@ import dataclasses
 
 import pytest
 
-from lifecycle.manifest.model import EndpointKind, Run, RunKind
+from lifecycle.manifest.model import EndpointKind, Policy, Run, RunKind
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.plan import Plan, build_plan
 from lifecycle.plan.model import ParticipantConnections
@@ -123,6 +123,18 @@ def test_nodes_are_sorted_without_tools_hidden_participants_and_placeholders() -
     )
     assert list(view.observed) == ["/an_arm", "/robot/camera", "/viewer", "/zed"]
     assert view.tools == {"/rviz2": "rviz2"}
+
+
+def test_what_the_policy_tolerates_by_a_hidden_name_is_a_tool_and_no_participant() -> None:
+    plan = planned(node("cam", publisher("a")))
+    recorder = both(
+        add_node("/_cam_recorder_1"), add_endpoint(SUB, "/_cam_recorder_1", "/a", gid="99")
+    )
+    assert view_after(recorder, plan).tools == {}
+    tolerant = dataclasses.replace(plan, policy=Policy(tolerated_nodes=("_cam_recorder_*",)))
+    view = view_after(recorder, tolerant)
+    assert view.tools == {"/_cam_recorder_1": "_cam_recorder_*"}
+    assert (view.undeclared, [each.name for each in view.of_tools]) == ((), ["/a"])
 
 
 def test_a_declared_node_that_is_named_like_a_tool_or_a_hidden_one_is_no_tool() -> None:
@@ -256,6 +268,17 @@ def test_a_part_of_an_action_of_no_node_is_that_of_the_node_that_declares_the_ac
     assert [each.name for each in view.unattributed] == ["/other/_action/send_goal"]
 
 
+def test_housekeeping_of_a_stranger_is_left_in_where_it_serves_what_is_declared() -> None:
+    of_parameters = "rcl_interfaces/srv/GetParameters"
+    serves = both(
+        add_endpoint(SERVER, "/guest", "/guest/get_parameters", type=of_parameters),
+        add_endpoint(SERVER, "/other", "/other/get_parameters", type=of_parameters),
+    )
+    asks = endpoint(CLIENT, "/guest/get_parameters", of_parameters, None)
+    view = view_after(serves, planned(node("one", asks)))
+    assert [each.name for each in view.foreign] == ["/guest/get_parameters"]
+
+
 def test_a_topic_of_no_node_is_nobodys_although_its_participant_is_known() -> None:
     view = view_after(nameless_service(STATUS, PUB, STRING))
     assert [(each.node, each.name) for each in view.unattributed] == [("", STATUS)]
@@ -319,6 +342,26 @@ def test_a_nameless_report_of_the_declared_type_is_chosen_before_one_of_another(
     assert [each.observed for each in view.actual] == list(seen.endpoints)
 
 
+def test_a_nameless_report_of_the_declared_type_is_chosen_where_discovery_shows_none() -> None:
+    plan = connected("udpv4://10.0.0.1:7911")
+    report = perfect(plan).configurations[0].endpoints[0]
+    right = dataclasses.replace(report, name="")
+    wrong = dataclasses.replace(right, type="std_msgs/msg/Int32", gid="99")
+    edit = both(drop_endpoint(PUB, "/a"), change_configuration("/one", endpoints=(wrong, right)))
+    view = view_after(edit, plan)
+    assert actual(view, PUB, "/a").report == right
+    assert actual(view, PUB, "/a").observed.type == STRING
+    assert [each.type for each in view.undeclared] == ["std_msgs/msg/Int32"]
+
+
+def test_a_report_of_another_type_is_not_taken_from_the_endpoint_that_it_is_on() -> None:
+    plan = planned(node("one", publisher("a"), publisher("/a", "std_msgs/msg/Int32")))
+    second = perfect(plan).configurations[0].endpoints[1]
+    nameless = dataclasses.replace(second, name="")
+    edit = both(drop_endpoint(PUB, "/a"), change_configuration("/one", endpoints=(nameless,)))
+    assert [each.report for each in view_after(edit, plan).actual] == [None, nameless]
+
+
 def test_of_several_endpoints_of_one_name_the_one_with_the_reported_gid_is_the_declared() -> None:
     seen = perfect(PLAN)
     gid = next(each.gid for each in seen.endpoints if (each.kind, each.name) == (PUB, STATUS))
@@ -378,9 +421,22 @@ def test_what_client_libraries_bring_along_is_not_left_over_of_a_report_either()
         resolved="/robot/camera/remap",
         type="rcl_interfaces/srv/SetParameters",
     )
+    own = dataclasses.replace(remap, type=TRIGGER)
     camera = perfect(PLAN).configurations[0]
-    edit = change_configuration("/robot/camera", endpoints=(*camera.endpoints, rosout, remap))
-    assert view_after(edit).undeclared == ()
+    for told, left_over in (((rosout, remap), []), ((rosout, own), [own.resolved])):
+        edit = change_configuration("/robot/camera", endpoints=(*camera.endpoints, *told))
+        assert [each.name for each in view_after(edit).undeclared] == left_over
+
+
+def test_what_client_libraries_bring_along_hides_nothing_that_is_seen_after_it() -> None:
+    seen = perfect(PLAN)
+    rosout = ObservedEndpoint(
+        kind=PUB, node="/robot/camera", name="/rosout", type="rcl_interfaces/msg/Log", gid="99"
+    )
+    seen = dataclasses.replace(seen, endpoints=(rosout, *seen.endpoints))
+    view = lay_out(PLAN, seen, Stage.CONNECTED)
+    assert all(each.observed for each in view.actual)
+    assert view.undeclared == ()
 
 
 def test_further_names_of_a_declared_endpoint_are_left_over() -> None:

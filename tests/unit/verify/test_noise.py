@@ -151,6 +151,7 @@ def test_what_users_call_like_the_node_interface_is_left_in():
     [
         (SERVER, "/dock/_action/send_goal", (ACTION_SERVER, "/dock")),
         (PUB, "/ns/dock/_action/feedback", (ACTION_SERVER, "/ns/dock")),
+        (PUB, "/a/_action/dock/_action/feedback", (ACTION_SERVER, "/a/_action/dock")),
         (CLIENT, "/dock/_action/get_result", (ACTION_CLIENT, "/dock")),
         (SUB, "/dock/_action/status", (ACTION_CLIENT, "/dock")),
         (SUB, "/dock/_action/send_goal", None),

@@ -360,6 +360,7 @@ def test_a_pair_of_strangers_or_of_two_types_does_not_end_the_judgement_of_a_top
         add_endpoint(PUB, "/B", "/a", gid="92", qos=BEST_EFFORT),
         add_endpoint(SUB, "/A", "/a", gid="93", qos=QosProfile()),
         add_endpoint(PUB, "/B", "/b", gid="94", qos=BEST_EFFORT),
+        add_endpoint(SUB, "/one", "/a", gid="96", qos=QosProfile(), type="std_msgs/msg/Bool"),
         # A topic with subscriptions alone has no pair.
         add_endpoint(SUB, "/one", "/c", gid="95", qos=QosProfile()),
     )

@@ -269,9 +269,12 @@ def test_sentences_wrap_at_the_width_and_at_40_where_it_is_less(asked: int, widt
 
 
 def test_sentences_wrap_at_100_columns_where_nobody_says_otherwise():
-    finding = dataclasses.replace(VIOLATED, message="aa " * 100)
-    lines = render_text(dataclasses.replace(WRITTEN, findings=(finding,))).splitlines()
-    assert max(len(line) for line in lines if line.endswith(" aa")) == 100
+    longest = []
+    for word in ("a", "aa"):
+        finding = dataclasses.replace(VIOLATED, message=f"{word} " * 100)
+        lines = render_text(dataclasses.replace(WRITTEN, findings=(finding,))).splitlines()
+        longest.append(max(len(line) for line in lines if line.endswith(f" {word}")))
+    assert longest == [99, 100]
 
 
 def test_names_and_addresses_stay_whole_where_lines_are_wrapped():
@@ -311,6 +314,16 @@ flows
 ended after it was active, exit code 3: /one died; taken on trust: 1 depth
 """
     )
+
+
+def test_the_first_line_counts_the_findings_of_each_outcome_and_the_flows():
+    verdict = dataclasses.replace(
+        WRITTEN,
+        findings=(VIOLATED, VIOLATED, NOT_KNOWN, VIOLATED),
+        flows=(*WRITTEN.flows, *WRITTEN.flows),
+    )
+    first = "verdict: violated (3 violated, 1 unverifiable, 2 flows)"
+    assert render_text(verdict).splitlines()[0] == first
 
 
 def test_flows_are_left_out_where_nobody_asks_for_them():
@@ -520,8 +533,12 @@ def test_test_cases_have_the_same_names_whatever_the_outcome():
     assert list(cases(UNJUDGED)) == names
     assert list(cases(UNJUDGED, plan=None)) == names
     assert list(cases(INVALID, plan=None)) == names
-    assert sorted(each.partition("/")[0] for each in names) == sorted(
-        ["manifest", *(each.id for each in RULES), "run"]
+    assert sorted(names) == sorted(
+        [
+            "manifest/the manifest is valid",
+            *(f"{each.id}/{each.meaning}" for each in RULES),
+            "run/end",
+        ]
     )
 
 

@@ -40,6 +40,7 @@ from lifecycle.verify import (
     Stage,
     verify,
 )
+from lifecycle.verify.rules.definitions import differ
 from tests.unit.plan.samples import (
     IMAGE,
     at,
@@ -932,6 +933,15 @@ def test_two_ends_of_one_type_name_and_two_definitions_are_violated():
     )
 
 
+def test_a_stranger_of_another_definition_does_not_put_declared_ends_in_the_wrong():
+    """No definition is installed here, and the stranger comes first by alphabet."""
+    plan = dataclasses.replace(defined(""), policy=Policy(undeclared_nodes=EndpointPolicy.OPEN))
+    stranger = add_endpoint(PUB, "/a_guest", "/chatter", gid="99", type_hash=OTHER)
+    verdict = verify(plan, both(hashes(HERE, HERE), stranger)(perfect(plan)), stage=Stage.CONNECTED)
+    differing = [each for each in verdict.findings if each.rule == "graph.type-definition-differs"]
+    assert [(each.node, each.observed[-64:]) for each in differing] == [("/a_guest", "b" * 64)]
+
+
 def test_two_ends_that_agree_on_another_definition_than_the_installed_are_violated():
     found = findings_after(hashes(OTHER, OTHER), plan=defined(HERE))
     assert found == [("graph.type-definition-differs", "violated", "/chatter")] * 2
@@ -953,6 +963,13 @@ def test_without_any_hash_there_is_nothing_to_compare():
 
 def test_hashes_of_two_hash_versions_are_not_compared():
     assert findings_after(hashes(NEWER, HERE), plan=defined(HERE)) == []
+
+
+def test_a_hash_that_is_none_but_begins_with_the_version_is_another_definition():
+    odd = "RIHS01_a_b"
+    assert differ(odd, HERE)
+    assert differ(HERE, odd)
+    assert not differ(odd, odd)
 
 
 def test_a_service_of_another_definition_is_violated():

@@ -589,8 +589,9 @@ def test_the_transport_of_a_link_without_ends_is_not_judged_and_that_of_the_next
     plan = dataclasses.replace(
         plan,
         data_layer=DataLayer(at=at(5)),
-        flows=tuple(dataclasses.replace(each, medium="shm") for each in plan.flows),
+        flows=tuple(dataclasses.replace(each, medium="shm") for each in reversed(plan.flows)),
     )
+    assert [each.topic for each in plan.flows] == ["/a", "/b"]
     edit = both(change_report(PUB, "/b", nfes=(SHM,)), change_report(SUB, "/b", nfes=(SHM,)))
     verdict = verify(plan, edit(perfect(plan)), stage=Stage.CONNECTED)
     found = [each.subject for each in verdict.findings if each.rule.startswith("flow.wrong-")]
