@@ -36,7 +36,7 @@ from tests.unit.supervisor.programming.samples import (
 )
 from tests.unit.supervisor.programming.servers import TOKEN
 
-_TIMEOUT_S = 0.4
+_TIMEOUT_S = 1.0
 _BOUND_S = 8.0
 """Far above what any of it takes, far below what a server that drips would take."""
 
