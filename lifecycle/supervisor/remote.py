@@ -101,6 +101,10 @@ def differences(path: Path, plan: Plan) -> tuple[str, ...]:
     return () if answer is None else answer.differences
 
 
+_ANSWERED = frozenset(ExitCode) - {ExitCode.INTERNAL}
+"""Exit codes that may be passed on; of an error of its own a supervisor tells no client."""
+
+
 def order(path: Path, question: Question, timeout_s: float) -> Answer:
     """Have a supervisor pause, resume or restart its system, or one node of it.
 
@@ -114,8 +118,10 @@ def order(path: Path, question: Question, timeout_s: float) -> Answer:
     answer = _asked(path, question, timeout_s)
     if answer is None:
         raise _killed(path)
-    if answer.exit_code is None:
-        raise strange(path / _SOCKET, "it has no exit code")
+    if answer.exit_code not in _ANSWERED:
+        code = answer.exit_code
+        why = "it has no exit code" if code is None else f"its exit code is {code}"
+        raise strange(path / _SOCKET, why)
     return answer
 
 

@@ -14,6 +14,7 @@ import os
 import re
 import socket
 import stat
+import struct
 import tempfile
 import time
 import uuid
@@ -289,6 +290,10 @@ def short_path(path: Path) -> Iterator[str]:
         os.close(descriptor)
 
 
+_SHORTEST_S = 0.001
+"""Less would be no limit at all, socket(7)."""
+
+
 def connect(path: Path, timeout_s: float) -> socket.socket:
     """Connect to a control socket, with that limit for whatever is done on it.
 
@@ -300,8 +305,15 @@ def connect(path: Path, timeout_s: float) -> socket.socket:
     sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         with short_path(path) as name:
-            sock.settimeout(timeout_s)
+            # With a timeout of Python's, a full queue would be an error at once.
+            seconds, fraction = divmod(max(timeout_s, _SHORTEST_S), 1)
+            limit = struct.pack("@ll", int(seconds), int(fraction * 1e6))
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, limit)
             sock.connect(name)
+        sock.settimeout(timeout_s)
+    except BlockingIOError:
+        sock.close()
+        raise TimeoutError from None
     except OSError:
         sock.close()
         raise

@@ -44,8 +44,7 @@ class Running:
         self.open: list[socket.socket] = []
 
     def connect(self) -> socket.socket:
-        made = connect(self.run / "control")
-        made.settimeout(WAIT_S)
+        made = connect(self.run / "control", WAIT_S)
         self.open.append(made)
         return made
 
@@ -68,8 +67,7 @@ def stage(place: Place, attacks: Sequence[Attack]) -> Iterator[Running]:
         if system.up.finish() != 130:
             raise Unhandled(f"it ended with {system.up.process.returncode}")
         system.up.assert_nothing_left()
-        assert system.up.process.stderr is not None
-        check_text(system.up.process.stderr.read())
+        check_text(system.up.said())
     finally:
         system.up.close()
 

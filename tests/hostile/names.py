@@ -149,8 +149,7 @@ def stage(place: Place, attacks: Sequence[Attack]) -> Iterator[Seen]:
         if (code := run.finish()) != ExitCode.INTERRUPTED:
             raise Unhandled(f"the supervisor ended with {code}")
         run.assert_nothing_left()
-        assert run.process.stderr is not None
-        check_text(run.process.stderr.read())
+        check_text(run.said())
     finally:
         for each in intruders:
             each.kill()

@@ -69,8 +69,7 @@ def stage(place: Place, attacks: Sequence[Attack]) -> Iterator[Stage]:
             staged.up.signal(signal.SIGINT)
             staged.up.finish()
             staged.up.assert_nothing_left()
-            assert staged.up.process.stderr is not None
-            check_text(staged.up.process.stderr.read())
+            check_text(staged.up.said())
         finally:
             staged.up.close()
     finally:

@@ -126,8 +126,7 @@ def stage(place: Place, attacks: Sequence[Attack]) -> Iterator[System]:
         if system.up.finish() != 130:
             raise Unhandled(f"it ended with {system.up.process.returncode}")
         system.up.assert_nothing_left()
-        assert system.up.process.stderr is not None
-        check_text(system.up.process.stderr.read())
+        check_text(system.up.said())
     finally:
         players.close()
         system.up.close()

@@ -103,7 +103,7 @@ class Up:
         self.events: list[Event] = []
         self.segments: set[str] = set()
         self._lines: queue.Queue[str] = queue.Queue()
-        self._said: list[str] = []
+        self._heard: list[str] = []
         # What hangs is aborted, see `finish`, and says where it stood.
         python, *verb = command("up")
         said = (str(manifest), "--format", "json", *options)
@@ -131,7 +131,7 @@ class Up:
     def _hear(self) -> None:
         assert self.process.stderr is not None
         for line in self.process.stderr:
-            self._said.append(line)
+            self._heard.append(line)
 
     def until(self, kind: str, **fields: object) -> Event:
         """Read on until an event of this kind and with these fields came, and return it."""
@@ -142,7 +142,7 @@ class Up:
             except queue.Empty:
                 late = f"no {kind} {fields} within {BOUND_S:g} s; the last: {self.events[-5:]}"
                 raise AssertionError(late) from None
-            assert line, f"ended without {kind} {fields}: {self.events[-5:]} {self._errors()}"
+            assert line, f"ended without {kind} {fields}: {self.events[-5:]} {self.said()}"
             event = json.loads(line)
             self.events.append(event)
             if _is(event, kind, fields):
@@ -216,7 +216,7 @@ class Up:
             self.catch_up()
             self.process.send_signal(signal.SIGABRT)
             late = f"not ended within {BOUND_S:g} s; the last: {self.events[-5:]}"
-            raise AssertionError(f"{late} {self._errors()}") from None
+            raise AssertionError(f"{late} {self.said()}") from None
         for each in self._readers:
             each.join(BOUND_S)
         while line := self._lines.get(timeout=1):
@@ -272,10 +272,11 @@ class Up:
             assert stream is not None
             stream.close()
 
-    def _errors(self) -> str:
+    def said(self) -> str:
+        """Wait for the end; return what it wrote to standard error."""
         self.process.wait(BOUND_S)
         self._readers[1].join(BOUND_S)
-        return "".join(self._said)
+        return "".join(self._heard)
 
 
 def _is(event: Event, kind: str, fields: Mapping[str, object]) -> bool:

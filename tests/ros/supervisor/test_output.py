@@ -309,8 +309,7 @@ def test_a_full_disk_under_logs_and_run_directory_is_said_once_and_supervision_g
         assert run.finish() == ExitCode.OK
         said = [each["message"] for each in run.of_kind("notice")]
         assert len([each for each in said if each.startswith("cannot write")]) == 2, said
-        assert run.process.stderr is not None
-        assert run.process.stderr.read() == ""
+        assert run.said() == ""
         run.assert_nothing_left()
     finally:
         run.close()

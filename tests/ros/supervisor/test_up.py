@@ -532,9 +532,8 @@ def test_without_room_for_its_threads_a_system_is_not_begun_and_says_so(
     through = limited(f"--nproc={processes}")
     run = Up(pair(tmp_path, fresh_domain), runtime=tmp_path, through=through)
     try:
-        _, said = run.process.communicate(timeout=BOUND_S)
-        assert run.process.returncode == ExitCode.BRING_UP_FAILED
-        last = said.splitlines()[-1]
+        assert run.process.wait(BOUND_S) == ExitCode.BRING_UP_FAILED
+        last = run.said().splitlines()[-1]
         assert "cannot start the fork server: " in last or (
             "cannot start the 24 threads that this needs: the limit of processes and threads is "
             f"reached ({processes} for this user" in last
