@@ -11,11 +11,14 @@ import asyncio
 import collections
 import contextlib
 import datetime as dt
+import errno
 import os
 import socket
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
+
+from lifecycle.errors import UsageError
 
 LONGEST_LINE = 64 * 1024
 """Bytes; a longer line is cut into pieces, so that a process cannot fill our memory."""
@@ -44,6 +47,23 @@ def ros_log_root(environment: Mapping[str, str]) -> Path:
     if environment.get("ROS_HOME"):
         return Path(environment["ROS_HOME"]).expanduser() / "log"
     return Path("~/.ros/log").expanduser()
+
+
+def check_log_root(environment: Mapping[str, str]) -> None:
+    """Make sure that there is, or can be, a ROS log directory: rcl starts no node without.
+
+    Raises:
+        UsageError: there cannot. That its disk is full is no reason.
+    """
+    root = ros_log_root(environment)
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise UsageError(
+                f"cannot use {str(root)!r} as ROS log directory: {error.strerror}",
+                hint="set ROS_LOG_DIR to a directory, or to one that can be made",
+            ) from error
 
 
 def log_directory(environment: Mapping[str, str], system: str) -> Path:

@@ -18,7 +18,7 @@ from lifecycle.manifest.model import Authority, DataLayerSource, EndpointPolicy,
 from lifecycle.middleware.doors import discovery_peers, peers_environment
 from lifecycle.middleware.process import adopt_orphans, check_threads, exit_after
 from lifecycle.middleware.profiles import discovery_environment
-from lifecycle.middleware.shm import sweep
+from lifecycle.middleware.shm import check_room, sweep
 from lifecycle.plan import moved_observer
 from lifecycle.plan.contacts import reached_hosts
 from lifecycle.plan.model import Plan
@@ -27,7 +27,7 @@ from lifecycle.supervisor.ending import Ending
 from lifecycle.supervisor.events import Emitter, Event, Listener, Notice, RunStarted
 from lifecycle.supervisor.eyes import Eyes
 from lifecycle.supervisor.failure import StepFailedError, never_connected, with_failure
-from lifecycle.supervisor.logs import log_directory
+from lifecycle.supervisor.logs import check_log_root, log_directory
 from lifecycle.supervisor.networks import open_networks, token_variables
 from lifecycle.supervisor.options import (
     UpOptions,
@@ -203,6 +203,7 @@ def _up(
         # Servers may be asked to remove what dead runs left: that must not outlast a signal.
         with ending.raised() if options.program else contextlib.nullcontext():
             networks = open_networks(plan, options, directory, emit, environment=os.environ)
+        check_log_root(os.environ)
         _enter_graph(plan, options, directory)
 
         async def run(leaving: contextlib.AsyncExitStack) -> UpResult:
@@ -364,6 +365,7 @@ def _enter_graph(plan: Plan, options: UpOptions, directory: RunDirectory) -> Non
     """
     adopt_orphans()
     check_threads(THREADS)
+    check_room()
     os.environ["ROS_DOMAIN_ID"] = str(plan.domain_id)
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = plan.discovery_range.name
     hosts = reached_hosts(plan, own_machines(plan, options.machine))

@@ -164,6 +164,8 @@ class RunDirectory:
                 hint=f"end it first: lifecycle down {name}",
             ) from None
         except OSError as error:
+            if directory.previous is None:
+                directory.release()
             directory._let_go()
             if error.errno in (errno.ENOSPC, errno.EDQUOT):
                 raise UsageError(
