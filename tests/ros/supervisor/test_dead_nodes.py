@@ -97,6 +97,7 @@ def test_a_killed_process_is_gone_for_everybody_at_once_and_comes_back_at_once(
         until(lambda: dead < {*bystander.get_node_names()}, time.monotonic())
         until(lambda: bystander.count_publishers("/chatter") == 1, time.monotonic())
         pid = run.pid_of("crowd")
+        since = run.catch_up()
         at = kill(run, "crowd")
         gone_s = until(lambda: not dead & {*bystander.get_node_names()}, at)
         until(lambda: bystander.count_publishers("/chatter") == 0, at)
@@ -107,7 +108,7 @@ def test_a_killed_process_is_gone_for_everybody_at_once_and_comes_back_at_once(
             assert seen[name]["died"] == f"pid {pid} died: killed by SIGKILL"
             assert (seen[name]["state"], seen[name]["matched"]) == ("", 0)
         # The verdict follows the death by a moment.
-        run.until_found("graph.missing-node", "/quiet")
+        run.until_found("graph.missing-node", "/quiet", since=since)
         told = verb("status", "pair", runtime=tmp_path).stdout.splitlines()
         assert told[0].startswith("pair: active 1/3, verdict violated (missing: /quiet (node), ")
         states = [line.split()[3] for line in told if line.startswith("/")]
@@ -139,9 +140,10 @@ def test_where_ports_are_fixed_a_killed_node_is_gone_and_comes_back_at_once(
     manifest = pair(tmp_path, fresh_domain, edit={"discovery": how})
     with up(manifest, "--keep-going", runtime=tmp_path) as run:
         run.until("system", reached="active")
+        since = run.catch_up()
         at = kill(run, "talker")
         run.until("failure", rule="run.process-died")
-        run.until_found("graph.missing-node", "/talker")
+        run.until_found("graph.missing-node", "/talker", since=since)
         gone_s = time.monotonic() - at
         assert gone_s < AT_ONCE_S
         if mode == "static":
