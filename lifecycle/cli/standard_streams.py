@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, NamedTuple, TextIO, cast
 
 import click
 
-from lifecycle.errors import ExitCode
+from lifecycle.errors import ExitCode, MiddlewareError
 
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
@@ -120,10 +120,12 @@ def own_streams(*, waits: bool = True) -> Streams:
     _replace("stdout", io.BufferedWriter(stdout))
     stderr = os.dup(_STDERR)
     writer = None
-    if waits:
+    if not waits:
+        with contextlib.suppress(MiddlewareError):  # the verb will say so
+            writer = Writer(stderr, "standard error", marker=lambda text: f"{text}\n")
+    if writer is None:
         _replace("stderr", _Tolerant(stderr))
     else:
-        writer = Writer(stderr, "standard error", marker=lambda text: f"{text}\n")
         _replace("stderr", _Queued(writer, kept=False))
         _never_wait(_STDERR)
     os.dup2(_STDERR, _STDOUT)
@@ -206,6 +208,9 @@ class Writer:
         marker: makes what stands in the stream of a message about it.
         say: takes messages that the stream itself cannot take, from any thread.
         encoding: of the texts.
+
+    Raises:
+        MiddlewareError: there is no room for another thread.
     """
 
     def __init__(
@@ -239,7 +244,12 @@ class Writer:
         self._progress = 0
         self._tried_s = 0.0
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
-        self._thread.start()
+        try:
+            self._thread.start()
+        except RuntimeError as error:
+            from lifecycle.middleware.process import no_room_for_threads
+
+            raise no_room_for_threads(1) from error
 
     def put(self, text: str, *, kept: bool = True) -> None:
         """Write a text, whole lines, once there is room for it.

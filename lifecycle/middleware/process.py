@@ -118,15 +118,21 @@ def check_threads(count: int) -> None:
             thread.start()
             started.append(thread)
     except RuntimeError as error:
-        raise MiddlewareError(
-            f"cannot start the {count} threads that this needs: the limit of processes and threads "
-            f"is reached{_limits()}",
-            hint="raise it (ulimit -u, TasksMax= or pids.max), or end other processes",
-        ) from error
+        raise no_room_for_threads(count) from error
     finally:
         over.set()
         for thread in started:
             thread.join()
+
+
+def no_room_for_threads(count: int) -> MiddlewareError:
+    """Return the error of a process that can have no more threads; names the limits that hold."""
+    threads = "the thread" if count == 1 else f"the {count} threads"
+    return MiddlewareError(
+        f"cannot start {threads} that this needs: the limit of processes and threads is "
+        f"reached{_limits()}",
+        hint="raise it (ulimit -u, TasksMax= or pids.max), or end other processes",
+    )
 
 
 def _limits() -> str:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Coroutine, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
-from lifecycle.errors import BringUpError
+from lifecycle.middleware.process import no_room_for_threads
 
 T = TypeVar("T")
 
@@ -59,7 +59,7 @@ class Worker:
     be taken down (asyncio's own executor starts a thread when it is used, and one to end).
 
     Raises:
-        BringUpError: no thread can be started.
+        MiddlewareError: no thread can be started.
     """
 
     def __init__(self, name: str) -> None:
@@ -67,10 +67,7 @@ class Worker:
         try:
             self._executor.submit(int)
         except RuntimeError as error:
-            raise BringUpError(
-                "cannot start a thread: the limit of processes and threads is reached",
-                hint="raise it (ulimit -u, TasksMax= or pids.max), or end other processes",
-            ) from error
+            raise no_room_for_threads(1) from error
 
     async def run(self, work: Callable[..., T], *arguments: object) -> T:
         """Do `work` in the thread, and return what it returns."""
