@@ -16,7 +16,7 @@ from collections.abc import Iterable, Mapping
 from rclpy.node import Node
 
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.middleware.graph_queries import endpoints_of, node_names
+from lifecycle.middleware.graph_queries import endpoints_of, endpoints_of_node, node_names
 
 _NODES_TOPIC = "ros_discovery_info"
 """Every participant of rmw_fastrtps writes it, and no other; a plain DDS name."""
@@ -68,7 +68,8 @@ class Census:
             count > homes.get(name, Counter()).total() and self._homes.get(name)
             for name, count in shown.items()
         ):
-            shown = without_ghosts(shown, homes, self._homes, self.participants())
+            known = self._known(shown, homes)
+            shown = without_ghosts(shown, homes, self._homes, self.participants(), known)
         for name, where in homes.items():
             self._homes[name] = self._homes.get(name, frozenset()) | where.keys()
         return shown
@@ -80,6 +81,27 @@ class Census:
             if not self.ignores(each.gid):
                 homes.setdefault(each.node, Counter())[each.gid[:_PREFIX_DIGITS]] += 1
         return homes
+
+    def _known(self, shown: Iterable[str], homes: Homes) -> frozenset[str]:
+        """Return the prefixes of the participants of which some node is known.
+
+        The participants of a node's connections have a node without parameters, which is known by
+        any other of its endpoints.
+        """
+        known = {prefix for where in homes.values() for prefix in where}
+        for name in shown:
+            if name in homes:
+                continue
+            for kind in (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION):
+                for topic in {
+                    topic for topic, _ in endpoints_of_node(self._node, kind, name) or ()
+                }:
+                    known |= {
+                        each.gid[:_PREFIX_DIGITS]
+                        for each in endpoints_of(self._node, kind, topic)
+                        if each.node == name
+                    }
+        return frozenset(known)
 
     def participants(self) -> frozenset[str]:
         """Return the prefixes of every participant of rmw_fastrtps that is not ignored."""
@@ -125,6 +147,7 @@ def without_ghosts(
     homes: Homes,
     before: Mapping[str, frozenset[str]],
     alive: frozenset[str],
+    known: frozenset[str],
 ) -> Counter[str]:
     """Return `shown` without the nodes of participants that have left.
 
@@ -132,10 +155,10 @@ def without_ghosts(
         shown: how many nodes of each name rmw_dds_common has.
         homes: where they are now, as far as that can be seen.
         before: the prefixes of every participant that a node of this name was ever seen on.
-        alive: the prefixes of every participant that discovery has. While one of them is not known
-            to have any node it may be the home of each, and nothing is taken for a ghost.
+        alive: the prefixes of every participant that discovery has.
+        known: the prefixes of those of which some node is known. While one that is alive is not
+            among them it may be the home of each, and nothing is taken for a ghost.
     """
-    known = frozenset(prefix for where in homes.values() for prefix in where)
     if not alive <= known:
         return Counter(shown)
     counts: Counter[str] = Counter()

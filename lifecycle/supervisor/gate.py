@@ -36,6 +36,21 @@ class VerificationError(LifecycleError):
         super().__init__(f"cannot activate: {is_now} {verdict.verdict.value}\n{named}")
 
 
+_LEAST_S = 2.0
+
+
+def behind_s(deadline: float) -> float:
+    """Return the seconds that are left once the gate has opened.
+
+    A verdict that comes in the last moment, or in a look that ended after it, is not worth less:
+    programming and activating have 2 s all the same.
+
+    Args:
+        deadline: of everything, by the running loop's clock.
+    """
+    return max(_LEAST_S, deadline - asyncio.get_running_loop().time())
+
+
 def closes(verdict: Verdict, *, strict: bool) -> bool:
     """Whether `verdict` keeps the gate closed; `strict` refuses whatever is unverifiable too."""
     if verdict.verdict is Outcome.VIOLATED or verdict.blocking:

@@ -17,7 +17,7 @@ from lifecycle.supervisor.bring_up import BringUp
 from lifecycle.supervisor.events import Emitter, GateOpened, Notice, Reach, SystemReached
 from lifecycle.supervisor.failure import START_FAILED, StepFailedError
 from lifecycle.supervisor.first_contact import TRIES, UNCHANGED_S, undiscovered
-from lifecycle.supervisor.gate import Gate, Permit, VerificationError, closes
+from lifecycle.supervisor.gate import Gate, Permit, VerificationError, behind_s, closes
 from lifecycle.supervisor.judge import Judge
 from lifecycle.supervisor.orders import (
     ACTIVE,
@@ -286,7 +286,7 @@ class Regulator:
         )
         try:
             # What comes again sends from other ports: their rules come before its first message.
-            await self._alive(self.program(permit, deadline - loop.time()))
+            await self._alive(self.program(permit, behind_s(deadline)))
         except VerificationError:
             self.phase = before
             raise
@@ -297,13 +297,13 @@ class Regulator:
             )
         )
         try:
-            await self._alive(self._bring_up.activate(permit, deadline - loop.time(), waiting))
+            await self._alive(self._bring_up.activate(permit, behind_s(deadline), waiting))
         except VerificationError:
             await self._withdraw(permit, waiting)
             self.phase = before
             raise
         self._judge.ahead = frozenset()
-        await self._alive(self._judge.until_clear(Stage.ACTIVE, deadline - loop.time()))
+        await self._alive(self._judge.until_clear(Stage.ACTIVE, behind_s(deadline)))
         # The same question as at the gate: what became active must be what was verified.
         self._gate.judge(self._judge.latest)
         self._reached(ACTIVE)
@@ -336,7 +336,7 @@ class Regulator:
         programmed = None
         while permit.verdict.flows != programmed:
             programmed = permit.verdict.flows
-            await self._program(permit.verdict, deadline - loop.time())
+            await self._program(permit.verdict, behind_s(deadline))
             # A network may take seconds: what changed meanwhile is judged before the gate opens.
             await permit.renewed()
 

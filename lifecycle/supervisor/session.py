@@ -32,7 +32,7 @@ from lifecycle.supervisor.events import (
 )
 from lifecycle.supervisor.eyes import Eyes
 from lifecycle.supervisor.failure import StepFailedError, with_failure
-from lifecycle.supervisor.gate import Gate, VerificationError, closes
+from lifecycle.supervisor.gate import Gate, VerificationError, behind_s, closes
 from lifecycle.supervisor.holding import Holding
 from lifecycle.supervisor.judge import Changes, Judge
 from lifecycle.supervisor.neighbours import Neighbours
@@ -380,15 +380,15 @@ class Session:
         self._reached("verified")
         if self._options.until is Until.VERIFIED:
             return await self._hold(Stage.CONNECTED)
-        await self._vigil.during(self._regulator.program(permit, deadline - loop.time()))
+        await self._vigil.during(self._regulator.program(permit, behind_s(deadline)))
         verdict = permit.verdict
         self._trusted = taken_on_trust(verdict)
         self._regulator.phase = "activating"
         managed = tuple(each.name for each in self._system.nodes.values() if each.planned.managed)
         self._emit(GateOpened(outcome=verdict.verdict.value, nodes=managed, trusted=self._trusted))
         async with self._following():
-            await self._vigil.during(self._bring_up.activate(permit, deadline - loop.time()))
-        await self._vigil.during(self._judge.until_clear(Stage.ACTIVE, deadline - loop.time()))
+            await self._vigil.during(self._bring_up.activate(permit, behind_s(deadline)))
+        await self._vigil.during(self._judge.until_clear(Stage.ACTIVE, behind_s(deadline)))
         # The same question as at the gate: what became active must be what was verified.
         self._gate.judge(self._judge.latest or verdict)
         self._regulator.phase = "active"

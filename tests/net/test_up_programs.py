@@ -135,7 +135,8 @@ def ask(host: Host, verb: str, manifest: Path, runtime: Path) -> None:
         timeout=_BOUND_S,
         check=False,
     )
-    assert (done.returncode, done.stderr) == (ExitCode.OK, "")
+    assert done.returncode == ExitCode.OK, done.stderr
+    assert done.stderr == ""
 
 
 def of_new_writers(wire: Capture, known: AbstractSet[bytes]) -> list[Packet]:

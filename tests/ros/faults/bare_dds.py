@@ -4,7 +4,9 @@ Spoken by hand: it announces itself and its endpoints as DDSI-RTPS 2.3 says (§8
 loopback, under the vendor id of Cyclone DDS, to every participant of ROS_DOMAIN_ID, and answers
 whoever asks who is there. TOPIC and TYPE are DDS's own: `rt/chatter:std_msgs::msg::dds_::String_`.
 With `--node` it says on `ros_discovery_info` that it has such nodes, as rmw_dds_common would; the
-first of them has all endpoints. Names are taken byte by byte as they are given, legal or not.
+first of them has all endpoints; with `--ghost PREFIX SPACE NAME` it says so in the name of another
+participant, as one that has left may be heard last. Names are taken byte by byte as they are given,
+legal or not.
 It sends no data besides: what is judged is that it could. Prints `ready` at its first announcement,
 and lives until SIGTERM or the end of its parent.
 """
@@ -131,6 +133,7 @@ def main() -> None:
     parser.add_argument("--write", action="append", default=[])
     parser.add_argument("--read", action="append", default=[])
     parser.add_argument("--node", nargs=2, action="append", default=[])
+    parser.add_argument("--ghost", nargs=3, action="append", default=[])
     options = parser.parse_args()
     prefix = VENDOR + os.urandom(10)
     domain = int(os.environ.get("ROS_DOMAIN_ID", "0"))
@@ -159,7 +162,9 @@ def main() -> None:
         number = len(options.write) + 1
         said.append(endpoint(prefix, port, NODES_WRITER, NODES_TOPIC, NODES_TYPE, number))
         claimed = nodes(prefix, options.node, entities)
-        claims.append(sample(prefix, NODES_WRITER, b"\0\0\0\0", claimed, 1))
+        told = [claimed, *(nodes(bytes.fromhex(of), [names], []) for of, *names in options.ghost)]
+        for number, each in enumerate(told, 1):
+            claims.append(sample(prefix, NODES_WRITER, b"\0\0\0\0", each, number))
     parent = os.getppid()
     asked: set[int] = set()
     first = True

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -18,7 +22,11 @@ from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import Durability, History, QosProfile, Reliability
 from lifecycle.middleware import FlowParticipant, GraphObserver, to_rclpy
+from lifecycle.middleware.graph_queries import endpoints_of, node_names
+from lifecycle.middleware.hidden_node import quiet_node
 from lifecycle.verify.observation import ObservedNode
+from tests.ros.faults.system import BARE_DDS
+from tests.ros.supervisor.running import ROOT
 from tests.stalls import assert_in_time
 
 MakeNode = Callable[..., Node]
@@ -29,6 +37,18 @@ WaitUntil = Callable[..., None]
 def observer(domain_id: int) -> Iterator[GraphObserver]:
     with GraphObserver(domain_id) as observer:
         yield observer
+
+
+@contextlib.contextmanager
+def a_node(domain_id: int, name: str) -> Iterator[None]:
+    """Have a node on a participant of its own, and none at the end."""
+    context, node = quiet_node(name, "/", domain_id)
+    try:
+        yield
+    finally:
+        node.destroy_node()
+        context.try_shutdown()
+        context.destroy()
 
 
 def nodes(observer: GraphObserver) -> dict[str, ObservedNode]:
@@ -93,6 +113,40 @@ def test_two_nodes_of_one_name_count_twice(
             nodes(observer).get("/twin") == ObservedNode(full_name="/twin", count=2, managed=False)
         )
     )
+
+
+def test_a_ghost_is_not_counted_beside_participants_of_connections(
+    observer: GraphObserver, domain_id: int, wait_until: WaitUntil
+) -> None:
+    """rmw_dds_common keeps the names of a participant that is heard once more after it has left."""
+
+    def home() -> str:
+        wait_until(lambda: "/twin" in nodes(observer))
+        events = endpoints_of(observer.node, EndpointKind.PUBLISHER, "/parameter_events")
+        return next(each.gid[:24] for each in events if each.node == "/twin")
+
+    with a_node(domain_id, "twin"):
+        gone = home()
+    wait_until(lambda: "/twin" not in nodes(observer))
+    ghost = [
+        *(sys.executable, BARE_DDS, "--write", "rt/said:std_msgs::msg::dds_::String_"),
+        *("--node", "/", "bare", "--ghost", gone, "/", "twin"),
+    ]
+    with (
+        FlowParticipant("_twin_flow_0", "/", domain_id) as participant,
+        a_node(domain_id, "twin"),
+        subprocess.Popen(
+            ghost, cwd=ROOT, env={**os.environ, "ROS_DOMAIN_ID": str(domain_id)}
+        ) as claims,
+    ):
+        participant.create_publisher(String, "/video", QosProfile())
+        assert home() != gone
+        try:
+            wait_until(lambda: node_names(observer.node).count("/twin") == 2)
+            wait_until(lambda: "/bare" in nodes(observer) and nodes(observer)["/twin"].count == 1)
+            assert node_names(observer.node).count("/twin") == 2
+        finally:
+            claims.terminate()
 
 
 def test_a_managed_node_is_told_by_its_services(

@@ -11,7 +11,7 @@ import pytest
 from lifecycle.errors import BringUpError, ExitCode
 from lifecycle.node.control import Operation
 from lifecycle.supervisor.driver import ServiceDriver
-from lifecycle.supervisor.gate import Gate, Permit, VerificationError
+from lifecycle.supervisor.gate import Gate, Permit, VerificationError, behind_s
 from lifecycle.verify.verdict import Outcome, Verdict
 from tests.unit.supervisor.fakes import planned_node, verdict_of
 
@@ -335,3 +335,13 @@ def test_to_close_a_gate_twice_changes_nothing() -> None:
     gate.close()
     gate.close()
     assert gate.permit is None
+
+
+def test_a_gate_that_opens_in_the_last_moment_leaves_time_to_activate() -> None:
+    async def left() -> tuple[float, float]:
+        now = asyncio.get_running_loop().time()
+        return behind_s(now - 0.1), behind_s(now + 20.0)
+
+    late, early = asyncio.run(left())
+    assert late == 2.0
+    assert 19.0 < early <= 20.0
