@@ -45,30 +45,51 @@ def _play(node: Node, way: str) -> None:
             node.create_service(SetParameters, "~/map_to", lambda _, response: response)
 
 
+class _Spinning:
+    """Nodes, and the thread that spins them."""
+
+    def __init__(self) -> None:
+        self.nodes: list[Node] = []
+        self._begin()
+
+    def _begin(self) -> None:
+        self.executor = SingleThreadedExecutor()
+        self._thread = threading.Thread(target=self.executor.spin, daemon=True)
+        self._thread.start()
+
+    def leave(self) -> None:
+        """Unmake all nodes.
+
+        No executor may hold them then: they would be unmade later, and rmw_dds_common, which knows
+        them by their names, gives the endpoints of the next node of a name to the last one.
+        """
+        self.executor.shutdown()
+        self._thread.join()
+        for each in self.nodes:
+            each.destroy_node()
+        self.nodes.clear()
+        self._begin()
+
+
 def main() -> None:
     rclpy.init()
-    nodes: list[Node] = []
-    executor = SingleThreadedExecutor()
-    thread = threading.Thread(target=executor.spin, daemon=True)
-    thread.start()
+    spinning = _Spinning()
     for line in sys.stdin:
         way, _, name = line.strip().rpartition(" ")
         if name == "leave":
-            for each in nodes:
-                executor.remove_node(each)
-                each.destroy_node()
-            nodes.clear()
+            spinning.leave()
         elif way.startswith("say "):
             _, topic, index = f"{way} {name}".split(" ")
-            _say(nodes, executor, topic, int(index))
+            _say(spinning.nodes, topic, int(index))
         else:
-            nodes.append(Node(name, enable_rosout=False))
-            _play(nodes[-1], way if way == "change_state" else way.replace("_", " "))
-            executor.add_node(nodes[-1])
+            node = Node(name, enable_rosout=False)
+            spinning.nodes.append(node)
+            _play(node, way if way == "change_state" else way.replace("_", " "))
+            spinning.executor.add_node(node)
         print("done", flush=True)
 
 
-def _say(nodes: list[Node], executor: SingleThreadedExecutor, topic: str, index: int) -> None:
+def _say(nodes: list[Node], topic: str, index: int) -> None:
     from lifecycle.graph.dds import GRAPH_QOS
     from lifecycle.middleware.plan_notices import _qos
     from tests.hostile.answers import MESSAGES

@@ -54,8 +54,9 @@ def _signalled(
         for number in numbers:
             process.send_signal(number)
         done = ended(process, mark, folder, limit_s=BOUND_S)
-    # Before the handlers are there a signal ends any program, without a word of ours.
-    if done.code < 0 and isinstance(after, float) and after < 1.0 and not done.out + done.err:
+    # Before anything has begun a signal ends any program, without a word of ours.
+    began = not isinstance(after, float) or after >= 1.0 or bool(done.out + done.err)
+    if not began and (done.code < 0 or (done.code == ExitCode.INTERRUPTED and INT in numbers)):
         return
     check(done, *map(int, ENDS))
     if done.code == 0 and INT in numbers:

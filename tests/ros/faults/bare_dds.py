@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import socket
 import struct
 import time
@@ -154,7 +155,8 @@ def main() -> None:
     entities = []
     for kind, asked_for in ((WRITER, options.write), (READER, options.read)):
         for index, spelled in enumerate(asked_for):
-            topic, _, type_ = os.fsencode(spelled).partition(b":")
+            # The last single colon: names may have any, and types have double ones.
+            topic, type_ = re.findall(rb"(?s)(.*)(?<!:):(?!:)(.*)", os.fsencode(spelled))[0]
             entities.append(struct.pack(">HBB", 0, 2 + index, kind))
             said.append(endpoint(prefix, port, entities[-1], topic, type_, index + 1))
     claims = []

@@ -73,7 +73,8 @@ def restarts_at_once(run: Up, runtime: Path, node: str = "talker") -> float:
     began = time.monotonic()
     done = verb("restart", "pair", node, runtime=runtime)
     took_s = time.monotonic() - began
-    assert (done.returncode, done.stderr) == (ExitCode.OK, "")
+    assert done.returncode == ExitCode.OK, done.stderr
+    assert done.stderr == ""
     run.until("system", reached="active")
     rules = {
         each["rule"]
