@@ -139,9 +139,9 @@ def test_a_ghost_is_not_counted_beside_participants_of_connections(
             ghost, cwd=ROOT, env={**os.environ, "ROS_DOMAIN_ID": str(domain_id)}
         ) as claims,
     ):
-        participant.create_publisher(String, "/video", QosProfile())
-        assert home() != gone
         try:
+            participant.create_publisher(String, "/video", QosProfile())
+            assert home() != gone
             wait_until(lambda: node_names(observer.node).count("/twin") == 2)
             wait_until(lambda: "/bare" in nodes(observer) and nodes(observer)["/twin"].count == 1)
             assert node_names(observer.node).count("/twin") == 2
