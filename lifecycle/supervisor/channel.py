@@ -165,6 +165,8 @@ class ControlChannel:
         except ValueError as error:
             reason = f"its process sent what is not an event: {error}"
         finally:
+            # A process that was killed while it was busy would be said to hang.
+            self._watch_no_more()
             self._fail(ChannelClosedError(f"cannot reach process {self._spec.process!r}: {reason}"))
 
     def _dispatch(self, event: Event) -> None:
@@ -193,6 +195,12 @@ class ControlChannel:
         if self._sign is not None and (why := self._sign.overdue()):
             self._on_hang(why)
 
+    def _watch_no_more(self) -> None:
+        if self._sign is not None:
+            asyncio.get_running_loop().remove_reader(self._sign)
+            self._sign.close()
+            self._sign = None
+
     def _fail(self, error: ChannelClosedError) -> None:
         if not self._ready.done():
             self._ready.set_exception(error)
@@ -202,10 +210,7 @@ class ControlChannel:
 
     async def close(self) -> None:
         """Close our end, which makes the host shut down."""
-        if self._sign is not None:
-            asyncio.get_running_loop().remove_reader(self._sign)
-            self._sign.close()
-            self._sign = None
+        self._watch_no_more()
         if self._writer is not None:
             writer, self._writer = self._writer, None
             writer.close()

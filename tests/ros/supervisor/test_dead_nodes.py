@@ -94,6 +94,9 @@ def test_a_killed_process_is_gone_for_everybody_at_once_and_comes_back_at_once(
     with up(pair(tmp_path, fresh_domain, edit=CROWD), "--keep-going", runtime=tmp_path) as run:
         run.until("system", reached="active")
         run.note_segments()
+        # The bystander may have a port of the dead open until after the end, and whoever was killed
+        # never gives its own share of it back: then nobody may remove it.
+        run.segments = {each for each in run.segments if "_port" not in each}
         dead = {"talker", "quiet"}
         until(lambda: dead < {*bystander.get_node_names()}, time.monotonic())
         until(lambda: bystander.count_publishers("/chatter") == 1, time.monotonic())

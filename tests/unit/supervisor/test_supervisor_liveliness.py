@@ -19,7 +19,7 @@ from lifecycle.middleware.busy_sign import BusySign, Overdue
 from lifecycle.node.control import SIGN_DESCRIPTORS, HostSpec, Operation
 from lifecycle.node.control import Event as HostEvent
 from lifecycle.plan.model import Plan, PlannedProcess
-from lifecycle.supervisor.channel import ControlChannel
+from lifecycle.supervisor.channel import ChannelClosedError, ControlChannel
 from lifecycle.supervisor.events import (
     Emitter,
     Event,
@@ -507,6 +507,35 @@ def test_a_channel_tells_that_its_host_hangs_and_when_it_came_back() -> None:
         assert await asyncio.wait_for(told.get(), 10) is None
         sign.close()
         theirs.close()
+        await channel.close()
+
+    asyncio.run(test())
+
+
+def test_a_process_that_was_killed_while_it_was_busy_does_not_hang() -> None:
+    """Its nodes may run again in another one, when the limit of the first is over."""
+
+    async def test() -> None:
+        node = planned_node("camera", timeouts=Timeouts(silent_s=0.05))
+        spec = HostSpec(
+            system="robot",
+            process="p",
+            domain_id=0,
+            discovery_range=DiscoveryRange.LOCALHOST,
+            nodes=(node,),
+        )
+        told: asyncio.Queue[Overdue | None] = asyncio.Queue()
+        channel = ControlChannel(spec, lambda _: None, told.put_nowait)
+        theirs = await channel.open()
+        _, descriptors, _, _ = socket.recv_fds(theirs, 1, SIGN_DESCRIPTORS)
+        sign = BusySign(*descriptors)
+        sign.begin()
+        theirs.close()
+        with pytest.raises(ChannelClosedError):
+            await asyncio.wait_for(channel.ready(), 10)
+        with pytest.raises(asyncio.TimeoutError):
+            await asyncio.wait_for(told.get(), 10 * sign.limit_s)
+        sign.close()
         await channel.close()
 
     asyncio.run(test())
