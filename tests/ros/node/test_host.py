@@ -157,12 +157,15 @@ def test_an_async_callback_that_waits_does_not_keep_the_process(start: Start) ->
     assert "cannot go on with /one: on_configure" in host.log.read_text()
 
 
-def test_a_callback_that_blocks_does_not_keep_the_process_beyond_its_bound(start: Start) -> None:
+def test_a_callback_that_blocks_does_not_keep_the_process_beyond_its_bound(
+    start: Start, wait_until: Callable[..., None]
+) -> None:
     classes = ("Blocking", "BlockingConstructor")
     hosts = [start(hosted("one", each, timeouts=Timeouts(shutdown_s=0.1))) for each in classes]
     hosts[0].until("ready")
     hosts[0].ask("/one", CONFIGURE)
     assert hosts[0].states(1) == ["configuring"]
+    wait_until(lambda: "constructing" in hosts[1].log.read_text())
     for host in hosts:
         host.hang_up()
     for host in hosts:
