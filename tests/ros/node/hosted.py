@@ -48,7 +48,7 @@ class Blocking(LifecycleNode):
 class BlockingConstructor(LifecycleNode):
     def __init__(self) -> None:
         super().__init__()
-        print("constructing", flush=True)
+        print("constructing", file=sys.stderr, flush=True)
         time.sleep(3600)
 
 
