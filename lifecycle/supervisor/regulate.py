@@ -1,12 +1,14 @@
-"""Pausing, resuming and restarting a system that is up, always through the gate.
+"""The gate sequence, and the orders that go through it: pause, resume, restart.
 
-Owns: the steps of each order. What is active stays so only as long as the gate that let it through;
-nothing is activated again before a new verdict opens the gate again. Must not import rclpy.
+Owns: the one way from a connected to an active system: judge, permit, networks, activate, judge
+again; and the steps of each order. What is active stays so only as long as the gate that let it
+through; nothing is activated again before a new verdict opens it again. Must not import rclpy.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import Callable, Coroutine, Iterable
 from typing import Any
 
@@ -34,6 +36,7 @@ from lifecycle.supervisor.states import ProcessState
 from lifecycle.supervisor.system import NodeRun, System
 from lifecycle.supervisor.together import together
 from lifecycle.verify import not_ok
+from lifecycle.verify.missing import taken_on_trust
 from lifecycle.verify.verdict import Stage, Verdict
 
 Alive = Callable[[Coroutine[Any, Any, object]], Coroutine[Any, Any, None]]
@@ -51,11 +54,14 @@ class Regulator:
         vanishes: waits, bounded, until the graph shows no node of this name.
         replanned: told the names of nodes that the plan connects otherwise from now on.
         program: programs networks with the flows of a verdict within seconds, done when it returns.
+        following: keeps looking at the nodes of others, and at ours that others may drive, for the
+            length of its block.
         spawner: must be able to start processes before any is ended to be started anew.
         timeout_s: for bringing up again what an order took down.
 
     Attributes:
         phase: as people read it; see orders.py and SystemStatus.
+        trusted: what the gate last took on trust; empty if nothing.
     """
 
     def __init__(
@@ -74,6 +80,7 @@ class Regulator:
         replanned: Callable[[Iterable[str]], None],
         program: Callable[[Verdict, float], Coroutine[Any, Any, None]],
         spawner: Spawner,
+        following: Callable[[], contextlib.AbstractAsyncContextManager[None]],
         hurry: asyncio.Event,
         timeout_s: float,
     ) -> None:
@@ -90,9 +97,11 @@ class Regulator:
         self._vanishes = vanishes
         self._replanned = replanned
         self._program = program
+        self._following = following
         self._hurry = hurry
         self._timeout_s = timeout_s
         self.phase = "connecting"
+        self.trusted = ""
 
     @property
     def stage(self) -> Stage:
@@ -262,51 +271,78 @@ class Regulator:
         system.replan(plan)
         self._replanned(each.name for each in nodes)
 
-    async def _through_the_gate(self) -> None:
-        """Judge the system as it stands, and activate what is not active."""
-        loop = asyncio.get_running_loop()
-        deadline = loop.time() + self._timeout_s
-        before = PAUSED if self.phase == PAUSED else HELD
+    async def verify(self, timeout_s: float) -> Permit:
+        """Judge the system as it stands until its gate opens; activate nothing.
+
+        Args:
+            timeout_s: seconds, for all of it.
+
+        Raises:
+            StepFailedError: as for `until_clear`.
+            VerificationError: the gate stays closed.
+        """
         self._gate.close()
         self.phase = "verifying"
         self._judge.ahead = self._active()
-        await self.until_clear(self._timeout_s)
+        await self.until_clear(timeout_s)
         assert self._judge.latest is not None
+        permit = self._gate.judge(self._judge.latest)
+        self.trusted = taken_on_trust(permit.verdict)
+        self._emit(SystemReached(reached="verified", elapsed_s=self._emit.elapsed_s))
+        return permit
+
+    async def activate(self, permit: Permit, deadline: float) -> None:
+        """Program networks, activate what is not active, and judge what it has become.
+
+        Args:
+            permit: of `verify`.
+            deadline: of all of it, by the running loop's clock, see `behind_s`.
+
+        Raises:
+            StepFailedError: a step failed, or a network could not be programmed.
+            VerificationError: what changed meanwhile closed the gate for all that were not sent
+                their requests (`again`), or what became active is not what was verified.
+        """
+        # What comes again sends from other ports: their rules come before its first message.
+        await self._alive(self._program_flows(permit, deadline))
+        self.trusted = taken_on_trust(permit.verdict)
+        self.phase = "activating"
+        waiting = self._inactive()
+        self._emit(
+            GateOpened(
+                outcome=permit.verdict.verdict.value,
+                nodes=tuple(each.name for each in waiting),
+                trusted=self.trusted,
+            )
+        )
+        async with self._following():
+            await self._alive(self._bring_up.activate(permit, behind_s(deadline), waiting))
+        self._judge.ahead = frozenset()
+        await self._alive(self._judge.until_clear(Stage.ACTIVE, behind_s(deadline)))
+        # The same question as at the gate: what became active must be what was verified.
+        assert self._judge.latest is not None
+        self._gate.judge(self._judge.latest)
+        self._reached(ACTIVE)
+
+    async def _through_the_gate(self) -> None:
+        """Judge the system as it stands, and activate what is not active."""
+        deadline = asyncio.get_running_loop().time() + self._timeout_s
+        before = PAUSED if self.phase == PAUSED else HELD
         try:
-            permit = self._gate.judge(self._judge.latest)
+            permit = await self.verify(self._timeout_s)
         except VerificationError:
             # What is active was verified before; what is not stays inactive until asked again.
             self.phase = before
             raise
-        self._emit(SystemReached(reached="verified", elapsed_s=self._emit.elapsed_s))
-        waiting = tuple(
-            each
-            for each in self._system.nodes.values()
-            if each.planned.managed and each.reach is not Reach.ACTIVE
-        )
+        waiting = self._inactive()
         try:
-            # What comes again sends from other ports: their rules come before its first message.
-            await self._alive(self.program(permit, behind_s(deadline)))
-        except VerificationError:
-            self.phase = before
+            await self.activate(permit, deadline)
+        except VerificationError as error:
+            if error.again:
+                if self.phase == "activating":
+                    await self._withdraw(permit, waiting)
+                self.phase = before
             raise
-        self.phase = "activating"
-        self._emit(
-            GateOpened(
-                outcome=permit.verdict.verdict.value, nodes=tuple(each.name for each in waiting)
-            )
-        )
-        try:
-            await self._alive(self._bring_up.activate(permit, behind_s(deadline), waiting))
-        except VerificationError:
-            await self._withdraw(permit, waiting)
-            self.phase = before
-            raise
-        self._judge.ahead = frozenset()
-        await self._alive(self._judge.until_clear(Stage.ACTIVE, behind_s(deadline)))
-        # The same question as at the gate: what became active must be what was verified.
-        self._gate.judge(self._judge.latest)
-        self._reached(ACTIVE)
 
     async def _withdraw(self, permit: Permit, waiting: Iterable[NodeRun]) -> None:
         """Deactivate again what was activated since the gate opened: the rest may not follow."""
@@ -320,25 +356,21 @@ class Regulator:
         await self._alive(self._bring_up.deactivate(begun))
         self._judge.ahead = self._active()
 
-    async def program(self, permit: Permit, timeout_s: float) -> None:
-        """Program networks with the flows of the verdict that nodes are activated on.
-
-        Args:
-            permit: to activate them.
-            timeout_s: seconds, for all of it.
-
-        Raises:
-            StepFailedError: a network could not be programmed.
-            VerificationError: what changed meanwhile closed the gate.
-        """
-        loop = asyncio.get_running_loop()
-        deadline = loop.time() + timeout_s
+    async def _program_flows(self, permit: Permit, deadline: float) -> None:
+        """Program networks with the flows of the verdict that nodes are activated on."""
         programmed = None
         while permit.verdict.flows != programmed:
             programmed = permit.verdict.flows
             await self._program(permit.verdict, behind_s(deadline))
             # A network may take seconds: what changed meanwhile is judged before the gate opens.
             await permit.renewed()
+
+    def _inactive(self) -> tuple[NodeRun, ...]:
+        return tuple(
+            each
+            for each in self._system.nodes.values()
+            if each.planned.managed and each.reach is not Reach.ACTIVE
+        )
 
     def _active(self) -> frozenset[str]:
         return frozenset(

@@ -23,7 +23,6 @@ from lifecycle.supervisor.elsewhere import Elsewhere
 from lifecycle.supervisor.ending import ENDED_BY, Ending
 from lifecycle.supervisor.events import (
     Emitter,
-    GateOpened,
     LogLine,
     Notice,
     Stopped,
@@ -32,7 +31,7 @@ from lifecycle.supervisor.events import (
 )
 from lifecycle.supervisor.eyes import Eyes
 from lifecycle.supervisor.failure import StepFailedError, with_failure
-from lifecycle.supervisor.gate import Gate, VerificationError, behind_s, closes
+from lifecycle.supervisor.gate import Gate, VerificationError, closes
 from lifecycle.supervisor.holding import Holding
 from lifecycle.supervisor.judge import Changes, Judge
 from lifecycle.supervisor.neighbours import Neighbours
@@ -54,7 +53,7 @@ from lifecycle.supervisor.together import Worker, ended
 from lifecycle.supervisor.vigil import Vigil
 from lifecycle.supervisor.wiring import authority_of
 from lifecycle.supervisor.zygote import Zygote
-from lifecycle.verify.missing import missing, not_ok, taken_on_trust
+from lifecycle.verify.missing import missing, not_ok
 from lifecycle.verify.verdict import NOT_JUDGED, Outcome, RunEnd, Stage, Verdict
 
 _GLANCE_S = 1.0
@@ -130,7 +129,6 @@ class Session:
         self._ending = ending
         self._furthest: str | None = None
         self._held = False
-        self._trusted = ""
         self._ends = ""
         self._hurry = asyncio.Event()
         self._stop: asyncio.Future[None] = asyncio.get_running_loop().create_future()
@@ -177,6 +175,7 @@ class Session:
             vanishes=sightings.vanishes,
             replanned=self._replanned,
             program=networks.begin,
+            following=self._following,
             spawner=zygote,
             hurry=self._hurry,
             timeout_s=options.timeout_s,
@@ -294,7 +293,7 @@ class Session:
             reason=reason,
             reached=self._furthest,
             exit_code=end.exit_code,
-            trusted=self._trusted,
+            trusted=self._regulator.trusted,
         )
         verdict = dataclasses.replace(end.verdict or self._judge.latest or NOT_JUDGED, run=run)
         return UpResult(exit_code=end.exit_code, verdict=verdict, plan=self._system.first)
@@ -367,32 +366,17 @@ class Session:
         deadline = loop.time() + self._options.timeout_s
         async with self._following():
             await self._vigil.during(self._bring_up.connect(self._options.timeout_s))
-        self._reached("connected")
+        self._furthest = "connected"
+        self._emit(SystemReached(reached="connected", elapsed_s=self._emit.elapsed_s))
         if self._options.until is Until.CONNECTED:
             await self._vigil.during(self._judge.until_clear(Stage.CONNECTED, _GLANCE_S))
             return await self._hold(Stage.CONNECTED)
-        self._regulator.phase = "verifying"
-        await self._regulator.until_clear(deadline - loop.time())
-        verdict = self._judge.latest
-        assert verdict is not None
-        permit = self._gate.judge(verdict)
-        self._trusted = taken_on_trust(verdict)
-        self._reached("verified")
+        permit = await self._regulator.verify(deadline - loop.time())
+        self._furthest = "verified"
         if self._options.until is Until.VERIFIED:
             return await self._hold(Stage.CONNECTED)
-        await self._vigil.during(self._regulator.program(permit, behind_s(deadline)))
-        verdict = permit.verdict
-        self._trusted = taken_on_trust(verdict)
-        self._regulator.phase = "activating"
-        managed = tuple(each.name for each in self._system.nodes.values() if each.planned.managed)
-        self._emit(GateOpened(outcome=verdict.verdict.value, nodes=managed, trusted=self._trusted))
-        async with self._following():
-            await self._vigil.during(self._bring_up.activate(permit, behind_s(deadline)))
-        await self._vigil.during(self._judge.until_clear(Stage.ACTIVE, behind_s(deadline)))
-        # The same question as at the gate: what became active must be what was verified.
-        self._gate.judge(self._judge.latest or verdict)
-        self._regulator.phase = "active"
-        self._reached("active")
+        await self._regulator.activate(permit, deadline)
+        self._furthest = "active"
         return await self._hold(Stage.ACTIVE)
 
     @contextlib.asynccontextmanager
@@ -483,10 +467,6 @@ class Session:
             self._authority.replan(self._system.plan, frozenset(nodes))
         self._neighbours.renew()
         self._agreement.announce(self._system.first)
-
-    def _reached(self, reached: str) -> None:
-        self._furthest = reached
-        self._emit(SystemReached(reached=reached, elapsed_s=self._emit.elapsed_s))
 
 
 def _hurried(result: UpResult) -> UpResult:
