@@ -34,8 +34,6 @@ class Operation(enum.Enum):
     CONNECT_TO = "connect_to"  # connection, urls
     MAP_TO = "map_to"  # endpoint, connection
     DISCONNECT_FROM = "disconnect_from"  # connection
-    REMAP = "remap"  # endpoint, name
-    ALIAS = "alias"  # endpoint, names; none takes them away
     # Of the whole process: a link is down, and send again soon what nobody acknowledged; and tell
     # the graph anew which nodes are here.
     SEND_AGAIN_SOON = "send_again_soon"
@@ -61,8 +59,7 @@ class Command:
         node: fully qualified name.
         connection: name of a connection, for CONNECT_TO, MAP_TO and DISCONNECT_FROM.
         connections: what to connect to, for CONNECT_TO.
-        endpoint: `publishers/video`, kind and declared name, for MAP_TO, REMAP and ALIAS.
-        names: new names, for REMAP (one) and ALIAS.
+        endpoint: `publishers/video`, kind and declared name, for MAP_TO.
     """
 
     id: int
@@ -71,7 +68,6 @@ class Command:
     connection: str = ""
     connections: ParticipantConnections = ParticipantConnections()
     endpoint: str = ""
-    names: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

@@ -102,18 +102,8 @@ async def _disconnect_from(interface: NodeInterface, command: Command) -> None:
     interface.disconnect(command.connection)
 
 
-async def _remap(interface: NodeInterface, command: Command) -> None:
-    interface.remap(command.endpoint, command.names[0] if command.names else "")
-
-
-async def _alias(interface: NodeInterface, command: Command) -> None:
-    interface.alias(command.endpoint, command.names)
-
-
 _NODE_INTERFACE = {
     Operation.CONNECT_TO: _connect_to,
     Operation.MAP_TO: _map_to,
     Operation.DISCONNECT_FROM: _disconnect_from,
-    Operation.REMAP: _remap,
-    Operation.ALIAS: _alias,
 }

@@ -7,11 +7,9 @@ from lifecycle.plan.data_layer import (
     NegotiatedConnection,
     NegotiatedFlow,
     NegotiationProblem,
-    NodeChange,
     Party,
     PartyEndpoint,
     Terms,
-    difference,
 )
 from lifecycle.plan.errors import PlanError
 from lifecycle.plan.model import (
@@ -38,7 +36,6 @@ __all__ = [
     "NegotiatedConnection",
     "NegotiatedFlow",
     "NegotiationProblem",
-    "NodeChange",
     "ParticipantConnections",
     "ParticipantCost",
     "Party",
@@ -56,7 +53,6 @@ __all__ = [
     "build_plan",
     "changes",
     "check_plan",
-    "difference",
     "differences",
     "effective_domain",
     "hosts_of",

@@ -1,13 +1,12 @@
 """The data layer graph: who takes part, what was negotiated, and what changes between two of them.
 
-Owns: `Party`, `Terms`, `DataLayerGraph` and `difference`. The rules are `media`'s, and `negotiate`
+Owns: `Party`, `Terms` and `DataLayerGraph`. The rules are `media`'s, and `negotiate`
 applies them. Pure.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
 
 from lifecycle.manifest.model import EndpointKind, FlowTransport
 from lifecycle.manifest.qos import QosProfile
@@ -178,87 +177,3 @@ class DataLayerGraph:
     flows: tuple[NegotiatedFlow, ...] = ()
     connections: tuple[NegotiatedConnection, ...] = ()
     problems: tuple[NegotiationProblem, ...] = ()
-
-
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class NodeChange:
-    """What one node must be told, in this order: connect, map, disconnect.
-
-    Attributes:
-        node: key of the party.
-        connect: (name, URLs) of connections that are new. One whose URLs have changed is in
-            `disconnect` of an earlier step of its own: see `replace`.
-        replace: (name, URLs) of connections that must be made again with other URLs.
-        map: (label, connection) of endpoints that go elsewhere than before, or whose connection is
-            replaced; an empty name is the node's own participant.
-        disconnect: names of connections that go.
-    """
-
-    node: str
-    connect: tuple[tuple[str, tuple[str, ...]], ...] = ()
-    replace: tuple[tuple[str, tuple[str, ...]], ...] = ()
-    map: tuple[tuple[str, str], ...] = ()
-    disconnect: tuple[str, ...] = ()
-
-
-def difference(before: DataLayerGraph, after: DataLayerGraph) -> tuple[NodeChange, ...]:
-    """Return what must be done to come from one data layer graph to another, node by node.
-
-    Nothing that both have is touched. Nodes, connections and endpoints are sorted.
-    """
-    old, new = _by_node(before), _by_node(after)
-    changes = (_change(node, old.get(node, {}), new.get(node, {})) for node in sorted({*old, *new}))
-    return tuple(each for each in changes if each != NodeChange(node=each.node))
-
-
-_Connections = dict[str, NegotiatedConnection]
-
-
-def _by_node(graph: DataLayerGraph) -> dict[str, _Connections]:
-    found: dict[str, _Connections] = {}
-    for each in graph.connections:
-        found.setdefault(each.node, {})[each.name] = each
-    return found
-
-
-def _mapped(connections: _Connections) -> dict[str, str]:
-    return {label: each.name for each in connections.values() for label in each.map}
-
-
-def _change(node: str, old: _Connections, new: _Connections) -> NodeChange:
-    replaced = {name for name in {*old} & {*new} if old[name].urls != new[name].urls}
-    was, becomes = _mapped(old), _mapped(new)
-
-    def moves() -> Iterator[tuple[str, str]]:
-        for label in sorted({*was, *becomes}):
-            there = becomes.get(label, "")
-            if was.get(label, "") != there or there in replaced:
-                yield label, there
-
-    return NodeChange(
-        node=node,
-        connect=tuple((name, new[name].urls) for name in sorted({*new} - {*old})),
-        replace=tuple((name, new[name].urls) for name in sorted(replaced)),
-        map=tuple(moves()),
-        disconnect=tuple(sorted({*old} - {*new})),
-    )
-
-
-def apply(
-    before: tuple[NegotiatedConnection, ...], changes: tuple[NodeChange, ...]
-) -> dict[tuple[str, str], tuple[tuple[str, ...], tuple[str, ...]]]:
-    """Return what connections are there after changes: (node, name) → (URLs, sorted labels)."""
-    urls = {(each.node, each.name): each.urls for each in before}
-    mapped = {(each.node, label): each.name for each in before for label in each.map}
-    for change in changes:
-        for name, told in (*change.connect, *change.replace):
-            urls[change.node, name] = told
-        for label, name in change.map:
-            mapped[change.node, label] = name
-        for name in change.disconnect:
-            del urls[change.node, name]
-    labels: dict[tuple[str, str], list[str]] = {key: [] for key in urls}
-    for (node, label), name in mapped.items():
-        if name:
-            labels[node, name].append(label)
-    return {key: (urls[key], tuple(sorted(labels[key]))) for key in urls}

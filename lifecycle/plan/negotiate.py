@@ -45,7 +45,7 @@ def negotiate(
         wishes: what links say.
         terms: what the system gives.
         before: what is there already: connections that still fit keep their names, ports, groups
-            and URLs, so that `difference` is small.
+            and URLs, so that little is made anew.
     """
     pairs = tuple(_pairs(sorted(parties, key=lambda each: each.key), wishes))
     chosen, problems = _choose(pairs, terms)

@@ -211,12 +211,6 @@ def test_a_supervisor_does_the_same_over_the_control_channel(start: Start) -> No
     assert mappings(mapped.configuration) == [("in", "", False), ("out", "net", True)]
     connected = host.do("/it", Operation.CONNECT)
     assert mappings(connected.configuration) == [("in", "", True), ("out", "net", True)]
-    renamed = host.do("/it", Operation.REMAP, endpoint="in", names=("/there",))
-    assert renamed.configuration is not None
-    assert renamed.configuration.endpoints[0].resolved == "/there"
-    aliased = host.do("/it", Operation.ALIAS, endpoint="in", names=("/more",))
-    assert aliased.configuration is not None
-    assert aliased.configuration.endpoints[0].aliases == ("/more",)
     refused = host.do("/it", Operation.MAP_TO, endpoint="map", connection="net")
     assert (refused.ok, refused.configuration) == (False, None)
     assert refused.error == (
