@@ -157,7 +157,12 @@ def _manifest(make: Make, verb: str, place: Place) -> None:
 def _named(name: str, place: Place) -> None:
     check(in_process("check", name), *_INVALID)
     check(in_process("status", name, variables={"XDG_RUNTIME_DIR": str(place.folder())}))
-    check(in_process("check", "x", "--report", f"{name}.json"), *_INVALID)
+    before = Path.cwd()
+    os.chdir(place.folder())
+    try:
+        check(in_process("check", "x", "--report", f"{name}.json"), *_INVALID)
+    finally:
+        os.chdir(before)
     check(in_process("check", "x", variables={"XDG_RUNTIME_DIR": name}), *_INVALID)
 
 
