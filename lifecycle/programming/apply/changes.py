@@ -10,8 +10,7 @@ import enum
 from collections.abc import Iterable, Sequence
 from typing import Protocol
 
-from lifecycle.programming.rules.rules import FlowRule
-from lifecycle.programming.rules.wording import asks
+from lifecycle.programming.rules.rules import FlowRule, asks
 
 
 class ChangeKind(enum.Enum):

@@ -29,8 +29,7 @@ from lifecycle.programming.rules.nftables import (
     render_nft_removal,
     table_name,
 )
-from lifecycle.programming.rules.rules import FlowRule
-from lifecycle.programming.rules.wording import rules_digest
+from lifecycle.programming.rules.rules import FlowRule, rules_digest
 
 KIND = "nft"
 

@@ -32,7 +32,7 @@ from lifecycle.programming.apply.tool import (
     qdiscs_of,
     refused,
 )
-from lifecycle.programming.rules.rules import FlowRule
+from lifecycle.programming.rules.rules import FlowRule, rules_digest
 from lifecycle.programming.rules.tc import render_tc, render_tc_removal
 from lifecycle.programming.rules.tc_classes import class_of
 from lifecycle.programming.rules.tc_filters import TcFilter, anchors, tc_filters
@@ -44,7 +44,6 @@ from lifecycle.programming.rules.tc_settings import (
     TcMatch,
     TcSettings,
 )
-from lifecycle.programming.rules.wording import rules_digest
 
 KIND = "tc"
 

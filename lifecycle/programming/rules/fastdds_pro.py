@@ -15,8 +15,7 @@ from xml.sax.saxutils import quoteattr
 
 from lifecycle.network.dscp import describe, tos
 from lifecycle.network.nfe import InternetProtocol, TransportProtocol
-from lifecycle.programming.rules.rules import FlowRule, LeftOut
-from lifecycle.programming.rules.wording import named
+from lifecycle.programming.rules.rules import FlowRule, LeftOut, named
 
 _KINDS = {InternetProtocol.IPV4: "UDPv4", InternetProtocol.IPV6: "UDPv6"}
 

@@ -13,8 +13,7 @@ from typing import Generic, Protocol, TypeVar
 
 from lifecycle.codec import to_json
 from lifecycle.programming.rules.packet_filter import Direction, check_address
-from lifecycle.programming.rules.rules import FlowRule, LeftOut
-from lifecycle.programming.rules.wording import asks
+from lifecycle.programming.rules.rules import FlowRule, LeftOut, asks
 
 _ENDS = ("source", "destination")
 

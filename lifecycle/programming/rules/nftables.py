@@ -17,8 +17,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from lifecycle.codec import to_json
 from lifecycle.network.dscp import code_points, describe, dscp_name
 from lifecycle.network.nfe import InternetProtocol
-from lifecycle.programming.rules.rules import FlowRule, LeftOut
-from lifecycle.programming.rules.wording import asks, named
+from lifecycle.programming.rules.rules import FlowRule, LeftOut, asks, named
 
 FAMILY = "inet"
 CHAIN = "post"

@@ -17,10 +17,9 @@ from lifecycle.programming.rules.fastdds_pro import render_fastdds_pro
 from lifecycle.programming.rules.flows_csv import flows_to_csv
 from lifecycle.programming.rules.nef import NefSettings, render_nef
 from lifecycle.programming.rules.nftables import render_nft, render_nft_json
-from lifecycle.programming.rules.rules import RuleSet, SourceAddress, flow_rules
+from lifecycle.programming.rules.rules import RuleSet, SourceAddress, flow_rules, rules_digest
 from lifecycle.programming.rules.tc import render_tc
 from lifecycle.programming.rules.tc_settings import TcSettings
-from lifecycle.programming.rules.wording import rules_digest
 from lifecycle.programming.rules.zenoh import render_zenoh
 from lifecycle.verify.verdict import FlowReport
 

@@ -2,7 +2,8 @@
 
 Owns: the step from flow reports to rules. A rule says only what was observed or declared: a flow
 whose verdict is not ok, shared memory, groups and tuples that two flows share in disagreement make
-no rule, and each is listed with its reason. Pure.
+no rule, and each is listed with its reason. And how a rule reads in the comments of every export:
+DSCP and TOS always side by side, because products differ in which of the two they ask for. Pure.
 """
 
 from __future__ import annotations
@@ -11,9 +12,10 @@ import dataclasses
 import hashlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
+from lifecycle.codec import to_json
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.network.address import canonical, is_loopback, is_multicast, is_wildcard, socket_text
-from lifecycle.network.dscp import parse_dscp
+from lifecycle.network.dscp import describe, parse_dscp
 from lifecycle.network.five_qi_dscp import DscpMapping
 from lifecycle.network.flow import FlowTuple
 from lifecycle.network.nfe import InternetProtocol, TransportProtocol, is_ip
@@ -379,3 +381,27 @@ def _same_host(plan: Plan, report: FlowReport) -> bool:
     ends = [_node(plan, name) for name in (report.publisher, report.subscription)]
     places = {"" if end is None else addresses.get(end.machine, "") for end in ends}
     return len(places) == 1
+
+
+def named(rule: FlowRule) -> str:
+    """Return the flows of a rule: `/robot/video /robot/camera → /viewer`, several with commas."""
+    return ", ".join(
+        f"{topic} {publisher} → {subscription}" for topic, publisher, subscription in rule.names
+    )
+
+
+def asks(rule: FlowRule) -> str:
+    """Return what a rule asks for: `EF = DSCP 46 = TOS 184 (0xb8), 5QI 85`."""
+    found = [] if rule.dscp is None else [describe(rule.dscp)]
+    if rule.five_qi is not None:
+        found.append(f"5QI {rule.five_qi}")
+    if rule.flow_label:
+        found.append(f"flow label {rule.flow_label:#07x}")
+    if rule.max_delay_ms is not None:
+        found.append(f"at most {rule.max_delay_ms:g} ms")
+    return ", ".join(found) or "nothing"
+
+
+def rules_digest(rules: Iterable[FlowRule]) -> str:
+    """Return sixteen hexadecimal digits that are equal for equal rules in equal order."""
+    return hashlib.sha256(to_json(tuple(rules))).hexdigest()[:16]

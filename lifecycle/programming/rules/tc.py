@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 
-from lifecycle.programming.rules.rules import FlowRule, LeftOut
+from lifecycle.programming.rules.rules import FlowRule, LeftOut, asks, named
 from lifecycle.programming.rules.tc_classes import (
     DEFAULT_MINOR,
     TrafficClass,
@@ -22,7 +22,6 @@ from lifecycle.programming.rules.tc_classes import (
 )
 from lifecycle.programming.rules.tc_filters import anchors, tc_filters
 from lifecycle.programming.rules.tc_settings import OWNED_HANDLE, TcMatch, TcSettings
-from lifecycle.programming.rules.wording import asks, named
 
 _PRIO_BANDS = 16
 """TCQ_PRIO_BANDS."""

@@ -13,8 +13,7 @@ from collections.abc import Iterable, Sequence
 from lifecycle.codec import to_json
 from lifecycle.network.dscp import describe, tos
 from lifecycle.network.nfe import InternetProtocol
-from lifecycle.programming.rules.rules import FlowRule, LeftOut
-from lifecycle.programming.rules.wording import named
+from lifecycle.programming.rules.rules import FlowRule, LeftOut, named
 
 
 def zenoh_endpoint(rule: FlowRule) -> str:

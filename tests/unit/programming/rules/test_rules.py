@@ -10,8 +10,7 @@ import pytest
 from lifecycle.network.five_qi_dscp import dscp_mapping
 from lifecycle.network.nfe import TransportProtocol
 from lifecycle.plan import PlannedNode
-from lifecycle.programming.rules.rules import FlowRule, flow_rules
-from lifecycle.programming.rules.wording import asks, named, rules_digest
+from lifecycle.programming.rules.rules import FlowRule, asks, flow_rules, named, rules_digest
 from lifecycle.verify.verdict import FlowReport, Outcome
 from tests.unit.programming.rules.samples import SHM, VIDEO, nfe, plan, report, rule
 
