@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from lifecycle.codec import to_json
-from lifecycle.export.flows_csv import flows_to_csv
 from lifecycle.manifest.model import UniqueHow
 from lifecycle.network.dscp import describe
 from lifecycle.network.nfe import NetworkFlowEndpoint
 from lifecycle.printable import json_text, lines, one_line
+from lifecycle.programming.rules.flows_csv import flows_to_csv
 from lifecycle.verify import FlowReport
 
 _HEADS = (

@@ -1,6 +1,6 @@
 """`lifecycle flows --export`: verified flows as the file of another system.
 
-Owns: from options to what an export needs, and its refusals. The texts are lifecycle.export's.
+Owns: from options to what an export needs, and its refusals. The texts are `programming.rules`'s.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from lifecycle.printable import lines
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from lifecycle.export import ExportSettings
     from lifecycle.plan.model import Plan
-    from lifecycle.supervisor.programming import TargetOptions, Treatment
+    from lifecycle.programming.apply import TargetOptions, Treatment
+    from lifecycle.programming.rules import ExportSettings
     from lifecycle.verify.verdict import FlowReport
 
 NAMES = ("nft", "nft-json", "tc", "nef", "camara", "fastdds-pro", "zenoh", "csv")
@@ -58,8 +58,8 @@ class Export:
         Raises:
             UsageError: it cannot be exported so.
         """
-        from lifecycle.export import EXPORTS, ExportInput
-        from lifecycle.supervisor.programming import open_programmer
+        from lifecycle.programming.apply import open_programmer
+        from lifecycle.programming.rules import EXPORTS, ExportInput
 
         programmer = open_programmer(plan, (), environment=os.environ, treatment=self._treatment)
         given = ExportInput(
@@ -79,8 +79,8 @@ class Export:
 
 
 def _settings(options: Sequence[TargetOptions]) -> ExportSettings:
-    from lifecycle.export import ExportSettings
-    from lifecycle.supervisor.programming.settings import load_settings
+    from lifecycle.programming.apply.settings import load_settings
+    from lifecycle.programming.rules import ExportSettings
 
     for each in options:
         if each.kind == "tc":

@@ -19,7 +19,7 @@ from lifecycle.printable import lines
 
 if TYPE_CHECKING:
     from lifecycle.plan.model import Plan
-    from lifecycle.supervisor.programming import Changes, Programmer, TargetOptions, Treatment
+    from lifecycle.programming.apply import Changes, Programmer, TargetOptions, Treatment
     from lifecycle.verify.verdict import FlowReport, Verdict
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -153,8 +153,8 @@ def chosen(
     Raises:
         UsageError: they do not fit together.
     """
-    from lifecycle.export.tc_settings import TcMatch
-    from lifecycle.supervisor.programming import TargetOptions, parse_queue, parse_rate
+    from lifecycle.programming.apply import TargetOptions, parse_queue, parse_rate
+    from lifecycle.programming.rules.tc_settings import TcMatch
 
     kinds = tuple(dict.fromkeys(targets))
     if "tc" not in kinds and (device or rate or any(guarantees)):
@@ -204,7 +204,7 @@ def treatment_of(*, mapping: str, flow_labels: bool) -> Treatment:
         UsageError: no such mapping, or its file cannot be used.
     """
     from lifecycle.network.five_qi_dscp import dscp_mapping, parse_mapping
-    from lifecycle.supervisor.programming import Treatment
+    from lifecycle.programming.apply import Treatment
 
     if not mapping:
         return Treatment(label_flows=flow_labels)
@@ -228,7 +228,7 @@ def apply(
 
     What is made stays until `remove`, or until the system is brought down.
     """
-    from lifecycle.supervisor.programming import PartlyError
+    from lifecycle.programming.apply import PartlyError
 
     programmer = _open(plan, options, treatment)
     try:
@@ -377,7 +377,7 @@ def _spell(plan: Plan) -> str:
 def _open(
     plan: Plan, options: Sequence[TargetOptions], treatment: Treatment | None = None
 ) -> Programmer:
-    from lifecycle.supervisor.programming import open_programmer
+    from lifecycle.programming.apply import open_programmer
 
     return open_programmer(plan, options, environment=os.environ, treatment=treatment)
 

@@ -24,8 +24,8 @@ def command(target: str | None, assignments: tuple[str, ...], machine: str, form
     """
     from lifecycle.cli.target import target_run
     from lifecycle.codec import to_json
+    from lifecycle.rundir import runtime_root
     from lifecycle.supervisor.remote import running, status
-    from lifecycle.supervisor.rundir import runtime_root
     from lifecycle.verify.verdict import Outcome
 
     if target is None:

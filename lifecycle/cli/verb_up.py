@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from lifecycle.cli.up_output import Output
+    from lifecycle.programming.apply import TargetOptions, Treatment
     from lifecycle.supervisor.options import UpResult
-    from lifecycle.supervisor.programming import TargetOptions, Treatment
 
 
 @click.command("up")

@@ -11,13 +11,13 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from lifecycle.rundir import AlreadyRunningError, run_name, runtime_root
     from lifecycle.supervisor.attach import follow_running, judge_running
     from lifecycle.supervisor.events import Emitter, Event, Listener, to_record
     from lifecycle.supervisor.failure import ended_early
     from lifecycle.supervisor.options import Until, UpOptions, UpResult
     from lifecycle.supervisor.remote import down, find_run, running, status
     from lifecycle.supervisor.run import Forerunner, up
-    from lifecycle.supervisor.rundir import AlreadyRunningError, run_name, runtime_root
     from lifecycle.supervisor.status import NodeStatus, SystemStatus
 
 __all__ = [
@@ -45,7 +45,7 @@ __all__ = [
 ]
 
 _HOME = {
-    "AlreadyRunningError": "rundir",
+    "AlreadyRunningError": ".rundir",
     "Emitter": "events",
     "Event": "events",
     "Forerunner": "run",
@@ -60,9 +60,9 @@ _HOME = {
     "find_run": "remote",
     "follow_running": "attach",
     "judge_running": "attach",
-    "run_name": "rundir",
+    "run_name": ".rundir",
     "running": "remote",
-    "runtime_root": "rundir",
+    "runtime_root": ".rundir",
     "status": "remote",
     "to_record": "events",
     "up": "run",
@@ -73,4 +73,4 @@ def __getattr__(name: str) -> object:
     """Import the module that defines `name` (PEP 562)."""
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
+    return getattr(importlib.import_module(f".{_HOME[name]}", __name__), name)

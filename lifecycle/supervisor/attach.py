@@ -17,13 +17,13 @@ from lifecycle.manifest.model import EndpointPolicy
 from lifecycle.middleware.doors import peers_environment
 from lifecycle.plan.contacts import reached_hosts
 from lifecycle.plan.model import Plan
+from lifecycle.rundir import run_name, runtime_root
 from lifecycle.supervisor.eyes import Eyes
 from lifecycle.supervisor.gate import closes
 from lifecycle.supervisor.judge import with_findings
 from lifecycle.supervisor.options import onlooker_connections, own_machines
 from lifecycle.supervisor.remote import look, running
 from lifecycle.supervisor.renegotiation import Expectation, is_negotiated
-from lifecycle.supervisor.rundir import run_name, runtime_root
 from lifecycle.supervisor.settling import Settling
 from lifecycle.verify import verify
 from lifecycle.verify.noise import tolerating_pattern

@@ -12,10 +12,10 @@ from pathlib import Path
 
 from lifecycle.export.picture import Picture, Supervised, build_picture
 from lifecycle.plan.model import Plan
+from lifecycle.rundir import is_held, run_name, runtime_root
 from lifecycle.supervisor.attach import Seen, following, judge_running
 from lifecycle.supervisor.events import Reach
 from lifecycle.supervisor.remote import look
-from lifecycle.supervisor.rundir import is_held, run_name, runtime_root
 from lifecycle.supervisor.server import Look, follow
 from lifecycle.supervisor.states import ProcessState
 from lifecycle.supervisor.status import SystemStatus

@@ -25,7 +25,7 @@ from lifecycle.verify.verdict import Verdict
 from lifecycle.verify.view import only_shared_memory
 
 if TYPE_CHECKING:
-    from lifecycle.supervisor.programming import TargetOptions, Treatment
+    from lifecycle.programming.apply import TargetOptions, Treatment
 
 
 class Until(enum.Enum):

@@ -13,7 +13,6 @@ import contextlib
 import os
 import select
 import signal
-import threading
 import time
 from collections.abc import Iterable
 from pathlib import Path
@@ -22,7 +21,7 @@ from typing import Protocol
 import psutil
 
 from lifecycle.middleware.shm import segments_of
-from lifecycle.supervisor.rundir import RUN_VARIABLE, RunRecord, boot_id, start_ticks
+from lifecycle.rundir import OWN_CHILD, RUN_VARIABLE, RunRecord, boot_id, start_ticks
 
 GRACE_S = 3.0
 """Between asking an orphan to end and killing it."""
@@ -34,10 +33,6 @@ _TASKS = Path("/proc/self/task")
 
 _ROUNDS = 3
 """How often what was started while others were ended is looked for."""
-
-OWN_CHILD = threading.Lock()
-"""Held by whoever runs a program and waits for it himself. If it were buried as an orphan first,
-its exit code would be lost, and `subprocess` takes a lost one for success."""
 
 
 class _Orphan:

@@ -12,9 +12,9 @@ import os
 from collections.abc import Iterator
 
 from lifecycle.middleware.shm import Creations, segments_of
+from lifecycle.rundir import ChildRecord, RunDirectory, start_ticks
 from lifecycle.supervisor.events import Emitter, Notice
 from lifecycle.supervisor.orphans import Family
-from lifecycle.supervisor.rundir import ChildRecord, RunDirectory, start_ticks
 from lifecycle.supervisor.system import System
 from lifecycle.supervisor.together import Worker
 

@@ -11,9 +11,9 @@ from pathlib import Path
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.middleware.shm import sweep
 from lifecycle.plan.model import Plan
+from lifecycle.rundir import RunDirectory, is_held, new_run_id, read_record
 from lifecycle.supervisor.networks import remove_programmed
 from lifecycle.supervisor.orphans import end_run
-from lifecycle.supervisor.rundir import RunDirectory, is_held, new_run_id, read_record
 from lifecycle.supervisor.server import Answer, Ask, Look, Question, ask, strange
 from lifecycle.supervisor.status import SystemStatus
 

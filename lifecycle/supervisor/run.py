@@ -22,6 +22,14 @@ from lifecycle.middleware.shm import check_room, sweep
 from lifecycle.plan import moved_observer
 from lifecycle.plan.contacts import reached_hosts
 from lifecycle.plan.model import Plan
+from lifecycle.rundir import (
+    RUN_VARIABLE,
+    RunDirectory,
+    RunRecord,
+    new_run_id,
+    run_name,
+    runtime_root,
+)
 from lifecycle.supervisor import discovery_server
 from lifecycle.supervisor.ending import Ending
 from lifecycle.supervisor.events import Emitter, Event, Listener, Notice, RunStarted
@@ -38,14 +46,6 @@ from lifecycle.supervisor.options import (
 )
 from lifecycle.supervisor.orphans import end_run
 from lifecycle.supervisor.records import Records, noting
-from lifecycle.supervisor.rundir import (
-    RUN_VARIABLE,
-    RunDirectory,
-    RunRecord,
-    new_run_id,
-    run_name,
-    runtime_root,
-)
 from lifecycle.supervisor.session import Session
 from lifecycle.supervisor.status import SystemStatus
 from lifecycle.supervisor.system import System

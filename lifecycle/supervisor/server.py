@@ -17,8 +17,8 @@ from pathlib import Path
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import UsageError
 from lifecycle.plan.model import Plan
+from lifecycle.rundir import connect, short_path
 from lifecycle.supervisor.orders import Done, Order, OrderKind
-from lifecycle.supervisor.rundir import connect, short_path
 from lifecycle.supervisor.status import SystemStatus
 from lifecycle.verify.observation import Observation
 from lifecycle.verify.verdict import Verdict

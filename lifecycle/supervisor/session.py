@@ -15,6 +15,7 @@ from collections.abc import AsyncIterator, Coroutine, Iterable, Iterator
 from typing import Any
 
 from lifecycle.errors import ExitCode
+from lifecycle.rundir import RunDirectory
 from lifecycle.supervisor import discovery_server
 from lifecycle.supervisor.activation_guard import ActivationGuard
 from lifecycle.supervisor.agreement import Agreement
@@ -42,7 +43,6 @@ from lifecycle.supervisor.orphans import end_strays, reap_adopted
 from lifecycle.supervisor.records import Records
 from lifecycle.supervisor.regulate import Regulator
 from lifecycle.supervisor.revision import Revisions
-from lifecycle.supervisor.rundir import RunDirectory
 from lifecycle.supervisor.server import ControlServer, Look
 from lifecycle.supervisor.shutdown import TakeDown
 from lifecycle.supervisor.sightings import Sightings

@@ -153,8 +153,8 @@ class _Zygote:
         for pid in tuple(self._children):
             self._reap(pid)
         if self._again:
+            from lifecycle.rundir import RUN_VARIABLE
             from lifecycle.supervisor.orphans import end_strays
-            from lifecycle.supervisor.rundir import RUN_VARIABLE
 
             end_strays(os.environ.get(RUN_VARIABLE, ""))
 

@@ -18,7 +18,6 @@ from pathlib import Path
 from lifecycle import codec
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import LifecycleError
-from lifecycle.export.nftables import parse_managed_comment
 from lifecycle.graph.messages import GraphMessageError, Joined, encode
 from lifecycle.graph.messages import decode as decode_message
 from lifecycle.manifest import ManifestError, load
@@ -30,18 +29,19 @@ from lifecycle.node.control import Event
 from lifecycle.plan.notice import PlanNoticeError, announced_plan, notice_of
 from lifecycle.plan.notice import decode as decode_notice
 from lifecycle.plan.notice import encode as encode_notice
-from lifecycle.supervisor.programming.errors import ProgrammingError
-from lifecycle.supervisor.programming.ledger import Ledger
-from lifecycle.supervisor.programming.nft import root_qdiscs
-from lifecycle.supervisor.programming.settings import load_settings
-from lifecycle.supervisor.programming.tool import HostTool, Output
-from lifecycle.supervisor.rundir import read_record
+from lifecycle.programming.apply.errors import ProgrammingError
+from lifecycle.programming.apply.ledger import Ledger
+from lifecycle.programming.apply.nft import root_qdiscs
+from lifecycle.programming.apply.settings import load_settings
+from lifecycle.programming.apply.tool import HostTool, Output
+from lifecycle.programming.rules.nftables import parse_managed_comment
+from lifecycle.rundir import read_record
 from lifecycle.supervisor.server import Answer, Question
 from lifecycle.verify import Stage
 from lifecycle.verify.observation import ConfigurationError, decode_configuration
 from tests.hostile.attack import Attack, HostileClass, Place, mutated
-from tests.unit.supervisor.programming.fakes import FakeTool
-from tests.unit.supervisor.programming.samples import nef_settings
+from tests.unit.programming.apply.fakes import FakeTool
+from tests.unit.programming.apply.samples import nef_settings
 from tests.unit.verify.perfect import perfect
 from tests.unit.verify.test_verify_rules import PLAN
 
@@ -101,8 +101,8 @@ def _printed(data: bytes, folder: Path) -> object:
 
 
 def _tc(data: bytes, folder: Path) -> object:
-    from lifecycle.export.tc_settings import TcSettings
-    from lifecycle.supervisor.programming.tc import TcTarget
+    from lifecycle.programming.apply.tc import TcTarget
+    from lifecycle.programming.rules.tc_settings import TcSettings
 
     tool = FakeTool(("tc", Output(returncode=0, stdout=_text(data), stderr="")))
     settings = TcSettings(device="eth0", link_kbit=20_000)

@@ -17,7 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from lifecycle.supervisor.programming.errors import PartlyError
+from lifecycle.programming.apply.errors import PartlyError
 from tests.hostile.attack import (
     Attack,
     HostileClass,
@@ -29,9 +29,9 @@ from tests.hostile.attack import (
     started,
 )
 from tests.ros.supervisor.running import Up, marked, pair
-from tests.unit.supervisor.programming.samples import nef_settings, rule, settings_file
-from tests.unit.supervisor.programming.servers import TOKEN
-from tests.unit.supervisor.programming.test_hostile_servers import (
+from tests.unit.programming.apply.samples import nef_settings, rule, settings_file
+from tests.unit.programming.apply.servers import TOKEN
+from tests.unit.programming.apply.test_hostile_servers import (
     HOSTILE,
     SESSION,
     Behave,

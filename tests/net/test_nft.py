@@ -10,14 +10,14 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.export.rules import FlowRule
-from lifecycle.supervisor.programming.changes import ChangeKind
-from lifecycle.supervisor.programming.errors import NotOursError, PrivilegeError
-from lifecycle.supervisor.programming.ledger import Ledger
-from lifecycle.supervisor.programming.nft import NftTarget
-from lifecycle.supervisor.programming.tool import HostTool
+from lifecycle.programming.apply.changes import ChangeKind
+from lifecycle.programming.apply.errors import NotOursError, PrivilegeError
+from lifecycle.programming.apply.ledger import Ledger
+from lifecycle.programming.apply.nft import NftTarget
+from lifecycle.programming.apply.tool import HostTool
+from lifecycle.programming.rules.rules import FlowRule
 from tests.net.hosts import Host, Hosts, lacking
-from tests.unit.supervisor.programming.samples import ledger_in, rule
+from tests.unit.programming.apply.samples import ledger_in, rule
 
 pytestmark = pytest.mark.net
 

@@ -11,21 +11,21 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.export.rules import FlowRule
-from lifecycle.export.tc_settings import TcFeatures, TcMatch, TcSettings
-from lifecycle.supervisor.programming import tc
-from lifecycle.supervisor.programming.changes import ChangeKind, Changes
-from lifecycle.supervisor.programming.errors import (
+from lifecycle.programming.apply import tc
+from lifecycle.programming.apply.changes import ChangeKind, Changes
+from lifecycle.programming.apply.errors import (
     MissingFeatureError,
     NotOursError,
     PrivilegeError,
     ProgrammingError,
 )
-from lifecycle.supervisor.programming.ledger import Ledger
-from lifecycle.supervisor.programming.tc import TcTarget, probe_features
-from lifecycle.supervisor.programming.tool import HostTool, Output
+from lifecycle.programming.apply.ledger import Ledger
+from lifecycle.programming.apply.tc import TcTarget, probe_features
+from lifecycle.programming.apply.tool import HostTool, Output
+from lifecycle.programming.rules.rules import FlowRule
+from lifecycle.programming.rules.tc_settings import TcFeatures, TcMatch, TcSettings
 from tests.net.hosts import Host, Hosts, lacking
-from tests.unit.supervisor.programming.samples import ledger_in, rule
+from tests.unit.programming.apply.samples import ledger_in, rule
 
 pytestmark = pytest.mark.net
 

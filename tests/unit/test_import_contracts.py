@@ -9,7 +9,17 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-PURE_ROOMS = ("manifest", "network", "plan", "verify", "export", "codec", "errors")
+PURE_ROOMS = (
+    "manifest",
+    "network",
+    "plan",
+    "verify",
+    "export",
+    "rundir",
+    "programming.rules",
+    "codec",
+    "errors",
+)
 
 
 def test_imports_point_one_way() -> None:
@@ -32,6 +42,18 @@ def test_a_pure_room_imports_without_ros(room: str) -> None:
         "    del sys.modules[each]\n"
         "sys.meta_path.insert(0, Refuse())\n"
         f"import lifecycle.{room}\n"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert result.returncode == 0, result.stderr
+
+
+def test_networks_are_programmed_without_ros_and_loaded_without_httpx() -> None:
+    code = (
+        "import sys\n"
+        "sys.modules['rclpy'] = sys.modules['httpx'] = None\n"
+        "import lifecycle.programming.apply\n"
     )
     result = subprocess.run(
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False

@@ -11,9 +11,9 @@ from click.testing import CliRunner
 from lifecycle.cli import verb_flows, verb_up
 from lifecycle.cli.flows_export import NAMES, Export
 from lifecycle.errors import UsageError
-from lifecycle.export import EXPORTS
-from tests.unit.export.samples import plan, report
-from tests.unit.supervisor.programming.samples import nef_settings, settings_file
+from lifecycle.programming.rules import EXPORTS
+from tests.unit.programming.apply.samples import nef_settings, settings_file
+from tests.unit.programming.rules.samples import plan, report
 
 NOTHING = {"device": "", "rate": "", "guarantees": (), "match": "flow", "config": ""}
 

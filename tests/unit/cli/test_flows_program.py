@@ -11,10 +11,10 @@ from click.testing import CliRunner
 
 from lifecycle.cli import flows_program
 from lifecycle.errors import ExitCode, UsageError
-from lifecycle.supervisor.programming import TargetOptions
-from tests.unit.export.samples import nfe, plan, report
-from tests.unit.supervisor.programming.samples import nef_settings, settings_file
-from tests.unit.supervisor.programming.servers import TOKEN, NefServer
+from lifecycle.programming.apply import MissingFeatureError, TargetOptions
+from tests.unit.programming.apply.samples import nef_settings, settings_file
+from tests.unit.programming.apply.servers import TOKEN, NefServer
+from tests.unit.programming.rules.samples import nfe, plan, report
 
 NOTHING = {"device": "", "rate": "", "guarantees": (), "match": "flow", "config": ""}
 
@@ -115,6 +115,22 @@ def test_a_5qi_mapping_is_one_of_ours_or_a_file(tmp_path: Path) -> None:
     assert own.mapping.dscp_for(85) == 46
     with pytest.raises(UsageError, match="cannot find 5QI to DSCP mapping 'nope'"):
         flows_program.treatment_of(mapping="nope", flow_labels=False)
+
+
+@pytest.mark.usefixtures("options")
+def test_without_httpx_a_server_is_refused_by_the_name_of_the_extra(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = nef_options(tmp_path, "http://127.0.0.1:9")
+    monkeypatch.setattr("lifecycle.programming.apply.http.httpx", None)
+
+    with pytest.raises(MissingFeatureError) as caught:
+        flows_program.apply(plan(), [report()], options, dry_run=False)
+
+    assert str(caught.value) == (
+        "cannot reach http://127.0.0.1:9/3gpp-as-session-with-qos/v1/robots: httpx is not installed"
+        "; install it: pip install 'ros-lifecycle-manifests[networks]'"
+    )
 
 
 @pytest.mark.usefixtures("options")

@@ -12,24 +12,24 @@ from pathlib import Path
 import pytest
 
 from lifecycle.errors import ExitCode
-from lifecycle.supervisor.events import Emitter, Notice, VerdictChanged
-from lifecycle.supervisor.failure import StepFailedError
-from lifecycle.supervisor.networks import Networks, open_networks, remove_programmed
-from lifecycle.supervisor.options import UpOptions
-from lifecycle.supervisor.orphans import OWN_CHILD, reap_adopted
-from lifecycle.supervisor.programming import (
+from lifecycle.programming.apply import (
     Change,
     ChangeKind,
     Changes,
     PrivilegeError,
     TargetOptions,
 )
+from lifecycle.rundir import OWN_CHILD, RunDirectory, new_run_id
+from lifecycle.supervisor.events import Emitter, Notice, VerdictChanged
+from lifecycle.supervisor.failure import StepFailedError
+from lifecycle.supervisor.networks import Networks, open_networks, remove_programmed
+from lifecycle.supervisor.options import UpOptions
+from lifecycle.supervisor.orphans import reap_adopted
 from lifecycle.supervisor.remote import down
-from lifecycle.supervisor.rundir import RunDirectory, new_run_id
 from lifecycle.verify.verdict import FlowReport, Outcome, Stage, Verdict
-from tests.unit.export.samples import plan, report
-from tests.unit.supervisor.programming.samples import nef_settings, settings_file
-from tests.unit.supervisor.programming.servers import TOKEN, NefServer
+from tests.unit.programming.apply.samples import nef_settings, settings_file
+from tests.unit.programming.apply.servers import TOKEN, NefServer
+from tests.unit.programming.rules.samples import plan, report
 
 _BOUND_S = 5.0
 
@@ -192,8 +192,8 @@ class Applied:
         self.environment = {"XDG_RUNTIME_DIR": str(directory)}
 
     def apply(self, *, owned: bool = False) -> Path:
-        from lifecycle.supervisor.programming import open_programmer
-        from lifecycle.supervisor.rundir import run_name
+        from lifecycle.programming.apply import open_programmer
+        from lifecycle.rundir import run_name
 
         programmer = open_programmer(
             plan(), [self.options], environment=self.environment, owned=owned

@@ -28,7 +28,7 @@ from lifecycle.supervisor.shutdown import TakeDown
 from lifecycle.verify.observation import Observation
 from lifecycle.verify.verdict import Outcome
 from tests.unit.supervisor.fakes import World, plan_of, planned_node, run, verdict_of
-from tests.unit.supervisor.test_supervisor_rundir import STATUS
+from tests.unit.test_rundir import STATUS
 
 PLAN = plan_of(
     planned_node("camera"),

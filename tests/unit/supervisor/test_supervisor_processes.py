@@ -22,6 +22,7 @@ from lifecycle.manifest.model import Run, RunKind
 from lifecycle.node.control import HostSpec
 from lifecycle.plan import build_plan
 from lifecycle.plan.model import PlannedProcess
+from lifecycle.rundir import RUN_VARIABLE, ChildRecord, RunRecord, boot_id, start_ticks
 from lifecycle.supervisor import logs
 from lifecycle.supervisor.channel import ControlChannel
 from lifecycle.supervisor.events import Emitter, LogLine
@@ -34,7 +35,6 @@ from lifecycle.supervisor.logs import (
 )
 from lifecycle.supervisor.orphans import end_run
 from lifecycle.supervisor.process import COMMAND_ESCALATION, ManagedProcess
-from lifecycle.supervisor.rundir import RUN_VARIABLE, ChildRecord, RunRecord, boot_id, start_ticks
 from lifecycle.supervisor.states import ProcessExit, ProcessState, change
 from lifecycle.supervisor.zygote import Zygote, ZygoteProcess
 from tests.unit.plan.samples import teleop

@@ -1,0 +1,142 @@
+"""What a target would change, or has changed: the answer of plan, diff, apply and remove.
+
+Owns: the types and their text. Pure.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+from collections.abc import Iterable, Sequence
+from typing import Protocol
+
+from lifecycle.programming.rules.rules import FlowRule, asks
+
+
+class ChangeKind(enum.Enum):
+    """What happens to one flow."""
+
+    CREATE = "create"
+    UPDATE = "update"
+    DELETE = "delete"
+    KEEP = "keep"
+
+
+_SIGNS = {
+    ChangeKind.CREATE: "+",
+    ChangeKind.UPDATE: "~",
+    ChangeKind.DELETE: "-",
+    ChangeKind.KEEP: "=",
+}
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Change:
+    """One flow in one target.
+
+    Attributes:
+        key: of the FlowRule.
+        what: the rule for people, `udp 10.77.0.1:17900 → 10.77.0.2:17910, EF = DSCP 46 …`.
+        detail: why, or what came of it: "gone from the server", "granted for 600 s".
+    """
+
+    kind: ChangeKind
+    key: str
+    what: str
+    detail: str = ""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Changes:
+    """What one target has to do, or did.
+
+    Attributes:
+        target: for people: "nft table inet flowqos_teleop", "tc on eth0".
+        left_out: flows that this target cannot express, each with its reason.
+        warnings: what people should know, whole sentences.
+    """
+
+    target: str
+    changes: tuple[Change, ...] = ()
+    left_out: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def pending(self) -> bool:
+        """Whether there is anything to do."""
+        return any(each.kind is not ChangeKind.KEEP for each in self.changes)
+
+    def of(self, kind: ChangeKind) -> tuple[Change, ...]:
+        """Return the changes of one kind."""
+        return tuple(each for each in self.changes if each.kind is kind)
+
+    def render(self, *, done: bool = False) -> str:
+        """Return the changes as text, one line per flow.
+
+        Args:
+            done: they have been made.
+        """
+        words = ("created", "updated", "deleted") if done else ("create", "update", "delete")
+        kinds = (ChangeKind.CREATE, ChangeKind.UPDATE, ChangeKind.DELETE)
+        counts = [
+            f"{len(found)} {'' if done else 'to '}{word}"
+            for word, kind in zip(words, kinds, strict=True)
+            if (found := self.of(kind))
+        ]
+        counts.append(f"{len(self.of(ChangeKind.KEEP))} unchanged")
+        lines = [f"{self.target}: {', '.join(counts)}"]
+        for each in self.changes:
+            detail = f" ({each.detail})" if each.detail else ""
+            what = f": {each.what}" if each.what else ""
+            lines.append(f"  {_SIGNS[each.kind]} {each.key}{what}{detail}")
+        lines += [f"  left out: {reason}" for reason in self.left_out]
+        lines += [f"  warning: {warning}" for warning in self.warnings]
+        return "\n".join(lines)
+
+
+class Target(Protocol):
+    """A network that can be programmed with flow rules, and everything of ours in it.
+
+    A target touches only what its ledger or a mark of its own says is ours.
+    """
+
+    @property
+    def name(self) -> str:
+        """For people: "nft table inet flowqos_teleop"."""
+        ...
+
+    def plan(self, rules: Sequence[FlowRule]) -> Changes:
+        """Compare what should be with what is; changes nothing."""
+        ...
+
+    def apply(self, rules: Sequence[FlowRule]) -> Changes:
+        """Make it so, and return what was done; a second time changes nothing."""
+        ...
+
+    def dry_run(self, rules: Sequence[FlowRule]) -> str:
+        """Return what would be sent, checked as far as that is possible; changes nothing."""
+        ...
+
+    def remove(self) -> Changes:
+        """Delete everything of ours."""
+        ...
+
+    def renew(self) -> float | None:
+        """Prolong what would expire; return seconds until the next time, None if never."""
+        ...
+
+
+def describe_rule(rule: FlowRule) -> str:
+    """Return a rule for people: the tuple and what it gets."""
+    return f"{rule.describe()}, {asks(rule)}"
+
+
+def deletions(target: str, entries: Iterable[tuple[str, str]], detail: str = "") -> Changes:
+    """Return the removal of (key, what) pairs as changes."""
+    return Changes(
+        target=target,
+        changes=tuple(
+            Change(kind=ChangeKind.DELETE, key=key, what=what, detail=detail)
+            for key, what in entries
+        ),
+    )

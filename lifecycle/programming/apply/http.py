@@ -1,0 +1,811 @@
+"""HTTP to a network's exposure interface: one request at a time, with a deadline, retries, checks.
+
+Owns: which answers are tried again and when, that a token goes to one server only and into no log,
+that no server holds a request up past its deadline, and how a refusal and an answer that cannot be
+used read: every one of them is an `HttpError` that names the request and the field. Knows nothing
+of what is asked for.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import email.utils
+import json
+import socket
+import ssl
+import threading
+import time
+import zlib
+from collections.abc import Collection, Mapping
+from typing import Any, NoReturn, Protocol
+from urllib.parse import quote, unquote, urlsplit
+
+from lifecycle.network.address import is_loopback
+from lifecycle.programming.apply.deadline import Deadline
+from lifecycle.programming.apply.errors import HttpError, MissingFeatureError, SettingsError
+from lifecycle.programming.apply.settings import Token
+
+try:
+    import httpx
+except ModuleNotFoundError:  # an extra: most systems program no network that is reached over HTTP
+    httpx = None  # type: ignore[assignment]
+
+MERGE_PATCH = "application/merge-patch+json"
+"""RFC 7396; what TS 29.122 wants of PATCH."""
+
+_IDEMPOTENT = frozenset({"GET", "PUT", "DELETE", "PATCH"})
+"""RFC 9110 §9.2.2, and PATCH: a merge patch that is applied twice gives the same."""
+
+_PASSING = frozenset({500, 502, 503, 504})
+_MAX_QUOTED = 300
+_LARGEST_ANSWER = 4 * 1024 * 1024
+"""Bytes, unpacked: answers are a session or a subscription each, and a list of them all when one
+was lost."""
+
+_LONGEST_ID = 512
+"""Characters of the id of a subscription or a session; CAMARA's are UUIDs."""
+
+_SPARE_S = 1.0
+
+_GZIP_OR_ZLIB = 32 + zlib.MAX_WBITS
+"""zlib finds out by itself which of the two headers there is."""
+
+
+class Clock(Protocol):
+    """Time, so that tests need not wait."""
+
+    def now_s(self) -> float:
+        """Return seconds since the epoch."""
+        ...
+
+    def sleep(self, seconds: float, woken: threading.Event) -> None:
+        """Wait, or until `woken` is set."""
+        ...
+
+
+class SystemClock:
+    """The machine's clock."""
+
+    def now_s(self) -> float:
+        """Return seconds since the epoch."""
+        return time.time()
+
+    def sleep(self, seconds: float, woken: threading.Event) -> None:
+        """Wait, or until `woken` is set."""
+        woken.wait(seconds)
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Patience:
+    """How long to go on asking.
+
+    Attributes:
+        attempts: at most so many requests.
+        first_s: wait before the second, then doubled each time.
+        longest_s: longest single wait of our own choice.
+        total_s: one request with all its attempts, and all waits between them; a Retry-After
+            beyond it is not waited for.
+    """
+
+    attempts: int = 5
+    first_s: float = 0.5
+    longest_s: float = 8.0
+    total_s: float = 60.0
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Fields:
+    """A JSON object of an answer; what is read of it is checked first.
+
+    Attributes:
+        asked: the request, "GET http://nef.example.net/…".
+        status: of the answer.
+        values: the object.
+        where: of the object in the answer, "[2]."; empty for the whole.
+    """
+
+    asked: str
+    status: int
+    values: Mapping[str, Any]
+    where: str = ""
+
+    def text(self, key: str, *, required: bool = False) -> str:
+        """Return a string; empty if there is none.
+
+        Raises:
+            HttpError: it is something else, or is required and not there.
+        """
+        value = self.values.get(key)
+        if value is None and not required:
+            return ""
+        if not isinstance(value, str) or (required and not value):
+            self.refuse(key, "a string" if value is not None else "", value)
+        return value
+
+    def one_of(self, key: str, allowed: Collection[str]) -> str:
+        """Return a string that is one of a few.
+
+        Raises:
+            HttpError: it is not.
+        """
+        value = self.values.get(key)
+        if not isinstance(value, str) or value not in allowed:
+            self.refuse(key, f"one of {', '.join(allowed)}", value)
+        return value
+
+    def whole(self, key: str, least: int, most: int) -> int | None:
+        """Return a whole number; None if there is none.
+
+        Raises:
+            HttpError: it is something else, or less than `least`, or more than `most`.
+        """
+        value = self.values.get(key)
+        if value is None:
+            return None
+        if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+            self.refuse(key, f"a whole number from {least} to {most}", value)
+        return value
+
+    def identifier(self, key: str) -> str:
+        """Return an id that can be a path segment of a URL; empty if there is none.
+
+        Raises:
+            HttpError: it cannot be one.
+        """
+        value = self.text(key)
+        if value and not _is_identifier(value):
+            self.refuse(key, _IDENTIFIER, value)
+        return value
+
+    def link(self, key: str) -> str:
+        """Return the id at the end of a URL, see `last_segment`; empty if there is none.
+
+        Raises:
+            HttpError: it is no URL, or its end cannot be an id.
+        """
+        value = self.text(key)
+        try:
+            found = last_segment(value)
+        except ValueError:
+            self.refuse(key, "a URL", value)
+        if found and not _is_identifier(found):
+            self.refuse(key, f"a URL that ends in {_IDENTIFIER}", value)
+        return found
+
+    def refuse(self, key: str, allowed: str, value: object = None) -> NoReturn:
+        """Raise for a field that cannot be used.
+
+        Args:
+            key: of the field.
+            allowed: what it must be, "a string".
+            value: what it is; None if it is missing.
+
+        Raises:
+            HttpError: always. The request may have taken effect.
+        """
+        is_there = f"{show(value)} is not {allowed}" if value is not None else "is missing"
+        raise unusable(self.asked, self.status, f"{self.where}{key}", is_there)
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Reply:
+    """An answer of status 2xx, or 404 and 410 where those are asked for.
+
+    Attributes:
+        asked: the request, "GET http://nef.example.net/…".
+        body: decoded JSON object or array; None if there was none.
+        flaw: why there is no body that can be used; empty if there is one, or was none.
+        location: of what was created; empty if there was none.
+    """
+
+    asked: str
+    status: int
+    body: object
+    flaw: str
+    location: str
+
+    @property
+    def gone(self) -> bool:
+        """Whether there is no such thing (any more)."""
+        return self.status in (404, 410)
+
+    def object(self, *, may_be_empty: bool = False) -> Fields:
+        """Return the body, which must be a JSON object.
+
+        Args:
+            may_be_empty: an answer without a body is an object without fields.
+
+        Raises:
+            HttpError: it is something else.
+        """
+        body = self.body
+        if may_be_empty and body is None and not self.flaw:
+            body = {}
+        if self.flaw or not isinstance(body, dict):
+            raise self._unusable("a JSON object")
+        return Fields(asked=self.asked, status=self.status, values=body)
+
+    def objects(self) -> tuple[Fields, ...]:
+        """Return the body, which must be an array of JSON objects; none of it if it is gone.
+
+        Raises:
+            HttpError: it is something else.
+        """
+        if self.gone:
+            return ()
+        if self.flaw or not isinstance(self.body, list):
+            raise self._unusable("a JSON array")
+        found = []
+        for index, each in enumerate(self.body):
+            if not isinstance(each, dict):
+                raise unusable(
+                    self.asked, self.status, f"[{index}]", f"{show(each)} is not a JSON object"
+                )
+            found.append(
+                Fields(asked=self.asked, status=self.status, values=each, where=f"[{index}].")
+            )
+        return tuple(found)
+
+    def created(self) -> str:
+        """Return the id at the end of Location; empty if there is no Location.
+
+        Raises:
+            HttpError: it is no URL, or its end cannot be an id.
+        """
+        headers = {"Location": self.location}
+        return Fields(asked=self.asked, status=self.status, values=headers).link("Location")
+
+    def _unusable(self, allowed: str) -> HttpError:
+        reason = f"is not {allowed}"
+        if self.flaw:
+            reason = self.flaw
+        elif self.body is not None:
+            reason = f"{show(self.body)} is not {allowed}"
+        return unusable(self.asked, self.status, "its body", reason)
+
+
+def unusable(asked: str, status: int, field: str, reason: str) -> HttpError:
+    """Return the error for an answer that was understood as far as `field`.
+
+    Args:
+        asked: the request.
+        status: of the answer.
+        field: "duration", "[2].self", "Location".
+        reason: follows the field, "'x' is not a string".
+    """
+    return HttpError(
+        f"cannot use the answer {status} to {asked}: {field}: {reason}",
+        status=status,
+        # Whatever the answer is worth, the server has taken the request.
+        uncertain=True,
+        hint="check that the url is that of such a server",
+    )
+
+
+def show(value: object) -> str:
+    """Spell a value of an answer on one line, printable and short."""
+    if isinstance(value, dict):
+        return "a JSON object"
+    if isinstance(value, list):
+        return "a JSON array"
+    if value is None:
+        return "null"
+    spelled = str(value).lower() if isinstance(value, bool) else repr(value)
+    return spelled if len(spelled) <= _SHOWN else f"{spelled[: _SHOWN - 2]}…{spelled[-1]}"
+
+
+_SHOWN = 60
+_IDENTIFIER = f"an id of 1 to {_LONGEST_ID} printable characters"
+
+
+def _is_identifier(text: str) -> bool:
+    return 0 < len(text) <= _LONGEST_ID and text.isprintable() and text not in (".", "..")
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class _Sent:
+    """A request.
+
+    Attributes:
+        body: None for none.
+        type: media type of the body.
+    """
+
+    method: str
+    url: str
+    body: bytes | None
+    type: str
+
+    @property
+    def what(self) -> str:
+        """For messages."""
+        return f"{self.method} {self.url}"
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class _Answer:
+    """An answer as bytes.
+
+    Attributes:
+        headers: by lower-case name; bytes that are no ASCII are taken for Latin-1 (RFC 9110 §5.5).
+        flaw: why `body` is not all of it; empty if it is.
+    """
+
+    status: int
+    reason: str
+    headers: Mapping[str, str]
+    body: bytes
+    flaw: str = ""
+
+    @property
+    def is_success(self) -> bool:
+        return 200 <= self.status < 300
+
+
+class _Connection:
+    """An HTTP client that another thread can cut off in the middle of a request.
+
+    httpx bounds each read and write, never all of them together: a server that sends a byte a
+    second would hold a request up for as long as it likes. So a request is made in a thread, and
+    whoever waits for it shuts the socket down at the deadline.
+    """
+
+    def __init__(self, client: httpx.Client) -> None:
+        self._client = client
+        self._lock = threading.Lock()
+        self._socket: socket.socket | None = None
+        self._is_cut = False
+        self.sent = False
+
+    def close(self) -> None:
+        """Close it; only while no request is under way."""
+        self._client.close()
+        self._hold(None)
+
+    def cut(self) -> None:
+        """End a request that is under way; its thread then closes the connection."""
+        with self._lock:
+            self._is_cut = True
+            _shut(self._socket)
+
+    def send(self, sent: _Sent, headers: Mapping[str, str], limit_s: float) -> _Answer:
+        """Send one request and read the answer.
+
+        Raises:
+            httpx.HTTPError: there is none.
+        """
+        self.sent = False
+        try:
+            with self._client.stream(
+                sent.method,
+                sent.url,
+                headers=headers,
+                content=sent.body,
+                # A little more: the deadline of the whole is kept by whoever waits.
+                timeout=limit_s + _SPARE_S,
+                extensions={"trace": self._trace},
+            ) as response:
+                return _read(response)
+        finally:
+            if self._is_cut:
+                self.close()
+
+    def _trace(self, event: str, info: Mapping[str, Any]) -> None:
+        """Follow a request, as httpx documents its `trace` extension."""
+        if event.endswith("send_request_headers.started"):
+            self.sent = True
+        elif event.endswith("connect_tcp.complete"):
+            # A copy: TLS takes the descriptor of the socket that it is put on.
+            self._hold(info["return_value"].get_extra_info("socket").dup())
+        if event.endswith(("connect_tcp.complete", "start_tls.complete")):
+            self._check_reads(info["return_value"])
+
+    def _check_reads(self, stream: Any) -> None:
+        """Have no read begin once it is cut: Linux lets a socket that was shut down receive."""
+        read = stream.read
+
+        def checked(*arguments: Any, **named: Any) -> bytes:
+            if self._is_cut:
+                raise httpx.ReadTimeout("cut off")
+            received: bytes = read(*arguments, **named)
+            return received
+
+        stream.read = checked
+
+    def _hold(self, connected: socket.socket | None) -> None:
+        with self._lock:
+            if self._socket is not None:
+                self._socket.close()
+            self._socket = connected
+            if self._is_cut:
+                _shut(connected)
+
+
+def _shut(connected: socket.socket | None) -> None:
+    if connected is not None:
+        with contextlib.suppress(OSError):  # it is closed already
+            connected.shutdown(socket.SHUT_RDWR)
+
+
+class Api:
+    """One server's interface.
+
+    Args:
+        url: what every path is appended to.
+        token: sent as a bearer token; None sends none.
+        timeout_s: of one attempt, from looking the name up to the last byte of the answer.
+        ca_file: certificates to check the server against; empty for the system's.
+        patience: see Patience.
+        clock: see Clock.
+        deadline: bounds all requests together; None does not.
+
+    Raises:
+        MissingFeatureError: httpx, the extra `networks`, is not installed.
+        SettingsError: `ca_file`, or a proxy that the environment names, cannot be used.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        *,
+        token: Token | None = None,
+        timeout_s: float = 10.0,
+        ca_file: str = "",
+        patience: Patience | None = None,
+        clock: Clock | None = None,
+        deadline: Deadline | None = None,
+    ) -> None:
+        self.url = url.rstrip("/")
+        if httpx is None:
+            raise MissingFeatureError(
+                f"cannot reach {self.url}: httpx is not installed",
+                hint="install it: pip install 'ros-lifecycle-manifests[networks]'",
+            )
+        self.clock = clock or SystemClock()
+        self._token = token
+        self._timeout_s = timeout_s
+        self._patience = patience or Patience()
+        self._deadline = deadline or Deadline()
+        self._certificates = _certificates(ca_file)
+        self._connection: _Connection | None = self._connect()
+
+    def close(self) -> None:
+        """Close the connections."""
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
+
+    def _connect(self) -> _Connection:
+        host = urlsplit(self.url).hostname or ""
+        try:
+            client = httpx.Client(
+                # A redirect could carry the token elsewhere, so none is followed.
+                follow_redirects=False,
+                verify=self._certificates,
+                # What is for this host goes to no proxy: it would read the token, and cannot even
+                # reach what it is for.
+                trust_env=not (host == "localhost" or is_loopback(host)),
+            )
+        except (ValueError, ImportError, httpx.InvalidURL):
+            # Not quoted: it may hold a password.
+            raise SettingsError(
+                f"cannot reach {self.url} through the proxy that the environment names: it is not "
+                "http:// or https:// with a host",
+                hint="see HTTPS_PROXY, HTTP_PROXY, ALL_PROXY and NO_PROXY",
+            ) from None
+        return _Connection(client)
+
+    def pause(self, seconds: float) -> None:
+        """Wait, unless the deadline comes first or is cancelled.
+
+        Raises:
+            HttpError: it does.
+        """
+        if seconds > self._deadline.left_s():
+            raise HttpError(f"cannot wait for {self.url}: {self._why_late()}", uncertain=True)
+        woken = threading.Event()
+        with self._deadline.waking(woken):
+            self.clock.sleep(seconds, woken)
+
+    def request(
+        self,
+        method: str,
+        path: str,
+        body: Mapping[str, object] | None = None,
+        *,
+        content_type: str = "application/json",
+        may_be_gone: bool = False,
+    ) -> Reply:
+        """Ask, and ask again where that is right; always back by the deadline.
+
+        429 and 503 are asked again after Retry-After; 409 too, because a server may still be
+        deleting what is in the way; other server errors and lost answers only where asking twice
+        is the same as asking once. A connection that could not be made is tried again.
+
+        Args:
+            method: HTTP method.
+            path: below `url`; starts with a slash.
+            body: sent as JSON.
+            content_type: of the body.
+            may_be_gone: 404 and 410 are answers, not errors.
+
+        Raises:
+            HttpError: refused, or still not done after all patience.
+        """
+        content = None if body is None else json.dumps(body).encode()
+        sent = _Sent(method=method, url=f"{self.url}{path}", body=content, type=content_type)
+        with self._deadline.within(self._patience.total_s):
+            return self._patiently(sent, may_be_gone=may_be_gone)
+
+    def _patiently(self, sent: _Sent, *, may_be_gone: bool) -> Reply:
+        what, method = sent.what, sent.method
+        waited_s = 0.0
+        wait_s = self._patience.first_s
+        for attempt in range(1, self._patience.attempts + 1):
+            last = attempt == self._patience.attempts
+            asked_s = None
+            found = self._attempt(sent)
+            if isinstance(found, HttpError):
+                failed = found
+                if last or (failed.uncertain and method not in _IDEMPOTENT):
+                    raise failed
+            else:
+                if found.is_success or (may_be_gone and found.status in (404, 410)):
+                    return _reply(what, found)
+                failed = self._refusal(what, found, method)
+                asked_s = _retry_after_s(found, self.clock.now_s())
+                if last or not _again(found.status, method):
+                    raise failed
+                if waited_s + (asked_s or 0.0) > self._patience.total_s:
+                    raise _with_hint(failed, asked_s or 0.0, self._patience.total_s)
+            pause_s = min(wait_s, self._patience.longest_s) if asked_s is None else asked_s
+            left_s = self._deadline.left_s()
+            if pause_s >= left_s:
+                # What has failed says more than that there is no time to try again.
+                raise failed if asked_s is None else _with_hint(failed, asked_s, left_s)
+            self.pause(pause_s)
+            waited_s += pause_s
+            wait_s *= 2
+        raise AssertionError("the last attempt returns or raises")
+
+    def _attempt(self, sent: _Sent) -> _Answer | HttpError:
+        """Ask once; return the error if there was no answer, which may be worth another try.
+
+        Raises:
+            HttpError: there is no answer that another try could make better.
+        """
+        what = sent.what
+        limit_s = min(self._timeout_s, self._deadline.left_s())
+        if limit_s <= 0:
+            raise HttpError(f"cannot {what}: {self._why_late()}")
+        if self._connection is None:
+            self._connection = self._connect()
+        connection = self._connection
+        found = self._in_thread(connection, sent, limit_s)
+        if isinstance(found, _Answer):
+            return found
+        uncertain = connection.sent
+        if found is None:
+            reason = self._why_late() if self._deadline.is_cancelled else ""
+            reason = reason or f"no {'whole answer' if uncertain else 'connection'} in time"
+            return HttpError(f"cannot {what}: {reason} ({limit_s:.3g} s)", uncertain=uncertain)
+        if isinstance(found, httpx.TransportError):
+            reason = _transport_reason(found)
+            return HttpError(f"cannot {what}: {reason}", uncertain=uncertain)
+        # What a library makes of bytes that it did not expect; never its own words, which may
+        # quote the request.
+        raise HttpError(
+            f"cannot {what}: its answer is no HTTP that can be read ({type(found).__name__})",
+            uncertain=uncertain,
+            hint="check that the url is that of such a server",
+        )
+
+    def _in_thread(
+        self, connection: _Connection, sent: _Sent, limit_s: float
+    ) -> _Answer | Exception | None:
+        """Return the answer, or what kept it from being read; None if it did not come in time."""
+        headers = self._headers(sent.type if sent.body is not None else "")
+        found: list[_Answer | Exception] = []
+        over = threading.Event()
+
+        def work() -> None:
+            try:
+                found.append(connection.send(sent, headers, limit_s))
+            except Exception as error:  # noqa: BLE001 - told by the thread that waits
+                found.append(error)
+            finally:
+                over.set()
+
+        # Nobody joins it: looking a name up cannot be ended from outside.
+        threading.Thread(target=work, name="lifecycle-http", daemon=True).start()
+        try:
+            with self._deadline.waking(over):
+                over.wait(limit_s)
+        finally:
+            if not found:
+                self._connection = None
+                connection.cut()
+        return found[0] if found else None
+
+    def _headers(self, content_type: str) -> dict[str, str]:
+        headers = {
+            "accept": "application/json, application/problem+json",
+            # A few bytes packed well may be as many gigabytes unpacked.
+            "accept-encoding": "identity",
+        }
+        if content_type:
+            headers["content-type"] = content_type
+        if self._token is not None:
+            # Revealed for this request only; the client keeps no copy in its defaults.
+            headers["authorization"] = f"Bearer {self._token.reveal()}"
+        return headers
+
+    def _why_late(self) -> str:
+        return "it was ended before it was done" if self._deadline.is_cancelled else "no time left"
+
+    def _refusal(self, what: str, answer: _Answer, method: str) -> HttpError:
+        """Read problem+json (RFC 7807; `cause`: TS 29.122) or CAMARA's {status, code, message}."""
+        body = _reply(what, answer).body
+        found = body if isinstance(body, dict) else {}
+        # Some servers quote the credentials that they refuse.
+        secret = "" if self._token is None else self._token.reveal()
+        cause = text_of(found.get("cause"), secret) or text_of(found.get("code"), secret)
+        detail = next(
+            (
+                text
+                for key in ("detail", "message", "title")
+                if (text := text_of(found.get(key), secret))
+            ),
+            "",
+        )
+        reason = text_of(answer.reason, secret)
+        words = [f"{answer.status} {reason}".strip(), cause, detail]
+        hint = ""
+        if answer.status in (401, 403):
+            hint = "check the token and what it is allowed to do"
+        return HttpError(
+            f"cannot {what}: {': '.join(word for word in words if word)}",
+            status=answer.status,
+            cause=cause,
+            uncertain=answer.status in _PASSING - {503} and method == "POST",
+            hint=hint,
+        )
+
+
+def _read(response: httpx.Response) -> _Answer:
+    """Return status, headers and unpacked body, of which no more is read than can be of use."""
+    whole = bytearray()
+    flaw = ""
+    for chunk in response.iter_raw():
+        whole += chunk
+        if len(whole) > _LARGEST_ANSWER:
+            flaw = _TOO_LARGE
+            break
+    headers = {
+        name.decode("latin-1").lower(): value.decode("latin-1")
+        for name, value in response.headers.raw
+    }
+    body = bytes(whole)
+    if not flaw:
+        body, flaw = _unpacked(body, headers.get("content-encoding", ""))
+    return _Answer(
+        status=response.status_code,
+        reason=response.reason_phrase,
+        headers=headers,
+        body=body,
+        flaw=flaw,
+    )
+
+
+_TOO_LARGE = f"is larger than {_LARGEST_ANSWER} bytes"
+
+
+def _unpacked(body: bytes, encoding: str) -> tuple[bytes, str]:
+    """Return a body unpacked, and what is wrong with it; some servers pack what was not to be."""
+    coding = encoding.strip().lower()
+    if not body or coding in ("", "identity"):
+        return body, ""
+    if coding not in ("gzip", "x-gzip", "deflate"):
+        return b"", f"is packed as {show(encoding)}, which was not asked for"
+    unpacking = zlib.decompressobj(_GZIP_OR_ZLIB)
+    try:
+        plain = unpacking.decompress(body, _LARGEST_ANSWER + 1)
+    except zlib.error:
+        return b"", f"is no {coding}, as its Content-Encoding says"
+    if len(plain) > _LARGEST_ANSWER:
+        return b"", _TOO_LARGE
+    return (plain, "") if unpacking.eof else (b"", f"is {coding} that ends in the middle")
+
+
+def last_segment(location: str) -> str:
+    """Return the last path segment of a URL, absolute or relative: the id of what was created.
+
+    Only the id is taken of a Location: behind a gateway its host is often one that cannot be
+    reached from here, and a token must not follow it.
+    """
+    segment = unquote(urlsplit(location).path.rstrip("/").rpartition("/")[2])
+    return "" if segment in (".", "..") else segment
+
+
+def as_segment(identifier: str) -> str:
+    """Return an id as one path segment."""
+    return quote(identifier, safe="")
+
+
+def _certificates(ca_file: str) -> ssl.SSLContext | bool:
+    if not ca_file:
+        return True
+    try:
+        return ssl.create_default_context(cafile=ca_file)
+    except (OSError, ssl.SSLError) as error:
+        raise SettingsError(f"cannot use ca_file {ca_file!r}: {error}") from error
+
+
+def _again(status: int, method: str) -> bool:
+    if status in (409, 429, 503):
+        return True
+    return status in _PASSING and method in _IDEMPOTENT
+
+
+def _reply(what: str, answer: _Answer) -> Reply:
+    body, flaw = None, answer.flaw
+    if answer.body and not flaw:
+        try:
+            body = json.loads(answer.body, parse_constant=_no_number)
+        except RecursionError:
+            flaw = "is JSON that is nested too deeply"
+        except ValueError:  # no JSON, no UTF-8, or a number of thousands of digits
+            flaw = "is no JSON"
+    return Reply(
+        asked=what,
+        status=answer.status,
+        body=body,
+        flaw=flaw,
+        location=answer.headers.get("location", ""),
+    )
+
+
+def _no_number(text: str) -> NoReturn:
+    """NaN and Infinity, which are no JSON (RFC 8259 §6)."""
+    raise ValueError(text)
+
+
+def _with_hint(error: HttpError, asked_s: float, total_s: float) -> HttpError:
+    return HttpError(
+        error.message,
+        status=error.status,
+        cause=error.cause,
+        hint=f"the server asks to wait {asked_s:g} s, more than the {total_s:g} s that this waits "
+        "for; try again then",
+    )
+
+
+def text_of(value: object, secret: str = "") -> str:
+    """A server's words on one line, printable and short, without `secret`."""
+    if not isinstance(value, str):
+        return ""
+    if secret:
+        value = value.replace(secret, "***")
+    plain = "".join(each if each.isprintable() else " " for each in value)
+    return plain[:_MAX_QUOTED].strip()
+
+
+def _retry_after_s(response: _Answer, now_s: float) -> float | None:
+    """Retry-After as seconds from now (RFC 9110 §10.2.3); None if there is none to be read."""
+    text = response.headers.get("retry-after", "").strip()
+    if text.isascii() and text.isdigit():
+        return float(text[:9])
+    try:
+        ends_s = email.utils.parsedate_to_datetime(text).timestamp()
+    except (ValueError, TypeError, IndexError, OverflowError, OSError):  # whatever is no date
+        return None
+    return max(0.0, ends_s - now_s)
+
+
+def _transport_reason(error: httpx.TransportError) -> str:
+    if isinstance(error, httpx.ConnectTimeout):
+        return "no connection in time"
+    if isinstance(error, httpx.TimeoutException):
+        return "no whole answer in time"
+    return text_of(str(error)) or type(error).__name__

@@ -1,0 +1,267 @@
+"""The ledger: what this package made in networks, written down before and after it is made.
+
+Owns: the file `programmed.json` in a run directory. It outlives the process, so that a second apply
+changes nothing, a removal deletes only what is ours, and the next run finds what a dead one left.
+It holds ids and digests, never a credential.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import enum
+import fcntl
+import hashlib
+import os
+import stat
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from lifecycle.codec import from_json, to_json
+from lifecycle.errors import LifecycleError, UsageError
+from lifecycle.programming.apply.errors import ProgrammingError
+from lifecycle.rundir import (
+    LEDGER_LOCK_NAME,
+    LEDGER_NAME,
+    ChildRecord,
+    boot_id,
+    start_ticks,
+)
+
+FILE_NAME = LEDGER_NAME
+LOCK_NAME = LEDGER_LOCK_NAME
+
+_LOCK_S = 30.0
+"""How long another process may keep the ledger: it talks to servers meanwhile."""
+
+_LOCK_CHECK_S = 0.05
+"""A lock cannot be waited for with a deadline."""
+
+
+class EntryState(enum.Enum):
+    """How far something is."""
+
+    PENDING = "pending"  # asked for, but nobody knows whether it was made
+    MADE = "made"
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Entry:
+    """One thing of ours in a network, for one flow.
+
+    Attributes:
+        key: of its FlowRule.
+        id: what the network calls it: a subscription, a session, a filter's preference; empty
+            while pending.
+        digest: of what was asked for.
+        what: for people.
+        expires_s: seconds since the epoch; None if it does not expire.
+        body: what was asked for, as JSON; what finds it again while its id is not known.
+    """
+
+    key: str
+    digest: str
+    what: str
+    state: EntryState = EntryState.MADE
+    id: str = ""
+    expires_s: float | None = None
+    body: str = ""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class TargetRecord:
+    """Everything of ours in one network.
+
+    Attributes:
+        target: "nft", "tc", "nef" or "camara".
+        scope: which one of that kind: a table, a device, a URL.
+        settings: path of the settings file that says how to get there; empty if none is needed.
+        digest: of the whole of what was asked for, where it is made in one piece.
+        seen: digest of what the network showed right after it was made, to notice a change by
+            others; empty where that is not read.
+    """
+
+    target: str
+    scope: str
+    settings: str = ""
+    digest: str = ""
+    seen: str = ""
+    entries: tuple[Entry, ...] = ()
+
+    def entry(self, key: str) -> Entry | None:
+        """Return the entry of a flow; None if there is none."""
+        return next((each for each in self.entries if each.key == key), None)
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class LedgerFile:
+    """The file.
+
+    Attributes:
+        owner: the supervisor whose end ends it all; None if somebody applied by hand, so that it
+            stays until it is removed by hand or the system is brought down.
+        boot_id: of the kernel that the owner ran on.
+    """
+
+    version: int = 1
+    system: str = ""
+    owner: ChildRecord | None = None
+    boot_id: str = ""
+    targets: tuple[TargetRecord, ...] = ()
+
+
+class Ledger:
+    """One system's ledger.
+
+    Args:
+        directory: of the run.
+        system: name of the system.
+        owned: this process is the supervisor whose end is to end what it makes.
+    """
+
+    def __init__(self, directory: Path, system: str, *, owned: bool = False) -> None:
+        self._directory = directory
+        self._path = directory / FILE_NAME
+        self.system = system
+        self._owned = owned
+
+    @contextlib.contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep other processes out, such as `flows apply` beside `up`; does not nest.
+
+        Raises:
+            ProgrammingError: somebody else keeps it for too long.
+        """
+        for each in (self._directory.parent, self._directory):
+            _own_directory(each)
+        lock = os.open(self._directory / LOCK_NAME, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        try:
+            deadline = time.monotonic() + _LOCK_S
+            while not _locks(lock):
+                if time.monotonic() > deadline:
+                    raise ProgrammingError(
+                        f"cannot program the flows of {self.system!r}: another process has been "
+                        f"doing so for {_LOCK_S:g} s",
+                        hint="wait for it, or end it",
+                    )
+                time.sleep(_LOCK_CHECK_S)
+            yield
+        finally:
+            os.close(lock)
+
+    def read(self) -> LedgerFile:
+        """Return what is written.
+
+        Raises:
+            ProgrammingError: it cannot be read: what it tells of cannot be removed then.
+        """
+        try:
+            data = self._path.read_bytes()
+        except FileNotFoundError:
+            return LedgerFile(system=self.system)
+        try:
+            return from_json(data, LedgerFile)
+        except ValueError as error:
+            raise ProgrammingError(
+                f"cannot read ledger {str(self._path)!r}: {error}",
+                hint="look at what it lists, remove that by hand, then delete the file",
+            ) from error
+
+    def record(self, target: str, scope: str) -> TargetRecord | None:
+        """Return what is ours in one network; None if nothing is."""
+        for each in self.read().targets:
+            if (each.target, each.scope) == (target, scope):
+                return each
+        return None
+
+    def put(self, record: TargetRecord) -> None:
+        """Write down what is ours in one network, in place of what was written of it."""
+        self._write(self._others(record.target, record.scope), record)
+
+    def drop(self, target: str, scope: str) -> None:
+        """Nothing of ours is left in one network."""
+        self._write(self._others(target, scope), None)
+
+    def restore(self, target: str, scope: str, record: TargetRecord | None) -> None:
+        """Write down what was of ours in one network before; None if nothing was."""
+        self._write(self._others(target, scope), record)
+
+    def _others(self, target: str, scope: str) -> tuple[TargetRecord, ...]:
+        return tuple(
+            each for each in self.read().targets if (each.target, each.scope) != (target, scope)
+        )
+
+    def _write(self, others: tuple[TargetRecord, ...], record: TargetRecord | None) -> None:
+        targets = others if record is None else (*others, record)
+        if not targets:
+            self._path.unlink(missing_ok=True)
+            return
+        before = self.read()
+        # What somebody applies by hand after a supervisor has died is not the dead one's.
+        owner = None if owner_is_dead(before) else before.owner
+        if self._owned:
+            pid = os.getpid()
+            owner = ChildRecord(name="supervisor", pid=pid, start_ticks=start_ticks(pid) or 0)
+        part = self._path.with_name(f".{FILE_NAME}")
+        text = to_json(
+            LedgerFile(system=self.system, owner=owner, boot_id=boot_id(), targets=targets)
+        )
+        try:
+            with part.open("wb") as file:
+                file.write(text)
+                file.flush()
+                # What it lists costs money at some operators: it must survive a power cut.
+                os.fsync(file.fileno())
+            part.replace(self._path)
+        except OSError as error:
+            raise ProgrammingError(
+                f"cannot write ledger {str(self._path)!r}: {error.strerror}",
+                hint="make room there: nothing is programmed that is not written down first",
+            ) from error
+
+
+def has_ledger(directory: Path) -> bool:
+    """Whether anything of ours may be left of the run in `directory`."""
+    return (directory / FILE_NAME).is_file()
+
+
+def owner_is_dead(file: LedgerFile) -> bool:
+    """Whether the supervisor that made all this is gone; False if somebody applied by hand."""
+    if file.owner is None:
+        return False
+    return file.boot_id != boot_id() or start_ticks(file.owner.pid) != file.owner.start_ticks
+
+
+def digest_of(*parts: str) -> str:
+    """Return a digest of texts: 16 hex digits, enough to tell changes apart."""
+    whole = hashlib.sha256("\0".join(parts).encode())
+    return whole.hexdigest()[:16]
+
+
+def as_programming_error(error: LifecycleError | OSError) -> LifecycleError:
+    """Return any failure as one of ours, for reports that list several."""
+    return (
+        error if isinstance(error, LifecycleError) else ProgrammingError(f"cannot go on: {error}")
+    )
+
+
+def _own_directory(path: Path) -> None:
+    """Make `path` if need be; what others can write would make us delete what is not ours."""
+    path.mkdir(mode=0o700, parents=True, exist_ok=True)
+    status = path.lstat()
+    others = stat.S_IWGRP | stat.S_IWOTH
+    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & others:
+        raise UsageError(
+            f"cannot keep a ledger in {str(path)!r}: it must be a directory of this user that "
+            "others cannot write",
+            hint="remove it, or set XDG_RUNTIME_DIR",
+        )
+
+
+def _locks(descriptor: int) -> bool:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True

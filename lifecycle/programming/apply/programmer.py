@@ -1,0 +1,425 @@
+"""Keeps networks in step with the verified flows of one system.
+
+Owns: `Programmer`: from flow reports to rules to targets, again whenever the reports change, and
+everything removed in the end; the address that this host sends from to a destination, as its
+routing decides; and the removal of what dead runs left. What somebody applied by hand stays:
+`lifecycle flows remove` or `lifecycle down` ends it. Blocking: a supervisor has a thread for it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import socket
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+import psutil
+
+from lifecycle.errors import LifecycleError
+from lifecycle.network.address import canonical, is_loopback
+from lifecycle.network.five_qi_dscp import DscpMapping
+from lifecycle.plan.model import Plan, PlannedNode
+from lifecycle.programming.apply.changes import Changes, Target
+from lifecycle.programming.apply.deadline import Deadline
+from lifecycle.programming.apply.errors import PartlyError
+from lifecycle.programming.apply.ledger import Ledger, has_ledger, owner_is_dead
+from lifecycle.programming.apply.targets import TargetOptions, Targets
+from lifecycle.programming.rules.rules import FlowRule, LeftOut, RuleSet, SourceAddress, flow_rules
+from lifecycle.rundir import is_held, run_name, runtime_root
+from lifecycle.verify.verdict import FlowReport, Outcome
+
+_DISCARD_PORT = 9
+"""RFC 863; connecting a UDP socket sends nothing."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Treatment:
+    """What flows get beyond what the manifest says.
+
+    Attributes:
+        mapping: gives the DSCP of flows that have a 5QI and no DSCP; None gives none.
+        label_flows: each IPv6 flow gets a flow label of its own.
+    """
+
+    mapping: DscpMapping | None = None
+    label_flows: bool = False
+
+
+class RouteSources:
+    """Observes source addresses, see rules.SourceAddress.
+
+    A publisher's socket is bound to `0.0.0.0`, so the source address of its packets is known only
+    by the route they take. For publishers on other machines this host cannot tell.
+
+    Args:
+        plan: says which machine a node is on.
+        machine: the machine that this host is; empty to tell by the addresses it has.
+    """
+
+    def __init__(self, plan: Plan, machine: str = "") -> None:
+        own = {
+            canonical(each.address.partition("%")[0])
+            for addresses in psutil.net_if_addrs().values()
+            for each in addresses
+            if each.family in (socket.AF_INET, socket.AF_INET6)
+        }
+        self._local = {
+            each.name
+            for each in plan.machines
+            if each.name == machine or not each.address or canonical(each.address) in own
+        }
+        self._machines = {each.name for each in plan.machines}
+
+    def __call__(self, node: PlannedNode, destination: str) -> str:
+        """Return the address; empty for a node of another machine, or if there is no route."""
+        if node.machine in self._machines and node.machine not in self._local:
+            return ""
+        if is_loopback(destination):
+            # A packet to loopback comes from loopback, whatever the routing says.
+            return canonical(destination)
+        return route_source(destination)
+
+
+def route_source(destination: str) -> str:
+    """Return the address that this host sends from to `destination`; empty if it has no route."""
+    family = socket.AF_INET6 if ":" in destination else socket.AF_INET
+    with socket.socket(family, socket.SOCK_DGRAM) as sock:
+        try:
+            sock.connect((destination, _DISCARD_PORT))
+        except OSError:
+            return ""
+        return canonical(str(sock.getsockname()[0]))
+
+
+class Programmer:
+    """Programs targets with the verified flows of one system.
+
+    Args:
+        plan: of the system.
+        targets: to keep in step.
+        ledger: of the system, which the targets write to.
+        source_address: observes where publishers send from; None believes the manifest only.
+        treatment: what flows get beyond what the manifest says.
+        made_by: what to close in the end, and holds the deadline.
+    """
+
+    def __init__(
+        self,
+        plan: Plan,
+        targets: Sequence[Target],
+        ledger: Ledger,
+        *,
+        source_address: SourceAddress | None = None,
+        treatment: Treatment | None = None,
+        made_by: Targets | None = None,
+    ) -> None:
+        self._plan = plan
+        self._targets = tuple(targets)
+        self._ledger = ledger
+        self._source_address = source_address
+        self._treatment = treatment or Treatment()
+        self._made_by = made_by
+        self._deadline = made_by.deadline if made_by is not None else Deadline()
+        self._applied: tuple[FlowRule, ...] | None = None
+        self.left_out: tuple[LeftOut, ...] = ()
+
+    def rules(self, flows: Iterable[FlowReport]) -> RuleSet:
+        """Return what may be programmed of these flows, and what may not."""
+        return flow_rules(
+            flows,
+            self._plan,
+            source_address=self._source_address,
+            mapping=self._treatment.mapping,
+            label_flows=self._treatment.label_flows,
+        )
+
+    def diff(self, flows: Iterable[FlowReport]) -> tuple[Changes, ...]:
+        """Return what `update` would do; changes no network."""
+        rules = self._take(flows)
+        with self._ledger.locked():
+            return tuple(each.plan(rules) for each in self._targets)
+
+    def dry_run(self, flows: Iterable[FlowReport]) -> str:
+        """Return what `update` would send if nothing were there, checked where that is possible."""
+        rules = self._take(flows)
+        return "\n".join(each.dry_run(rules) for each in self._targets)
+
+    def update(
+        self,
+        flows: Iterable[FlowReport],
+        *,
+        hold: bool = False,
+        within_s: float | None = None,
+    ) -> tuple[Changes, ...]:
+        """Bring every target up to date with these flows.
+
+        Args:
+            flows: as last verified.
+            hold: a flow that was programmed and is not verified at this moment keeps its rule
+                until it is verified again or is no longer declared: while a node restarts, its old
+                rule harms nobody, and a session of a mobile network is costly to make again.
+            within_s: for all that servers are asked; None for the patience with each request.
+
+        Returns:
+            What was done, per target; nothing if the rules are the same as last time.
+
+        Raises:
+            PartlyError: one target or several could not be brought up to date; others are.
+        """
+        reports = tuple(flows)
+        rules = self._take(reports)
+        if hold and self._applied is not None:
+            rules = _with_held(rules, self._applied, reports)
+        if rules == self._applied:
+            return ()
+        # Forgotten first: if a target fails, the next call must not take it for done.
+        self._applied = None
+        with self._deadline.within(within_s), self._ledger.locked():
+            done = _each(self._targets, lambda target: target.apply(rules))
+        self._applied = rules
+        return done
+
+    def renew(self, *, within_s: float | None = None) -> float | None:
+        """Prolong what would expire; return seconds until the next time, None if never."""
+        with self._deadline.within(within_s), self._ledger.locked():
+            due = [each.renew() for each in self._targets]
+        return min((each for each in due if each is not None), default=None)
+
+    def close(self, *, within_s: float | None = None) -> tuple[Changes, ...]:
+        """Remove everything that the ledger lists, by whichever target it was made.
+
+        Args:
+            within_s: for all that servers are asked; None for the patience with each request.
+
+        Raises:
+            PartlyError: something could not be removed, or not in time; it stays listed.
+        """
+        try:
+            return remove_all(self._ledger, self._made_by, within_s=within_s)
+        finally:
+            self.release()
+
+    def cancel(self) -> None:
+        """From another thread: have what servers are asked fail at once, until `resume`."""
+        self._deadline.cancel()
+
+    def resume(self) -> None:
+        """Ask servers again after a `cancel`."""
+        self._deadline.renew()
+
+    def release(self) -> None:
+        """Close connections and leave in the networks what was made."""
+        self._applied = None
+        if self._made_by is not None:
+            self._made_by.close()
+
+    def _take(self, flows: Iterable[FlowReport]) -> tuple[FlowRule, ...]:
+        found = self.rules(flows)
+        self.left_out = found.left_out
+        return found.rules
+
+
+def ledger_of(
+    plan: Plan, environment: Mapping[str, str], *, machine: str = "", owned: bool = False
+) -> Ledger:
+    """Return the ledger of a system on this host; it need not exist yet."""
+    directory: Path = runtime_root(environment) / run_name(plan, machine)
+    return Ledger(directory, plan.system, owned=owned)
+
+
+def open_programmer(
+    plan: Plan,
+    options: Sequence[TargetOptions],
+    *,
+    environment: Mapping[str, str],
+    machine: str = "",
+    owned: bool = False,
+    treatment: Treatment | None = None,
+) -> Programmer:
+    """Return a programmer for this host.
+
+    Args:
+        plan: of the system.
+        options: one per target.
+        environment: says where run directories are.
+        machine: the machine that this host is; empty to tell by its addresses.
+        owned: the caller is the supervisor whose end is to end what is made.
+        treatment: see Treatment.
+
+    Raises:
+        UsageError: options or settings cannot be used.
+    """
+    ledger = ledger_of(plan, environment, machine=machine, owned=owned)
+    targets = Targets(ledger)
+    try:
+        made = [targets.make(each) for each in options]
+    except LifecycleError:
+        targets.close()
+        raise
+    return Programmer(
+        plan,
+        made,
+        ledger,
+        source_address=RouteSources(plan, machine),
+        treatment=treatment,
+        made_by=targets,
+    )
+
+
+def remove_all(
+    ledger: Ledger, targets: Targets | None = None, *, within_s: float | None = None
+) -> tuple[Changes, ...]:
+    """Remove everything that a ledger lists.
+
+    Args:
+        ledger: says what there is.
+        targets: make what removes; None for new ones.
+        within_s: for all that servers are asked; None for the patience with each request.
+
+    Raises:
+        PartlyError: something could not be removed; it stays listed.
+    """
+    own = targets or Targets(ledger)
+    try:
+        with own.deadline.within(within_s), ledger.locked():
+            records = ledger.read().targets
+            return _each(records, lambda record: own.restore(record).remove())
+    finally:
+        if targets is None:
+            own.close()
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Swept:
+    """What became of the leftovers.
+
+    Attributes:
+        removed: per target.
+        errors: what could not be removed, and why; it stays listed.
+    """
+
+    removed: tuple[Changes, ...] = ()
+    errors: tuple[LifecycleError, ...] = ()
+
+
+def sweep_orphans(root: Path, *, own: str = "", within_s: float | None = None) -> Swept:
+    """Remove what the dead runs of this user left in networks.
+
+    Args:
+        root: directory of all run directories, see rundir.runtime_root.
+        own: name of the caller's own run, whose directory it holds itself.
+        within_s: for all that servers are asked; None for the patience with each request.
+    """
+    until_s = math.inf if within_s is None else time.monotonic() + within_s
+    removed: list[Changes] = []
+    errors: list[LifecycleError] = []
+    for directory in sorted(root.iterdir()) if root.is_dir() else ():
+        if not has_ledger(directory) or (directory.name != own and is_held(directory)):
+            continue
+        try:
+            removed += _sweep(directory, until_s - time.monotonic())
+        except LifecycleError as error:
+            errors.append(error)
+    return Swept(removed=tuple(removed), errors=tuple(errors))
+
+
+def remove_run(directory: Path, *, within_s: float | None = None) -> tuple[Changes, ...]:
+    """Remove everything that a run has in networks, also what somebody applied by hand.
+
+    For `lifecycle down`.
+
+    Args:
+        directory: of the run.
+        within_s: for all that servers are asked; None for the patience with each request.
+
+    Raises:
+        ProgrammingError: something could not be removed; it stays listed.
+    """
+    if not has_ledger(directory):
+        return ()
+    return Removal(directory).close(within_s=within_s)
+
+
+class Removal:
+    """Removes everything that a run has in networks, from one thread and cancelled from another.
+
+    Args:
+        directory: of the run.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        self._ledger = Ledger(directory, _system(directory))
+        self._targets = Targets(self._ledger)
+
+    def close(self, *, within_s: float | None) -> tuple[Changes, ...]:
+        """Remove it.
+
+        Args:
+            within_s: for all that servers are asked; None for the patience with each request.
+
+        Raises:
+            ProgrammingError: something could not be removed; it stays listed.
+        """
+        try:
+            return remove_all(self._ledger, self._targets, within_s=within_s)
+        finally:
+            self._targets.close()
+
+    def cancel(self) -> None:
+        """Have what servers are asked fail at once."""
+        self._targets.deadline.cancel()
+
+
+def _sweep(directory: Path, within_s: float) -> tuple[Changes, ...]:
+    file = Ledger(directory, _system(directory)).read()
+    return remove_run(directory, within_s=within_s) if owner_is_dead(file) else ()
+
+
+def _system(directory: Path) -> str:
+    """The system's name as the ledger has it: a directory's name is made safe."""
+    return Ledger(directory, "").read().system or directory.name.partition("@")[0]
+
+
+def _with_held(
+    rules: tuple[FlowRule, ...], applied: tuple[FlowRule, ...], reports: Sequence[FlowReport]
+) -> tuple[FlowRule, ...]:
+    unsure = {
+        (each.topic, each.publisher, each.subscription)
+        for each in reports
+        if each.outcome is not Outcome.OK or not each.source or not each.destination
+    }
+    keys = {each.key for each in rules}
+    held = tuple(
+        each
+        for each in applied
+        if each.key not in keys and all(map(unsure.__contains__, each.names))
+    )
+    return tuple(sorted((*rules, *held), key=lambda each: each.key))
+
+
+_T = TypeVar("_T")
+
+
+def _each(things: Iterable[_T], do: Callable[[_T], Changes]) -> tuple[Changes, ...]:
+    """Do it to each, whatever becomes of the others."""
+    every = tuple(things)
+    done: list[Changes] = []
+    errors: list[LifecycleError] = []
+    for each in every:
+        try:
+            done.append(do(each))
+        except LifecycleError as error:  # noqa: PERF203 - the other targets go on
+            errors.append(error)
+    if len(errors) == len(every) == 1:
+        raise errors[0]
+    if errors:
+        raise PartlyError(
+            "targets",
+            len(every),
+            [("", error) for error in errors],
+            done=[each.render(done=True) for each in done if each.changes],
+        )
+    return tuple(done)

@@ -1,0 +1,326 @@
+"""A target that keeps one thing per flow at a server: subscriptions, sessions.
+
+Owns: the difference between rules, ledger and server, and the order in which it is made up for. A
+request is written down before it is sent, so that what was made is found again even if the answer
+was lost. What a thing is and how it is asked for is the service's.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from typing import Protocol
+
+from lifecycle.errors import LifecycleError
+from lifecycle.programming.apply.changes import Change, ChangeKind, Changes, describe_rule
+from lifecycle.programming.apply.errors import HttpError, PartlyError
+from lifecycle.programming.apply.ledger import (
+    Entry,
+    EntryState,
+    Ledger,
+    TargetRecord,
+    digest_of,
+)
+from lifecycle.programming.rules.mobile import B, Requests
+from lifecycle.programming.rules.rules import FlowRule
+
+Body = dict[str, object]
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Made:
+    """One thing as the server has it.
+
+    Attributes:
+        id: what the server calls it.
+        expires_s: seconds since the epoch; None if it does not expire.
+        detail: for people: "granted for 600 s instead of 3600 s".
+        differs: why it is not what was asked for; empty if it is.
+    """
+
+    id: str
+    expires_s: float | None = None
+    detail: str = ""
+    differs: str = ""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Ask:
+    """One thing to ask for.
+
+    Attributes:
+        key: names it for as long as the manifest does.
+        what: for people.
+    """
+
+    key: str
+    what: str
+    body: Body
+
+
+def asks_of(found: Requests[B]) -> tuple[tuple[Ask, ...], tuple[str, ...]]:
+    """Return what `Service.asks` does, of the requests that rules became."""
+    asks = tuple(
+        Ask(key=each.key, what=describe_rule(each.rule), body=each.content.body())
+        for each in found.requests
+    )
+    return asks, tuple(map(str, found.left_out))
+
+
+class Service(Protocol):
+    """One kind of thing at one server."""
+
+    @property
+    def kind(self) -> str:
+        """Name of the target: "nef", "camara"."""
+        ...
+
+    @property
+    def scope(self) -> str:
+        """URL of the server."""
+        ...
+
+    def asks(self, rules: Sequence[FlowRule]) -> tuple[tuple[Ask, ...], tuple[str, ...]]:
+        """Return what is to be asked for, and each flow that this interface cannot say, and why."""
+        ...
+
+    def create(self, body: Body) -> Made:
+        """Ask for it."""
+        ...
+
+    def find(self, body: Body) -> Made | None:
+        """Look for one that was asked for with this body; None if there is none."""
+        ...
+
+    def see(self, id_: str, body: Body) -> Made | None:
+        """Look at one, and compare it with what was asked for; None if it is gone."""
+        ...
+
+    def update(self, id_: str, before: Body, body: Body) -> Made:
+        """Change one; the id may become another."""
+        ...
+
+    def delete(self, id_: str) -> None:
+        """Delete one; that it is gone already is no error."""
+        ...
+
+    def prolong(self, entry: Entry, body: Body) -> Made | None:
+        """Prolong one that is due; None if it is not."""
+        ...
+
+    def due_in_s(self, entry: Entry) -> float | None:
+        """Return seconds until it must be prolonged; None if never."""
+        ...
+
+
+class RemoteTarget:
+    """A server, see changes.Target.
+
+    Args:
+        service: see Service.
+        ledger: of the system.
+        settings: path of the settings file, so that a later run can remove what this one leaves.
+    """
+
+    def __init__(self, service: Service, ledger: Ledger, settings: str = "") -> None:
+        self._service = service
+        self._ledger = ledger
+        self._settings = settings
+
+    @property
+    def name(self) -> str:
+        """The server."""
+        return f"{self._service.kind} at {self._service.scope}"
+
+    def plan(self, rules: Sequence[FlowRule]) -> Changes:
+        """Compare rules, ledger and server; asks the server about each thing of ours."""
+        asks, left_out = self._service.asks(rules)
+        wanted = {each.key for each in asks}
+        changes = [
+            Change(kind=ChangeKind.DELETE, key=each.key, what=each.what)
+            for each in self._record().entries
+            if each.key not in wanted
+        ]
+        for ask in asks:
+            kind, detail = self._compare(self._record().entry(ask.key), ask.body)
+            changes.append(Change(kind=kind, key=ask.key, what=ask.what, detail=detail))
+        return Changes(target=self.name, changes=tuple(changes), left_out=left_out)
+
+    def apply(self, rules: Sequence[FlowRule]) -> Changes:
+        """Make it so, one flow after the other.
+
+        Raises:
+            PartlyError: for some flows it failed; the others are done.
+        """
+        planned = self.plan(rules)
+        bodies = {each.key: each.body for each in self._service.asks(rules)[0]}
+        done: list[Change] = []
+        errors: list[tuple[str, LifecycleError]] = []
+        # Deletions come first in the plan: what is in the way of something new goes before it.
+        for change in planned.changes:
+            try:
+                detail = self._make(change, bodies.get(change.key, {}))
+            except LifecycleError as error:  # noqa: PERF203 - the other flows go on
+                errors.append((change.key, error))
+            else:
+                done.append(dataclasses.replace(change, detail=detail or change.detail))
+        if errors:
+            raise self._partly(len(planned.changes), errors, done)
+        return dataclasses.replace(planned, changes=tuple(done))
+
+    def _partly(
+        self, total: int, errors: Sequence[tuple[str, LifecycleError]], done: Sequence[Change]
+    ) -> PartlyError:
+        made = Changes(target=self.name, changes=tuple(done))
+        return PartlyError(
+            self.name, total, errors, done=[made.render(done=True)] if made.pending else ()
+        )
+
+    def dry_run(self, rules: Sequence[FlowRule]) -> str:
+        """Return the bodies as JSON, one per flow; asks no server."""
+        asks, _ = self._service.asks(rules)
+        shown = [{"key": each.key, "flow": each.what, "body": each.body} for each in asks]
+        return json.dumps(shown, indent=2, ensure_ascii=False) + "\n"
+
+    def remove(self) -> Changes:
+        """Delete everything of ours at the server.
+
+        Raises:
+            PartlyError: some could not be deleted; they stay in the ledger.
+        """
+        entries = self._record().entries
+        done: list[Change] = []
+        errors: list[tuple[str, LifecycleError]] = []
+        for entry in entries:
+            change = Change(kind=ChangeKind.DELETE, key=entry.key, what=entry.what)
+            try:
+                self._delete(entry)
+            except LifecycleError as error:
+                errors.append((entry.key, error))
+            else:
+                done.append(change)
+        if errors:
+            raise self._partly(len(entries), errors, done)
+        return Changes(target=self.name, changes=tuple(done))
+
+    def renew(self) -> float | None:
+        """Prolong what is due.
+
+        Raises:
+            PartlyError: something could not be prolonged and will expire or has expired.
+        """
+        errors: list[tuple[str, LifecycleError]] = []
+        for entry in self._record().entries:
+            if entry.state is not EntryState.MADE:
+                continue
+            try:
+                made = self._service.prolong(entry, json.loads(entry.body))
+            except LifecycleError as error:
+                errors.append((entry.key, error))
+            else:
+                if made is not None:
+                    self._note(dataclasses.replace(entry, id=made.id, expires_s=made.expires_s))
+        if errors:
+            raise PartlyError(self.name, len(self._record().entries), errors)
+        due = [self._service.due_in_s(each) for each in self._record().entries]
+        return min((each for each in due if each is not None), default=None)
+
+    def _compare(self, entry: Entry | None, body: Body) -> tuple[ChangeKind, str]:
+        if entry is None:
+            return ChangeKind.CREATE, ""
+        asked: Body = json.loads(entry.body)
+        if entry.state is EntryState.PENDING:
+            found = self._service.find(asked)
+            if found is None:
+                return ChangeKind.CREATE, "asked for before, but never made"
+            self._note(dataclasses.replace(entry, id=found.id, state=EntryState.MADE))
+            entry = self._record().entry(entry.key)
+            assert entry is not None
+        seen = self._service.see(entry.id, asked)
+        if seen is None:
+            return ChangeKind.CREATE, "gone from the server"
+        if seen.expires_s != entry.expires_s:
+            self._note(dataclasses.replace(entry, expires_s=seen.expires_s))
+        if asked != body:
+            return ChangeKind.UPDATE, ""
+        if seen.differs:
+            return ChangeKind.UPDATE, seen.differs
+        return ChangeKind.KEEP, seen.detail
+
+    def _make(self, change: Change, body: Body) -> str:
+        """Make one change; returns what is to be told of it."""
+        entry = self._record().entry(change.key)
+        if change.kind is ChangeKind.DELETE:
+            assert entry is not None
+            self._delete(entry)
+        elif change.kind is ChangeKind.UPDATE:
+            assert entry is not None
+            made = self._service.update(entry.id, json.loads(entry.body), body)
+            self._note(_entry(change, body, made))
+            return made.detail
+        elif change.kind is ChangeKind.CREATE:
+            return self._create(change, body)
+        return ""
+
+    def _create(self, change: Change, body: Body) -> str:
+        self._note(_entry(change, body, None))
+        try:
+            made = self._service.create(body)
+        except HttpError as error:
+            if not error.uncertain:
+                self._forget(change.key)
+                raise
+            try:
+                found = self._service.find(body)
+            except HttpError as second:
+                raise error from second
+            if found is None:
+                # The entry stays pending: the server may still be making it.
+                raise
+            made = found
+        self._note(_entry(change, body, made))
+        return made.detail
+
+    def _delete(self, entry: Entry) -> None:
+        id_ = entry.id
+        if entry.state is EntryState.PENDING:
+            found = self._service.find(json.loads(entry.body))
+            id_ = "" if found is None else found.id
+        if id_:
+            self._service.delete(id_)
+        self._forget(entry.key)
+
+    def _record(self) -> TargetRecord:
+        record = self._ledger.record(self._service.kind, self._service.scope)
+        return record or TargetRecord(
+            target=self._service.kind, scope=self._service.scope, settings=self._settings
+        )
+
+    def _note(self, entry: Entry) -> None:
+        record = self._record()
+        others = tuple(each for each in record.entries if each.key != entry.key)
+        self._ledger.put(
+            dataclasses.replace(record, settings=self._settings, entries=(*others, entry))
+        )
+
+    def _forget(self, key: str) -> None:
+        record = self._record()
+        left = tuple(each for each in record.entries if each.key != key)
+        if left:
+            self._ledger.put(dataclasses.replace(record, entries=left))
+        else:
+            self._ledger.drop(record.target, record.scope)
+
+
+def _entry(change: Change, body: Body, made: Made | None) -> Entry:
+    text = json.dumps(body, sort_keys=True)
+    return Entry(
+        key=change.key,
+        digest=digest_of(text),
+        what=change.what,
+        state=EntryState.PENDING if made is None else EntryState.MADE,
+        id="" if made is None else made.id,
+        expires_s=None if made is None else made.expires_s,
+        body=text,
+    )

@@ -1,0 +1,288 @@
+"""The settings file of the targets that are reached over HTTP.
+
+Owns: its keys, their ranges and how it is read. Never holds a credential, only where one is: tokens
+are read from the environment or a file at the moment they are needed, so that a rotated one is
+taken up, and no object here holds one that a log or a traceback could show.
+
+    nef:
+      url: https://nef.example.net
+      scs_as_id: robots
+      token: {env: NEF_TOKEN}
+      notification_destination: https://robots.example.net/events
+      devices: [10.45.0.0/16]
+      qos_references: {85: robot-control}
+    camara:
+      url: https://api.example.net/quality-on-demand/v1
+      token: {file: /run/secrets/camara}
+      devices: [10.45.0.0/16]
+      qos_profiles: {85: QOS_E}
+      duration_s: 3600
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+import stat
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TypeVar
+from urllib.parse import urlsplit
+
+import msgspec
+import yaml
+
+from lifecycle.network.address import is_loopback
+from lifecycle.programming.apply.errors import SettingsError
+from lifecycle.programming.rules.camara import CamaraSettings
+from lifecycle.programming.rules.nef import NefSettings, UplinkFilter
+
+_MAX_BYTES = 256 * 1024
+_MAX_TOKEN_BYTES = 64 * 1024
+
+
+def read_file(path: str | Path, most: int) -> bytes:
+    """Return the first `most` bytes of a regular file, without ever waiting for a writer.
+
+    Raises:
+        OSError: it cannot be read, or is a pipe, a device or anything else that is no file.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    with os.fdopen(descriptor, "rb") as file:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise OSError(errno.EINVAL, "it is not a regular file")
+        return file.read(most)
+
+
+class Token(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Where a bearer token is: exactly one of the two.
+
+    Attributes:
+        env: name of an environment variable.
+        file: path of a file; a relative one is beside the settings file.
+    """
+
+    env: str = ""
+    file: str = ""
+
+    def __post_init__(self) -> None:
+        if bool(self.env) == bool(self.file):
+            raise ValueError("cannot find the token: give exactly one of env and file")
+
+    def reveal(self, environment: Mapping[str, str] | None = None) -> str:
+        """Return the token itself.
+
+        Raises:
+            SettingsError: it is not there, or is no token; its text is never quoted.
+        """
+        if self.env:
+            text = (os.environ if environment is None else environment).get(self.env, "")
+            where = f"environment variable {self.env}"
+        else:
+            where = f"file {self.file!r}"
+            try:
+                text = read_file(self.file, _MAX_TOKEN_BYTES).decode("ascii")
+            except (OSError, UnicodeDecodeError) as error:
+                reason = error.strerror if isinstance(error, OSError) else "it is not ASCII text"
+                # The cause is left out on purpose: a decoding error quotes the bytes.
+                raise SettingsError(f"cannot read the token from {where}: {reason}") from None
+        token = text.strip()
+        if not token:
+            raise SettingsError(f"cannot read the token from {where}: it is empty or not set")
+        # RFC 6750 §2.1: anything else could end the header line.
+        if not token.isascii() or any(not 0x21 <= ord(each) <= 0x7E for each in token):
+            raise SettingsError(
+                f"cannot use the token from {where}: it has characters that no token has"
+            )
+        return token
+
+
+class NefTargetSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How to reach a 3GPP NEF and what to ask it for (TS 29.122, release 17).
+
+    Attributes:
+        url: API root, before `/3gpp-as-session-with-qos/v1`.
+        scs_as_id: who we are to the operator.
+        notification_destination, devices, qos_references, default_qos_reference,
+            supported_features, protocol_by_name, uplink: see rules.nef.NefSettings.
+        token: None sends none.
+        ca_file: certificates that the server is checked against; empty for the system's.
+        timeout_s: of one request, > 0.
+    """
+
+    url: str
+    scs_as_id: str
+    notification_destination: str
+    devices: tuple[str, ...]
+    qos_references: dict[int, str] = {}
+    default_qos_reference: str = ""
+    supported_features: str = "0"
+    protocol_by_name: bool = False
+    uplink: UplinkFilter = UplinkFilter.IN
+    token: Token | None = None
+    ca_file: str = ""
+    timeout_s: float = 10.0
+
+    def __post_init__(self) -> None:
+        _check_url(self.url, token=self.token)
+        _check_positive(self.timeout_s, "timeout_s")
+        if not re.fullmatch(r"[A-Za-z0-9._~-]+", self.scs_as_id):
+            raise ValueError(
+                f"cannot use scs_as_id {self.scs_as_id!r}; use letters, digits and . _ ~ -"
+            )
+        self.asked()
+
+    def asked(self) -> NefSettings:
+        """Return what goes into bodies.
+
+        Raises:
+            ValueError: a value is not allowed.
+        """
+        return NefSettings(
+            notification_destination=self.notification_destination,
+            devices=self.devices,
+            qos_references=self.qos_references,
+            default_qos_reference=self.default_qos_reference,
+            supported_features=self.supported_features,
+            protocol_by_name=self.protocol_by_name,
+            uplink=self.uplink,
+        )
+
+
+class CamaraTargetSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How to reach a CAMARA QualityOnDemand 1.1.0 interface and what to ask it for.
+
+    Attributes:
+        url: everything before `/sessions`.
+        devices, qos_profiles, default_qos_profile, duration_s, sink, public_addresses,
+            device_by_token: see rules.camara.CamaraSettings.
+        token: None sends none.
+        ca_file: certificates that the server is checked against; empty for the system's.
+        timeout_s: of one request, > 0.
+        wait_s: how long a session may take to become available; 0 does not wait.
+    """
+
+    url: str
+    devices: tuple[str, ...]
+    qos_profiles: dict[int, str] = {}
+    default_qos_profile: str = ""
+    duration_s: int = 3600
+    sink: str = ""
+    public_addresses: dict[str, str] = {}
+    device_by_token: bool = False
+    token: Token | None = None
+    ca_file: str = ""
+    timeout_s: float = 10.0
+    wait_s: float = 10.0
+
+    def __post_init__(self) -> None:
+        _check_url(self.url, token=self.token)
+        _check_positive(self.timeout_s, "timeout_s")
+        self.asked()
+
+    def asked(self) -> CamaraSettings:
+        """Return what goes into bodies.
+
+        Raises:
+            ValueError: a value is not allowed.
+        """
+        return CamaraSettings(
+            devices=self.devices,
+            qos_profiles=self.qos_profiles,
+            default_qos_profile=self.default_qos_profile,
+            duration_s=self.duration_s,
+            sink=self.sink,
+            public_addresses=self.public_addresses,
+            device_by_token=self.device_by_token,
+        )
+
+
+class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The whole file.
+
+    Attributes:
+        path: of the file; empty if it was made in memory.
+    """
+
+    nef: NefTargetSettings | None = None
+    camara: CamaraTargetSettings | None = None
+    path: str = ""
+
+
+def load_settings(path: str | Path) -> Settings:
+    """Read a settings file, YAML or JSON.
+
+    Raises:
+        SettingsError: it cannot be read, or a key or value is not allowed; says which.
+    """
+    file = Path(path)
+    try:
+        data = read_file(file, _MAX_BYTES + 1)
+    except OSError as error:
+        raise SettingsError(f"cannot read settings {str(path)!r}: {error.strerror}") from error
+    if len(data) > _MAX_BYTES:
+        raise SettingsError(f"cannot read settings {str(path)!r}: larger than {_MAX_BYTES} bytes")
+    try:
+        # JSON is YAML, and the keys of a JSON object are converted like those of YAML.
+        plain = yaml.safe_load(data)
+        found = msgspec.convert(plain, Settings, strict=False)
+    except yaml.YAMLError as error:
+        # Only where: the library's own text quotes the line, which may hold a pasted token.
+        mark = getattr(error, "problem_mark", None)
+        where = "" if mark is None else f" at line {mark.line + 1}, column {mark.column + 1}"
+        raise SettingsError(f"cannot read settings {str(path)!r}: no YAML{where}") from None
+    except msgspec.ValidationError as error:
+        raise SettingsError(f"cannot use settings {str(path)!r}: {_readable(error)}") from error
+    except (ValueError, OverflowError, RecursionError):
+        # Dates and numbers that are none, and what is nested deeper than Python goes.
+        raise SettingsError(
+            f"cannot read settings {str(path)!r}: it is nested too deep, or has a number or date "
+            "that is none"
+        ) from None
+    return msgspec.structs.replace(
+        found,
+        nef=_beside(found.nef, file),
+        camara=_beside(found.camara, file),
+        path=str(file.absolute()),
+    )
+
+
+_T = TypeVar("_T", NefTargetSettings, CamaraTargetSettings)
+
+
+def _beside(settings: _T | None, file: Path) -> _T | None:
+    """Make a relative token file one beside the settings file."""
+    token = None if settings is None else settings.token
+    if settings is None or token is None or not token.file:
+        return settings
+    placed = str(file.absolute().parent / token.file)
+    return msgspec.structs.replace(settings, token=Token(file=placed))
+
+
+def _readable(error: msgspec.ValidationError) -> str:
+    """Rewrite the library's text in our way to write paths."""
+    text, separator, where = str(error).rpartition(" - at `")
+    if not separator:
+        return str(error)
+    whose, _, path = where.strip("`").rpartition("` in `")
+    return f"{'a key of ' if whose else ''}{path.removeprefix('$.')}: {text}"
+
+
+def _check_url(url: str, *, token: Token | None) -> None:
+    """A URL that a token may be sent to: https, or this host."""
+    parts = urlsplit(url)
+    if parts.scheme not in ("http", "https") or not parts.hostname:
+        raise ValueError(f"cannot use url {url!r}; use http:// or https:// and a host")
+    if parts.username or parts.password:
+        raise ValueError("cannot use a url with a password in it; use token")
+    if parts.query or parts.fragment:
+        raise ValueError(f"cannot use url {url!r}; leave out what follows '?' or '#'")
+    local = parts.hostname == "localhost" or is_loopback(parts.hostname)
+    if token is not None and parts.scheme == "http" and not local:
+        raise ValueError(f"cannot send a token to {url!r}: anyone could read it; use https://")
+
+
+def _check_positive(value: float, key: str) -> None:
+    if not 0 < value < float("inf"):
+        raise ValueError(f"cannot use {key} {value:g}; use a number > 0")

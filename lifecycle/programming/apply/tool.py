@@ -1,0 +1,178 @@
+"""Running the programs that change the kernel: nft, tc and unshare.
+
+Owns: how they are started, bounded and asked in English, and what their refusals mean: a missing
+program, a missing privilege and a missing kernel feature are each one sentence of their own.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import re
+import shlex
+import subprocess
+from collections.abc import Sequence
+from typing import Protocol
+
+from lifecycle.codec import from_json
+from lifecycle.programming.apply.errors import (
+    MissingFeatureError,
+    PrivilegeError,
+    ProgrammingError,
+)
+from lifecycle.rundir import OWN_CHILD
+
+_TIMEOUT_S = 10.0
+"""They talk to the kernel only; a busy machine needs tenths of a second."""
+
+_PACKAGES = {"nft": "nftables", "tc": "iproute2", "ip": "iproute2", "unshare": "util-linux"}
+
+HOW_PRIVILEGED = (
+    "run this command as root, or give it that capability: in a container --cap-add NET_ADMIN, in "
+    "a systemd unit AmbientCapabilities=CAP_NET_ADMIN"
+)
+"""Root is not enough where the capability was taken away: capabilities(7)."""
+
+_NO_PRIVILEGE = re.compile(r"operation not permitted|permission denied|must be root", re.IGNORECASE)
+_NO_FEATURE = re.compile(
+    r"qdisc kind is unknown|classifier not found|unknown qdisc|"
+    r"protocol not supported|operation not supported",
+    re.IGNORECASE,
+)
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Output:
+    """What a program left."""
+
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+class Tool(Protocol):
+    """Runs one program to its end."""
+
+    def run(self, argv: Sequence[str], *, stdin: str = "") -> Output:
+        """Run it and return what it left, whatever its exit code.
+
+        Raises:
+            MissingFeatureError: it is not installed.
+            ProgrammingError: it does not end.
+        """
+        ...
+
+
+class HostTool:
+    """Programs of this host.
+
+    Args:
+        prefix: words before each command line, such as `ip netns exec robot`.
+    """
+
+    def __init__(self, prefix: Sequence[str] = ()) -> None:
+        self._prefix = tuple(prefix)
+
+    def run(self, argv: Sequence[str], *, stdin: str = "") -> Output:
+        """Run it, see Tool."""
+        # Distributions keep these in sbin, which is not on every user's path.
+        path = f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"
+        try:
+            with OWN_CHILD:
+                done = subprocess.run(
+                    [*self._prefix, *argv],
+                    input=stdin,
+                    capture_output=True,
+                    text=True,
+                    errors="backslashreplace",
+                    timeout=_TIMEOUT_S,
+                    check=False,
+                    env={**os.environ, "LC_ALL": "C", "PATH": path},
+                )
+        except FileNotFoundError as error:
+            program = str(error.filename or argv[0])
+            package = _PACKAGES.get(program, program)
+            raise MissingFeatureError(
+                f"cannot run {program!r}: it is not installed",
+                hint=f"install it: apt-get install {package}",
+            ) from error
+        except subprocess.TimeoutExpired as error:
+            raise ProgrammingError(
+                f"cannot finish {shlex.join(argv)!r}: it still ran after {_TIMEOUT_S:g} s"
+            ) from error
+        except OSError as error:
+            raise ProgrammingError(f"cannot run {shlex.join(argv)!r}: {error.strerror}") from error
+        return Output(returncode=done.returncode, stdout=done.stdout, stderr=done.stderr)
+
+
+def demand(tool: Tool, argv: Sequence[str], *, doing: str, stdin: str = "") -> str:
+    """Run a program that has to succeed and return what it printed.
+
+    Args:
+        tool: runs it.
+        argv: the command line.
+        doing: what fails with it, to follow "cannot": "write nftables table inet flowqos_x".
+        stdin: what it reads.
+
+    Raises:
+        PrivilegeError: it needs a privilege; says which command.
+        MissingFeatureError: the kernel or the program is missing something.
+        ProgrammingError: it failed otherwise, in its own words.
+    """
+    output = tool.run(argv, stdin=stdin)
+    if output.returncode == 0:
+        return output.stdout
+    raise failure(output, argv, doing=doing)
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Qdisc:
+    """What is read of a queueing discipline in the list of `tc -j qdisc show`."""
+
+    kind: str
+    dev: str = ""
+    handle: str = "0:"
+    root: bool = False
+
+
+def qdiscs_of(text: str, argv: Sequence[str], *, doing: str) -> tuple[Qdisc, ...]:
+    """Return the queueing disciplines that `tc -j qdisc show` printed.
+
+    Args:
+        text: what it printed; nothing is an empty list.
+        argv: the command line.
+        doing: what fails if it is no such list, to follow "cannot".
+
+    Raises:
+        ProgrammingError: it is none.
+    """
+    try:
+        return from_json(text.strip() or "[]", tuple[Qdisc, ...])
+    except ValueError as error:
+        raise ProgrammingError(
+            f"cannot {doing}: what {shlex.join(argv)!r} prints is no list of qdiscs: {error}",
+            hint="look at what it prints, and which program that is",
+        ) from error
+
+
+def refused(output: Output, *, by: str) -> bool:
+    """Whether a program failed for want of a privilege, or the program `by` that starts it did."""
+    return bool(_NO_PRIVILEGE.search(output.stderr)) or output.stderr.startswith(f"{by}:")
+
+
+def failure(output: Output, argv: Sequence[str], *, doing: str) -> ProgrammingError:
+    """Return the error that a failed program means."""
+    command = shlex.join(argv)
+    said = _first_line(output.stderr) or f"exit code {output.returncode}"
+    if _NO_PRIVILEGE.search(output.stderr):
+        return PrivilegeError(
+            f"cannot {doing}: {command!r} needs CAP_NET_ADMIN in this network namespace",
+            hint=HOW_PRIVILEGED,
+        )
+    if _NO_FEATURE.search(output.stderr):
+        return MissingFeatureError(f"cannot {doing}: {command!r} says {said!r}")
+    return ProgrammingError(f"cannot {doing}: {command!r} says {said!r}")
+
+
+def _first_line(text: str) -> str:
+    return next((line.strip() for line in text.splitlines() if line.strip()), "")

@@ -1,0 +1,274 @@
+"""Flows as a mobile network sees them: which end is a device, and what class is asked for it.
+
+Owns: what NEF and CAMARA have in common. A mobile network treats the packets to and from its
+devices, so a flow between two devices is asked for twice, once for each. Pure.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import ipaddress
+from collections.abc import Callable, Iterable, Mapping
+from typing import Generic, Protocol, TypeVar
+
+from lifecycle.codec import to_json
+from lifecycle.programming.rules.packet_filter import Direction, check_address
+from lifecycle.programming.rules.rules import FlowRule, LeftOut, asks
+
+_ENDS = ("source", "destination")
+
+IpNetwork = ipaddress.IPv4Network | ipaddress.IPv6Network
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class DeviceEnd:
+    """One end of a flow that is a device of the mobile network, and the other end.
+
+    Attributes:
+        direction: of the flow's packets, as seen from the device.
+        device: address of the device.
+        device_port: 1–65535.
+        server: address of the other end, a device or not.
+        server_port: 1–65535.
+    """
+
+    direction: Direction
+    device: str
+    device_port: int
+    server: str
+    server_port: int
+
+
+class Content(Protocol):
+    """A validated request that knows its body."""
+
+    def body(self) -> dict[str, object]:
+        """Return the body, JSON-able."""
+
+
+T = TypeVar("T")
+B = TypeVar("B", bound=Content)
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Request(Generic[T]):
+    """What to ask the network for one flow and one of its ends.
+
+    Attributes:
+        key: of the FlowRule, with the direction behind it: unique.
+        rule: that it is made from.
+        end: that it is made for.
+        content: the validated body.
+    """
+
+    key: str
+    rule: FlowRule
+    end: DeviceEnd
+    content: T
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Requests(Generic[T]):
+    """Everything to ask the network for, and what cannot be asked."""
+
+    requests: tuple[Request[T], ...]
+    left_out: tuple[LeftOut, ...]
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Devices:
+    """How to tell which ends of flows are devices.
+
+    Attributes:
+        networks: that devices have their addresses from.
+        source: the sender of every flow is one.
+        destination: the receiver of every flow is one.
+        address: of the device as the mobile network knows it; empty for that of the flow.
+    """
+
+    networks: tuple[IpNetwork, ...]
+    source: bool = False
+    destination: bool = False
+    address: str = ""
+
+    def __str__(self) -> str:
+        return ", ".join(map(str, self.networks))
+
+
+def parse_devices(texts: Iterable[str], *, address: str = "") -> Devices:
+    """Return how to tell devices.
+
+    Args:
+        texts: `10.45.0.0/16`, `2001:db8:45::/48`, single addresses, or `source` and `destination`
+            for that end of every flow.
+        address: of the one device as the mobile network knows it, where flows show another.
+
+    Raises:
+        ValueError: not a network, or none at all: without it no end is known to be a device.
+    """
+    every = tuple(texts)
+    if not every:
+        raise ValueError(
+            "cannot tell which ends of flows are devices: devices is empty; name the addresses or "
+            "networks of the devices, such as 10.45.0.0/16, or 'source' or 'destination'"
+        )
+    if address:
+        check_address(address)
+    return Devices(
+        networks=tuple(_network(each) for each in every if each not in _ENDS),
+        source="source" in every,
+        destination="destination" in every,
+        address=address,
+    )
+
+
+def requests_of(
+    rules: Iterable[FlowRule],
+    devices: Devices,
+    make: Callable[[FlowRule, DeviceEnd], T],
+) -> Requests[T]:
+    """Return one request per flow and device, and the flows that none can be made for.
+
+    Args:
+        rules: of verified flows.
+        devices: which ends are devices.
+        make: the body for one flow and one of its ends; a ValueError leaves the flow out.
+    """
+    requests: list[Request[T]] = []
+    left: list[LeftOut] = []
+    for rule in rules:
+        made = _made(rule, devices, make)
+        if isinstance(made, str):
+            left += [
+                LeftOut(topic=topic, publisher=publisher, subscription=subscription, reason=made)
+                for topic, publisher, subscription in rule.names
+            ]
+        else:
+            requests += made
+    return Requests(requests=tuple(requests), left_out=tuple(left))
+
+
+def device_ends(rule: FlowRule, devices: Devices) -> tuple[DeviceEnd, ...]:
+    """Return the ends of a flow that are devices: none, one or both.
+
+    Raises:
+        ValueError: an end that has to be known is not.
+    """
+    source, destination = rule.source_address, rule.destination_address
+    if ipaddress.ip_address(destination).is_loopback:
+        raise ValueError("it never leaves its machine")
+    sends = devices.source or _is_in(source, devices.networks)
+    takes = devices.destination or _is_in(destination, devices.networks)
+    sender = (devices.address if sends else "") or source
+    receiver = (devices.address if takes else "") or destination
+    if not sender:
+        raise ValueError(
+            "the address it is sent from is not known; give its machine an address in the manifest"
+        )
+    if not sends and not takes:
+        raise ValueError(f"neither end is a device of the mobile network ({devices})")
+    found: list[DeviceEnd] = []
+    if takes:
+        found.append(
+            DeviceEnd(
+                direction=Direction.OUT,
+                device=receiver,
+                device_port=rule.destination_port,
+                server=source or sender,
+                server_port=rule.source_port,
+            )
+        )
+    if sends:
+        found.append(
+            DeviceEnd(
+                direction=Direction.IN,
+                device=sender,
+                device_port=rule.source_port,
+                server=destination,
+                server_port=rule.destination_port,
+            )
+        )
+    return tuple(found)
+
+
+def class_name(rule: FlowRule, names: Mapping[int, str], default: str, *, setting: str) -> str:
+    """Return what the operator calls the class that a flow asks for.
+
+    Args:
+        rule: of the flow.
+        names: by 5QI.
+        default: for flows whose 5QI has no name or that ask for none; empty leaves them out.
+        setting: name of `names` in the settings, for the message.
+
+    Raises:
+        ValueError: there is no name.
+    """
+    if rule.five_qi is not None and rule.five_qi in names:
+        return names[rule.five_qi]
+    if default:
+        return default
+    if rule.five_qi is None:
+        raise ValueError(f"it asks for no 5QI ({asks(rule)}), and there is no default class")
+    raise ValueError(
+        f"the operator's name for 5QI {rule.five_qi} is not known; add it to {setting}"
+    )
+
+
+def document(name: str, found: Requests[B], left_out: Iterable[LeftOut]) -> str:
+    """Return requests as JSON for people and scripts: each body beside what it is for.
+
+    Args:
+        name: of the list of requests.
+        found: the requests, and what they leave out.
+        left_out: what was left out before.
+    """
+    return to_json(
+        {
+            name: [
+                {
+                    "key": request.key,
+                    "flow": request.rule.describe(),
+                    "asks": asks(request.rule),
+                    "body": request.content.body(),
+                }
+                for request in found.requests
+            ],
+            "left_out": [str(each) for each in (*left_out, *found.left_out)],
+        }
+    ).decode()
+
+
+def _made(
+    rule: FlowRule, devices: Devices, make: Callable[[FlowRule, DeviceEnd], T]
+) -> list[Request[T]] | str:
+    """A rule's requests, or why there are none."""
+    try:
+        return [
+            Request(
+                # As stable as the rule's own key: a manifest keeps it whatever the ports are.
+                key=f"{rule.key} {'to' if end.direction is Direction.OUT else 'from'} device",
+                rule=rule,
+                end=end,
+                content=make(rule, end),
+            )
+            for end in device_ends(rule, devices)
+        ]
+    except ValueError as error:
+        return str(error)
+
+
+def _network(text: str) -> IpNetwork:
+    try:
+        return ipaddress.ip_network(text, strict=False)
+    except ValueError:
+        raise ValueError(
+            f"cannot use {text!r} as a network of devices; "
+            f"use an address or a network, such as 10.45.0.0/16"
+        ) from None
+
+
+def _is_in(address: str, networks: Iterable[IpNetwork]) -> bool:
+    if not address:
+        return False
+    parsed = ipaddress.ip_address(address)
+    return any(parsed in network for network in networks)

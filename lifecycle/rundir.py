@@ -1,0 +1,416 @@
+"""The directory of one supervised system: lock, record, control socket.
+
+Owns: where it is, that only one supervisor has it, and what it says about the processes, so that
+the next `up` can find what a killed supervisor left behind. Must not import rclpy.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import errno
+import fcntl
+import os
+import re
+import socket
+import stat
+import struct
+import tempfile
+import threading
+import time
+import uuid
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+
+from lifecycle.codec import from_json, to_json
+from lifecycle.errors import UsageError
+from lifecycle.plan.model import Plan
+
+RUN_VARIABLE = "LIFECYCLE_RUN"
+"""Set in every process of a run, with the run's id: what proves that a process is ours."""
+
+_OURS = os.O_CLOEXEC | os.O_NOFOLLOW
+
+_LONGEST_RECORD = 16 * 2**20
+"""Bytes; a record names processes and shared memory, a few kB."""
+
+LEDGER_NAME = "programmed.json"
+"""File in a run directory that lists what is ours in networks, see programming/apply/ledger.py."""
+
+LEDGER_LOCK_NAME = "programmed.lock"
+"""File beside it, locked by whoever changes it."""
+
+
+OWN_CHILD = threading.Lock()
+"""Held by whoever runs a program and waits for it himself. If it were buried as an orphan first,
+its exit code would be lost, and `subprocess` takes a lost one for success."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class ChildRecord:
+    """One process of ours.
+
+    Attributes:
+        start_ticks: field 22 of /proc/PID/stat, see proc(5): with the pid it names one process
+            of this boot for ever.
+    """
+
+    name: str
+    pid: int
+    start_ticks: int
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class RunRecord:
+    """What a supervisor writes down of its run.
+
+    Attributes:
+        run_id: value of LIFECYCLE_RUN in every process of the run.
+        boot_id: of the kernel; a record of an earlier boot names no living process.
+        began_s: seconds since the epoch.
+        segments: names of the shared memory files that the processes were seen to use.
+        domain_id: where the system is; None if it was not written down.
+    """
+
+    run_id: str
+    boot_id: str
+    began_s: float
+    supervisor: ChildRecord
+    children: tuple[ChildRecord, ...] = ()
+    segments: tuple[str, ...] = ()
+    domain_id: int | None = None
+
+
+def new_run_id() -> str:
+    """Return a fresh value for RUN_VARIABLE."""
+    return uuid.uuid4().hex
+
+
+class AlreadyRunningError(UsageError):
+    """Another supervisor has this system."""
+
+
+def runtime_root(environment: Mapping[str, str]) -> Path:
+    """Return where run directories are: $XDG_RUNTIME_DIR/lifecycle, else /tmp/lifecycle-UID.
+
+    Raises:
+        UsageError: another user can put things there, or it is no directory.
+    """
+    base = environment.get("XDG_RUNTIME_DIR")
+    if base and os.path.isdir(base):  # noqa: PTH112 - Path.is_dir() raises for a name too long
+        root = Path(base) / "lifecycle"
+    else:
+        root = Path(tempfile.gettempdir()) / f"lifecycle-{os.getuid()}"
+    _refuse_unsafe_parents(root)
+    if os.path.lexists(root):
+        _refuse_unless_private(root)
+    return root
+
+
+def run_name(plan: Plan, machine: str = "") -> str:
+    """Return the directory's name: the system, its domain, and the machine if it is only one."""
+    name = f"{plan.system}@{plan.domain_id}" + (f".{machine}" if machine else "")
+    return re.sub(r"[^A-Za-z0-9_.@-]", "_", name)
+
+
+def boot_id() -> str:
+    """Return the id of this boot, random(4)."""
+    return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+
+
+def start_ticks(pid: int) -> int | None:
+    """Return when a process started, in clock ticks since boot; None if it does not live."""
+    try:
+        text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
+    except (FileNotFoundError, ProcessLookupError):
+        return None
+    # The command stands in parentheses and may hold any character; the state follows it.
+    fields = text.rpartition(")")[2].split()
+    return None if fields[0] in "ZX" else int(fields[19])
+
+
+class RunDirectory:
+    """One run's directory, held by an exclusive lock as long as this object is open.
+
+    Attributes:
+        run_id: see RUN_VARIABLE.
+        previous: what the supervisor before us wrote, if it did not leave in order.
+    """
+
+    def __init__(self, path: Path, run_id: str, domain_id: int | None = None) -> None:
+        self.path = path
+        self.run_id = run_id
+        self.domain_id = domain_id
+        self.began_s = time.time()
+        self.previous: RunRecord | None = None
+        self._lock: int | None = None
+
+    @classmethod
+    def acquire(
+        cls, root: Path, name: str, run_id: str, *, domain_id: int | None = None
+    ) -> RunDirectory:
+        """Take the directory for the run `run_id`, in the domain `domain_id`.
+
+        Raises:
+            AlreadyRunningError: another supervisor has it.
+            UsageError: the directory belongs to another user, is writable by others, or cannot be
+                made or written.
+        """
+        directory = cls(root / name, run_id, domain_id)
+        try:
+            directory._take()
+            directory.previous = read_record(directory.path)
+            directory.socket_path.unlink(missing_ok=True)
+            directory.record(())
+        except BlockingIOError:
+            record = read_record(directory.path)
+            pid = f" (pid {record.supervisor.pid})" if record else ""
+            raise AlreadyRunningError(
+                f"cannot bring up {name!r}: another supervisor{pid} runs it already",
+                hint=f"end it first: lifecycle down {name}",
+            ) from None
+        except OSError as error:
+            if directory.previous is None:
+                directory.release()
+            directory._let_go()
+            if error.errno in (errno.ENOSPC, errno.EDQUOT):
+                raise UsageError(
+                    f"cannot write in run directory {str(directory.path)!r}: {error.strerror}",
+                    hint="make room there, or set XDG_RUNTIME_DIR to another directory",
+                ) from error
+            raise _unusable(error.filename or directory.path, str(error.strerror)) from error
+        return directory
+
+    def _take(self) -> None:
+        """Make the directory and lock it, also where its last supervisor just removes it.
+
+        Raises:
+            BlockingIOError: another supervisor has it.
+            OSError: it cannot be made.
+            UsageError: it is not ours alone.
+        """
+        _refuse_unsafe_parents(self.path.parent)
+        path = self.path / "lock"
+        while True:
+            _private_directory(self.path.parent)
+            _private_directory(self.path)
+            _refuse_unless_run(self.path)
+            try:
+                lock = os.open(path, os.O_RDWR | os.O_CREAT | _OURS, 0o600)
+            except FileNotFoundError:
+                continue
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                if path.exists() and os.path.samestat(os.fstat(lock), path.lstat()):
+                    self._lock = lock
+                    return
+            except FileNotFoundError:
+                pass
+            finally:
+                if self._lock is None:
+                    os.close(lock)
+
+    def _let_go(self) -> None:
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
+
+    @property
+    def socket_path(self) -> Path:
+        """Where `lifecycle down` and `status` reach the supervisor."""
+        return self.path / "control"
+
+    def record(self, children: tuple[ChildRecord, ...], segments: Iterable[str] = ()) -> None:
+        """Write down what runs, in one piece."""
+        record = RunRecord(
+            run_id=self.run_id,
+            boot_id=boot_id(),
+            began_s=self.began_s,
+            supervisor=ChildRecord(
+                name="supervisor", pid=os.getpid(), start_ticks=start_ticks(os.getpid()) or 0
+            ),
+            children=children,
+            segments=tuple(sorted(segments)),
+            domain_id=self.domain_id,
+        )
+        part = self.path / ".record.json"
+        part.unlink(missing_ok=True)
+        new = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _OURS, 0o600)
+        with os.fdopen(new, "wb") as file:
+            file.write(to_json(record))
+        part.replace(self.path / "record.json")
+
+    def release(self) -> None:
+        """Remove the directory and give up the lock; nothing of ours may run.
+
+        A list of what is still programmed in networks stays, and with it the directory.
+        """
+        if self._lock is None:
+            return
+        with contextlib.suppress(FileNotFoundError):
+            for each in tuple(self.path.iterdir()):
+                # The lock last: who takes it must not find what is being removed.
+                if each.name not in (LEDGER_NAME, "lock"):
+                    with contextlib.suppress(IsADirectoryError):
+                        each.unlink(missing_ok=True)
+            (self.path / "lock").unlink(missing_ok=True)
+            # Another supervisor may have it by now, or it is not empty.
+            with contextlib.suppress(OSError):
+                self.path.rmdir()
+        self._let_go()
+
+
+def read_record(path: Path) -> RunRecord | None:
+    """Return the record in a run directory; None if there is none that can be read."""
+    try:
+        # Not blocking: of a pipe in its place nobody might write the other end.
+        record = os.open(path / "record.json", os.O_RDONLY | os.O_NONBLOCK | _OURS)
+        with os.fdopen(record, "rb") as file:
+            if not stat.S_ISREG(os.fstat(record).st_mode):
+                return None
+            return from_json(file.read(_LONGEST_RECORD + 1), RunRecord, longest=_LONGEST_RECORD)
+    except (OSError, ValueError):
+        return None
+
+
+def is_held(path: Path) -> bool:
+    """Whether a supervisor holds this run directory now; what is not ours is none."""
+    try:
+        lock = os.open(path / "lock", os.O_RDWR | _OURS)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(lock)
+    return False
+
+
+@contextlib.contextmanager
+def short_path(path: Path) -> Iterator[str]:
+    """Give a name of `path` that fits in a socket address, 107 bytes (unix(7)), however deep."""
+    descriptor = os.open(path.parent, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        yield f"/proc/self/fd/{descriptor}/{path.name}"
+    finally:
+        os.close(descriptor)
+
+
+_SHORTEST_S = 0.001
+"""Less would be no limit at all, socket(7)."""
+
+
+def connect(path: Path, timeout_s: float) -> socket.socket:
+    """Connect to a control socket, with that limit for whatever is done on it.
+
+    Raises:
+        TimeoutError: whoever listens there takes nobody.
+        ConnectionRefusedError: nobody listens there any more.
+        FileNotFoundError: nobody ever did.
+    """
+    sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        with short_path(path) as name:
+            # With a timeout of Python's, a full queue would be an error at once.
+            seconds, fraction = divmod(max(timeout_s, _SHORTEST_S), 1)
+            limit = struct.pack("@ll", int(seconds), int(fraction * 1e6))
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, limit)
+            sock.connect(name)
+        sock.settimeout(timeout_s)
+    except BlockingIOError:
+        sock.close()
+        raise TimeoutError from None
+    except OSError:
+        sock.close()
+        raise
+    return sock
+
+
+def _private_directory(path: Path) -> None:
+    """Make `path` if need be, and insist that no other user can put things into it.
+
+    Raises:
+        UsageError: another user can, or something else is in its place.
+    """
+    with contextlib.suppress(FileExistsError):
+        path.mkdir(mode=0o700, parents=True)
+    _refuse_unless_private(path)
+
+
+def _refuse_unless_private(path: Path) -> None:
+    try:
+        status = path.lstat()
+    except FileNotFoundError:
+        return  # just removed by the run that had it
+    what = ""
+    if stat.S_ISLNK(status.st_mode):
+        what = "it is a symbolic link"
+    elif not stat.S_ISDIR(status.st_mode):
+        what = "it is not a directory"
+    elif status.st_uid != os.getuid():
+        what = f"it belongs to user {status.st_uid}, and this is user {os.getuid()}"
+    elif status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        what = "others can write it"
+    if what:
+        raise _unusable(path, what)
+
+
+def _refuse_unless_run(path: Path) -> None:
+    """Insist that a directory is a run's, or empty: at the end all that is in it is removed.
+
+    Raises:
+        UsageError: it holds something else.
+    """
+    try:
+        names = {each.name for each in path.iterdir()}
+    except FileNotFoundError:
+        return  # just removed by the run that had it
+    # A run that ends removes its lock last, and leaves what is programmed still.
+    marks = ("lock", LEDGER_NAME, LEDGER_LOCK_NAME)
+    if names and names.isdisjoint(marks) and read_record(path) is None:
+        raise _unusable(path, f"it holds {min(names)!r}, and was no run's")
+
+
+def _refuse_unsafe_parents(root: Path) -> None:
+    """Insist that no other user can put another directory into the place of `root`.
+
+    Each directory above it must belong to this user or to root, and be writable by all only with
+    the sticky bit, as /tmp is.
+
+    Raises:
+        UsageError: another user can.
+    """
+    trusted = {os.getuid(), 0, _unmapped_uid()}
+    # Where links lead to: they lie in the directories above, which are looked at as well.
+    for path in {*root.absolute().parents, *Path(os.path.realpath(root.parent) + "/x").parents}:
+        try:
+            status = path.stat()
+        except FileNotFoundError:
+            continue
+        except OSError as error:
+            raise _unusable(path, str(error.strerror)) from error
+        if status.st_uid not in trusted:
+            raise _unusable(
+                root,
+                f"{str(path)!r} belongs to user {status.st_uid}, and this is user {os.getuid()}",
+            )
+        if status.st_mode & stat.S_IWOTH and not status.st_mode & stat.S_ISVTX:
+            raise _unusable(root, f"everybody can write {str(path)!r}")
+
+
+def _unmapped_uid() -> int:
+    """Return as whom the owner of / is seen in a user namespace without root's uid; else 0."""
+    uids = Path("/proc/self/uid_map").read_text(encoding="ascii").split()
+    if int(uids[1]) == 0 and int(uids[0]) == 0:
+        return 0
+    return int(Path("/proc/sys/kernel/overflowuid").read_text(encoding="ascii"))
+
+
+def _unusable(path: Path | str, what: str) -> UsageError:
+    return UsageError(
+        f"cannot use {str(path)!r} as run directory: {what}; it must be a directory of this user "
+        "that others cannot write",
+        hint="remove it, or set XDG_RUNTIME_DIR to such a directory",
+    )

@@ -1,0 +1,364 @@
+"""Programmer, ledger, orphans and keeper, without any network."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from lifecycle.errors import UsageError
+from lifecycle.programming.apply import ledger as ledger_module
+from lifecycle.programming.apply.changes import Change, ChangeKind, Changes
+from lifecycle.programming.apply.errors import PartlyError, ProgrammingError
+from lifecycle.programming.apply.ledger import (
+    Entry,
+    Ledger,
+    LedgerFile,
+    TargetRecord,
+    owner_is_dead,
+)
+from lifecycle.programming.apply.programmer import (
+    Programmer,
+    RouteSources,
+    remove_run,
+    route_source,
+    sweep_orphans,
+)
+from lifecycle.programming.apply.targets import TargetOptions, Targets
+from lifecycle.programming.rules.rules import flow_rules
+from lifecycle.supervisor import networks as keeper_module
+from lifecycle.supervisor.networks import Keeper
+from lifecycle.verify.verdict import FlowReport, Outcome
+from tests.unit.programming.apply.fakes import FakeTarget
+from tests.unit.programming.apply.samples import (
+    ledger_in,
+    nef_settings,
+    rule,
+    settings_file,
+)
+from tests.unit.programming.apply.servers import NefServer
+from tests.unit.programming.rules.samples import nfe, plan, report
+
+
+def programmer(tmp_path: Path, *targets: FakeTarget) -> Programmer:
+    return Programmer(plan(), targets, ledger_in(tmp_path))
+
+
+def test_flows_are_programmed_once_and_again_only_when_they_change(tmp_path: Path) -> None:
+    target = FakeTarget()
+    programs = programmer(tmp_path, target)
+
+    (first,) = programs.update([report()])
+    again = programs.update([report()])
+    (moved,) = programs.update([report(source=(nfe("0.0.0.0", 45001),))])
+
+    assert [each.kind for each in first.changes] == [ChangeKind.CREATE]
+    assert again == ()
+    assert [each.kind for each in moved.changes] == [ChangeKind.UPDATE]
+    assert target.rules[0].source_port == 45001
+    assert target.applied == 2
+
+
+def test_a_flow_that_is_not_verified_is_not_programmed_and_the_reason_is_kept(
+    tmp_path: Path,
+) -> None:
+    target = FakeTarget()
+    programs = programmer(tmp_path, target)
+
+    programs.update([report(outcome=Outcome.UNVERIFIABLE)])
+
+    assert target.rules == ()
+    assert [str(each) for each in programs.left_out] == [
+        "/robot/video /robot/camera → /viewer: not verified: its verdict is unverifiable"
+    ]
+
+
+def test_while_a_node_restarts_its_rule_is_held_and_then_moved(tmp_path: Path) -> None:
+    target = FakeTarget()
+    programs = programmer(tmp_path, target)
+    programs.update([report()], hold=True)
+
+    programs.update([report(outcome=Outcome.VIOLATED, source=())], hold=True)
+    held = target.rules
+    (moved,) = programs.update([report(source=(nfe("0.0.0.0", 46000),))], hold=True)
+    programs.update([], hold=True)
+
+    assert [each.source_port for each in held] == [45000]
+    assert [each.kind for each in moved.changes] == [ChangeKind.UPDATE]
+    assert target.rules == ()
+
+
+def test_without_hold_an_unverified_flow_loses_its_rule(tmp_path: Path) -> None:
+    target = FakeTarget()
+    programs = programmer(tmp_path, target)
+    programs.update([report()])
+
+    programs.update([report(outcome=Outcome.VIOLATED)])
+
+    assert target.rules == ()
+
+
+def test_one_target_that_fails_does_not_keep_another_from_being_programmed(
+    tmp_path: Path,
+) -> None:
+    broken, sound = FakeTarget("broken"), FakeTarget("sound")
+    broken.fails = "cannot do it"
+    programs = programmer(tmp_path, broken, sound)
+
+    with pytest.raises(PartlyError) as caught:
+        programs.update([report()])
+    what = "/robot/video /robot/camera → /viewer udp 10.77.0.2"
+    assert str(caught.value) == (
+        "cannot make 1 of 2 changes to targets:\n"
+        "  cannot do it\n"
+        "done all the same:\n"
+        "sound: 1 created, 0 unchanged\n"
+        f"  + {what}: {sound.rules[0].describe()}"
+    )
+    assert len(sound.rules) == 1
+    broken.fails = ""
+    programs.update([report()])
+    assert len(broken.rules) == 1
+
+
+def test_all_failures_are_told_together(tmp_path: Path) -> None:
+    targets = [FakeTarget(), FakeTarget()]
+    for each, text in zip(targets, ("cannot one", "cannot two"), strict=True):
+        each.fails = text
+
+    with pytest.raises(PartlyError) as caught:
+        programmer(tmp_path, *targets).update([report()])
+
+    assert str(caught.value) == "cannot make 2 of 2 changes to targets:\n  cannot one\n  cannot two"
+
+
+def test_a_diff_changes_nothing(tmp_path: Path) -> None:
+    target = FakeTarget()
+    programs = programmer(tmp_path, target)
+
+    (changes,) = programs.diff([report()])
+
+    assert changes.pending
+    assert target.applied == 0
+
+
+def test_the_source_address_is_what_this_host_sends_from_where_it_is_the_publishers() -> None:
+    here = plan(robot="127.0.0.1")
+    sources = RouteSources(here)
+    camera, viewer = here.nodes
+
+    assert sources(camera, "127.0.0.9") == "127.0.0.9"
+    assert sources(viewer, "127.0.0.9") == ""
+    assert route_source("127.0.0.1") == "127.0.0.1"
+    (found,) = flow_rules(
+        [report(destination=(nfe("127.0.0.9", 7001),))],
+        plan(robot="", operator=""),
+        source_address=RouteSources(plan(robot="", operator="")),
+    ).rules
+    assert found.describe() == "udp 127.0.0.9:45000 → 127.0.0.9:7001"
+
+
+def test_a_ledger_keeps_targets_apart_and_vanishes_with_the_last_entry(tmp_path: Path) -> None:
+    ledger = ledger_in(tmp_path)
+    entry = Entry(key="k", digest="d", what="w")
+    one = TargetRecord(target="nft", scope="t", entries=(entry,))
+    other = TargetRecord(target="tc", scope="eth0")
+
+    ledger.put(one)
+    ledger.put(other)
+    assert ledger.record("nft", "t") == one
+    ledger.drop("nft", "t")
+    assert ledger.read().targets == (other,)
+    ledger.drop("tc", "eth0")
+
+    assert not (tmp_path / "run" / "robot@7" / "programmed.json").exists()
+
+
+def test_a_ledger_that_cannot_be_read_is_never_taken_for_an_empty_one(tmp_path: Path) -> None:
+    ledger = ledger_in(tmp_path)
+    file = tmp_path / "run" / "robot@7" / "programmed.json"
+    file.write_text("{")
+
+    with pytest.raises(ProgrammingError, match=f"cannot read ledger '{file}'.*remove that by hand"):
+        ledger.read()
+
+
+def test_a_directory_that_others_can_write_holds_no_ledger(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run").chmod(0o777)
+
+    with pytest.raises(UsageError, match="cannot keep a ledger in"):
+        ledger_in(tmp_path)
+
+
+def test_two_processes_never_program_one_system_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ledger = ledger_in(tmp_path)
+    monkeypatch.setattr(ledger_module, "_LOCK_S", 0.0)
+
+    with ledger.locked(), pytest.raises(ProgrammingError, match="another process"):  # noqa: SIM117
+        with Ledger(tmp_path / "run" / "robot@7", "robot").locked():
+            pass
+
+
+def test_a_ledger_of_a_living_supervisor_is_no_orphan_and_of_a_dead_one_is(
+    tmp_path: Path,
+) -> None:
+    ledger_in(tmp_path)
+    owned = Ledger(tmp_path / "run" / "robot@7", "robot", owned=True)
+    owned.put(TargetRecord(target="nft", scope="t"))
+    file = owned.read()
+
+    assert file.owner is not None
+    assert file.owner.pid == os.getpid()
+    assert not owner_is_dead(file)
+    dead = dataclasses.replace(file.owner, start_ticks=file.owner.start_ticks + 1)
+    assert owner_is_dead(dataclasses.replace(file, owner=dead))
+    assert owner_is_dead(dataclasses.replace(file, boot_id="another boot"))
+    assert not owner_is_dead(LedgerFile())
+
+
+def orphan(tmp_path: Path, server: NefServer, *, dead: bool) -> Path:
+    """A run directory whose ledger lists one subscription."""
+    ledger = ledger_in(tmp_path)
+    file = settings_file(tmp_path, nef=nef_settings(server.url))
+    directory = tmp_path / "run" / "robot@7"
+    owned = Ledger(directory, "robot", owned=dead)
+    targets = Targets(owned)
+    targets.make(TargetOptions(kind="nef", settings=file)).apply([rule()])
+    targets.close()
+    if dead:
+        written = ledger.read()
+        assert written.owner is not None
+        owner = dataclasses.replace(written.owner, start_ticks=1)
+        text = ledger_module.to_json(dataclasses.replace(written, owner=owner))
+        (directory / "programmed.json").write_bytes(text)
+    return directory
+
+
+def test_what_a_dead_run_left_at_a_server_is_swept_by_the_next(tmp_path: Path) -> None:
+    with NefServer() as server:
+        directory = orphan(tmp_path, server, dead=True)
+
+        swept = sweep_orphans(directory.parent)
+
+        assert [each.render(done=True).partition("\n")[0] for each in swept.removed] == [
+            f"nef at {server.url}/3gpp-as-session-with-qos/v1/robots: 1 deleted, 0 unchanged"
+        ]
+        assert swept.errors == ()
+        assert server.subscriptions == {}
+        assert not (directory / "programmed.json").exists()
+
+
+def test_what_somebody_applied_by_hand_is_not_swept_but_goes_down_with_the_system(
+    tmp_path: Path,
+) -> None:
+    with NefServer() as server:
+        directory = orphan(tmp_path, server, dead=False)
+
+        assert sweep_orphans(directory.parent).removed == ()
+        assert len(server.subscriptions) == 1
+        remove_run(directory)
+        assert server.subscriptions == {}
+
+
+def test_an_orphan_that_cannot_be_removed_is_told_and_stays_listed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with NefServer() as server:
+        directory = orphan(tmp_path, server, dead=True)
+        monkeypatch.delenv("TEST_TOKEN")
+
+        swept = sweep_orphans(directory.parent)
+
+        assert "environment variable TEST_TOKEN: it is empty or not set" in str(swept.errors[0])
+        assert (directory / "programmed.json").exists()
+
+
+class FakePrograms:
+    """A Programmer that notes what it is asked."""
+
+    def __init__(self) -> None:
+        self.seen: list[tuple[str, ...]] = []
+        self.fail = 0
+        self.done = asyncio.Event()
+        self.due_s: float | None = None
+        self.renewed = 0
+        self.loop = asyncio.get_running_loop()
+
+    def update(
+        self, flows: Sequence[FlowReport], *, hold: bool, within_s: float | None
+    ) -> tuple[Changes, ...]:
+        assert hold
+        self.seen.append(tuple(each.topic for each in flows))
+        if self.fail:
+            self.fail -= 1
+            raise ProgrammingError("cannot just now")
+        self.loop.call_soon_threadsafe(self.done.set)
+        change = Change(kind=ChangeKind.CREATE, key="k", what="w")
+        return (Changes(target="fake", changes=(change,)),)
+
+    def renew(self, *, within_s: float | None) -> float | None:
+        self.renewed += 1
+        return self.due_s
+
+    def close(self, *, within_s: float | None) -> tuple[Changes, ...]:
+        self.seen.append(("closed",))
+        return ()
+
+    def cancel(self) -> None:
+        pass
+
+    def resume(self) -> None:
+        pass
+
+
+async def _kept(programs: FakePrograms, told: list[str]) -> None:
+    keeper = Keeper(programs, told.append)
+    keeper.take([report("/one")])
+    await asyncio.wait_for(programs.done.wait(), 5)
+    await keeper.close()
+
+
+def test_a_keeper_programs_the_latest_flows_and_removes_everything_in_the_end() -> None:
+    told: list[str] = []
+
+    async def run() -> FakePrograms:
+        programs = FakePrograms()
+        await _kept(programs, told)
+        return programs
+
+    programs = asyncio.run(run())
+
+    assert programs.seen == [("/one",), ("closed",)]
+    assert told in ([], ["fake: 1 created, 0 unchanged\n  + k: w"])
+
+
+def test_a_keeper_tells_a_failure_and_tries_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(keeper_module, "_AGAIN_S", (0.001, 0.01))
+    told: list[str] = []
+
+    async def run() -> FakePrograms:
+        programs = FakePrograms()
+        programs.fail = 2
+        await _kept(programs, told)
+        return programs
+
+    programs = asyncio.run(run())
+
+    assert programs.seen == [("/one",)] * 3 + [("closed",)]
+    assert told[:2] == ["cannot just now"] * 2
+
+
+def test_a_keeper_that_never_had_flows_still_removes_what_is_listed() -> None:
+    async def run() -> FakePrograms:
+        programs = FakePrograms()
+        await Keeper(programs, print).close()
+        return programs
+
+    assert asyncio.run(run()).seen == [("closed",)]

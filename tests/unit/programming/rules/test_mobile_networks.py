@@ -1,0 +1,421 @@
+"""NEF and CAMARA bodies: our models, and CAMARA's own document as the judge of its half."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from openapi_core import OpenAPI
+from openapi_core.testing import MockRequest
+from openapi_core.validation.request.exceptions import InvalidRequestBody
+
+from lifecycle.programming.rules.camara import (
+    CamaraSettings,
+    QodSession,
+    camara_sessions,
+    render_camara,
+)
+from lifecycle.programming.rules.nef import (
+    FlowInfo,
+    NefSettings,
+    QosSubscription,
+    Snssai,
+    UplinkFilter,
+    nef_subscriptions,
+    render_nef,
+)
+from lifecycle.programming.rules.packet_filter import PortRange
+from tests.unit.programming.rules.samples import EXPECTED, LEFT_OUT, RULES, VIDEO, rule
+
+ROBOT, VIEWER = "10.9.0.1", "10.9.0.2"
+DOCUMENT = Path(__file__).parents[3] / "data" / "camara" / "quality-on-demand.yaml"
+IPV6 = rule("/lidar", "fd09::1:17904", "fd09::2:17914", five_qi=85)
+PORT = (PortRange(low=17900, high=17900),)
+
+
+def nef(**rest: object) -> NefSettings:
+    ordinary: dict[str, object] = {
+        "notification_destination": "https://robots.example.net/events",
+        "devices": (VIEWER, "fd09::/64"),
+        "qos_references": {85: "robot-control"},
+    }
+    return NefSettings(**{**ordinary, **rest})
+
+
+def camara(**rest: object) -> CamaraSettings:
+    ordinary: dict[str, object] = {
+        "devices": (VIEWER, "fd09::/64"),
+        "qos_profiles": {85: "QOS_E"},
+    }
+    return CamaraSettings(**{**ordinary, **rest})
+
+
+def cannot(message: str) -> object:
+    return pytest.raises(ValueError, match=f"^{re.escape(message)}$")
+
+
+def reasons(found: object) -> list[str]:
+    assert found.requests == ()
+    return [each.reason for each in found.left_out]
+
+
+# --- NEF
+
+
+def test_a_flow_to_a_device_is_a_subscription_with_one_filter_towards_it() -> None:
+    (request,) = nef_subscriptions([VIDEO], nef()).requests
+    assert request.key == "/video /robot/camera → /viewer udp 10.9.0.2 to device"
+    assert request.content.body() == {
+        "supportedFeatures": "0",
+        "notificationDestination": "https://robots.example.net/events",
+        "ueIpv4Addr": "10.9.0.2",
+        "flowInfo": [
+            {
+                "flowId": 1,
+                "flowDescriptions": ["permit out 17 from 10.9.0.1 17900 to 10.9.0.2 17910"],
+            }
+        ],
+        "qosReference": "robot-control",
+    }
+
+
+def test_a_flow_between_two_devices_is_asked_for_once_for_each() -> None:
+    found = nef_subscriptions([IPV6], nef())
+    assert [
+        (each.key.rpartition("udp ")[2], each.content.ue_ipv6_addr) for each in found.requests
+    ] == [("fd09::2 to device", "fd09::2"), ("fd09::2 from device", "fd09::1")]
+    assert [each.content.flow_info[0].flow_descriptions for each in found.requests] == [
+        ("permit out 17 from fd09::1 17904 to fd09::2 17914",),
+        ("permit in 17 from fd09::1 17904 to fd09::2 17914",),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({}, "permit in 17 from 10.9.0.1 17900 to 10.9.0.2 17910"),
+        ({"protocol_by_name": True}, "permit in udp from 10.9.0.1 17900 to 10.9.0.2 17910"),
+        (
+            {"uplink": UplinkFilter.OUT_REVERSED},
+            "permit out 17 from 10.9.0.2 17910 to 10.9.0.1 17900",
+        ),
+        ({"device_address": "10.45.0.3"}, "permit in 17 from 10.45.0.3 17900 to 10.9.0.2 17910"),
+    ],
+)
+def test_servers_differ_in_how_they_want_what_a_device_sends(
+    change: dict[str, object], text: str
+) -> None:
+    for devices in ((ROBOT,), ("source",)):
+        (request,) = nef_subscriptions([VIDEO], nef(devices=devices, **change)).requests
+        assert request.content.flow_info[0].flow_descriptions == (text,)
+        assert request.content.ue_ipv4_addr == change.get("device_address", ROBOT)
+
+
+def test_a_slice_and_a_data_network_are_asked_for_where_they_are_set() -> None:
+    settings = nef(dnn="robots", snssai=Snssai(sst=1, sd="00000a"))
+    (request,) = nef_subscriptions([VIDEO], settings).requests
+    body = request.content.body()
+    assert (body["dnn"], body["snssai"]) == ("robots", {"sst": 1, "sd": "00000a"})
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (
+            {"source_address": ""},
+            "the address it is sent from is not known; give its machine an address in the manifest",
+        ),
+        ({"five_qi": 9}, "the operator's name for 5QI 9 is not known; add it to qos_references"),
+        (
+            {"five_qi": None},
+            (
+                "it asks for no 5QI (EF = DSCP 46 = TOS 184 (0xb8), at most 5 ms), "
+                "and there is no default class"
+            ),
+        ),
+        (
+            {"destination_address": "10.9.0.3"},
+            "neither end is a device of the mobile network (10.9.0.2/32, fd09::/64)",
+        ),
+        (
+            {"source_address": "127.0.0.1", "destination_address": "127.0.0.1"},
+            "it never leaves its machine",
+        ),
+    ],
+)
+def test_what_cannot_be_asked_for_is_named_with_its_reason(
+    change: dict[str, object], reason: str
+) -> None:
+    changed = dataclasses.replace(VIDEO, **change)
+    assert reasons(nef_subscriptions([changed], nef())) == [reason]
+
+
+def test_a_default_class_takes_what_has_no_name() -> None:
+    settings = nef(default_qos_reference="best")
+    changed = dataclasses.replace(VIDEO, five_qi=9)
+    (request,) = nef_subscriptions([changed], settings).requests
+    assert request.content.qos_reference == "best"
+
+
+def test_the_export_says_what_each_body_is_for() -> None:
+    made = json.loads(render_nef(RULES, nef(), left_out=LEFT_OUT))
+    assert made == json.loads((EXPECTED / "nef.json").read_text(encoding="utf-8"))
+
+
+def subscription(**rest: object) -> QosSubscription:
+    ordinary: dict[str, object] = {
+        "notification_destination": "http://127.0.0.1:9/",
+        "qos_reference": "q",
+        "flow_info": (
+            FlowInfo(flow_id=1, flow_descriptions=("permit out 17 from 10.0.0.1 1 to 10.0.0.2 2",)),
+        ),
+        "ue_ipv4_addr": "10.0.0.2",
+    }
+    return QosSubscription(**{**ordinary, **rest})
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda: subscription(notification_destination="robots"),
+            (
+                "cannot use notificationDestination 'robots'; "
+                "use an http or https URL that the network can reach"
+            ),
+        ),
+        (
+            lambda: subscription(supported_features="x"),
+            "cannot use supportedFeatures 'x'; use hexadecimal digits, 0 for none",
+        ),
+        (
+            lambda: subscription(qos_reference=""),
+            "cannot use an empty qosReference; use a class of the operator's",
+        ),
+        (
+            lambda: subscription(flow_info=()),
+            "cannot ask for no flow; use at least one flowInfo",
+        ),
+        (
+            lambda: subscription(ue_ipv6_addr="fd00::1"),
+            ("cannot use ueIpv4Addr '10.0.0.2' with ueIpv6Addr 'fd00::1'; use exactly one of them"),
+        ),
+        (
+            lambda: subscription(ue_ipv4_addr="fd00::1"),
+            "cannot use fd00::1 as ueIpv4Addr; use an IPv4",
+        ),
+        (
+            lambda: FlowInfo(flow_id=-1, flow_descriptions=("",)),
+            "cannot use flowId -1; use 0 or more",
+        ),
+        (
+            lambda: FlowInfo(flow_id=1, flow_descriptions=()),
+            "cannot use 0 flowDescriptions; use one or two",
+        ),
+        (
+            lambda: FlowInfo(
+                flow_id=1, flow_descriptions=("permit out 0 from 1.1.1.1 to 1.1.1.2",)
+            ),
+            "cannot use protocol 0; use 1 to 255, such as 17 for UDP",
+        ),
+        (lambda: Snssai(sst=256), "cannot use sst 256; use 0 to 255"),
+        (lambda: Snssai(sst=1, sd="z"), "cannot use sd 'z'; use six hexadecimal digits"),
+        (
+            lambda: nef(devices=()),
+            (
+                "cannot tell which ends of flows are devices: devices is empty; name the "
+                "addresses or networks of the devices, such as 10.45.0.0/16, or 'source' or "
+                "'destination'"
+            ),
+        ),
+        (
+            lambda: nef(devices=("robots",)),
+            (
+                "cannot use 'robots' as a network of devices; "
+                "use an address or a network, such as 10.45.0.0/16"
+            ),
+        ),
+    ],
+)
+def test_a_subscription_that_a_server_would_misread_is_refused(
+    make: Callable[[], object], message: str
+) -> None:
+    with cannot(message):
+        make()
+
+
+# --- CAMARA
+
+
+@pytest.fixture(scope="module")
+def openapi() -> OpenAPI:
+    """CAMARA's document."""
+    return OpenAPI.from_file_path(str(DOCUMENT))
+
+
+def post(openapi: OpenAPI, body: object) -> None:
+    """Let CAMARA's document judge the request that creates a session."""
+    request = MockRequest(
+        "http://localhost:9091",
+        "post",
+        "/quality-on-demand/v1/sessions",
+        data=json.dumps(body).encode(),
+        content_type="application/json",
+    )
+    with warnings.catch_warnings():
+        # The validator knows no OpenID Connect and says so; who may ask is not judged here.
+        warnings.filterwarnings("ignore", message="Unsupported scheme type")
+        openapi.validate_request(request)
+
+
+VARIANTS = {
+    "plain": camara(),
+    "with a sink": camara(sink="https://robots.example.net/events"),
+    "device named by the token": camara(device_by_token=True),
+    "behind a translation": camara(public_addresses={VIEWER: "203.0.113.9"}),
+    "behind a shared address": camara(public_address="203.0.113.9", public_port=40000),
+    "the sender is the device": camara(devices=("source",)),
+}
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_camaras_document_accepts_every_session(openapi: OpenAPI, variant: str) -> None:
+    found = camara_sessions([VIDEO, IPV6], VARIANTS[variant])
+    assert found.left_out == ()
+    assert len(found.requests) >= 2
+    for each in found.requests:
+        post(openapi, each.content.body())
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"qosProfile": "no spaces"},
+        {"duration": 0},
+        {"sink": "http://robots.example.net"},
+        {"devicePorts": {}},
+        {"applicationServer": {}},
+        {"device": {"ipv4Address": {"publicAddress": "203.0.113.9"}}},
+    ],
+)
+def test_camaras_document_would_notice_a_wrong_session(
+    openapi: OpenAPI, change: dict[str, object]
+) -> None:
+    (request,) = camara_sessions([VIDEO], camara()).requests
+    with pytest.raises(InvalidRequestBody):
+        post(openapi, {**request.content.body(), **change})
+
+
+def test_a_session_is_a_device_a_server_and_a_port_at_each() -> None:
+    (request,) = camara_sessions([VIDEO], camara(sink="https://x.example/")).requests
+    assert request.content.body() == {
+        "device": {"ipv4Address": {"publicAddress": "10.9.0.2", "privateAddress": "10.9.0.2"}},
+        "applicationServer": {"ipv4Address": "10.9.0.1"},
+        "devicePorts": {"ports": [17910]},
+        "applicationServerPorts": {"ports": [17900]},
+        "qosProfile": "QOS_E",
+        "sink": "https://x.example/",
+        "duration": 3600,
+    }
+
+
+@pytest.mark.parametrize(
+    ("variant", "device"),
+    [
+        ("device named by the token", None),
+        (
+            "behind a translation",
+            {"ipv4Address": {"publicAddress": "203.0.113.9", "privateAddress": "10.9.0.2"}},
+        ),
+        (
+            "behind a shared address",
+            {"ipv4Address": {"publicAddress": "203.0.113.9", "publicPort": 40000}},
+        ),
+    ],
+)
+def test_a_device_is_named_as_the_outside_knows_it(variant: str, device: object) -> None:
+    (request,) = camara_sessions([VIDEO], VARIANTS[variant]).requests
+    assert request.content.body().get("device") == device
+
+
+def test_neighbouring_ports_are_a_range(openapi: OpenAPI) -> None:
+    body = session(device_ports=(*PORT, PortRange(low=7000, high=7399))).body()
+    assert body["devicePorts"] == {"ports": [17900], "ranges": [{"from": 7000, "to": 7399}]}
+    post(openapi, body)
+
+
+def test_the_camara_export_says_what_each_body_is_for() -> None:
+    made = json.loads(render_camara(RULES, camara(), left_out=LEFT_OUT))
+    assert made == json.loads((EXPECTED / "camara.json").read_text(encoding="utf-8"))
+
+
+def session(**rest: object) -> QodSession:
+    ordinary: dict[str, object] = {
+        "device": "10.0.0.2",
+        "public_device": "10.0.0.2",
+        "server": "10.0.0.1",
+        "device_ports": PORT,
+        "server_ports": PORT,
+        "qos_profile": "QOS_E",
+        "duration_s": 60,
+    }
+    return QodSession(**{**ordinary, **rest})
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda: session(qos_profile="x"),
+            (
+                "cannot use qosProfile 'x'; "
+                "use 3 to 256 letters, digits, '_', '.' and '-', such as QOS_E"
+            ),
+        ),
+        (lambda: session(duration_s=0), "cannot use a duration of 0 s; use 1 to 2147483647"),
+        (
+            lambda: session(sink="http://x.example/"),
+            "cannot use sink 'http://x.example/'; use an https URL, or none",
+        ),
+        (
+            lambda: session(public_device=""),
+            (
+                "cannot name device '10.0.0.2' by public address ''; "
+                "an IPv4 device needs one, an IPv6 device none"
+            ),
+        ),
+        (
+            lambda: session(public_device="fd00::1"),
+            "cannot use public address fd00::1; use an IPv4 address",
+        ),
+        (
+            lambda: session(server="fd00::1"),
+            (
+                "cannot filter packets from 10.0.0.2 to fd00::1: one is IPv4, the other IPv6; "
+                "use two addresses of one family"
+            ),
+        ),
+        (
+            lambda: session(device_ports=()),
+            "cannot ask for no port; a flow has a port at each end",
+        ),
+        (lambda: session(public_port=70000), "cannot use port 70000; use 1 to 65535"),
+        (
+            lambda: camara(qos_profiles={85: "a b"}),
+            (
+                "cannot use qosProfile 'a b'; "
+                "use 3 to 256 letters, digits, '_', '.' and '-', such as QOS_E"
+            ),
+        ),
+    ],
+)
+def test_a_session_that_a_server_would_refuse_is_refused_by_us(
+    make: Callable[[], object], message: str
+) -> None:
+    with cannot(message):
+        make()
