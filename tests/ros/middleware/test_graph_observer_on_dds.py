@@ -120,13 +120,17 @@ def test_a_ghost_is_not_counted_beside_participants_of_connections(
 ) -> None:
     """rmw_dds_common keeps the names of a participant that is heard once more after it has left."""
 
-    def home() -> str:
-        wait_until(lambda: "/twin" in nodes(observer))
+    def homes() -> list[str]:
         events = endpoints_of(observer.node, EndpointKind.PUBLISHER, "/parameter_events")
-        return next(each.gid[:24] for each in events if each.node == "/twin")
+        return [each.gid[:24] for each in events if each.node == "/twin"]
+
+    def home() -> str:
+        wait_until(homes)
+        return homes()[0]
 
     with a_node(domain_id, "twin"):
         gone = home()
+        wait_until(lambda: "/twin" in nodes(observer))
     wait_until(lambda: "/twin" not in nodes(observer))
     ghost = [
         *(sys.executable, BARE_DDS, "--write", "rt/said:std_msgs::msg::dds_::String_"),
