@@ -12,7 +12,7 @@ from lifecycle.network.connection_url import ConnectionUrl, ConnectionUrlError, 
 from lifecycle.plan.model import ParticipantConnections, PlannedNode
 from lifecycle.plan.restart import is_restarted_url
 from lifecycle.verify.observation import ConnectionReport
-from lifecycle.verify.rules.catalogue import Rule
+from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.verdict import Finding, Outcome
 from lifecycle.verify.view import Actual, View, connection_of
 
@@ -22,6 +22,9 @@ MISSING = Rule(
     outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
     fix="see who was to make it: the node at connect, or the supervisor by connect_to",
     concerns_flow=True,
+    about=About.CONNECTION,
+    heals=Heals.WITH_TIME,
+    if_gone=True,
 )
 FAILED = Rule(
     id="connection.failed",
@@ -29,6 +32,9 @@ FAILED = Rule(
     outcomes=(Outcome.VIOLATED,),
     fix="read the reason: addresses and ports of a URL must be free on the node's own machine",
     concerns_flow=True,
+    about=About.CONNECTION,
+    heals=Heals.WITH_TIME,
+    if_gone=True,
 )
 DIFFERS = Rule(
     id="connection.differs",
@@ -36,6 +42,9 @@ DIFFERS = Rule(
     outcomes=(Outcome.VIOLATED,),
     fix="see who called connect_to; disconnect it, and let its authority make it again",
     concerns_flow=True,
+    about=About.CONNECTION,
+    heals=Heals.WITH_TIME,
+    if_gone=True,
 )
 WRONG_MAPPING = Rule(
     id="connection.wrong-mapping",
@@ -43,6 +52,9 @@ WRONG_MAPPING = Rule(
     outcomes=(Outcome.VIOLATED,),
     fix="see who called map_to; map it back, or change the node's `connections`",
     concerns_flow=True,
+    about=About.CONNECTION,
+    heals=Heals.WITH_TIME,
+    if_gone=True,
 )
 RULES = (MISSING, FAILED, DIFFERS, WRONG_MAPPING)
 
