@@ -139,7 +139,8 @@ class Agreement:
         gone = {each.full_name for each in self._plan.nodes if each.machine in machines}
         violated = [each for each in verdict.findings if each.outcome is Outcome.VIOLATED]
         return bool(violated) and all(
-            rule(each.rule).if_gone and not gone.isdisjoint(each.nodes) for each in violated
+            rule(each.rule).about is not None and not gone.isdisjoint(each.nodes)
+            for each in violated
         )
 
     def findings(self, observation: Observation) -> tuple[Finding, ...]:

@@ -24,8 +24,9 @@ class Heals(enum.Enum):
 
 
 class About(enum.Enum):
-    """What a rule looks at, where others than its findings' readers have to know."""
+    """What a rule looks at that a node brings along: it is broken while the node is not there."""
 
+    PRESENCE = "presence"  # whether the node itself, or an endpoint of it, is there and alive
     MATCH = "match"  # whether two ends are matched: of that no node tells all
     PROGRESS = "progress"  # how far a node has come: its state, its report
     CONNECTION = "connection"  # a node's connections, and what is mapped onto them
@@ -44,8 +45,7 @@ class Rule:
         may_block: False for a rule whose unverifiable findings never close the gate, because the
             manifest waived the requirement itself.
         heals: what takes its findings back.
-        about: what it looks at, if anybody has to know.
-        if_gone: a node breaks it by not being there.
+        about: what it looks at that a node brings along; None for anything else.
         if_unheard: it breaks where one participant does not hear another.
         absence: for a rule whose violated findings say that something is not there (yet), how to
             call that, with `{kind}` of the endpoint and `{node}`; empty for others.
@@ -63,7 +63,6 @@ class Rule:
     may_block: bool = True
     heals: Heals = Heals.WITH_CHANGE
     about: About | None = None
-    if_gone: bool = False
     if_unheard: bool = False
     absence: str = ""
     awaits: Rule | None = None

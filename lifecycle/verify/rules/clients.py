@@ -21,7 +21,6 @@ UNMATCHED_CLIENT = Rule(
     fix="look at the QoS of both ends, and at the network between the two",
     about=About.MATCH,
     heals=Heals.WITH_TIME,
-    if_gone=True,
     if_unheard=True,
     absence="match",
 )

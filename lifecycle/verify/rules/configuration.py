@@ -15,7 +15,6 @@ MISSING_REPORT = Rule(
     fix="see whether its ~/get_configuration answers; look at its log",
     about=About.PROGRESS,
     heals=Heals.WITH_TIME,
-    if_gone=True,
     if_unheard=True,
     absence="report",
 )
@@ -26,7 +25,6 @@ INCOMPLETE_REPORT = Rule(
     fix="the node runs from another manifest, or has not connected: compare and restart it",
     about=About.PROGRESS,
     heals=Heals.WITH_TIME,
-    if_gone=True,
     if_unheard=True,
     absence="{kind} in the report of {node}",
 )

@@ -24,7 +24,6 @@ MISSING = Rule(
     concerns_flow=True,
     about=About.CONNECTION,
     heals=Heals.WITH_TIME,
-    if_gone=True,
 )
 FAILED = Rule(
     id="connection.failed",
@@ -34,7 +33,6 @@ FAILED = Rule(
     concerns_flow=True,
     about=About.CONNECTION,
     heals=Heals.WITH_TIME,
-    if_gone=True,
 )
 DIFFERS = Rule(
     id="connection.differs",
@@ -44,7 +42,6 @@ DIFFERS = Rule(
     concerns_flow=True,
     about=About.CONNECTION,
     heals=Heals.WITH_TIME,
-    if_gone=True,
 )
 WRONG_MAPPING = Rule(
     id="connection.wrong-mapping",
@@ -54,7 +51,6 @@ WRONG_MAPPING = Rule(
     concerns_flow=True,
     about=About.CONNECTION,
     heals=Heals.WITH_TIME,
-    if_gone=True,
 )
 RULES = (MISSING, FAILED, DIFFERS, WRONG_MAPPING)
 

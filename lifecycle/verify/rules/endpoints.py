@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from lifecycle.manifest.model import EndpointKind, EndpointPolicy
 from lifecycle.verify.noise import OFFERS
 from lifecycle.verify.observation import ObservedEndpoint
-from lifecycle.verify.rules.catalogue import Heals, Rule
+from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.verdict import Finding, Outcome
 from lifecycle.verify.view import Actual, Seen, View
 
@@ -18,7 +18,7 @@ MISSING_ENDPOINT = Rule(
     fix="compare the declared name, remaps and namespace with what the node creates",
     concerns_flow=True,
     heals=Heals.WITH_TIME,
-    if_gone=True,
+    about=About.PRESENCE,
     absence="{kind} of {node}",
 )
 TYPE_MISMATCH = Rule(

@@ -26,7 +26,6 @@ UNMATCHED_LINK = Rule(
     concerns_flow=True,
     about=About.MATCH,
     heals=Heals.WITH_TIME,
-    if_gone=True,
     if_unheard=True,
     absence="match",
 )
@@ -38,7 +37,6 @@ UNMATCHED_FLOW = Rule(
     concerns_flow=True,
     about=About.MATCH,
     heals=Heals.WITH_TIME,
-    if_gone=True,
     if_unheard=True,
     absence="match",
 )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from lifecycle.verify.rules.catalogue import Heals, Rule
+from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.verdict import Finding, Outcome
 from lifecycle.verify.view import View
 
@@ -57,7 +57,7 @@ SILENT_NODE = Rule(
     outcomes=(Outcome.VIOLATED,),
     fix="the message says which; a callback that may take long needs a larger `timeouts.silent_s`",
     heals=Heals.WITH_TIME,
-    if_gone=True,
+    about=About.PRESENCE,
 )
 PLANS_DIFFER = Rule(
     id="run.plans-differ",

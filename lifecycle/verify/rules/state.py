@@ -17,7 +17,6 @@ WRONG_STATE = Rule(
     fix="look at the node's log for the transition that failed, or at who else drives it",
     about=About.PROGRESS,
     heals=Heals.WITH_TIME,
-    if_gone=True,
     if_unheard=True,
 )
 STATE_UNVERIFIABLE = Rule(
@@ -27,7 +26,6 @@ STATE_UNVERIFIABLE = Rule(
     fix="see whether its ~/get_state answers; a plain node must be declared `managed: false`",
     about=About.PROGRESS,
     heals=Heals.WITH_TIME,
-    if_gone=True,
     if_unheard=True,
 )
 ACTIVATED_AT_CLOSED_GATE = Rule(
@@ -37,7 +35,6 @@ ACTIVATED_AT_CLOSED_GATE = Rule(
     fix="find out who drives the node beside the supervisor, and let the gate activate it",
     about=About.PROGRESS,
     heals=Heals.WITH_TIME,
-    if_gone=True,
     if_unheard=True,
 )
 RULES = (WRONG_STATE, STATE_UNVERIFIABLE, ACTIVATED_AT_CLOSED_GATE)
