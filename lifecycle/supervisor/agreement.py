@@ -30,7 +30,7 @@ from lifecycle.plan.notice import (
 )
 from lifecycle.supervisor.system import System
 from lifecycle.verify.observation import Observation
-from lifecycle.verify.rules import nodes, run
+from lifecycle.verify.rules import nodes, rule, run
 from lifecycle.verify.verdict import Finding, Outcome, Verdict
 
 ANNOUNCED_S = 5.0
@@ -42,9 +42,6 @@ _SHOWN = 5
 
 _MOST = 64
 """Supervisors whose notices are kept."""
-
-_ABSENCE = ("graph.missing-", "graph.unmatched-", "connection.", "config.", "state.", "run.silent-")
-"""Beginnings of the ids of rules that a node breaks by not being there."""
 
 _logger = logging.getLogger(__name__)
 
@@ -142,7 +139,8 @@ class Agreement:
         gone = {each.full_name for each in self._plan.nodes if each.machine in machines}
         violated = [each for each in verdict.findings if each.outcome is Outcome.VIOLATED]
         return bool(violated) and all(
-            each.rule.startswith(_ABSENCE) and not gone.isdisjoint(each.nodes) for each in violated
+            rule(each.rule).about is not None and not gone.isdisjoint(each.nodes)
+            for each in violated
         )
 
     def findings(self, observation: Observation) -> tuple[Finding, ...]:

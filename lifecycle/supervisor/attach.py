@@ -28,7 +28,7 @@ from lifecycle.supervisor.settling import Settling
 from lifecycle.verify import verify
 from lifecycle.verify.noise import tolerating_pattern
 from lifecycle.verify.observation import NodeConfiguration, Observation
-from lifecycle.verify.rules import rule
+from lifecycle.verify.rules import Heals, rule
 from lifecycle.verify.verdict import Outcome, Stage, Verdict
 
 _ASK_AGAIN_S = 0.5
@@ -175,7 +175,7 @@ async def _judge(plan: Plan, eyes: Eyes, timeout_s: float, *, strict: bool) -> S
 
 def _worth_waiting(verdict: Verdict, *, strict: bool) -> bool:
     """Whether another look may change the result: what nobody measures stays so."""
-    heals = [rule(each.rule).heals for each in verdict.findings]
+    heals = [rule(each.rule).heals is not Heals.NEVER for each in verdict.findings]
     if verdict.verdict is Outcome.UNVERIFIABLE and closes(verdict, strict=strict):
         return all(heals)
     return any(heals)

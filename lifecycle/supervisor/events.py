@@ -15,6 +15,7 @@ from typing import ClassVar, Union
 from lifecycle.codec import to_plain
 from lifecycle.node.control import Operation
 from lifecycle.supervisor.states import ProcessState
+from lifecycle.verify.report.json_document import plain_findings
 from lifecycle.verify.verdict import Stage, Verdict
 
 
@@ -338,4 +339,6 @@ def to_record(event: Event) -> dict[str, object]:
     """Return `event` as the JSON object that `--format json` prints."""
     plain = to_plain(event)
     assert isinstance(plain, dict)
+    if isinstance(event, VerdictChanged):
+        plain["verdict"]["findings"] = plain_findings(event.verdict)
     return {"event": event.kind, **plain}

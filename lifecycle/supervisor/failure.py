@@ -86,8 +86,8 @@ def finding_of(failure: StepFailedError) -> Finding:
         expected="",
         observed="",
         message=failure.message,
-        node=failure.subject if failure.subject.startswith("/") else "",
-        hint=f"{kind.fix}: {failure.log}" if failure.log and "log" in kind.fix else "",
+        node=run.node_of(failure.subject),
+        hint=f"{kind.fix}: {failure.log}" if failure.log and kind.names_log else "",
     )
 
 

@@ -15,7 +15,9 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Mapping
 
-from lifecycle.verify.verdict import Finding, Outcome, Verdict
+from lifecycle.verify.rules import About, rule
+from lifecycle.verify.rules.nodes import MISSING_NODE
+from lifecycle.verify.verdict import Outcome, Verdict
 
 UNCHANGED_S = 5.0
 """Who is discovered at all over TCP is after 0.1–1.6 s, on a machine with both processors busy
@@ -23,12 +25,6 @@ after 1–4 s; findings that have not changed for so long do not change any more
 
 TRIES = 3
 """So many nodes are started again before a gate at most: each takes 1–5 s of the bring-up."""
-
-_MISSING = "graph.missing-node"
-_UNMATCHED = "graph.unmatched-"
-_ON_ITS_WAY = ("state.", "config.")
-_FOLLOW = (_MISSING, _UNMATCHED, "graph.unattributed-", "flow.wrong-medium", *_ON_ITS_WAY)
-"""Beginnings of the ids of rules that break where one participant does not hear another."""
 
 
 def undiscovered(
@@ -46,26 +42,18 @@ def undiscovered(
         tries: how often each was started again before.
     """
     violated = [each for each in verdict.findings if each.outcome is Outcome.VIOLATED]
-    if any(not each.rule.startswith(_FOLLOW) for each in violated):
+    if not all(rule(each.rule).if_unheard for each in violated):
         return None
+    missing = [each for each in violated if each.rule == MISSING_NODE.id]
     # Who is not there yet, or not so far, keeps others waiting that nothing is wrong with.
-    awaited = {
-        each.subject if each.rule == _MISSING else each.node
-        for each in violated
-        if each.rule.startswith((_MISSING, *_ON_ITS_WAY))
-    }
-    lacks: Counter[str] = Counter()
-    for finding in violated:
-        ends = _ends(finding)
-        if awaited.isdisjoint(ends) or finding.rule == _MISSING:
-            lacks.update(name for name in ends if name in restartable)
+    coming = (each for each in violated if rule(each.rule).about is About.PROGRESS)
+    awaited = {each.node for each in (*missing, *coming)}
+    unmatched = (each for each in violated if rule(each.rule).about is About.MATCH)
+    pairs = (each.ends for each in unmatched if awaited.isdisjoint(each.ends))
+    lacks = Counter(
+        name
+        for names in (*pairs, *((each.node,) for each in missing))
+        for name in names
+        if name in restartable
+    )
     return max(lacks, key=lambda name: (lacks[name], -tries.get(name, 0), name), default=None)
-
-
-def _ends(finding: Finding) -> tuple[str, ...]:
-    """Return the nodes that a finding says are not discovered, or not by each other."""
-    if finding.rule == _MISSING:
-        return (finding.subject,)
-    if finding.rule.startswith(_UNMATCHED):
-        return tuple(finding.subject.rpartition(": ")[2].split(" → "))
-    return ()

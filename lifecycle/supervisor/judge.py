@@ -25,7 +25,8 @@ from lifecycle.supervisor.system import GraphObserver, System
 from lifecycle.supervisor.together import ended
 from lifecycle.verify import verify
 from lifecycle.verify.observation import Observation
-from lifecycle.verify.rules import rule
+from lifecycle.verify.rules import About, Heals, rule
+from lifecycle.verify.rules.configuration import MISSING_REPORT
 from lifecycle.verify.verdict import Finding, Outcome, Stage, Verdict
 
 QUIET_S = 0.005
@@ -49,25 +50,6 @@ are asked again: after this long, then twice as long each time, ..."""
 
 ASK_AGAIN_AT_MOST_S = 0.5
 """... up to this."""
-
-HEALING = (
-    "graph.missing-",
-    "graph.unmatched-",
-    "graph.unattributed-",
-    "graph.unseen-",
-    "connection.",
-    "flow.unverifiable",
-    "flow.wrong-medium",
-    "state.",
-    "config.",
-    "param.missing",
-    "run.silent-",
-    "run.plan-unknown",
-)
-"""Beginnings of the ids of rules that a system on its way up breaks for a moment."""
-
-_UNPROVEN = "flow.unverifiable"
-"""A requirement that only a node's report could prove."""
 
 
 class Changes:
@@ -294,7 +276,7 @@ class Judge:
         telling = {each.name for each in self._system.nodes.values() if each.tells}
         return any(
             each.outcome is Outcome.VIOLATED
-            and each.rule.startswith("graph.unmatched-")
+            and rule(each.rule).about is About.MATCH
             and telling.isdisjoint(each.nodes)
             for each in verdict.findings
         )
@@ -303,7 +285,7 @@ class Judge:
         """Whether a node that another supervisor brings up has a step to go: nobody tells us."""
         others = {each.name for each in self._system.remote.values()}
         return any(
-            each.rule.startswith(("state.", "config.")) and each.node in others
+            rule(each.rule).about is About.PROGRESS and each.node in others
             for each in verdict.findings
         )
 
@@ -358,15 +340,11 @@ def without_nodes(plan: Plan, silent: Collection[str]) -> Plan:
 
 def _patience(verdict: Verdict) -> float | None:
     """How long the findings of `verdict` may stand unchanged; None for as long as there is time."""
-    violated = [each for each in verdict.findings if each.outcome is Outcome.VIOLATED]
-    if any(not _may_heal(each) for each in violated):
+    violated = [rule(each.rule) for each in verdict.findings if each.outcome is Outcome.VIOLATED]
+    if any(each.heals is not Heals.WITH_TIME for each in violated):
         return SETTLED_S
-    if all(each.rule == _UNPROVEN for each in violated):
+    if all(each.awaits is MISSING_REPORT for each in violated):
         # A foreign node may report yet, or never will: that is not worth the whole time.
-        lasting = not violated and any(not rule(each.rule).heals for each in verdict.findings)
-        return SETTLED_S if lasting else UNVERIFIABLE_S
+        stays = any(rule(each.rule).heals is Heals.NEVER for each in verdict.findings)
+        return SETTLED_S if stays and not violated else UNVERIFIABLE_S
     return None
-
-
-def _may_heal(finding: Finding) -> bool:
-    return finding.rule.startswith(HEALING)

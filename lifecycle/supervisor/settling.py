@@ -10,6 +10,7 @@ from collections.abc import Iterator
 
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.plan.model import Plan
+from lifecycle.verify.rules import About, rule
 from lifecycle.verify.rules.clients import SERVER_OF
 from lifecycle.verify.rules.outsiders import UNATTRIBUTED_ENDPOINT
 from lifecycle.verify.verdict import Finding, Verdict
@@ -79,7 +80,7 @@ class Settling:
             (finding.subject,),
             (finding.node, finding.endpoint, finding.subject),
         }
-        if finding.rule.startswith("connection."):
+        if rule(finding.rule).about is About.CONNECTION:
             places.add(("connection", finding.node))
         return max(
             (since for (place, _), since in self._demanded.items() if place in places),

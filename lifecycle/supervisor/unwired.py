@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from lifecycle.supervisor.failure import NOT_WIRED
-from lifecycle.verify.rules import rule
+from lifecycle.verify.rules import run
 from lifecycle.verify.verdict import Finding, Outcome
 
 
@@ -14,11 +13,11 @@ def not_wired(subject: str, message: str) -> Finding:
         subject: fully qualified node name, or the system's name.
         message: a whole sentence with the reason.
     """
-    return rule(NOT_WIRED).finding(
+    return run.NOT_WIRED.finding(
         Outcome.VIOLATED,
         subject=subject,
         expected="wired",
         observed="not wired",
         message=message,
-        node=subject if subject.startswith("/") else "",
+        node=run.node_of(subject),
     )

@@ -5,7 +5,8 @@ Owns: `missing`, `not_ok`, `taken_on_trust`. Pure.
 
 from __future__ import annotations
 
-from lifecycle.verify.verdict import Finding, Outcome, Verdict
+from lifecycle.verify.rules import rule
+from lifecycle.verify.verdict import Outcome, Verdict
 
 
 def missing(verdict: Verdict) -> str:
@@ -22,20 +23,17 @@ def missing(verdict: Verdict) -> str:
     absent: list[str] = []
     wrong: list[str] = []
     unknown: list[str] = []
-    comes = any(each.rule == _NODE for each in findings)
-    reports = any(each.rule == _REPORT for each in findings)
+    broken = {each.rule for each in findings}
     for finding in findings:
-        phrase = _ABSENT.get(finding.rule)
+        kind = rule(finding.rule)
         named = f"{finding.subject} ({finding.rule})"
-        if phrase is not None and finding.outcome is Outcome.VIOLATED:
-            absent.append(f"{finding.subject} ({_what(finding, phrase)})")
-        elif finding.rule == _UNATTRIBUTED:
-            # Discovery tells of an endpoint before it tells of its node: most likely that one's.
-            if not comes:
-                unknown.append(named)
-        elif finding.rule == _UNPROVEN:
-            # Of a node whose report is missing, the report is what is waited for.
-            if not reports:
+        if kind.absence and finding.outcome is Outcome.VIOLATED:
+            what = finding.endpoint.noun if finding.endpoint else ""
+            phrase = kind.absence.format(kind=what, node=finding.node)
+            absent.append(f"{finding.subject} ({phrase})")
+        elif kind.awaits is not None:
+            # While what would tell is missing, that is what is waited for.
+            if kind.awaits.id not in broken:
                 unknown.append(named)
         elif finding.outcome is Outcome.UNVERIFIABLE:
             unknown.append(named)
@@ -78,38 +76,15 @@ def taken_on_trust(verdict: Verdict) -> str:
     by_rule: dict[str, list[str]] = {}
     for finding in verdict.findings:
         if finding.outcome is Outcome.UNVERIFIABLE:
-            number = f"{finding.expected} of " if finding.rule == _NOT_MEASURED else ""
-            by_rule.setdefault(finding.rule, []).append(f"{number}{finding.subject}")
+            what = f"{finding.expected} of " if rule(finding.rule).names_expected else ""
+            by_rule.setdefault(finding.rule, []).append(f"{what}{finding.subject}")
     parts = []
-    for rule, found in list(by_rule.items())[:_NAMED_RULES]:
+    for rule_id, found in list(by_rule.items())[:_NAMED_RULES]:
         subjects = list(dict.fromkeys(found))
         more = len(subjects) - _NAMED_EACH
         named = ", ".join(subjects[:_NAMED_EACH])
-        parts.append(named + (f" and {more} more" if more > 0 else "") + f" ({rule})")
+        parts.append(named + (f" and {more} more" if more > 0 else "") + f" ({rule_id})")
     if len(by_rule) > _NAMED_RULES:
         parts.append(f"and {len(by_rule) - _NAMED_RULES} more rules")
     line = "; ".join(parts)
     return line if len(line) <= _LONGEST else f"{line[: _LONGEST - 1]}…"
-
-
-_NOT_MEASURED = "flow.not-measured"
-_NODE = "graph.missing-node"
-_REPORT = "config.missing-report"
-_UNPROVEN = "flow.unverifiable"
-_UNATTRIBUTED = "graph.unattributed-endpoint"
-
-_ABSENT = {
-    _NODE: "node",
-    "graph.missing-endpoint": "{kind} of {node}",
-    "graph.unmatched-link": "match",
-    "graph.unmatched-flow": "match",
-    "graph.unmatched-client": "match",
-    _REPORT: "report",
-    "config.incomplete-report": "{kind} in the report of {node}",
-}
-"""Rules that say that something is not there (yet), and how to call it."""
-
-
-def _what(finding: Finding, phrase: str) -> str:
-    kind = finding.endpoint.noun if finding.endpoint else ""
-    return phrase.format(kind=kind, node=finding.node)

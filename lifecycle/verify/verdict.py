@@ -47,6 +47,8 @@ class Finding:
         node: fully qualified name of the node it concerns; empty if none or several.
         endpoint: kind of the endpoint it concerns; None if it is not about one endpoint.
         hint: what to do about it.
+        ends: of a flow or a pair, fully qualified names of the nodes at its two ends, as far as
+            they are known; `subject` says it for people, and reports write no more than that.
     """
 
     rule: str
@@ -59,13 +61,12 @@ class Finding:
     node: str = ""
     endpoint: EndpointKind | None = None
     hint: str = ""
+    ends: tuple[str, ...] = ()
 
     @property
     def nodes(self) -> tuple[str, ...]:
-        """Fully qualified names of the nodes it concerns: of a flow or a connection both ends."""
-        if self.node:
-            return (self.node,)
-        return tuple(self.subject.rpartition(": ")[2].split(" → "))
+        """Fully qualified names of the nodes it concerns: of a flow both ends."""
+        return (self.node,) if self.node else self.ends
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

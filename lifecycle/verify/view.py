@@ -115,6 +115,11 @@ class FlowView:
         return f"{self.planned.topic}: {self.publisher} → {self.subscription}"
 
     @property
+    def ends(self) -> tuple[str, str]:
+        """Fully qualified names of the two nodes."""
+        return self.publisher, self.subscription
+
+    @property
     def requirement(self) -> tuple[UniqueRequirement, UniqueRequirement]:
         """The strongest requirement of each end: several endpoints of a node are one end."""
         return _strongest(self.publishers), _strongest(self.subscriptions)

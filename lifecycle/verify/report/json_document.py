@@ -1,4 +1,7 @@
-"""The verdict as JSON. Owns: the document of schemas/verdict.v1.schema.json. Pure."""
+"""The verdict as JSON.
+
+Owns: the document of schemas/verdict.v1.schema.json, and how findings are written in any. Pure.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,7 @@ def to_json(verdict: Verdict, *, indent: int | None = None) -> str:
     """
     document: dict[str, object] = {
         "verdict": verdict.verdict.value,
-        "findings": codec.to_plain(verdict.findings),
+        "findings": plain_findings(verdict),
         "flows": codec.to_plain(verdict.flows),
     }
     if not verdict.judged:
@@ -38,3 +41,14 @@ def to_json(verdict: Verdict, *, indent: int | None = None) -> str:
     separators = (",", ":") if indent is None else None
     text = json.dumps(document, ensure_ascii=False, indent=indent, separators=separators)
     return json_text(text)
+
+
+def plain_findings(verdict: Verdict) -> list[dict[str, object]]:
+    """Return the findings as JSON holds them: of the two ends their subject says enough."""
+    found = []
+    for each in verdict.findings:
+        plain = codec.to_plain(each)
+        assert isinstance(plain, dict)
+        del plain["ends"]
+        found.append(plain)
+    return found

@@ -21,11 +21,11 @@ from lifecycle.verify.rules import (
     state,
     transport,
 )
-from lifecycle.verify.rules.catalogue import Rule
+from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.verdict import Finding
 from lifecycle.verify.view import View
 
-__all__ = ["CHECKS", "RULES", "Rule", "rule"]
+__all__ = ["CHECKS", "RULES", "About", "Heals", "Rule", "rule"]
 
 _FAMILIES = (
     nodes,

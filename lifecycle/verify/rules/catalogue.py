@@ -1,14 +1,35 @@
-"""What a rule is. Owns: `Rule`, which makes the findings that carry its id. Pure."""
+"""What a rule is. Owns: `Rule`, which makes the findings that carry its id. Pure.
+
+Whoever acts on findings asks their rules; nobody reads ids, subjects or messages for that.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import enum
 
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.plan.model import PlannedNode
 from lifecycle.verify.verdict import Finding, Outcome
 from lifecycle.verify.view import Actual
+
+
+class Heals(enum.Enum):
+    """What takes a finding back."""
+
+    WITH_TIME = "with time"  # a system on its way up breaks the rule for a moment
+    WITH_CHANGE = "with change"  # somebody has to change something
+    NEVER = "never"  # no second look can tell anything else
+
+
+class About(enum.Enum):
+    """What a rule looks at that a node brings along: it is broken while the node is not there."""
+
+    PRESENCE = "presence"  # whether the node itself, or an endpoint of it, is there and alive
+    MATCH = "match"  # whether two ends are matched: of that no node tells all
+    PROGRESS = "progress"  # how far a node has come: its state, its report
+    CONNECTION = "connection"  # a node's connections, and what is mapped onto them
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -23,7 +44,15 @@ class Rule:
         concerns_flow: a finding on an endpoint also spoils the flows of that endpoint.
         may_block: False for a rule whose unverifiable findings never close the gate, because the
             manifest waived the requirement itself.
-        heals: False for a rule whose findings no second look can take back.
+        heals: what takes its findings back.
+        about: what it looks at that a node brings along; None for anything else.
+        if_unheard: it breaks where one participant does not hear another.
+        absence: for a rule whose violated findings say that something is not there (yet), how to
+            call that, with `{kind}` of the endpoint and `{node}`; empty for others.
+        awaits: for a rule whose findings say that something is not known (yet), the rule that is
+            broken while what would tell is not there; None for others.
+        names_expected: its subjects mean nothing without what was expected of them.
+        names_log: its fix is in a log, and ends in the name of the file where that is known.
     """
 
     id: str
@@ -32,7 +61,13 @@ class Rule:
     fix: str
     concerns_flow: bool = False
     may_block: bool = True
-    heals: bool = True
+    heals: Heals = Heals.WITH_CHANGE
+    about: About | None = None
+    if_unheard: bool = False
+    absence: str = ""
+    awaits: Rule | None = None
+    names_expected: bool = False
+    names_log: bool = False
 
     def finding(
         self,
@@ -46,6 +81,7 @@ class Rule:
         node: str = "",
         endpoint: EndpointKind | None = None,
         hint: str = "",
+        ends: tuple[str, ...] = (),
     ) -> Finding:
         """Make a finding of this rule; `hint` defaults to the rule's fix.
 
@@ -65,6 +101,7 @@ class Rule:
             node=node,
             endpoint=endpoint,
             hint=hint or self.fix,
+            ends=ends,
         )
 
     def on_endpoint(

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.verify.observation import ObservedEndpoint
-from lifecycle.verify.rules.catalogue import Rule
+from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.verdict import Finding, Outcome
 from lifecycle.verify.view import Actual, View
 
@@ -19,6 +19,10 @@ UNMATCHED_CLIENT = Rule(
     meaning="a declared client and a declared server of its service or action are not matched",
     outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
     fix="look at the QoS of both ends, and at the network between the two",
+    about=About.MATCH,
+    heals=Heals.WITH_TIME,
+    if_unheard=True,
+    absence="match",
 )
 RULES = (UNMATCHED_CLIENT,)
 
@@ -78,6 +82,7 @@ def _judge(client: Actual, server: str, *, count: int) -> Iterator[Finding]:
     yield UNMATCHED_CLIENT.finding(
         outcome,
         subject=f"{name}: {node} → {server}",
+        ends=(node, server),
         expected="matched",
         observed=reason,
         message=f"cannot {verb} {node} → {server} {state} on"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from lifecycle.verify.rules.catalogue import Rule
+from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.verdict import Finding, Outcome
 from lifecycle.verify.view import View
 
@@ -13,12 +13,20 @@ MISSING_REPORT = Rule(
     meaning="a node of ours did not report its configuration",
     outcomes=(Outcome.VIOLATED,),
     fix="see whether its ~/get_configuration answers; look at its log",
+    about=About.PROGRESS,
+    heals=Heals.WITH_TIME,
+    if_unheard=True,
+    absence="report",
 )
 INCOMPLETE_REPORT = Rule(
     id="config.incomplete-report",
     meaning="a node of ours does not mention a declared endpoint in its report",
     outcomes=(Outcome.VIOLATED,),
     fix="the node runs from another manifest, or has not connected: compare and restart it",
+    about=About.PROGRESS,
+    heals=Heals.WITH_TIME,
+    if_unheard=True,
+    absence="{kind} in the report of {node}",
 )
 RULES = (MISSING_REPORT, INCOMPLETE_REPORT)
 

@@ -12,7 +12,7 @@ from lifecycle.network.connection_url import ConnectionUrl, ConnectionUrlError, 
 from lifecycle.plan.model import ParticipantConnections, PlannedNode
 from lifecycle.plan.restart import is_restarted_url
 from lifecycle.verify.observation import ConnectionReport
-from lifecycle.verify.rules.catalogue import Rule
+from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.verdict import Finding, Outcome
 from lifecycle.verify.view import Actual, View, connection_of
 
@@ -22,6 +22,8 @@ MISSING = Rule(
     outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
     fix="see who was to make it: the node at connect, or the supervisor by connect_to",
     concerns_flow=True,
+    about=About.CONNECTION,
+    heals=Heals.WITH_TIME,
 )
 FAILED = Rule(
     id="connection.failed",
@@ -29,6 +31,8 @@ FAILED = Rule(
     outcomes=(Outcome.VIOLATED,),
     fix="read the reason: addresses and ports of a URL must be free on the node's own machine",
     concerns_flow=True,
+    about=About.CONNECTION,
+    heals=Heals.WITH_TIME,
 )
 DIFFERS = Rule(
     id="connection.differs",
@@ -36,6 +40,8 @@ DIFFERS = Rule(
     outcomes=(Outcome.VIOLATED,),
     fix="see who called connect_to; disconnect it, and let its authority make it again",
     concerns_flow=True,
+    about=About.CONNECTION,
+    heals=Heals.WITH_TIME,
 )
 WRONG_MAPPING = Rule(
     id="connection.wrong-mapping",
@@ -43,6 +49,8 @@ WRONG_MAPPING = Rule(
     outcomes=(Outcome.VIOLATED,),
     fix="see who called map_to; map it back, or change the node's `connections`",
     concerns_flow=True,
+    about=About.CONNECTION,
+    heals=Heals.WITH_TIME,
 )
 RULES = (MISSING, FAILED, DIFFERS, WRONG_MAPPING)
 

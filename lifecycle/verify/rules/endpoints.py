@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from lifecycle.manifest.model import EndpointKind, EndpointPolicy
 from lifecycle.verify.noise import OFFERS
 from lifecycle.verify.observation import ObservedEndpoint
-from lifecycle.verify.rules.catalogue import Rule
+from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.verdict import Finding, Outcome
 from lifecycle.verify.view import Actual, Seen, View
 
@@ -17,6 +17,9 @@ MISSING_ENDPOINT = Rule(
     outcomes=(Outcome.VIOLATED,),
     fix="compare the declared name, remaps and namespace with what the node creates",
     concerns_flow=True,
+    heals=Heals.WITH_TIME,
+    about=About.PRESENCE,
+    absence="{kind} of {node}",
 )
 TYPE_MISMATCH = Rule(
     id="graph.type-mismatch",
@@ -38,6 +41,7 @@ UNSEEN_ENDPOINT = Rule(
     outcomes=(Outcome.UNVERIFIABLE,),
     fix="verify it where it can be seen: on its own host, or with its connection's peers",
     concerns_flow=True,
+    heals=Heals.WITH_TIME,
 )
 MEETS = {
     EndpointKind.PUBLISHER: "topic",

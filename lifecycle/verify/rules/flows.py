@@ -17,7 +17,8 @@ from lifecycle.network.nfe import (
     UniqueRequirement,
     meets,
 )
-from lifecycle.verify.rules.catalogue import Rule
+from lifecycle.verify.rules.catalogue import Heals, Rule
+from lifecycle.verify.rules.configuration import MISSING_REPORT
 from lifecycle.verify.uniqueness import Uniqueness
 from lifecycle.verify.verdict import Finding, Outcome
 from lifecycle.verify.view import Actual, FlowView, View
@@ -37,6 +38,8 @@ UNVERIFIABLE = Rule(
     fix="run the node with `run: python` under rmw_fastrtps_cpp, which reports network flow"
     " endpoints; or ask for `unique: optionally_required`, or drop the link's `unique`",
     concerns_flow=True,
+    heals=Heals.WITH_TIME,
+    awaits=MISSING_REPORT,  # nothing else could prove it
 )
 BROKEN_ENDPOINT = Rule(
     id="flow.broken-endpoint",
@@ -52,7 +55,8 @@ NOT_MEASURED = Rule(
     outcomes=(Outcome.UNVERIFIABLE,),
     fix="nothing here measures it: measure it where the data are used, or leave it out of the"
     " manifest; `--strict` refuses it, and so does `policy.unverifiable: block`",
-    heals=False,
+    heals=Heals.NEVER,
+    names_expected=True,
 )
 RULES = (NOT_UNIQUE, UNVERIFIABLE, BROKEN_ENDPOINT, NOT_MEASURED)
 
@@ -87,7 +91,7 @@ def _not_measured(view: View) -> Iterator[Finding]:
             continue
         for each in flow.planned.quantities:
             where = f"the flow {flow.publisher} → {flow.subscription} on {flow.planned.topic}"
-            yield _unmeasured(each, where, subject=flow.subject)
+            yield _unmeasured(each, where, subject=flow.subject, ends=flow.ends)
 
 
 def _unmeasured(
@@ -97,6 +101,7 @@ def _unmeasured(
     subject: str,
     node: str = "",
     endpoint: EndpointKind | None = None,
+    ends: tuple[str, ...] = (),
 ) -> Finding:
     return NOT_MEASURED.finding(
         Outcome.UNVERIFIABLE,
@@ -107,6 +112,7 @@ def _unmeasured(
         at=quantity.at,
         node=node,
         endpoint=endpoint,
+        ends=ends,
     )
 
 
@@ -175,6 +181,7 @@ def _demanded(flow: FlowView, uniqueness: Uniqueness) -> Iterator[Finding]:
     yield rule.finding(
         Outcome.VIOLATED,
         subject=flow.subject,
+        ends=flow.ends,
         expected=f"{how} unique flow",
         observed=observed,
         message=f"cannot accept the flow {flow.publisher} → {flow.subscription} on"

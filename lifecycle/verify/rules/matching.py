@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import Certainty, QosProfile, incompatibilities
-from lifecycle.verify.rules.catalogue import Rule
+from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.verdict import Finding, Outcome
 from lifecycle.verify.view import UNKNOWN_QOS, Actual, FlowView, Seen, View, actual_qos
 
@@ -24,6 +24,10 @@ UNMATCHED_LINK = Rule(
     outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
     fix="see the other findings on its ends; if there are none, look at the network between them",
     concerns_flow=True,
+    about=About.MATCH,
+    heals=Heals.WITH_TIME,
+    if_unheard=True,
+    absence="match",
 )
 UNMATCHED_FLOW = Rule(
     id="graph.unmatched-flow",
@@ -31,6 +35,10 @@ UNMATCHED_FLOW = Rule(
     outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
     fix="look at the network between the two: discovery range, multicast, firewall, peers",
     concerns_flow=True,
+    about=About.MATCH,
+    heals=Heals.WITH_TIME,
+    if_unheard=True,
+    absence="match",
 )
 RULES = (UNMATCHED_LINK, UNMATCHED_FLOW)
 
@@ -59,6 +67,7 @@ def check(view: View) -> Iterator[Finding]:
         yield rule.finding(
             outcome,
             subject=flow.subject,
+            ends=flow.ends,
             expected="matched",
             observed=reason,
             message=f"cannot see {pair} matched on {flow.planned.topic}: {reason}"

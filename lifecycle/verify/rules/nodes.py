@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from lifecycle.manifest.model import EndpointPolicy, RunKind
-from lifecycle.verify.rules.catalogue import Rule
+from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.verdict import Finding, Outcome
 from lifecycle.verify.view import View
 
@@ -15,6 +15,10 @@ MISSING_NODE = Rule(
     outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
     fix="look at the node's process and its log; compare domain, RMW and discovery range",
     concerns_flow=True,
+    heals=Heals.WITH_TIME,
+    about=About.PRESENCE,
+    if_unheard=True,
+    absence="node",
 )
 UNDECLARED_NODE = Rule(
     id="graph.undeclared-node",

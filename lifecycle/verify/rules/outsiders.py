@@ -11,8 +11,9 @@ from collections.abc import Iterator
 
 from lifecycle.manifest.model import EndpointPolicy
 from lifecycle.verify.observation import ObservedEndpoint
-from lifecycle.verify.rules.catalogue import Rule
+from lifecycle.verify.rules.catalogue import Heals, Rule
 from lifecycle.verify.rules.endpoints import UNDECLARED
+from lifecycle.verify.rules.nodes import MISSING_NODE
 from lifecycle.verify.verdict import Finding, Outcome, Stage
 from lifecycle.verify.view import View
 
@@ -21,6 +22,9 @@ UNATTRIBUTED_ENDPOINT = Rule(
     meaning="the graph has an endpoint whose node is not known",
     outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
     fix="wait for discovery; a plain DDS program never tells a node name: give it another domain",
+    heals=Heals.WITH_TIME,
+    if_unheard=True,
+    awaits=MISSING_NODE,  # discovery tells of an endpoint before it tells of its node
 )
 RULES = (UNATTRIBUTED_ENDPOINT,)
 

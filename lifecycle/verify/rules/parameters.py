@@ -8,7 +8,7 @@ from lifecycle.manifest.model import ParameterValue
 from lifecycle.plan.model import ExpectedParameter, PlannedNode
 from lifecycle.plan.parameters import COMMAND, DEFAULT, GIVEN, NOT_FINITE
 from lifecycle.verify.observation import ParameterReport, digest_of
-from lifecycle.verify.rules.catalogue import Rule
+from lifecycle.verify.rules.catalogue import Heals, Rule
 from lifecycle.verify.verdict import Finding, Outcome
 from lifecycle.verify.view import View
 
@@ -17,6 +17,7 @@ MISSING = Rule(
     meaning="a node does not have a parameter that is declared or given",
     outcomes=(Outcome.VIOLATED,),
     fix="correct the name, or have the node declare it; a value for none has no effect",
+    heals=Heals.WITH_TIME,
 )
 TYPE_DIFFERS = Rule(
     id="param.type-differs",

@@ -201,6 +201,7 @@ def _incompatible(publisher: Seen, subscription: Seen, found: Incompatibility) -
     return QOS_INCOMPATIBLE.finding(
         Outcome.VIOLATED if certain else Outcome.UNVERIFIABLE,
         subject=f"{publisher.name}: {offers} → {requests}",
+        ends=tuple(filter(None, (publisher.node, subscription.node))),
         expected=f"{found.policy} of at least {found.requested} offered",
         observed=f"{found.policy} {found.offered} offered",
         message=f"{verb} {offers} → {requests} on {publisher.name}: {offers} offers"

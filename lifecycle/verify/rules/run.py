@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from lifecycle.verify.rules.catalogue import Rule
+from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.verdict import Finding, Outcome
 from lifecycle.verify.view import View
 
@@ -17,18 +17,21 @@ PROCESS_DIED = Rule(
     meaning="a process of the system ended although nobody asked it to",
     outcomes=(Outcome.VIOLATED,),
     fix="look at the last lines of its log",
+    names_log=True,
 )
 START_FAILED = Rule(
     id="run.start-failed",
     meaning="a process or node could not be started",
     outcomes=(Outcome.VIOLATED,),
     fix="look at its `run` entry and at the last lines of its log",
+    names_log=True,
 )
 TRANSITION_FAILED = Rule(
     id="run.transition-failed",
     meaning="a node refused or failed a transition",
     outcomes=(Outcome.VIOLATED,),
     fix="look at the reason, and at the traceback in the node's log",
+    names_log=True,
 )
 DEADLINE = Rule(
     id="run.deadline",
@@ -53,6 +56,8 @@ SILENT_NODE = Rule(
     meaning="a node was stopped, hangs in a callback, or cannot be reached any more",
     outcomes=(Outcome.VIOLATED,),
     fix="the message says which; a callback that may take long needs a larger `timeouts.silent_s`",
+    heals=Heals.WITH_TIME,
+    about=About.PRESENCE,
 )
 PLANS_DIFFER = Rule(
     id="run.plans-differ",
@@ -65,6 +70,7 @@ PLAN_UNKNOWN = Rule(
     meaning="the supervisor of another machine does not say what it planned",
     outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
     fix="run the same version of lifecycle on every machine of the system",
+    heals=Heals.WITH_TIME,
 )
 RULES = (
     PROCESS_DIED,
@@ -83,3 +89,8 @@ def check(view: View) -> Iterator[Finding]:
     """Find nothing: see above."""
     del view
     yield from ()
+
+
+def node_of(subject: str) -> str:
+    """Return the node that a subject of these rules names; empty for a process or a system."""
+    return subject if subject.startswith("/") else ""

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from lifecycle.plan.model import PlannedNode
 from lifecycle.verify.observation import NodeConfiguration
-from lifecycle.verify.rules.catalogue import Rule
+from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.verdict import Finding, Outcome, Stage
 from lifecycle.verify.view import View
 
@@ -15,18 +15,27 @@ WRONG_STATE = Rule(
     meaning="a managed node is not in the state that this stage needs",
     outcomes=(Outcome.VIOLATED,),
     fix="look at the node's log for the transition that failed, or at who else drives it",
+    about=About.PROGRESS,
+    heals=Heals.WITH_TIME,
+    if_unheard=True,
 )
 STATE_UNVERIFIABLE = Rule(
     id="state.unverifiable",
     meaning="a managed node's state could not be learnt",
     outcomes=(Outcome.UNVERIFIABLE,),
     fix="see whether its ~/get_state answers; a plain node must be declared `managed: false`",
+    about=About.PROGRESS,
+    heals=Heals.WITH_TIME,
+    if_unheard=True,
 )
 ACTIVATED_AT_CLOSED_GATE = Rule(
     id="state.activated-at-closed-gate",
     meaning="somebody else activated a managed node while the gate is closed",
     outcomes=(Outcome.VIOLATED,),
     fix="find out who drives the node beside the supervisor, and let the gate activate it",
+    about=About.PROGRESS,
+    heals=Heals.WITH_TIME,
+    if_unheard=True,
 )
 RULES = (WRONG_STATE, STATE_UNVERIFIABLE, ACTIVATED_AT_CLOSED_GATE)
 

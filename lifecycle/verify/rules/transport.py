@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from lifecycle.manifest.model import FlowTransport
-from lifecycle.verify.rules.catalogue import Rule
+from lifecycle.verify.rules.catalogue import Heals, Rule
 from lifecycle.verify.transport import (
     INTRAPROCESS,
     MULTICAST,
@@ -36,6 +36,8 @@ WRONG_MEDIUM = Rule(
     fix="compare the connections of both ends with `lifecycle plan`; see what each process was"
     " given by its environment",
     concerns_flow=True,
+    heals=Heals.WITH_TIME,
+    if_unheard=True,
 )
 RULES = (WRONG_TRANSPORT, WRONG_MEDIUM)
 
@@ -82,6 +84,7 @@ def _not_by_network(flow: FlowView, demanding: Actual, used: str) -> Finding:
     return WRONG_TRANSPORT.finding(
         Outcome.UNVERIFIABLE if unknown else Outcome.VIOLATED,
         subject=flow.subject,
+        ends=flow.ends,
         expected="an IP transport",
         observed=_WORDS[used],
         message=f"cannot {'verify' if unknown else 'accept'} the flow {flow.publisher} →"
@@ -97,6 +100,7 @@ def _otherwise(flow: FlowView, used: str) -> Finding:
     return WRONG_MEDIUM.finding(
         Outcome.UNVERIFIABLE if unknown else Outcome.VIOLATED,
         subject=flow.subject,
+        ends=flow.ends,
         expected=planned,
         observed=word,
         message=f"cannot {'verify' if unknown else 'accept'} what carries {flow.publisher} →"

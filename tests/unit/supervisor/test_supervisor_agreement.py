@@ -207,6 +207,7 @@ def test_only_the_absence_of_who_was_shut_down_is_how_a_system_of_several_hosts_
     unmatched = UNMATCHED_FLOW.finding(
         Outcome.VIOLATED,
         subject="/video: /camera → /viewer",
+        ends=("/camera", "/viewer"),
         expected="matched",
         observed="the subscription is missing",
         message="cannot see /camera → /viewer matched on /video: the subscription is missing",

@@ -25,7 +25,14 @@ def verdict(*found: tuple[str, str], outcome: Outcome = Outcome.VIOLATED) -> Ver
         blocking=True,
         findings=tuple(
             Finding(
-                rule=rule, outcome=outcome, subject=subject, expected="", observed="", message=""
+                rule=rule,
+                outcome=outcome,
+                subject=subject,
+                expected="",
+                observed="",
+                message="",
+                node="" if "→" in subject else subject,
+                ends=tuple(subject.rpartition(": ")[2].split(" → ")) if "→" in subject else (),
             )
             for rule, subject in found
         ),
@@ -54,7 +61,7 @@ def test_who_lacks_most_is_started_again_and_nobody_where_more_is_wrong(
     assert undiscovered(verdict(*found), OURS, tries) == again
 
 
-@pytest.mark.parametrize("rule", ["state.wrong-state", "config.missing-configuration"])
+@pytest.mark.parametrize("rule", ["state.wrong-state", "config.missing-report"])
 def test_who_waits_for_a_node_that_is_on_its_way_is_not_started_again(rule: str) -> None:
     on_its_way = verdict(TO_AWAITED, (rule, "what is said of it"))
     waiting, late = on_its_way.findings

@@ -228,7 +228,7 @@ def test_an_unmatched_pair_is_asked_again_because_its_match_changes_no_graph(
 
 
 def test_a_node_that_tells_of_its_matches_is_not_asked_for_them(tmp_path: Path) -> None:
-    finding = dataclasses.replace(UNMATCHED.findings[0], subject="/video: /camera → /viewer")
+    finding = dataclasses.replace(UNMATCHED.findings[0], ends=("/camera", "/viewer"))
     unmatched = dataclasses.replace(UNMATCHED, findings=(finding,))
 
     async def test(bench: _Bench) -> None:
@@ -690,7 +690,7 @@ def test_a_match_that_is_only_unverifiable_is_not_asked_for(tmp_path: Path) -> N
     _run(tmp_path, test, verdict_of(Outcome.UNVERIFIABLE, "graph.unmatched-link", blocking=True))
 
 
-@pytest.mark.parametrize("rule", ["state.wrong-state", "config.missing-configuration"])
+@pytest.mark.parametrize("rule", ["state.wrong-state", "config.missing-report"])
 @pytest.mark.parametrize(("node", "asked"), [("/viewer", True), ("/camera", False)])
 def test_a_node_of_another_supervisor_that_has_a_step_to_go_is_asked_again(
     tmp_path: Path, rule: str, node: str, asked: bool

@@ -36,11 +36,12 @@ from lifecycle.supervisor.events import (
     VerdictChanged,
     WiringChanged,
     WiringLost,
+    to_record,
 )
 from lifecycle.supervisor.options import UpResult
 from lifecycle.supervisor.states import ProcessState
 from lifecycle.supervisor.status import NodeStatus, SystemStatus
-from lifecycle.verify import FlowReport, Outcome, Stage
+from lifecycle.verify import FlowReport, Outcome, Stage, to_json
 from lifecycle.verify.observation import ConnectionReport
 from tests.unit.supervisor.fakes import verdict_of
 
@@ -155,6 +156,16 @@ def test_what_the_others_print_while_a_failed_run_is_rolled_back_does_not_bury_t
         "[camera] shutter is stuck",
     ]
     assert _said(*after) == ["[viewer] Traceback", "[camera] shutter is stuck"]
+
+
+def test_an_event_writes_findings_as_every_report_does() -> None:
+    unmatched = verdict_of(Outcome.VIOLATED, "graph.unmatched-link")
+    pair = dataclasses.replace(unmatched.findings[0], ends=("/camera", "/viewer"))
+    verdict = dataclasses.replace(unmatched, findings=(pair,))
+    record = to_record(VerdictChanged(stage=Stage.ACTIVE, verdict=verdict))
+    written = json.loads(json.dumps(record))["verdict"]["findings"]
+    assert written == json.loads(to_json(verdict))["findings"]
+    assert "ends" not in written[0]
 
 
 def test_a_verdict_that_reads_as_the_last_one_did_is_not_told_again() -> None:

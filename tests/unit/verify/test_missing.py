@@ -8,7 +8,7 @@ import pytest
 
 from lifecycle.manifest.model import EndpointKind, Policy
 from lifecycle.plan import build_plan
-from lifecycle.verify import Finding, Outcome, Stage, Verdict, missing, not_ok, verify
+from lifecycle.verify import RULES, Finding, Outcome, Stage, Verdict, missing, not_ok, verify
 from lifecycle.verify.missing import taken_on_trust
 from tests.unit.plan.samples import teleop
 from tests.unit.verify.edits import (
@@ -142,19 +142,23 @@ def test_what_is_taken_on_trust_is_named_by_rule_two_of_each_at_most():
 
 @pytest.mark.parametrize(
     ("count", "words"),
-    [(1, "/0 (a.b)"), (2, "/0, /1 (a.b)"), (3, "/0, /1 and 1 more (a.b)")],
+    [(1, "/0"), (2, "/0, /1"), (3, "/0, /1 and 1 more")],
 )
 def test_two_subjects_of_a_rule_are_named_and_the_others_counted(count, words):
-    assert trusted(*(unverifiable("a.b", f"/{each}") for each in range(count))) == words
+    found = (unverifiable("graph.missing-node", f"/{each}") for each in range(count))
+    assert trusted(*found) == f"{words} (graph.missing-node)"
 
 
 @pytest.mark.parametrize(("count", "more"), [(4, ""), (5, "; and 1 more rules")])
 def test_four_rules_are_named_and_the_others_counted(count, more):
-    found = [unverifiable(f"a.r{each}", f"/{each}") for each in range(count)]
-    assert trusted(*found) == "/0 (a.r0); /1 (a.r1); /2 (a.r2); /3 (a.r3)" + more
+    ids = [each.id for each in RULES[:count]]
+    named = "; ".join(f"/{each} ({each})" for each in ids[:4])
+    assert trusted(*(unverifiable(each, f"/{each}") for each in ids)) == named + more
 
 
-@pytest.mark.parametrize(("length", "cut"), [(494, False), (495, True), (900, True)])
+@pytest.mark.parametrize(("length", "cut"), [(479, False), (480, True), (900, True)])
 def test_what_is_taken_on_trust_is_one_line_of_at_most_500_characters(length, cut):
-    line = "x" * length + " (a.b)"
-    assert trusted(unverifiable("a.b", "x" * length)) == (line[:499] + "…" if cut else line)
+    line = "x" * length + " (graph.missing-node)"
+    assert trusted(unverifiable("graph.missing-node", "x" * length)) == (
+        line[:499] + "…" if cut else line
+    )

@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
+import lifecycle
 from lifecycle.verify import RULES, Outcome, Rule
+from lifecycle.verify.rules import About, Heals
 
 PAGE = Path(__file__).parents[3] / "docs" / "rules.md"
 
@@ -50,3 +52,18 @@ def test_a_rule_cannot_be_given_an_outcome_that_it_does_not_document():
     with pytest.raises(ValueError) as error:
         rule.finding(Outcome.UNVERIFIABLE, subject="/a", expected="", observed="", message="")
     assert str(error.value) == "cannot give rule graph.undeclared-node the outcome unverifiable"
+
+
+@pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.id)
+def test_what_is_only_not_there_yet_may_come(rule: Rule):
+    passing = rule.absence or rule.awaits or rule.about or rule.if_unheard
+    assert not passing or rule.heals is Heals.WITH_TIME
+    assert (rule.about is not About.MATCH) or rule.absence
+
+
+@pytest.mark.parametrize("room", ["supervisor", "verify", "cli"])
+def test_nobody_reads_from_the_id_of_a_rule_what_the_rule_says(room: str):
+    files = sorted((Path(lifecycle.__path__[0]) / room).rglob("*.py"))
+    assert files
+    parsed = re.compile(r"\.(rule|subject)\.(startswith|partition|rpartition|split)\(")
+    assert [each.name for each in files if parsed.search(each.read_text("utf-8"))] == []

@@ -86,6 +86,7 @@ def test_a_pair_that_is_not_matched_is_told_whole(linked: bool, rule: str, hint:
             rule=rule,
             outcome=Outcome.VIOLATED,
             subject="/a: /one → /two",
+            ends=("/one", "/two"),
             expected="matched",
             observed=reason,
             message=f"cannot see /one → /two matched on /a: {reason}",

@@ -295,6 +295,7 @@ def test_an_incompatible_pair_is_told_whole():
             rule="graph.qos-incompatible",
             outcome=Outcome.VIOLATED,
             subject="/a: /one → /two",
+            ends=("/one", "/two"),
             expected="reliability of at least RELIABLE offered",
             observed="reliability BEST_EFFORT offered",
             message="cannot match /one → /two on /a: /one offers reliability BEST_EFFORT, /two"

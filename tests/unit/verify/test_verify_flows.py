@@ -404,6 +404,7 @@ def test_a_link_whose_demand_is_not_met_is_told_whole(how: UniqueHow):
             rule="flow.not-unique",
             outcome=Outcome.VIOLATED,
             subject="/a: /one → /two",
+            ends=("/one", "/two"),
             expected=f"{how.value} unique flow",
             observed=observed,
             message="cannot accept the flow /one → /two on /a: its link demands a"
@@ -422,6 +423,7 @@ def test_a_link_whose_demand_cannot_be_proven_is_told_whole():
             rule="flow.unverifiable",
             outcome=Outcome.VIOLATED,
             subject="/a: /one → /two",
+            ends=("/one", "/two"),
             expected="strongly unique flow",
             observed=observed,
             message="cannot accept the flow /one → /two on /a: its link demands a strongly unique"
@@ -501,6 +503,7 @@ def test_a_number_that_nobody_measures_is_told_whole():
             rule="flow.not-measured",
             outcome=Outcome.UNVERIFIABLE,
             subject="/a: /one → /two",
+            ends=("/one", "/two"),
             expected="max_delay_ms 2",
             observed="not measured",
             message="cannot verify max_delay_ms 2 of the flow /one → /two on /a: nothing measures"

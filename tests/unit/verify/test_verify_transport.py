@@ -161,6 +161,7 @@ def test_a_flow_that_needs_the_network_is_violated_by_shared_memory_although_udp
             rule="flow.wrong-transport",
             outcome=Outcome.VIOLATED,
             subject="/a: /one → /two",
+            ends=("/one", "/two"),
             expected="an IP transport",
             observed="shared memory",
             message="cannot accept the flow /one → /two on /a: it needs the network, and what"
@@ -446,6 +447,7 @@ def test_a_flow_of_which_nobody_tells_that_the_network_carries_it_is_told_whole(
         rule="flow.wrong-transport",
         outcome=Outcome.UNVERIFIABLE,
         subject="/a: /one → /two",
+        ends=("/one", "/two"),
         expected="an IP transport",
         observed="not known",
         message="cannot verify the flow /one → /two on /a: it needs the network, and nobody tells"
@@ -479,6 +481,7 @@ def test_a_flow_that_another_medium_carries_is_told_whole(medium, nfes, planned_
         rule="flow.wrong-medium",
         outcome=Outcome.VIOLATED,
         subject="/a: /one → /two",
+        ends=("/one", "/two"),
         expected=planned_words,
         observed=used_words,
         message=f"cannot accept what carries /one → /two on /a: it must be {planned_words}, and it"
@@ -493,6 +496,7 @@ def test_a_flow_of_which_nobody_tells_the_medium_is_told_whole():
         rule="flow.wrong-medium",
         outcome=Outcome.UNVERIFIABLE,
         subject="/a: /one → /two",
+        ends=("/one", "/two"),
         expected="shared memory",
         observed="not known",
         message="cannot verify what carries /one → /two on /a: it must be shared memory, and"
