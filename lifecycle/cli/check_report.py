@@ -15,7 +15,7 @@ from urllib.parse import quote
 from lifecycle.codec import to_json
 from lifecycle.errors import ExitCode
 from lifecycle.manifest import Diagnostic, Severity
-from lifecycle.plan.programs import Unresolved
+from lifecycle.plan.programs.programs import Unresolved
 
 _NOT_XML = re.compile(r"[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 

@@ -356,7 +356,7 @@ def _plan(manifest: str, assignments: tuple[str, ...]) -> Plan:
 
 
 def _judged(manifest: str, assignments: tuple[str, ...], timeout_s: float) -> tuple[Plan, Verdict]:
-    from lifecycle.supervisor.attach import judge_running
+    from lifecycle.supervisor.run.attach import judge_running
 
     seen = judge_running(_plan(manifest, assignments), timeout_s=timeout_s, strict=False)
     if seen.where:

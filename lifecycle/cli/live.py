@@ -20,7 +20,8 @@ from rich.text import Text
 from lifecycle.cli.standard_streams import Writer
 from lifecycle.cli.up_output import Rollback, describe, verdict_line
 from lifecycle.printable import log_line, one_line
-from lifecycle.supervisor.events import (
+from lifecycle.supervisor.control.status import NodeStatus, SystemStatus
+from lifecycle.supervisor.run.events import (
     Event,
     Failure,
     LogLine,
@@ -31,8 +32,7 @@ from lifecycle.supervisor.events import (
     SystemReached,
     VerdictChanged,
 )
-from lifecycle.supervisor.options import UpResult
-from lifecycle.supervisor.status import NodeStatus, SystemStatus
+from lifecycle.supervisor.run.options import UpResult
 from lifecycle.verify import Outcome, render_text
 
 _REDRAW_S = 0.04

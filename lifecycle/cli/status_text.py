@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from lifecycle.printable import one_line
-from lifecycle.supervisor.status import NodeStatus, SystemStatus
+from lifecycle.supervisor.control.status import NodeStatus, SystemStatus
 from lifecycle.verify.observation import ConnectionReport
 
 _HEADS = ("node", "process", "pid", "state", "matched", "unique flows", "")

@@ -49,7 +49,7 @@ def target_run(
 
 
 def _say_differences(path: Path, plan: Plan) -> None:
-    from lifecycle.supervisor.remote import differences
+    from lifecycle.supervisor.control.client import differences
 
     if found := differences(path, plan):
         listed = "\n".join(found)
@@ -68,7 +68,7 @@ def target_plan(
         ManifestError: the manifest cannot be loaded.
     """
     from lifecycle.rundir import run_name, runtime_root
-    from lifecycle.supervisor.remote import find_run
+    from lifecycle.supervisor.control.client import find_run
 
     root = runtime_root(environment)
     if not os.path.isfile(target):  # noqa: PTH113 - Path.is_file() raises for a name too long
@@ -118,8 +118,8 @@ def give_order(  # noqa: PLR0917 - in the order of the command line
         UsageError: no such run, or no manifest to reload.
         ManifestError: the manifest cannot be loaded.
     """
-    from lifecycle.supervisor.remote import order
-    from lifecycle.supervisor.server import Ask, Question
+    from lifecycle.supervisor.control.client import order
+    from lifecycle.supervisor.control.server import Ask, Question
 
     path, plan = target_plan(os.environ, target, assignments, machine)
     if reload and plan is None:

@@ -16,9 +16,11 @@ from typing import Protocol
 import click
 
 from lifecycle.cli.standard_streams import Writer
-from lifecycle.node.control import Operation
+from lifecycle.node.host.control import Operation
 from lifecycle.printable import json_text, log_line, one_line
-from lifecycle.supervisor.events import (
+from lifecycle.supervisor.control.status import SystemStatus
+from lifecycle.supervisor.processes.states import ProcessState
+from lifecycle.supervisor.run.events import (
     Event,
     Failure,
     GateOpened,
@@ -39,9 +41,7 @@ from lifecycle.supervisor.events import (
     WiringLost,
     to_record,
 )
-from lifecycle.supervisor.options import UpResult
-from lifecycle.supervisor.states import ProcessState
-from lifecycle.supervisor.status import SystemStatus
+from lifecycle.supervisor.run.options import UpResult
 from lifecycle.verify import Outcome, Stage, Verdict, missing, not_ok, render_text, to_json
 
 

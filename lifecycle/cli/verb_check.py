@@ -19,7 +19,7 @@ from lifecycle.errors import ExitCode, LifecycleError
 from lifecycle.manifest import Diagnostic, Manifest, ManifestError, Severity, load
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.plan import check_plan, effective_domain
-from lifecycle.plan.programs import Resolution
+from lifecycle.plan.programs.programs import Resolution
 from lifecycle.printable import json_text, lines
 
 

@@ -47,7 +47,7 @@ def _show(
     from lifecycle.cli.flow_table import render_flows
     from lifecycle.cli.verb_verify import exit_code
     from lifecycle.plan import build_plan
-    from lifecycle.supervisor.attach import follow_running, judge_running
+    from lifecycle.supervisor.run.attach import follow_running, judge_running
     from lifecycle.verify import Verdict
 
     exporter = None

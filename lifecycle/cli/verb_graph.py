@@ -61,7 +61,7 @@ def command(
     if path is not None:
         _supervised(path, draw, watch=watch)
     elif plan is not None:
-        from lifecycle.supervisor.looking import attached_picture, attached_pictures
+        from lifecycle.supervisor.run.looking import attached_picture, attached_pictures
 
         if watch:
             attached_pictures(plan, draw)
@@ -93,14 +93,14 @@ def _found(
         return target_run(os.environ, target, assignments, machine), None
     from lifecycle.cli.common import load_manifest
     from lifecycle.plan import build_plan
-    from lifecycle.supervisor.looking import supervisor_of
+    from lifecycle.supervisor.run.looking import supervisor_of
 
     plan = build_plan(load_manifest(target, assignments, quiet=True).manifest)
     return supervisor_of(os.environ, plan, machine), plan
 
 
 def _supervised(path: Path, draw: Callable[[Picture], None], *, watch: bool) -> None:
-    from lifecycle.supervisor.looking import supervised_picture, supervised_pictures
+    from lifecycle.supervisor.run.looking import supervised_picture, supervised_pictures
 
     try:
         if not watch:

@@ -31,7 +31,7 @@ from lifecycle.network.ports import (
     unique_flow_ports,
 )
 from lifecycle.plan.build import build_plan, effective_domain
-from lifecycle.plan.demand import demand
+from lifecycle.plan.connections.demand import demand
 from lifecycle.plan.model import Plan
 
 THIS = "this"

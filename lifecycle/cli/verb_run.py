@@ -13,9 +13,9 @@ import click
 from lifecycle.cli.common import load_manifest
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest.model import DiscoveryRange, RunKind
-from lifecycle.middleware.doors import peers_environment
+from lifecycle.middleware.discovery.probe_targets import peers_environment
 from lifecycle.plan import Plan, PlannedNode, build_plan
-from lifecycle.plan.contacts import reached_hosts
+from lifecycle.plan.connections.contacts import reached_hosts
 
 _ROS_ARGUMENTS = "--ros-args"
 
@@ -73,9 +73,9 @@ def find_node(plan: Plan, name: str) -> PlannedNode:
 
 def _run_class(plan: Plan, planned: PlannedNode, arguments: list[str], *, lifecycle: str) -> int:
     # Late: everything before this works without ROS, and says what is wrong without it.
-    from lifecycle.node.loading import load_class
-    from lifecycle.node.node import LifecycleNode
-    from lifecycle.node.standalone import run
+    from lifecycle.node.author.loading import load_class
+    from lifecycle.node.author.node import LifecycleNode
+    from lifecycle.node.host.standalone import run
 
     if planned.run.working_directory:
         os.chdir(planned.run.working_directory)

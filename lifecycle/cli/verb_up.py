@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from lifecycle.cli.up_output import Output
     from lifecycle.programming.apply import TargetOptions, Treatment
-    from lifecycle.supervisor.options import UpResult
+    from lifecycle.supervisor.run.options import UpResult
 
 
 @click.command("up")
@@ -77,12 +77,12 @@ def command(
     --program tells networks which flows were verified before anything is activated, and takes it
     back in the end.
     """
-    from lifecycle.supervisor.ending import Ended, Ending
+    from lifecycle.supervisor.run.signals import Ended, Ending
 
     try:
         with Ending() as ending, Report(report, strict=strict) as written:
-            from lifecycle.supervisor.networks import token_variables
-            from lifecycle.supervisor.run import Forerunner
+            from lifecycle.supervisor.connections.networks import token_variables
+            from lifecycle.supervisor.run.up import Forerunner
 
             # Its imports and ours, and reading the manifest, take as long as each other: side by
             # side.

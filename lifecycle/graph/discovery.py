@@ -19,8 +19,8 @@ from lifecycle.graph.asking import Asker
 from lifecycle.graph.events import GraphEvents
 from lifecycle.graph.transport import Remove
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.middleware.census import Census
-from lifecycle.middleware.graph_queries import endpoints_of_node
+from lifecycle.middleware.rcl.graph_queries import endpoints_of_node
+from lifecycle.middleware.rcl.stale_node_filter import Census
 from lifecycle.verify.noise import fold_actions, is_noise_node, known_node, without_noise
 from lifecycle.verify.observation import (
     EndpointReport,

@@ -11,16 +11,17 @@ import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-from lifecycle.manifest import include, salvage
-from lifecycle.manifest.arguments import substitute
-from lifecycle.manifest.build import Fragment, build_fragment
-from lifecycle.manifest.cursor import Cursor
+from lifecycle.manifest import salvage
+from lifecycle.manifest.builders.cursor import Cursor
+from lifecycle.manifest.builders.system import Fragment, build_fragment
+from lifecycle.manifest.checks import check, check_sound
 from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, Severity
-from lifecycle.manifest.document import Document, error, warning
 from lifecycle.manifest.model import Manifest
-from lifecycle.manifest.schema import validate
-from lifecycle.manifest.semantics import check, check_sound
-from lifecycle.manifest.source import is_outside, read_document
+from lifecycle.manifest.schema.validation import validate
+from lifecycle.manifest.yaml import include
+from lifecycle.manifest.yaml.arguments import substitute
+from lifecycle.manifest.yaml.document import Document, error, warning
+from lifecycle.manifest.yaml.source import is_outside, read_document
 
 SUFFIX = ".lifecycle.yaml"
 """What a manifest's name ends in; plain `.yaml` belongs to ROS launch files."""

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from lifecycle.errors import ExitCode, LifecycleError
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.remapping import RemapKind, RemapRule, parse_rule
-from lifecycle.manifest.scalars import quote
+from lifecycle.manifest.yaml.scalars import quote
 
 MAX_TOPIC_LENGTH = 247
 """RMW_TOPIC_MAX_NAME_LENGTH: 255 less 8 that are reserved for prefixes."""

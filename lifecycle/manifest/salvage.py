@@ -10,13 +10,13 @@ import dataclasses
 import re
 from collections.abc import Iterable, Mapping, Sequence
 
+from lifecycle.manifest.checks import Partial
+from lifecycle.manifest.checks.partial import SEPARABLE
 from lifecycle.manifest.diagnostics import Diagnostic
-from lifecycle.manifest.document import Document, Place, Value
 from lifecycle.manifest.model import Manifest, Node
-from lifecycle.manifest.schema import MANIFEST, read_schema
-from lifecycle.manifest.semantics import Partial
-from lifecycle.manifest.semantics.partial import SEPARABLE
-from lifecycle.manifest.wording import nearest
+from lifecycle.manifest.schema.message_text import nearest
+from lifecycle.manifest.schema.validation import MANIFEST, read_schema
+from lifecycle.manifest.yaml.document import Document, Place, Value
 
 _SEGMENTS = re.compile(r"[^.\[]+")
 """Finds `nodes`, `camera`, `interface` in `nodes.camera.interface[0]`."""

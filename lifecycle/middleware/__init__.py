@@ -10,38 +10,38 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from lifecycle.middleware.clients import NodeClients
-    from lifecycle.middleware.discovery_server import (
+    from lifecycle.middleware.discovery.discovery_server import (
         discovery_server_command,
         discovery_server_listens,
     )
-    from lifecycle.middleware.dscp import get_dscp
-    from lifecycle.middleware.graph import GraphObserver
-    from lifecycle.middleware.graph_changes import on_graph_change
-    from lifecycle.middleware.graph_queries import EndpointInfo, endpoints_of
-    from lifecycle.middleware.interface_types import UnknownInterfaceError, import_interface
-    from lifecycle.middleware.matched_peers import guid_of, matched_with
-    from lifecycle.middleware.nfe import (
+    from lifecycle.middleware.fastdds.participant import FlowParticipant
+    from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
+    from lifecycle.middleware.fastdds.profiles import discovery_environment
+    from lifecycle.middleware.fastdds.settings import participant_settings
+    from lifecycle.middleware.process.control import adopt_orphans, exit_after
+    from lifecycle.middleware.process.shared_memory import leftovers, segments_of, sweep
+    from lifecycle.middleware.process.teardown import leave_and_exit
+    from lifecycle.middleware.rcl.graph import GraphObserver
+    from lifecycle.middleware.rcl.graph_changes import on_graph_change
+    from lifecycle.middleware.rcl.graph_queries import EndpointInfo, endpoints_of
+    from lifecycle.middleware.rcl.interface_types import UnknownInterfaceError, import_interface
+    from lifecycle.middleware.rcl.matched_peers import guid_of, matched_with
+    from lifecycle.middleware.rcl.qos import from_rclpy, to_rclpy
+    from lifecycle.middleware.rcl.unique import (
+        UniqueFlowNotFeasible,
+        create_publisher,
+        create_subscription,
+    )
+    from lifecycle.middleware.services.clients import NodeClients
+    from lifecycle.middleware.services.parameters import parameter_value, type_word
+    from lifecycle.middleware.services.server_watch import ServerWatch, is_server_matched
+    from lifecycle.middleware.services.service_calls import ServiceUnansweredError
+    from lifecycle.middleware.sockets.dscp import get_dscp
+    from lifecycle.middleware.sockets.nfe import (
         SHARED_MEMORY,
         NetworkFlowEndpointsUnsupported,
         get_network_flow_endpoints,
         has_shared_memory,
-    )
-    from lifecycle.middleware.parameters import parameter_value, type_word
-    from lifecycle.middleware.participant import FlowParticipant
-    from lifecycle.middleware.participant_profile import ParticipantSettings
-    from lifecycle.middleware.process import adopt_orphans, exit_after
-    from lifecycle.middleware.profiles import discovery_environment
-    from lifecycle.middleware.qos import from_rclpy, to_rclpy
-    from lifecycle.middleware.server_watch import ServerWatch, is_server_matched
-    from lifecycle.middleware.service_calls import ServiceUnansweredError
-    from lifecycle.middleware.settings import participant_settings
-    from lifecycle.middleware.shm import leftovers, segments_of, sweep
-    from lifecycle.middleware.teardown import leave_and_exit
-    from lifecycle.middleware.unique import (
-        UniqueFlowNotFeasible,
-        create_publisher,
-        create_subscription,
     )
 
 __all__ = [
@@ -84,42 +84,42 @@ __all__ = [
 ]
 
 _HOME = {
-    "SHARED_MEMORY": "nfe",
-    "EndpointInfo": "graph_queries",
-    "FlowParticipant": "participant",
-    "GraphObserver": "graph",
-    "NetworkFlowEndpointsUnsupported": "nfe",
-    "NodeClients": "clients",
-    "ParticipantSettings": "participant_profile",
-    "ServerWatch": "server_watch",
-    "ServiceUnansweredError": "service_calls",
-    "UniqueFlowNotFeasible": "unique",
-    "UnknownInterfaceError": "interface_types",
-    "adopt_orphans": "process",
-    "create_publisher": "unique",
-    "create_subscription": "unique",
-    "discovery_environment": "profiles",
-    "discovery_server_command": "discovery_server",
-    "discovery_server_listens": "discovery_server",
-    "endpoints_of": "graph_queries",
-    "exit_after": "process",
-    "from_rclpy": "qos",
-    "get_dscp": "dscp",
-    "get_network_flow_endpoints": "nfe",
-    "guid_of": "matched_peers",
-    "has_shared_memory": "nfe",
-    "import_interface": "interface_types",
-    "is_server_matched": "server_watch",
-    "leave_and_exit": "teardown",
-    "leftovers": "shm",
-    "matched_with": "matched_peers",
-    "on_graph_change": "graph_changes",
-    "parameter_value": "parameters",
-    "participant_settings": "settings",
-    "segments_of": "shm",
-    "sweep": "shm",
-    "to_rclpy": "qos",
-    "type_word": "parameters",
+    "SHARED_MEMORY": "sockets.nfe",
+    "EndpointInfo": "rcl.graph_queries",
+    "FlowParticipant": "fastdds.participant",
+    "GraphObserver": "rcl.graph",
+    "NetworkFlowEndpointsUnsupported": "sockets.nfe",
+    "NodeClients": "services.clients",
+    "ParticipantSettings": "fastdds.participant_profile",
+    "ServerWatch": "services.server_watch",
+    "ServiceUnansweredError": "services.service_calls",
+    "UniqueFlowNotFeasible": "rcl.unique",
+    "UnknownInterfaceError": "rcl.interface_types",
+    "adopt_orphans": "process.control",
+    "create_publisher": "rcl.unique",
+    "create_subscription": "rcl.unique",
+    "discovery_environment": "fastdds.profiles",
+    "discovery_server_command": "discovery.discovery_server",
+    "discovery_server_listens": "discovery.discovery_server",
+    "endpoints_of": "rcl.graph_queries",
+    "exit_after": "process.control",
+    "from_rclpy": "rcl.qos",
+    "get_dscp": "sockets.dscp",
+    "get_network_flow_endpoints": "sockets.nfe",
+    "guid_of": "rcl.matched_peers",
+    "has_shared_memory": "sockets.nfe",
+    "import_interface": "rcl.interface_types",
+    "is_server_matched": "services.server_watch",
+    "leave_and_exit": "process.teardown",
+    "leftovers": "process.shared_memory",
+    "matched_with": "rcl.matched_peers",
+    "on_graph_change": "rcl.graph_changes",
+    "parameter_value": "services.parameters",
+    "participant_settings": "fastdds.settings",
+    "segments_of": "process.shared_memory",
+    "sweep": "process.shared_memory",
+    "to_rclpy": "rcl.qos",
+    "type_word": "services.parameters",
 }
 
 

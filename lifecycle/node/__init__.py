@@ -10,13 +10,13 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from lifecycle.node.connection_events import ConnectionEvent, ConnectionEventKind
-    from lifecycle.node.connections import Connection
-    from lifecycle.node.goal_run import GoalInterruptedError
-    from lifecycle.node.handlers import on_action, on_goal, on_message, on_service, on_timer
-    from lifecycle.node.node import LifecycleNode
-    from lifecycle.node.returns import ERROR, FAILURE, SUCCESS, TransitionCallbackReturn
-    from lifecycle.node.standalone import run
+    from lifecycle.node.actions.goal_run import GoalInterruptedError
+    from lifecycle.node.author.handlers import on_action, on_goal, on_message, on_service, on_timer
+    from lifecycle.node.author.node import LifecycleNode
+    from lifecycle.node.author.returns import ERROR, FAILURE, SUCCESS, TransitionCallbackReturn
+    from lifecycle.node.connections.connection_events import ConnectionEvent, ConnectionEventKind
+    from lifecycle.node.connections.connections import Connection
+    from lifecycle.node.host.standalone import run
 
 __all__ = [
     "ERROR",
@@ -28,7 +28,6 @@ __all__ = [
     "GoalInterruptedError",
     "LifecycleNode",
     "TransitionCallbackReturn",
-    "host",
     "on_action",
     "on_goal",
     "on_message",
@@ -38,28 +37,26 @@ __all__ = [
 ]
 
 _HOME = {
-    "Connection": "connections",
-    "ConnectionEvent": "connection_events",
-    "ConnectionEventKind": "connection_events",
-    "ERROR": "returns",
-    "FAILURE": "returns",
-    "SUCCESS": "returns",
-    "GoalInterruptedError": "goal_run",
-    "LifecycleNode": "node",
-    "TransitionCallbackReturn": "returns",
-    "on_action": "handlers",
-    "on_goal": "handlers",
-    "on_message": "handlers",
-    "on_service": "handlers",
-    "on_timer": "handlers",
-    "run": "standalone",
+    "Connection": "connections.connections",
+    "ConnectionEvent": "connections.connection_events",
+    "ConnectionEventKind": "connections.connection_events",
+    "ERROR": "author.returns",
+    "FAILURE": "author.returns",
+    "SUCCESS": "author.returns",
+    "GoalInterruptedError": "actions.goal_run",
+    "LifecycleNode": "author.node",
+    "TransitionCallbackReturn": "author.returns",
+    "on_action": "author.handlers",
+    "on_goal": "author.handlers",
+    "on_message": "author.handlers",
+    "on_service": "author.handlers",
+    "on_timer": "author.handlers",
+    "run": "host.standalone",
 }
 
 
 def __getattr__(name: str) -> object:
     """Import the module that defines `name` (PEP 562)."""
-    if name == "host":
-        return importlib.import_module("lifecycle.node.host")
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)

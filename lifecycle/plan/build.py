@@ -14,10 +14,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from lifecycle.errors import UsageError
-from lifecycle.manifest.ament_index import search_prefixes
 from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position
-from lifecycle.manifest.document import error
-from lifecycle.manifest.flow_needs import FlowNeeds, ParticipantGroup, ResolvedNeed
+from lifecycle.manifest.flows.flow_needs import FlowNeeds, ParticipantGroup, ResolvedNeed
 from lifecycle.manifest.model import (
     Discovery,
     DiscoveryMode,
@@ -29,11 +27,14 @@ from lifecycle.manifest.model import (
     RunKind,
 )
 from lifecycle.manifest.names import resolve
-from lifecycle.manifest.source import read_bytes
-from lifecycle.manifest.type_hash import installed_hash
+from lifecycle.manifest.types.ament_index import search_prefixes
+from lifecycle.manifest.types.type_hash import installed_hash
+from lifecycle.manifest.yaml.document import error
+from lifecycle.manifest.yaml.source import read_bytes
 from lifecycle.network.ports import MAX_DOMAIN_ID, domain_of
 from lifecycle.network.rmw_capabilities import DEFAULT_RMW
-from lifecycle.plan.declared_connections import place_declared
+from lifecycle.plan.connections.declared_connections import place_declared
+from lifecycle.plan.connections.wiring import Wired, variables_of, wire
 from lifecycle.plan.errors import PlanError
 from lifecycle.plan.flows import planned_flows
 from lifecycle.plan.levels import dependency_levels
@@ -41,7 +42,6 @@ from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedFile, PlannedNode
 from lifecycle.plan.parameters import ParameterFiles
 from lifecycle.plan.participants import place_flows
 from lifecycle.plan.processes import planned_processes, process_name
-from lifecycle.plan.wiring import Wired, variables_of, wire
 
 
 def build_plan(manifest: Manifest, *, environment: Mapping[str, str] | None = None) -> Plan:

@@ -1,7 +1,7 @@
 """Extra participants for endpoints that need a network flow or a mark of their own.
 
-Owns: naming and describing the participants that `lifecycle.manifest.flow_needs` groups endpoints
-into, and what one costs. On Fast DDS a publisher's
+Owns: naming and describing the participants that `manifest/flows/flow_needs.py` groups
+endpoints into, and what one costs. On Fast DDS a publisher's
 network flow endpoints are its participant's sender sockets, so only a participant of its own makes
 it unique, and only all publishers of one participant together can carry a DSCP. From the same
 sockets subscriptions send their acknowledgements. Pure.
@@ -12,7 +12,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
-from lifecycle.manifest.flow_needs import ParticipantGroup
+from lifecycle.manifest.flows.flow_needs import ParticipantGroup
 from lifecycle.network.dscp import describe
 from lifecycle.plan.model import PlannedEndpoint, PlannedParticipant
 

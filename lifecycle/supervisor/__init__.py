@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from lifecycle.rundir import AlreadyRunningError, run_name, runtime_root
-    from lifecycle.supervisor.attach import follow_running, judge_running
-    from lifecycle.supervisor.events import Emitter, Event, Listener, to_record
-    from lifecycle.supervisor.failure import ended_early
-    from lifecycle.supervisor.options import Until, UpOptions, UpResult
-    from lifecycle.supervisor.remote import down, find_run, running, status
-    from lifecycle.supervisor.run import Forerunner, up
-    from lifecycle.supervisor.status import NodeStatus, SystemStatus
+    from lifecycle.supervisor.control.client import down, find_run, running, status
+    from lifecycle.supervisor.control.status import NodeStatus, SystemStatus
+    from lifecycle.supervisor.run.attach import follow_running, judge_running
+    from lifecycle.supervisor.run.events import Emitter, Event, Listener, to_record
+    from lifecycle.supervisor.run.failure import ended_early
+    from lifecycle.supervisor.run.options import Until, UpOptions, UpResult
+    from lifecycle.supervisor.run.up import Forerunner, up
 
 __all__ = [
     "AlreadyRunningError",
@@ -46,26 +46,26 @@ __all__ = [
 
 _HOME = {
     "AlreadyRunningError": ".rundir",
-    "Emitter": "events",
-    "Event": "events",
-    "Forerunner": "run",
-    "Listener": "events",
-    "NodeStatus": "status",
-    "SystemStatus": "status",
-    "Until": "options",
-    "UpOptions": "options",
-    "UpResult": "options",
-    "down": "remote",
-    "ended_early": "failure",
-    "find_run": "remote",
-    "follow_running": "attach",
-    "judge_running": "attach",
+    "Emitter": "run.events",
+    "Event": "run.events",
+    "Forerunner": "run.up",
+    "Listener": "run.events",
+    "NodeStatus": "control.status",
+    "SystemStatus": "control.status",
+    "Until": "run.options",
+    "UpOptions": "run.options",
+    "UpResult": "run.options",
+    "down": "control.client",
+    "ended_early": "run.failure",
+    "find_run": "control.client",
+    "follow_running": "run.attach",
+    "judge_running": "run.attach",
     "run_name": ".rundir",
-    "running": "remote",
+    "running": "control.client",
     "runtime_root": ".rundir",
-    "status": "remote",
-    "to_record": "events",
-    "up": "run",
+    "status": "control.client",
+    "to_record": "run.events",
+    "up": "run.up",
 }
 
 

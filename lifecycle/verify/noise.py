@@ -15,7 +15,7 @@ import re
 from collections.abc import Collection, Iterable, Mapping
 
 from lifecycle.manifest.model import TOLERATED_NODES, EndpointKind
-from lifecycle.manifest.type_hash import join
+from lifecycle.manifest.types.type_hash import join
 from lifecycle.plan.model import Plan
 from lifecycle.verify.observation import ObservedEndpoint
 

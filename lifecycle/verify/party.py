@@ -10,10 +10,10 @@ from collections.abc import Collection
 
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.network.nfe import UniqueRequirement
-from lifecycle.plan.contacts import contacts_of
-from lifecycle.plan.data_layer import RMW_DEFAULT, TRANSPORTS, Party, PartyEndpoint
+from lifecycle.plan.connections.contacts import contacts_of
 from lifecycle.plan.model import PlannedNode
-from lifecycle.plan.parties import FAST_DDS, endpoint_of, transports_of
+from lifecycle.plan.negotiation.data_layer import RMW_DEFAULT, TRANSPORTS, Party, PartyEndpoint
+from lifecycle.plan.negotiation.parties import FAST_DDS, endpoint_of, transports_of
 from lifecycle.verify.observation import ConnectionReport, EndpointReport, NodeConfiguration
 
 _OWN_FLOW = (UniqueRequirement.STRICTLY_REQUIRED, UniqueRequirement.OPTIONALLY_REQUIRED)
@@ -33,7 +33,7 @@ def party_of(
 
     Args:
         configuration: as the node reports it.
-        host: its host, see `lifecycle.plan.hosts`.
+        host: its host, see `lifecycle.plan.connections.hosts`.
         planned: the node as the manifest declares it; None if it does not.
         negotiated: names of connections that a negotiation made before: it may unmake them. Others
             are somebody else's, and what is mapped onto them stays there.

@@ -16,7 +16,7 @@ from lifecycle.codec import to_json, to_plain
 from lifecycle.manifest import load
 from lifecycle.plan import build_plan
 from lifecycle.rundir import connect
-from lifecycle.supervisor.server import Ask, Question, ask
+from lifecycle.supervisor.control.server import Ask, Question, ask
 from tests.hostile.attack import (
     Attack,
     HostileClass,

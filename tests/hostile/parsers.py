@@ -22,10 +22,10 @@ from lifecycle.graph.messages import GraphMessageError, Joined, encode
 from lifecycle.graph.messages import decode as decode_message
 from lifecycle.manifest import ManifestError, load
 from lifecycle.manifest.diagnostics import Position
-from lifecycle.manifest.idl import IdlError, parse_struct
-from lifecycle.manifest.nodl import read_interface
-from lifecycle.manifest.type_hash import _hashes
-from lifecycle.node.control import Event
+from lifecycle.manifest.nodl.document import read_interface
+from lifecycle.manifest.types.idl import IdlError, parse_struct
+from lifecycle.manifest.types.type_hash import _hashes
+from lifecycle.node.host.control import Event
 from lifecycle.plan.notice import PlanNoticeError, announced_plan, notice_of
 from lifecycle.plan.notice import decode as decode_notice
 from lifecycle.plan.notice import encode as encode_notice
@@ -36,7 +36,7 @@ from lifecycle.programming.apply.settings import load_settings
 from lifecycle.programming.apply.tool import HostTool, Output
 from lifecycle.programming.rules.nftables import parse_managed_comment
 from lifecycle.rundir import read_record
-from lifecycle.supervisor.server import Answer, Question
+from lifecycle.supervisor.control.server import Answer, Question
 from lifecycle.verify import Stage
 from lifecycle.verify.observation import ConfigurationError, decode_configuration
 from tests.hostile.attack import Attack, HostileClass, Place, mutated

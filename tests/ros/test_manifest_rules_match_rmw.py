@@ -18,6 +18,8 @@ from rclpy.impl.implementation_singleton import rclpy_implementation as rcl
 from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 from rclpy.validate_full_topic_name import validate_full_topic_name
 
+from lifecycle.manifest.checks.parameters.parameter_sections import read_sections
+from lifecycle.manifest.checks.parameters.parameter_types import type_of
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.names import (
     NameNotLegalError,
@@ -40,8 +42,6 @@ from lifecycle.manifest.qos import (
     incompatibilities,
 )
 from lifecycle.manifest.remapping import RemapRuleError, parse_rule
-from lifecycle.manifest.semantics.parameter_sections import read_sections
-from lifecycle.manifest.semantics.parameter_types import type_of
 
 pytestmark = pytest.mark.ros
 

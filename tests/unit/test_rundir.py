@@ -24,10 +24,10 @@ from lifecycle.rundir import (
     runtime_root,
     short_path,
 )
-from lifecycle.supervisor import server
-from lifecycle.supervisor.remote import find_run, running
-from lifecycle.supervisor.server import Ask, ControlServer, Question, ask, follow
-from lifecycle.supervisor.status import SystemStatus
+from lifecycle.supervisor.control import server
+from lifecycle.supervisor.control.client import find_run, running
+from lifecycle.supervisor.control.server import Ask, ControlServer, Question, ask, follow
+from lifecycle.supervisor.control.status import SystemStatus
 from tests.unit.supervisor.fakes import plan_of, planned_node
 
 STATUS = SystemStatus(

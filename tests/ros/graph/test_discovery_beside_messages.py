@@ -40,8 +40,9 @@ def test_a_node_that_reports_is_asked_although_its_services_are_not_shown_yet(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     # The graph shows /it, and nothing on it yet.
-    monkeypatch.setattr("lifecycle.middleware.census.node_names", lambda _: ["/it"])
-    monkeypatch.setattr("lifecycle.middleware.census.endpoints_of", lambda *_, **__: [])
+    filtering = "lifecycle.middleware.rcl.stale_node_filter"
+    monkeypatch.setattr(f"{filtering}.node_names", lambda _: ["/it"])
+    monkeypatch.setattr(f"{filtering}.endpoints_of", lambda *_, **__: [])
     monkeypatch.setattr("lifecycle.graph.discovery.endpoints_of_node", lambda *_: [])
     scheduler = ManualScheduler()
     network = InMemoryNetwork(scheduler)

@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import pytest
 
 from lifecycle.graph import Observer
-from lifecycle.middleware.graph import PATIENCE_S
+from lifecycle.middleware.rcl.graph import PATIENCE_S
 from tests.stalls import Stalls, assert_in_time, noted_stalls
 
 pytestmark = pytest.mark.ros

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import pytest
 
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.middleware.graph import GraphObserver
+from lifecycle.middleware.rcl.graph import GraphObserver
 from tests.ros.faults.system import BARE_DDS
 
 pytestmark = pytest.mark.ros

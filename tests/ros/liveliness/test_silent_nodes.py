@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 import yaml
 
-from lifecycle.middleware.healing import tell_names
+from lifecycle.middleware.discovery.rediscovery import tell_names
 from tests.ros.supervisor.running import ROOT, Event, Up, environment, up, verb
 from tests.stalls import Stalls, assert_in_time, noted_stalls
 

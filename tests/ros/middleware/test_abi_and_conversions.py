@@ -19,13 +19,13 @@ from lifecycle.middleware import (
     NetworkFlowEndpointsUnsupported,
     UniqueFlowNotFeasible,
     UnknownInterfaceError,
-    abi,
     create_subscription,
     from_rclpy,
     get_network_flow_endpoints,
     import_interface,
     to_rclpy,
 )
+from lifecycle.middleware.rcl import abi
 from lifecycle.network.nfe import UniqueRequirement
 
 MakeNode = Callable[..., Node]
@@ -245,7 +245,7 @@ def test_a_package_that_fails_to_import_is_not_said_to_be_missing(
         raise ModuleNotFoundError("No module named 'numpy'", name="numpy")
 
     monkeypatch.setattr(
-        "lifecycle.middleware.interface_types.importlib",
+        "lifecycle.middleware.rcl.interface_types.importlib",
         SimpleNamespace(import_module=import_module),
     )
     with pytest.raises(ModuleNotFoundError, match="numpy"):

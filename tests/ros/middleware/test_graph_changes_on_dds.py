@@ -11,7 +11,8 @@ import rclpy
 from rclpy.node import Node
 from std_msgs.msg import String
 
-from lifecycle.middleware import graph_guard, on_graph_change
+from lifecycle.middleware import on_graph_change
+from lifecycle.middleware.rcl import graph_guard
 
 BOUND_S = 30.0
 

@@ -22,8 +22,8 @@ from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import Durability, History, QosProfile, Reliability
 from lifecycle.middleware import FlowParticipant, GraphObserver, to_rclpy
-from lifecycle.middleware.graph_queries import endpoints_of, node_names
-from lifecycle.middleware.hidden_node import quiet_node
+from lifecycle.middleware.rcl.graph_queries import endpoints_of, node_names
+from lifecycle.middleware.rcl.hidden_node import quiet_node
 from lifecycle.verify.observation import ObservedNode
 from tests.ros.faults.system import BARE_DDS
 from tests.ros.supervisor.running import ROOT

@@ -26,7 +26,7 @@ from lifecycle.middleware import (
     get_dscp,
     get_network_flow_endpoints,
 )
-from lifecycle.middleware import unique as creation
+from lifecycle.middleware.rcl import unique as creation
 from lifecycle.network.nfe import TransportProtocol, UniqueRequirement
 
 MakeNode = Callable[..., Node]
@@ -106,7 +106,7 @@ def test_not_required_goes_through_rclpy_untouched(
     def refuse() -> None:
         raise AssertionError("rcl was loaded")
 
-    monkeypatch.setattr("lifecycle.middleware.abi.load", refuse)
+    monkeypatch.setattr("lifecycle.middleware.rcl.abi.load", refuse)
     node = make_node("node")
     assert create_publisher(node, String, "/a", QOS) in node.publishers
     assert create_subscription(node, String, "/a", ignore, QOS) in node.subscriptions

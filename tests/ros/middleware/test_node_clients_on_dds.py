@@ -137,7 +137,7 @@ def test_a_transition_that_fails_is_told_apart_from_one_that_succeeds(
 @pytest.fixture
 def soon_read_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without an answer the state is looked at earlier than by default."""
-    monkeypatch.setattr("lifecycle.middleware.clients._REREAD_S", 0.2)
+    monkeypatch.setattr("lifecycle.middleware.services.clients._REREAD_S", 0.2)
 
 
 @pytest.mark.usefixtures("soon_read_again")

@@ -27,7 +27,7 @@ from lifecycle.middleware import (
     has_shared_memory,
     participant_settings,
 )
-from lifecycle.middleware.discovery_range import without_localhost
+from lifecycle.middleware.discovery.discovery_range import without_localhost
 from lifecycle.network.nfe import NetworkFlowEndpoint, TransportProtocol
 from lifecycle.verify.observation import Identity
 from lifecycle.verify.transport import carrier
@@ -318,7 +318,7 @@ def test_a_participant_without_a_dscp_sends_none(domain_id: int, wait_until: Wai
 
 
 def test_a_mark_that_was_lost_is_set_again(domain_id: int) -> None:
-    from lifecycle.middleware.dscp import set_dscp
+    from lifecycle.middleware.sockets.dscp import set_dscp
 
     with FlowParticipant("_flow", "/", domain_id, dscp=46) as participant:
         participant.create_publisher(String, "/flow", QOS)
@@ -330,7 +330,7 @@ def test_a_mark_that_was_lost_is_set_again(domain_id: int) -> None:
 
 
 def test_one_socket_without_the_mark_is_what_is_read(domain_id: int) -> None:
-    from lifecycle.middleware.dscp import get_dscps, set_dscp
+    from lifecycle.middleware.sockets.dscp import get_dscps, set_dscp
 
     with FlowParticipant("_flow", "/", domain_id, dscp=46, transports=BOTH) as participant:
         nfes = participant.network_flow_endpoints
@@ -346,7 +346,7 @@ def test_one_socket_without_the_mark_is_what_is_read(domain_id: int) -> None:
 def test_a_mark_that_was_lost_is_set_again_before_a_subscription_is_handed_out(
     domain_id: int,
 ) -> None:
-    from lifecycle.middleware.dscp import set_dscp
+    from lifecycle.middleware.sockets.dscp import set_dscp
 
     with FlowParticipant("_flow", "/", domain_id, dscp=46) as participant:
         set_dscp(participant.network_flow_endpoints, 0)
@@ -360,7 +360,7 @@ def test_sockets_that_came_later_are_marked_before_a_publisher_is_handed_out(
     with FlowParticipant("_flow", "/", domain_id, dscp=46) as participant:
         # As if the participant had been made before one of its sockets was there.
         later = participant.network_flow_endpoints
-        from lifecycle.middleware.dscp import get_dscps, set_dscp
+        from lifecycle.middleware.sockets.dscp import get_dscps, set_dscp
 
         set_dscp(later[-1:], 0)
         participant._nfes = later[:-1]
@@ -400,7 +400,7 @@ def test_static_peers_and_the_range_are_read_and_left_as_they_were(
 
 def test_another_rmw_is_refused_in_words(domain_id: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        "lifecycle.middleware.settings.get_rmw_implementation_identifier",
+        "lifecycle.middleware.fastdds.settings.get_rmw_implementation_identifier",
         lambda: "rmw_cyclonedds_cpp",
     )
     with pytest.raises(MiddlewareError) as refused:

@@ -16,7 +16,7 @@ from planning import planned
 
 from lifecycle import codec
 from lifecycle.manifest.model import DiscoveryRange, Run, RunKind
-from lifecycle.node.control import Command, Event, HostSpec, Operation
+from lifecycle.node.host.control import Command, Event, HostSpec, Operation
 from lifecycle.plan.model import PlannedNode
 
 HERE = Path(__file__).parent
@@ -36,7 +36,12 @@ class HostProcess:
         self.log = log
         with log.open("w", encoding="utf-8") as stderr, theirs:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "lifecycle.node.host", f"--control-fd={theirs.fileno()}"],
+                [
+                    sys.executable,
+                    "-m",
+                    "lifecycle.node.host.host",
+                    f"--control-fd={theirs.fileno()}",
+                ],
                 pass_fds=[theirs.fileno()],
                 cwd=HERE,
                 stderr=stderr,

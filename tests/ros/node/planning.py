@@ -12,8 +12,8 @@ import rclpy
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import QosProfile
-from lifecycle.node.node import LifecycleNode
-from lifecycle.node.spec import Construction, Mode, constructing, plan_without_manifest
+from lifecycle.node.author.node import LifecycleNode
+from lifecycle.node.author.spec import Construction, Mode, constructing, plan_without_manifest
 from lifecycle.plan.model import PlannedEndpoint, PlannedNode
 
 AT = Position(file="test.lifecycle.yaml", line=7, column=5, path="nodes.it")

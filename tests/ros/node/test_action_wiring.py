@@ -21,8 +21,8 @@ from test_msgs.action import Fibonacci
 
 from lifecycle import LifecycleNode, on_message
 from lifecycle.errors import LifecycleError
-from lifecycle.middleware.action_client import ActionClientGoneError
-from lifecycle.node.blocking import DeadlockError
+from lifecycle.middleware.services.action_client import ActionClientGoneError
+from lifecycle.node.author.blocking import DeadlockError
 
 Active = Callable[..., Any]
 Ask = Callable[..., Asking]

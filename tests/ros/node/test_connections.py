@@ -21,11 +21,11 @@ from lifecycle import LifecycleNode, codec, on_message, on_service
 from lifecycle.manifest.model import Authority
 from lifecycle.manifest.qos import Durability
 from lifecycle.network.nfe import TransportProtocol, UniqueRequirement
-from lifecycle.node import handover
-from lifecycle.node.connection_events import ConnectionEvent, ConnectionEventKind
-from lifecycle.node.connections import ConnectError, UnknownConnectionError
-from lifecycle.node.endpoint_names import UnknownEndpointError
-from lifecycle.node.node_interface import NotConfiguredError
+from lifecycle.node.connections.connection_events import ConnectionEvent, ConnectionEventKind
+from lifecycle.node.connections.connections import ConnectError, UnknownConnectionError
+from lifecycle.node.connections.node_interface import NotConfiguredError
+from lifecycle.node.endpoints import handover
+from lifecycle.node.endpoints.endpoint_names import UnknownEndpointError
 from lifecycle.plan.model import ParticipantConnections, PlannedParticipant
 from lifecycle.verify.observation import NodeConfiguration
 

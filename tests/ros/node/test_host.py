@@ -19,7 +19,7 @@ from std_msgs.msg import String
 
 from lifecycle import codec
 from lifecycle.manifest.model import DiscoveryRange, Timeouts
-from lifecycle.node.control import Event, HostSpec, Operation
+from lifecycle.node.host.control import Event, HostSpec, Operation
 
 HERE = Path(__file__).parent
 CONFIGURE, CONNECT, ACTIVATE = Operation.CONFIGURE, Operation.CONNECT, Operation.ACTIVATE
@@ -205,7 +205,7 @@ def test_a_supervisor_that_goes_before_it_speaks_leaves_nothing(tmp_path: Path) 
     ours, theirs = socket.socketpair()
     with theirs:
         process = subprocess.Popen(
-            [sys.executable, "-m", "lifecycle.node.host", f"--control-fd={theirs.fileno()}"],
+            [sys.executable, "-m", "lifecycle.node.host.host", f"--control-fd={theirs.fileno()}"],
             pass_fds=[theirs.fileno()],
         )
     ours.close()
@@ -215,7 +215,7 @@ def test_a_supervisor_that_goes_before_it_speaks_leaves_nothing(tmp_path: Path) 
 def test_importing_the_host_needs_no_ros_and_preloading_starts_nothing() -> None:
     code = """
 import sys, threading
-from lifecycle.node import host
+from lifecycle.node.host import host
 assert not [name for name in sys.modules if name.startswith("rclpy")], "host imports rclpy"
 host.preload()
 import rclpy
@@ -234,7 +234,7 @@ def test_a_fork_of_a_preloaded_process_can_host(fresh_domain: int, tmp_path: Pat
     ours.settimeout(20)
     code = f"""
 import gc, os
-from lifecycle.node import host
+from lifecycle.node.host import host
 host.preload()
 gc.freeze()
 if os.fork() == 0:

@@ -15,7 +15,7 @@ from rcl_interfaces.srv import SetParameters
 from std_msgs.msg import String
 
 from lifecycle import LifecycleNode, codec, on_message
-from lifecycle.node.control import Operation
+from lifecycle.node.host.control import Operation
 from lifecycle.plan.model import ParticipantConnections
 from lifecycle.verify.observation import NodeConfiguration
 

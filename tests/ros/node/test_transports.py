@@ -18,7 +18,7 @@ from std_msgs.msg import String
 from lifecycle import LifecycleNode, codec
 from lifecycle.middleware import discovery_environment
 from lifecycle.network.nfe import NetworkFlowEndpoint, UniqueRequirement, is_ip
-from lifecycle.node.control import Event, Operation
+from lifecycle.node.host.control import Event, Operation
 from lifecycle.plan.model import PlannedParticipant
 from lifecycle.verify.observation import EndpointReport, NodeConfiguration
 

@@ -178,7 +178,8 @@ def fork_server(run: Up) -> psutil.Process | None:
         (
             each
             for each in psutil.Process(run.process.pid).children()
-            if "lifecycle.supervisor.zygote_main" in each.cmdline() and each.pid not in forks
+            if "lifecycle.supervisor.processes.fork_server_main" in each.cmdline()
+            and each.pid not in forks
         ),
         None,
     )

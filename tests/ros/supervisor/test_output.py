@@ -24,7 +24,7 @@ import pytest
 
 from lifecycle.errors import ExitCode
 from lifecycle.rundir import short_path
-from lifecycle.supervisor.server import Ask, Question, ask
+from lifecycle.supervisor.control.server import Ask, Question, ask
 from tests.ros.supervisor.running import (
     BOUND_S,
     ROOT,

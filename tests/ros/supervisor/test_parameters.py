@@ -14,7 +14,7 @@ from rcl_interfaces.srv import SetParameters
 
 from lifecycle.errors import ExitCode
 from lifecycle.middleware import GraphObserver
-from lifecycle.middleware.service_calls import ServiceCalls
+from lifecycle.middleware.services.service_calls import ServiceCalls
 from tests.ros.supervisor.running import BOUND_S, ENOUGH, ROOT, Up, pair, up, verb
 
 ARM = str(ROOT / "tests" / "ros" / "supervisor" / "with_parameters.py")

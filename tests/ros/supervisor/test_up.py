@@ -21,7 +21,7 @@ from rclpy.node import Node
 
 from lifecycle.errors import ExitCode
 from lifecycle.middleware import segments_of
-from lifecycle.supervisor.judge import SETTLED_S
+from lifecycle.supervisor.gate.verification_loop import SETTLED_S
 from tests.ros.supervisor.running import (
     BOUND_S,
     ROOT,
@@ -478,9 +478,9 @@ def test_a_plain_command_is_started_verified_and_ended(tmp_path: Path, fresh_dom
 
 _HANGS_IN_FAST_DDS = """
 import threading
-import lifecycle.supervisor.run as run
+import lifecycle.supervisor.run.up as run
 from lifecycle.cli import program
-from lifecycle.supervisor.eyes import Eyes
+from lifecycle.supervisor.nodes.observer_participant import Eyes
 run.LEAVE_S = 1.0
 Eyes.destroy = lambda self: threading.Event().wait()
 raise SystemExit(program())

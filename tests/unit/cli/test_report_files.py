@@ -20,8 +20,8 @@ from lifecycle.cli.verb_up import _finished
 from lifecycle.errors import ExitCode, MiddlewareError, UsageError
 from lifecycle.manifest import Diagnostic, ManifestError, Position, Severity
 from lifecycle.plan import build_plan
-from lifecycle.supervisor.ending import Ended
-from lifecycle.supervisor.options import UpResult
+from lifecycle.supervisor.run.options import UpResult
+from lifecycle.supervisor.run.signals import Ended
 from lifecycle.verify import Outcome, Stage, Verdict, verify
 from tests.unit.plan.samples import teleop
 from tests.unit.verify.edits import drop_node

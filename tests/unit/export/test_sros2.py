@@ -15,8 +15,8 @@ from lifecycle.cli import cli
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.export.sros2 import OVERRIDE, PLANS_TOPIC, Enclave, documents, enclaves_of
 from lifecycle.manifest import load
-from lifecycle.middleware import plan_notices
-from lifecycle.middleware.liveliness import machine_topic, node_topic
+from lifecycle.middleware.discovery import plan_notices
+from lifecycle.middleware.discovery.liveliness import machine_topic, node_topic
 from lifecycle.plan import Plan, build_plan
 
 ROOT = Path(__file__).parents[3]

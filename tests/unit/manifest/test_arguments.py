@@ -6,8 +6,8 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from lifecycle.manifest.arguments import MAX_TEXT, Substituted, substitute
-from lifecycle.manifest.source import parse
+from lifecycle.manifest.yaml.arguments import MAX_TEXT, Substituted, substitute
+from lifecycle.manifest.yaml.source import parse
 
 NONE: dict[str, str] = {}
 

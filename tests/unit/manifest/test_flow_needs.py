@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from lifecycle.manifest import load
-from lifecycle.manifest.flow_needs import FlowNeeds, ParticipantGroup
-from lifecycle.manifest.marking import identifiers, marking_of
+from lifecycle.manifest.flows.dscp_resolution import identifiers, marking_of
+from lifecycle.manifest.flows.flow_needs import FlowNeeds, ParticipantGroup
 from lifecycle.manifest.model import (
     EndpointKind,
     FlowIdentification,

@@ -11,8 +11,8 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from lifecycle.manifest import ManifestError, load
-from lifecycle.manifest.compose import compose
-from lifecycle.manifest.schema import read_schema
+from lifecycle.manifest.schema.validation import read_schema
+from lifecycle.manifest.yaml.yaml_parser import compose
 
 SLOW = settings(
     max_examples=150,
@@ -161,7 +161,7 @@ def test_what_only_yaml_1_2_counts_among_numbers_is_one(text: str, number: float
 def test_the_c_parser_and_the_python_parser_agree(
     loader: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("lifecycle.manifest.compose._Loader", getattr(yaml, loader))
+    monkeypatch.setattr("lifecycle.manifest.yaml.yaml_parser._Loader", getattr(yaml, loader))
     text = "a: [1, 'x', &n {b: on}]\nc: *n\nd: |\n  text\ne:\n"
     document, found = compose(text, file="f")
     assert found == ()

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lifecycle.manifest.checks import check
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import (
     After,
@@ -26,7 +27,6 @@ from lifecycle.manifest.model import (
     UniqueHow,
 )
 from lifecycle.manifest.qos import PRESETS
-from lifecycle.manifest.semantics import check
 from lifecycle.network.nfe import UniqueRequirement
 
 Findings = Callable[..., list[str]]

@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
+from lifecycle.manifest.checks import check
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import (
     Endpoint,
@@ -24,7 +25,6 @@ from lifecycle.manifest.model import (
     UniqueHow,
 )
 from lifecycle.manifest.qos import PRESETS, QosProfile, Reliability
-from lifecycle.manifest.semantics import check
 from lifecycle.network.nfe import UniqueRequirement
 
 Findings = Callable[..., list[str]]

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lifecycle.manifest.checks import check
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import After, Condition, Manifest, Node, Run, RunKind
-from lifecycle.manifest.semantics import check
 
 Findings = Callable[..., list[str]]
 

@@ -6,10 +6,15 @@ from collections.abc import Callable
 
 import pytest
 
+from lifecycle.manifest.checks.parameters.parameter_sections import Section
+from lifecycle.manifest.checks.parameters.parameter_types import (
+    misfit,
+    read_scalar,
+    suggestion,
+    type_of,
+)
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import ParameterValue
-from lifecycle.manifest.semantics.parameter_sections import Section
-from lifecycle.manifest.semantics.parameter_types import misfit, read_scalar, suggestion, type_of
 
 Findings = Callable[..., list[str]]
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from lifecycle.manifest import ManifestError, load
-from lifecycle.manifest.source import MAX_BYTES, parse, read_document
+from lifecycle.manifest.yaml.source import MAX_BYTES, parse, read_document
 
 GOOD = "manifest_version: 1\nsystem: test\nnodes: {talker: {attach: true}}\n"
 

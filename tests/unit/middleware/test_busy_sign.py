@@ -10,8 +10,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from lifecycle.middleware import busy_sign
-from lifecycle.middleware.busy_sign import BusySign, Overdue
+from lifecycle.middleware.process import busy_timer
+from lifecycle.middleware.process.busy_timer import BusySign, Overdue
 
 LIMIT_S = 0.05
 BOUND_S = 10.0
@@ -118,10 +118,10 @@ class Turns:
         self.began = time.monotonic_ns()
         self.ready, self.ran, self.waited, self.at_s = ready, ran, waited, at_s
 
-    def __call__(self, thread: int, now: int) -> busy_sign._Turns:
+    def __call__(self, thread: int, now: int) -> busy_timer._Turns:
         passed = now - self.began
         counted = passed if passed >= self.at_s * 1e9 else 0
-        return busy_sign._Turns(
+        return busy_timer._Turns(
             at_ns=now,
             ran_ns=1 + round(counted * self.ran),
             waited_ns=round(counted * self.waited),
@@ -134,7 +134,7 @@ def busy(
 ) -> list[tuple[float, Overdue]]:
     """Be busy for so many limits; return after how many of them the watcher said what."""
     holder, watcher = sides
-    monkeypatch.setattr(busy_sign, "_turns_of", turns)
+    monkeypatch.setattr(busy_timer, "_turns_of", turns)
     monkeypatch.setattr(holder, "_note_turns", lambda: None)
     began = turns.began = time.monotonic_ns()
     said = []

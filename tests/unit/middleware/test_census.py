@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 
-from lifecycle.middleware.census import without_dead, without_ghosts
+from lifecycle.middleware.rcl.stale_node_filter import without_dead, without_ghosts
 
 OLD, NEW, OTHER = "0" * 24, "1" * 24, "2" * 24
 

@@ -5,7 +5,11 @@ from __future__ import annotations
 import socket
 import struct
 
-from lifecycle.middleware.dead_participants import disposal, is_of_process, remove_participants
+from lifecycle.middleware.discovery.dead_participants import (
+    disposal,
+    is_of_process,
+    remove_participants,
+)
 from lifecycle.network.connection_url import parse
 
 OURS = "010f7f013c5d59590000" + "0000"

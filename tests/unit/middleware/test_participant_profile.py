@@ -9,13 +9,13 @@ from xml.etree import ElementTree as ET
 import pytest
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.participant_profile import (
+from lifecycle.middleware.fastdds.participant_profile import (
     DefaultProfile,
     ParticipantSettings,
     default_profile,
     profile,
 )
-from lifecycle.middleware.profiles import discovery_profile
+from lifecycle.middleware.fastdds.profiles import discovery_profile
 
 UDP = ParticipantSettings(transports=("udpv4",))
 USERS = """<?xml version="1.0"?>

@@ -12,7 +12,7 @@ import pytest
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware import exit_after
-from lifecycle.middleware.profiles import discovery_environment, discovery_profile
+from lifecycle.middleware.fastdds.profiles import discovery_environment, discovery_profile
 
 VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 

@@ -13,8 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.middleware import leftovers, segments_of, shm, sweep
-from lifecycle.middleware.shm import Creations
+from lifecycle.middleware import leftovers, segments_of, sweep
+from lifecycle.middleware.process import shared_memory
+from lifecycle.middleware.process.shared_memory import Creations
 
 SEGMENT = "fastrtps_0123456789abcdef"
 PORT = "fastrtps_port7411"
@@ -27,7 +28,7 @@ def directory(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A stand-in for /dev/shm on the same kind of file system, where /proc shows it likewise."""
     path = Path(f"/dev/shm/lifecycle-test-{os.getpid()}")
     path.mkdir()
-    monkeypatch.setattr(shm, "_DIRECTORY", path)
+    monkeypatch.setattr(shared_memory, "_DIRECTORY", path)
     yield path
     for each in path.iterdir():
         each.unlink()
@@ -112,7 +113,7 @@ def test_use_is_noticed_without_a_look_at_other_processes(
 ) -> None:
     """/proc hides processes of other PID namespaces, and with hidepid those of other users."""
     make(directory, *GROUP, SEGMENT)
-    monkeypatch.setattr(shm, "_peek", lambda *_: pytest.fail("looked into a process"))
+    monkeypatch.setattr(shared_memory, "_peek", lambda *_: pytest.fail("looked into a process"))
     with mapped(directory / PORT), mapped(directory / SEGMENT):
         assert sweep(ALL) == ()
 
@@ -134,7 +135,7 @@ def test_a_mapped_segment_without_a_lock_file_stays(directory: Path) -> None:
 def test_files_of_another_user_stay(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     make(directory, *GROUP)
     uid = os.getuid()
-    monkeypatch.setattr(shm.os, "getuid", lambda: uid + 1)
+    monkeypatch.setattr(shared_memory.os, "getuid", lambda: uid + 1)
     assert sweep(ALL) == ()
 
 
@@ -142,13 +143,13 @@ def test_a_file_that_appeared_meanwhile_keeps_its_group(
     directory: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     make(directory, PORT)
-    claim = shm._claim
+    claim = shared_memory._claim
 
-    def opened(file: shm._File) -> contextlib.AbstractContextManager[None]:
+    def opened(file: shared_memory._File) -> contextlib.AbstractContextManager[None]:
         make(directory, f"sem.{PORT}_mutex", taken=True)
         return claim(file)
 
-    monkeypatch.setattr(shm, "_claim", opened)
+    monkeypatch.setattr(shared_memory, "_claim", opened)
     assert sweep(ALL) == ()
     assert names(directory) == tuple(sorted((PORT, f"sem.{PORT}_mutex")))
 
@@ -213,7 +214,7 @@ def test_a_process_that_has_ended_owns_nothing() -> None:
 def test_a_machine_without_shared_memory_has_nothing_to_sweep(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(shm, "_DIRECTORY", tmp_path / "missing")
+    monkeypatch.setattr(shared_memory, "_DIRECTORY", tmp_path / "missing")
     assert (sweep(ALL), leftovers(), segments_of([os.getpid()])) == ((), (), frozenset())
     with pytest.raises(FileNotFoundError):
         Creations()

@@ -8,14 +8,14 @@ from xml.etree import ElementTree as ET
 import pytest
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.static_discovery import (
+from lifecycle.middleware.fastdds.static_discovery import (
     endpoint_profiles,
     endpoint_table,
     find_endpoint,
     own_endpoints,
 )
+from lifecycle.plan.connections.static_endpoints import GRAPH_TOPIC, GRAPH_TYPE
 from lifecycle.plan.model import StaticEndpoint, StaticParticipant
-from lifecycle.plan.static_endpoints import GRAPH_TOPIC, GRAPH_TYPE
 
 _STRING = "std_msgs::msg::dds_::String_"
 

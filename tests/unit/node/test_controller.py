@@ -9,9 +9,9 @@ import pytest
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import Timeouts
-from lifecycle.node.controller import Controller
-from lifecycle.node.execution import Result
-from lifecycle.node.machine import NodeState, Outcome, RefusedError, Request
+from lifecycle.node.lifecycle.controller import Controller
+from lifecycle.node.lifecycle.execution import Result
+from lifecycle.node.lifecycle.machine import NodeState, Outcome, RefusedError, Request
 
 
 class FakeNode:

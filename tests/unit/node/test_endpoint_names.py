@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.node.endpoint_names import UnknownEndpointError, find
+from lifecycle.node.endpoints.endpoint_names import UnknownEndpointError, find
 
 VIDEO = (EndpointKind.PUBLISHER, "video")
 COMMAND = (EndpointKind.SUBSCRIPTION, "/robot/command")

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from lifecycle.node.execution import Interruptible, Result, call, judge
-from lifecycle.node.machine import Outcome
+from lifecycle.node.lifecycle.execution import Interruptible, Result, call, judge
+from lifecycle.node.lifecycle.machine import Outcome
 
 WHAT = "/camera: on_configure"
 

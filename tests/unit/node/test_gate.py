@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from lifecycle.errors import LifecycleError
-from lifecycle.node.gate import Gate, GatedPublisher, GatedSubscription, GatedTimer
-from lifecycle.node.publisher import DeclaredPublisher
+from lifecycle.node.endpoints.publisher import DeclaredPublisher
+from lifecycle.node.lifecycle.gate import Gate, GatedPublisher, GatedSubscription, GatedTimer
 
 
 class FakePublisher:

@@ -7,7 +7,7 @@ import pytest
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.node.handlers import match, on_action, on_message, on_service, on_timer
+from lifecycle.node.author.handlers import match, on_action, on_message, on_service, on_timer
 from lifecycle.plan.model import PlannedEndpoint
 
 AT = Position(file="robot.lifecycle.yaml", line=3, column=1)

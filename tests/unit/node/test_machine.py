@@ -6,7 +6,7 @@ import pytest
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from lifecycle.node.machine import (
+from lifecycle.node.lifecycle.machine import (
     TRANSITION_GRAPH,
     Change,
     LifecycleMachine,

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from lifecycle.node.machine import NodeState
-from lifecycle.node.watchdog import Watchdog
+from lifecycle.node.host.watchdog import Watchdog
+from lifecycle.node.lifecycle.machine import NodeState
 
 
 class Sign:

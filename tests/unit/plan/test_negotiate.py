@@ -18,9 +18,9 @@ from lifecycle.plan import (
     Terms,
     negotiate,
 )
-from lifecycle.plan.contacts import Contact
-from lifecycle.plan.data_layer import RMW_DEFAULT, TRANSPORTS
-from lifecycle.plan.parties import transports_of
+from lifecycle.plan.connections.contacts import Contact
+from lifecycle.plan.negotiation.data_layer import RMW_DEFAULT, TRANSPORTS
+from lifecycle.plan.negotiation.parties import transports_of
 
 STRING = "std_msgs/msg/String"
 HERE, THERE = "10.77.0.1", "10.77.0.2"

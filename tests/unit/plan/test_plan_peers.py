@@ -7,9 +7,9 @@ import dataclasses
 import pytest
 
 from lifecycle.manifest.model import DiscoveryMode, DiscoveryRange, Machine
-from lifecycle.middleware.doors import discovery_peers, peers_environment
-from lifecycle.middleware.profiles import discovery_profile
-from lifecycle.plan.contacts import reached_hosts
+from lifecycle.middleware.discovery.probe_targets import discovery_peers, peers_environment
+from lifecycle.middleware.fastdds.profiles import discovery_profile
+from lifecycle.plan.connections.contacts import reached_hosts
 from lifecycle.plan.model import Plan
 from tests.unit.supervisor.fakes import HERE, plan_of, planned_node
 

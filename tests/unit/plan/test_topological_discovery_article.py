@@ -27,7 +27,7 @@ from lifecycle.manifest.model import (
     Policy,
 )
 from lifecycle.network.connection_url import ConnectionTransport, ConnectionUrlError, parse
-from lifecycle.node.control import Operation
+from lifecycle.node.host.control import Operation
 from lifecycle.plan import (
     DataLayerGraph,
     Plan,
@@ -38,8 +38,8 @@ from lifecycle.plan import (
     terms_of,
     wishes_of,
 )
-from lifecycle.supervisor.instructions import Wired, planned_instructions, steps
-from lifecycle.supervisor.negotiation import NegotiatedSource
+from lifecycle.supervisor.connections.desired_state import Wired, planned_instructions, steps
+from lifecycle.supervisor.connections.negotiation import NegotiatedSource
 from lifecycle.verify.observation import EndpointReport, Identity, NodeConfiguration
 from lifecycle.verify.party import party_of
 from tests.unit.plan.samples import at, link, manifest, need, node, planned, publisher, subscription

@@ -10,6 +10,7 @@ import dataclasses
 
 import pytest
 
+from lifecycle.manifest.checks import check
 from lifecycle.manifest.model import (
     EndpointKind,
     FlowIdentification,
@@ -19,7 +20,6 @@ from lifecycle.manifest.model import (
     Network,
     UniqueHow,
 )
-from lifecycle.manifest.semantics import check
 from lifecycle.network.nfe import (
     InternetProtocol,
     NetworkFlowEndpoint,
@@ -27,7 +27,7 @@ from lifecycle.network.nfe import (
     UniqueRequirement,
 )
 from lifecycle.plan import PlanError, build_plan
-from lifecycle.plan.render import render_text
+from lifecycle.plan.render.text import render_text
 from lifecycle.verify import Outcome, Stage, verify
 from tests.unit.plan.samples import at, link, manifest, need, node, publisher, subscription
 from tests.unit.verify.edits import change_report

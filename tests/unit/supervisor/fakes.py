@@ -30,14 +30,14 @@ from lifecycle.manifest.model import (
     RunKind,
     Timeouts,
 )
-from lifecycle.node.control import Command, Event, HostSpec, Operation
+from lifecycle.node.host.control import Command, Event, HostSpec, Operation
 from lifecycle.plan.model import Plan, PlannedNode, PlannedProcess
-from lifecycle.supervisor.bring_up import BringUp
-from lifecycle.supervisor.events import Emitter
-from lifecycle.supervisor.events import Event as SupervisorEvent
-from lifecycle.supervisor.spawn import SpawnRequest
-from lifecycle.supervisor.states import ProcessExit
-from lifecycle.supervisor.system import System
+from lifecycle.supervisor.nodes.bring_up import BringUp
+from lifecycle.supervisor.nodes.system import System
+from lifecycle.supervisor.processes.spawn import SpawnRequest
+from lifecycle.supervisor.processes.states import ProcessExit
+from lifecycle.supervisor.run.events import Emitter
+from lifecycle.supervisor.run.events import Event as SupervisorEvent
 from lifecycle.verify.observation import (
     ConnectionReport,
     EndpointReport,

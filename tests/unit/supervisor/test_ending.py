@@ -9,7 +9,7 @@ import weakref
 import pytest
 
 from lifecycle.errors import ExitCode
-from lifecycle.supervisor.ending import Ended, Ending
+from lifecycle.supervisor.run.signals import Ended, Ending
 
 
 @pytest.mark.parametrize(

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import cast
 
 from lifecycle.manifest.model import RunKind
-from lifecycle.node.control import Operation
-from lifecycle.supervisor.activation_guard import TRIES, ActivationGuard
-from lifecycle.supervisor.driver import LifecycleServices, ServiceDriver
-from lifecycle.supervisor.events import Notice, Reach
-from lifecycle.supervisor.system import NodeRun
+from lifecycle.node.host.control import Operation
+from lifecycle.supervisor.gate.activation_guard import TRIES, ActivationGuard
+from lifecycle.supervisor.nodes.driver import LifecycleServices, ServiceDriver
+from lifecycle.supervisor.nodes.system import NodeRun
+from lifecycle.supervisor.run.events import Notice, Reach
 from lifecycle.verify.observation import Observation, ObservedNode
 from tests.unit.supervisor.fakes import World, plan_of, planned_node, run
 from tests.unit.supervisor.test_supervisor_gate import ForeignNode

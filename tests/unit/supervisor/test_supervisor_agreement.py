@@ -11,14 +11,14 @@ from pathlib import Path
 import pytest
 
 from lifecycle.manifest.model import DiscoveryRange, Machine, RunKind
-from lifecycle.node.machine_id import machine_id
+from lifecycle.node.reporting.machine_id import machine_id
 from lifecycle.plan.comparison import plan_checksum
 from lifecycle.plan.model import Plan
 from lifecycle.plan.notice import decode, encode, notice_of
-from lifecycle.supervisor.agreement import ANNOUNCED_S, Agreement
-from lifecycle.supervisor.events import Emitter
-from lifecycle.supervisor.judge import with_findings
-from lifecycle.supervisor.system import System
+from lifecycle.supervisor.gate.verification_loop import with_findings
+from lifecycle.supervisor.health.agreement import ANNOUNCED_S, Agreement
+from lifecycle.supervisor.nodes.system import System
+from lifecycle.supervisor.run.events import Emitter
 from lifecycle.verify.observation import Observation, ObservedNode
 from lifecycle.verify.rules.matching import UNMATCHED_FLOW
 from lifecycle.verify.rules.nodes import MISSING_NODE, UNDECLARED_NODE

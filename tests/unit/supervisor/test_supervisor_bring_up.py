@@ -10,15 +10,15 @@ import pytest
 
 from lifecycle.errors import BringUpError
 from lifecycle.manifest.model import Condition, RunKind, Timeouts
-from lifecycle.node.control import Operation
-from lifecycle.supervisor.bring_up import ALSO_S
-from lifecycle.supervisor.events import Notice, ProcessChanged, Reach, RequestSent
-from lifecycle.supervisor.failure import StepFailedError, with_failure
-from lifecycle.supervisor.gate import Gate, Permit, VerificationError
-from lifecycle.supervisor.judge import Changes, Judge
-from lifecycle.supervisor.shutdown import TakeDown
-from lifecycle.supervisor.states import ProcessExit, ProcessState
-from lifecycle.supervisor.vigil import Vigil
+from lifecycle.node.host.control import Operation
+from lifecycle.supervisor.gate.gate import Gate, Permit, VerificationError
+from lifecycle.supervisor.gate.verification_loop import Changes, Judge
+from lifecycle.supervisor.health.process_monitor import Vigil
+from lifecycle.supervisor.nodes.bring_up import ALSO_S
+from lifecycle.supervisor.processes.states import ProcessExit, ProcessState
+from lifecycle.supervisor.run.events import Notice, ProcessChanged, Reach, RequestSent
+from lifecycle.supervisor.run.failure import StepFailedError, with_failure
+from lifecycle.supervisor.run.shutdown import TakeDown
 from lifecycle.verify.observation import Observation, ObservedNode
 from lifecycle.verify.verdict import NOT_JUDGED, Outcome, Stage, Verdict
 from tests.unit.supervisor.fakes import (

@@ -13,12 +13,12 @@ import pytest
 
 from lifecycle.network.connection_url import parse
 from lifecycle.plan.model import ParticipantConnections, Plan, PlannedServer
-from lifecycle.supervisor import discovery_server
-from lifecycle.supervisor.failure import StepFailedError
-from lifecycle.supervisor.options import observer_connections, onlooker_connections
-from lifecycle.supervisor.states import ProcessExit, ProcessState
-from lifecycle.supervisor.system import System
-from lifecycle.supervisor.watch import first_death
+from lifecycle.supervisor.connections import discovery_server
+from lifecycle.supervisor.gate.watch import first_death
+from lifecycle.supervisor.nodes.system import System
+from lifecycle.supervisor.processes.states import ProcessExit, ProcessState
+from lifecycle.supervisor.run.failure import StepFailedError
+from lifecycle.supervisor.run.options import observer_connections, onlooker_connections
 from tests.unit.supervisor.fakes import FakeSpawner, World, plan_of, planned_node
 
 PREFIX = "44.53.00.5f.45.50.52.4f.53.49.4d.41"

@@ -10,9 +10,9 @@ import pytest
 
 from lifecycle.manifest.model import Condition
 from lifecycle.plan.model import Plan
-from lifecycle.supervisor.elsewhere import Elsewhere, RemoteNode
-from lifecycle.supervisor.system import System
-from lifecycle.supervisor.together import ended
+from lifecycle.supervisor.nodes.remote_nodes import Elsewhere, RemoteNode
+from lifecycle.supervisor.nodes.system import System
+from lifecycle.supervisor.run.tasks import ended
 from lifecycle.verify.observation import Identity, NodeConfiguration, Observation, ObservedNode
 from tests.unit.supervisor.fakes import World, plan_of, planned_node, run
 

@@ -9,9 +9,9 @@ from collections.abc import Awaitable, Callable, Coroutine
 import pytest
 
 from lifecycle.errors import BringUpError, ExitCode
-from lifecycle.node.control import Operation
-from lifecycle.supervisor.driver import ServiceDriver
-from lifecycle.supervisor.gate import Gate, Permit, VerificationError, behind_s
+from lifecycle.node.host.control import Operation
+from lifecycle.supervisor.gate.gate import Gate, Permit, VerificationError, behind_s
+from lifecycle.supervisor.nodes.driver import ServiceDriver
 from lifecycle.verify.verdict import Outcome, Verdict
 from tests.unit.supervisor.fakes import planned_node, verdict_of
 

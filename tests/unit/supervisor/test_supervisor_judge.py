@@ -11,18 +11,24 @@ from typing import Any
 import pytest
 
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.node.control import Event
+from lifecycle.node.host.control import Event
 from lifecycle.plan.model import Plan
-from lifecycle.supervisor.driver import Standing
-from lifecycle.supervisor.elsewhere import RemoteNode
-from lifecycle.supervisor.events import NodeJoined, Reach, VerdictChanged
-from lifecycle.supervisor.judge import Changes, Judge, with_findings, without, without_nodes
-from lifecycle.supervisor.liveliness import Cause
-from lifecycle.supervisor.process import ManagedProcess
-from lifecycle.supervisor.settling import PASSING_S
-from lifecycle.supervisor.states import ProcessExit, ProcessState
-from lifecycle.supervisor.system import System
-from lifecycle.supervisor.watch import Watch, first_death
+from lifecycle.supervisor.gate.grace_period import PASSING_S
+from lifecycle.supervisor.gate.verification_loop import (
+    Changes,
+    Judge,
+    with_findings,
+    without,
+    without_nodes,
+)
+from lifecycle.supervisor.gate.watch import Watch, first_death
+from lifecycle.supervisor.health.liveliness import Cause
+from lifecycle.supervisor.nodes.driver import Standing
+from lifecycle.supervisor.nodes.remote_nodes import RemoteNode
+from lifecycle.supervisor.nodes.system import System
+from lifecycle.supervisor.processes.process import ManagedProcess
+from lifecycle.supervisor.processes.states import ProcessExit, ProcessState
+from lifecycle.supervisor.run.events import NodeJoined, Reach, VerdictChanged
 from lifecycle.verify.observation import (
     NodeConfiguration,
     NodeParameters,

@@ -15,12 +15,19 @@ import pytest
 from lifecycle.cli.up_output import describe
 from lifecycle.codec import from_json, to_json
 from lifecycle.manifest.model import DiscoveryRange, Machine, Run, RunKind, Timeouts
-from lifecycle.middleware.busy_sign import BusySign, Overdue
-from lifecycle.node.control import SIGN_DESCRIPTORS, HostSpec, Operation
-from lifecycle.node.control import Event as HostEvent
+from lifecycle.middleware.process.busy_timer import BusySign, Overdue
+from lifecycle.node.host.control import SIGN_DESCRIPTORS, HostSpec, Operation
+from lifecycle.node.host.control import Event as HostEvent
 from lifecycle.plan.model import Plan, PlannedProcess
-from lifecycle.supervisor.channel import ChannelClosedError, ControlChannel
-from lifecycle.supervisor.events import (
+from lifecycle.supervisor.gate.verification_loop import without_nodes
+from lifecycle.supervisor.health.liveliness import Cause, Liveliness, Presence
+from lifecycle.supervisor.health.peer_supervisors import CALL_EACH_S, Listener, Neighbours
+from lifecycle.supervisor.nodes.system import System
+from lifecycle.supervisor.processes.control_channel import ChannelClosedError, ControlChannel
+from lifecycle.supervisor.processes.fork_server import Zygote, ZygoteProcess
+from lifecycle.supervisor.processes.logs import LogDirectory
+from lifecycle.supervisor.processes.process import ManagedProcess
+from lifecycle.supervisor.run.events import (
     Emitter,
     Event,
     MachineConnection,
@@ -29,13 +36,6 @@ from lifecycle.supervisor.events import (
     NodeLeft,
     NodeSilent,
 )
-from lifecycle.supervisor.judge import without_nodes
-from lifecycle.supervisor.liveliness import Cause, Liveliness, Presence
-from lifecycle.supervisor.logs import LogDirectory
-from lifecycle.supervisor.neighbours import CALL_EACH_S, Listener, Neighbours
-from lifecycle.supervisor.process import ManagedProcess
-from lifecycle.supervisor.system import System
-from lifecycle.supervisor.zygote import Zygote, ZygoteProcess
 from lifecycle.verify.observation import Observation, ObservedNode
 from lifecycle.verify.verdict import Outcome
 from tests.unit.supervisor.fakes import HERE, World, plan_of, planned_node, run

@@ -14,8 +14,8 @@ from lifecycle.manifest.model import (
     Policy,
 )
 from lifecycle.plan import Plan
-from lifecycle.supervisor.instructions import steps, wired
-from lifecycle.supervisor.negotiation import NegotiatedSource
+from lifecycle.supervisor.connections.desired_state import steps, wired
+from lifecycle.supervisor.connections.negotiation import NegotiatedSource
 from lifecycle.verify.observation import EndpointReport, Identity, NodeConfiguration
 from tests.unit.plan.samples import at, need, node, planned, publisher, subscription
 from tests.unit.supervisor.fakes import rewired

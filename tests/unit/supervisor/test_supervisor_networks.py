@@ -20,12 +20,12 @@ from lifecycle.programming.apply import (
     TargetOptions,
 )
 from lifecycle.rundir import OWN_CHILD, RunDirectory, new_run_id
-from lifecycle.supervisor.events import Emitter, Notice, VerdictChanged
-from lifecycle.supervisor.failure import StepFailedError
-from lifecycle.supervisor.networks import Networks, open_networks, remove_programmed
-from lifecycle.supervisor.options import UpOptions
-from lifecycle.supervisor.orphans import reap_adopted
-from lifecycle.supervisor.remote import down
+from lifecycle.supervisor.connections.networks import Networks, open_networks, remove_programmed
+from lifecycle.supervisor.control.client import down
+from lifecycle.supervisor.processes.orphans import reap_adopted
+from lifecycle.supervisor.run.events import Emitter, Notice, VerdictChanged
+from lifecycle.supervisor.run.failure import StepFailedError
+from lifecycle.supervisor.run.options import UpOptions
 from lifecycle.verify.verdict import FlowReport, Outcome, Stage, Verdict
 from tests.unit.programming.apply.samples import nef_settings, settings_file
 from tests.unit.programming.apply.servers import TOKEN, NefServer

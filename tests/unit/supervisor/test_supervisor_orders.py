@@ -10,9 +10,8 @@ import pytest
 
 from lifecycle.errors import BringUpError, ExitCode, UsageError
 from lifecycle.manifest.model import Condition, RunKind
-from lifecycle.supervisor.events import Reach
-from lifecycle.supervisor.gate import Gate
-from lifecycle.supervisor.orders import (
+from lifecycle.supervisor.control.client import look, order
+from lifecycle.supervisor.control.orders import (
     ACTIVE,
     HELD,
     PAUSED,
@@ -22,9 +21,10 @@ from lifecycle.supervisor.orders import (
     OrderKind,
     check_order,
 )
-from lifecycle.supervisor.remote import look, order
-from lifecycle.supervisor.server import Ask, ControlServer, Look, Question, follow
-from lifecycle.supervisor.shutdown import TakeDown
+from lifecycle.supervisor.control.server import Ask, ControlServer, Look, Question, follow
+from lifecycle.supervisor.gate.gate import Gate
+from lifecycle.supervisor.run.events import Reach
+from lifecycle.supervisor.run.shutdown import TakeDown
 from lifecycle.verify.observation import Observation
 from lifecycle.verify.verdict import Outcome
 from tests.unit.supervisor.fakes import World, plan_of, planned_node, run, verdict_of

@@ -22,8 +22,10 @@ from lifecycle.network.nfe import (
     TransportProtocol,
     UniqueRequirement,
 )
-from lifecycle.node.control import Operation
-from lifecycle.supervisor.events import (
+from lifecycle.node.host.control import Operation
+from lifecycle.supervisor.control.status import NodeStatus, SystemStatus
+from lifecycle.supervisor.processes.states import ProcessState
+from lifecycle.supervisor.run.events import (
     Event,
     Failure,
     GateOpened,
@@ -38,9 +40,7 @@ from lifecycle.supervisor.events import (
     WiringLost,
     to_record,
 )
-from lifecycle.supervisor.options import UpResult
-from lifecycle.supervisor.states import ProcessState
-from lifecycle.supervisor.status import NodeStatus, SystemStatus
+from lifecycle.supervisor.run.options import UpResult
 from lifecycle.verify import FlowReport, Outcome, Stage, to_json
 from lifecycle.verify.observation import ConnectionReport
 from tests.unit.supervisor.fakes import verdict_of

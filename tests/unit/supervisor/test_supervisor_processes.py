@@ -19,24 +19,24 @@ import pytest
 
 from lifecycle.errors import BringUpError
 from lifecycle.manifest.model import Run, RunKind
-from lifecycle.node.control import HostSpec
+from lifecycle.node.host.control import HostSpec
 from lifecycle.plan import build_plan
 from lifecycle.plan.model import PlannedProcess
 from lifecycle.rundir import RUN_VARIABLE, ChildRecord, RunRecord, boot_id, start_ticks
-from lifecycle.supervisor import logs
-from lifecycle.supervisor.channel import ControlChannel
-from lifecycle.supervisor.events import Emitter, LogLine
-from lifecycle.supervisor.logs import (
+from lifecycle.supervisor.processes import logs
+from lifecycle.supervisor.processes.control_channel import ControlChannel
+from lifecycle.supervisor.processes.fork_server import Zygote, ZygoteProcess
+from lifecycle.supervisor.processes.logs import (
     LONGEST_LINE,
     LineReader,
     LogDirectory,
     ProcessLog,
     ros_log_root,
 )
-from lifecycle.supervisor.orphans import end_run
-from lifecycle.supervisor.process import COMMAND_ESCALATION, ManagedProcess
-from lifecycle.supervisor.states import ProcessExit, ProcessState, change
-from lifecycle.supervisor.zygote import Zygote, ZygoteProcess
+from lifecycle.supervisor.processes.orphans import end_run
+from lifecycle.supervisor.processes.process import COMMAND_ESCALATION, ManagedProcess
+from lifecycle.supervisor.processes.states import ProcessExit, ProcessState, change
+from lifecycle.supervisor.run.events import Emitter, LogLine
 from tests.unit.plan.samples import teleop
 
 PYTHON = sys.executable

@@ -8,8 +8,8 @@ import pytest
 
 from lifecycle.manifest.model import EndpointKind, FlowTransport
 from lifecycle.plan import Plan
-from lifecycle.supervisor.negotiation import NegotiatedSource
-from lifecycle.supervisor.settling import PASSING_S, Settling
+from lifecycle.supervisor.connections.negotiation import NegotiatedSource
+from lifecycle.supervisor.gate.grace_period import PASSING_S, Settling
 from lifecycle.verify import Finding, Outcome, Verdict
 from tests.unit.supervisor.fakes import verdict_of
 from tests.unit.supervisor.test_supervisor_negotiation import LISTENER, TALKER, known, plan_of

@@ -8,10 +8,10 @@ from collections.abc import Iterable
 from types import SimpleNamespace
 from typing import Any, cast
 
-from lifecycle.supervisor.events import ProcessChanged
-from lifecycle.supervisor.stale import StaleNodes
-from lifecycle.supervisor.states import ProcessState
-from lifecycle.supervisor.system import System
+from lifecycle.supervisor.nodes.stale_nodes import StaleNodes
+from lifecycle.supervisor.nodes.system import System
+from lifecycle.supervisor.processes.states import ProcessState
+from lifecycle.supervisor.run.events import ProcessChanged
 
 PREFIX = "010f7f015d3c1b4c00000000"
 ENDED = ProcessChanged(process="camera", state=ProcessState.EXITED, pid=7)

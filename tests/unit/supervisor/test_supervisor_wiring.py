@@ -20,8 +20,8 @@ from lifecycle.manifest.model import (
     EndpointKind,
     RunKind,
 )
-from lifecycle.node.control import Event as HostEvent
-from lifecycle.node.control import Operation
+from lifecycle.node.host.control import Event as HostEvent
+from lifecycle.node.host.control import Operation
 from lifecycle.plan.model import (
     ParticipantConnections,
     Plan,
@@ -29,10 +29,8 @@ from lifecycle.plan.model import (
     PlannedNode,
     PlannedParticipant,
 )
-from lifecycle.supervisor.bring_up import BringUp
-from lifecycle.supervisor.events import Notice, WiringChanged, WiringLost
-from lifecycle.supervisor.failure import StepFailedError
-from lifecycle.supervisor.instructions import (
+from lifecycle.supervisor.connections.authority import TRIES, Authority, Hand, PlannedSource
+from lifecycle.supervisor.connections.desired_state import (
     Instructions,
     Step,
     Wired,
@@ -40,8 +38,10 @@ from lifecycle.supervisor.instructions import (
     steps,
     wired,
 )
-from lifecycle.supervisor.shutdown import TakeDown
-from lifecycle.supervisor.wiring import TRIES, Authority, Hand, PlannedSource
+from lifecycle.supervisor.nodes.bring_up import BringUp
+from lifecycle.supervisor.run.events import Notice, WiringChanged, WiringLost
+from lifecycle.supervisor.run.failure import StepFailedError
+from lifecycle.supervisor.run.shutdown import TakeDown
 from lifecycle.verify.observation import NodeConfiguration, Observation
 from tests.unit.supervisor.fakes import (
     HERE,

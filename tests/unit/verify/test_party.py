@@ -10,9 +10,9 @@ from lifecycle.manifest.model import EndpointKind, FlowTransport
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.network.connection_url import Peer
 from lifecycle.network.nfe import UniqueRequirement
-from lifecycle.plan.contacts import Contact
-from lifecycle.plan.data_layer import RMW_DEFAULT, TRANSPORTS, Party, PartyEndpoint
+from lifecycle.plan.connections.contacts import Contact
 from lifecycle.plan.model import ParticipantConnections, PlannedNode, PlannedParticipant
+from lifecycle.plan.negotiation.data_layer import RMW_DEFAULT, TRANSPORTS, Party, PartyEndpoint
 from lifecycle.verify import EndpointReport, Identity, NodeConfiguration
 from lifecycle.verify.observation import ConnectionReport
 from lifecycle.verify.party import party_of

@@ -22,9 +22,9 @@ from lifecycle.programming.apply.http import Api, Patience
 from lifecycle.programming.apply.ledger import EntryState
 from lifecycle.programming.apply.programmer import Programmer
 from lifecycle.programming.apply.targets import TargetOptions, Targets
-from lifecycle.supervisor.events import Emitter, Notice
-from lifecycle.supervisor.failure import StepFailedError
-from lifecycle.supervisor.networks import Networks
+from lifecycle.supervisor.connections.networks import Networks
+from lifecycle.supervisor.run.events import Emitter, Notice
+from lifecycle.supervisor.run.failure import StepFailedError
 from lifecycle.verify.verdict import Outcome, Verdict
 from tests.unit.programming.apply.samples import (
     camara_settings,

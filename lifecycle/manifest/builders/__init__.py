@@ -1,0 +1,1 @@
+"""Validated documents to frozen types."""

@@ -1,0 +1,257 @@
+"""Validated node of a document → frozen `Node`.
+
+Owns: how a node's keys become fields, its parameters flat and its paths absolute. What its
+interface holds is `build_interface`'s. Pure but for reading interfaces by reference.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from lifecycle.manifest.builders.connections import build_connections, connection_positions
+from lifecycle.manifest.builders.cursor import Cursor
+from lifecycle.manifest.builders.interface import Findings, build_interface, scalar_tuple
+from lifecycle.manifest.diagnostics import Position
+from lifecycle.manifest.model import (
+    After,
+    Condition,
+    EndpointKind,
+    EndpointPolicy,
+    FlowNeed,
+    FlowTransport,
+    Node,
+    ParameterValue,
+    Quantity,
+    Run,
+    RunKind,
+    Timeouts,
+)
+from lifecycle.manifest.yaml.document import error, warning
+from lifecycle.manifest.yaml.scalars import YAML_1_1_BOOLEANS, has_leading_zero
+from lifecycle.network.dscp import parse_dscp
+from lifecycle.network.nfe import UniqueRequirement
+
+__all__ = ["Findings", "build_node", "quantities"]
+
+_PROGRAMS = ("python", "command", "package", "executable")
+_POSITIONED = ("machine", "namespace", "name", "process", "run", "interface", "log_level")
+
+
+def build_node(
+    key: str,
+    cursor: Cursor,
+    *,
+    base: Path,
+    machine: str,
+    environment: Mapping[str, str],
+    found: Findings,
+) -> Node:
+    """Build one node.
+
+    Args:
+        key: its key in the document.
+        cursor: its value.
+        base: folder that relative paths start from.
+        machine: the machine of a node that names none.
+        environment: for AMENT_PREFIX_PATH.
+        found: findings are appended here.
+    """
+    namespace = cursor.text("namespace").strip("/")
+    parameters = _parameters(cursor, found)
+    interface = build_interface(cursor, base=base, environment=environment, found=found)
+    return Node(
+        key=key,
+        name=cursor.text("name", key),
+        namespace=f"/{namespace}",
+        machine=cursor.text("machine", machine),
+        run=_run(cursor, base, found),
+        managed=cursor.flag("managed", default=True),
+        process=cursor.text("process"),
+        parameters=tuple((name, value) for name, (value, _) in parameters.items()),
+        parameter_files=tuple(
+            absolute(base, each.value.text) for each in cursor.items("parameter_files")
+        ),
+        remap=tuple((name, each.value.text) for name, each in cursor.entries("remap")),
+        after=tuple(
+            After(node=name, condition=Condition(each.scalar), at=each.key_at)
+            for name, each in cursor.entries("after")
+        ),
+        timeouts=_timeouts(cursor),
+        interface=interface,
+        flows=tuple(_flows(cursor)),
+        endpoints=cursor.choice("endpoints", EndpointPolicy, EndpointPolicy.DECLARED),
+        connections=build_connections(cursor, interface, found),
+        log_level=cursor.text("log_level"),
+        positions=(
+            *_positions(cursor),
+            *connection_positions(cursor),
+            *((f"parameters.{name}", at) for name, (_, at) in parameters.items()),
+        ),
+        written_paths=tuple(_written_paths(cursor)),
+        at=cursor.key_at,
+    )
+
+
+def absolute(base: Path, path: str) -> str:
+    """Return a path of a manifest so that it holds whatever folder a process starts in."""
+    # Not Path.resolve(): a link stays the path that its user knows.
+    return os.path.abspath(base / path)  # noqa: PTH100
+
+
+def _run(node: Cursor, base: Path, found: Findings) -> Run:
+    cursor = node.get("run")
+    if cursor is None:
+        return Run(kind=RunKind.ATTACH)
+    kind = RunKind.COMMAND
+    if "python" in cursor:
+        kind = RunKind.PYTHON
+    elif "attach" in cursor:
+        kind = RunKind.ATTACH
+        for name in ("environment", "working_directory"):
+            if name in cursor:
+                at = cursor.document.key_at((*cursor.place, name))
+                message = f"cannot set {name} of a node that somebody else starts"
+                found.append(error("manifest.attach", at, message, "remove it"))
+    folder = cursor.text("working_directory")
+    return Run(
+        kind=kind,
+        python=cursor.text("python"),
+        command=tuple(each.value.text for each in cursor.items("command")),
+        package=cursor.text("package"),
+        executable=cursor.text("executable"),
+        environment=tuple((name, each.value.text) for name, each in cursor.entries("environment")),
+        working_directory=absolute(base, folder) if folder else "",
+    )
+
+
+def _parameters(node: Cursor, found: Findings) -> dict[str, tuple[ParameterValue, Position]]:
+    """Flatten parameter mappings into dotted names, as rcl's parameter files do."""
+    flat: dict[str, tuple[ParameterValue, Position]] = {}
+    pending = list(reversed(list(node.entries("parameters"))))
+    while pending:
+        name, cursor = pending.pop()
+        if isinstance(cursor.value.data, Mapping):
+            inner = [(f"{name}.{key}", each) for key, each in cursor.entries()]
+            pending.extend(reversed(inner))
+            continue
+        if name in flat:
+            message = f"cannot set the parameter {name!r} twice"
+            first = flat[name][1]
+            hint = f"the first value stands at {first.file}:{first.line}:{first.column}"
+            found.append(error("manifest.duplicate-parameter", cursor.at, message, hint))
+            continue
+        value = _parameter(name, cursor, found)
+        if value is not None:
+            flat[name] = (value, cursor.key_at)
+    return flat
+
+
+def _parameter(name: str, cursor: Cursor, found: Findings) -> ParameterValue | None:
+    if isinstance(cursor.value.data, tuple):
+        return scalar_tuple(cursor, found)
+    text = cursor.value.text
+    if not cursor.value.quoted and len(text) > 1 and text in YAML_1_1_BOOLEANS:
+        message = f"cannot tell whether {text} is meant as a boolean; it is read as a string"
+        hint = f'write {name}: true or false, or {name}: "{text}"'
+        found.append(warning("manifest.yaml-1.1-boolean", cursor.at, message, hint))
+    if not cursor.value.quoted and has_leading_zero(text):
+        message = f"cannot tell which number {text} is meant as; it is read as a string"
+        hint = f'write {name}: {text.lstrip("+0") or "0"}, or {name}: "{text}"'
+        found.append(warning("manifest.leading-zero", cursor.at, message, hint))
+    return cursor.scalar
+
+
+def _timeouts(node: Cursor) -> Timeouts:
+    cursor = node.get("timeouts")
+    if cursor is None:
+        return Timeouts()
+    given = {key: float(cursor.number(key) or 0) for key, _ in cursor.entries()}
+    return dataclasses.replace(Timeouts(), **given)
+
+
+def _flows(node: Cursor) -> list[FlowNeed]:
+    needs = []
+    for kind in (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION):
+        for name, cursor in node.entries("flows", kind.value):
+            dscp = cursor.get("dscp")
+            auto = cursor.text("five_qi") == "auto"
+            needs.append(
+                FlowNeed(
+                    kind=kind,
+                    name=name,
+                    unique=cursor.choice(
+                        "unique", UniqueRequirement, UniqueRequirement.NOT_REQUIRED
+                    ),
+                    # A number may stand as 46.0 or 0x2e: the scalar counts, not its text.
+                    dscp=None if dscp is None else parse_dscp(_dscp_word(dscp)),
+                    transport_priority=cursor.integer("transport_priority"),
+                    enforce=cursor.flag("enforce", default=True),
+                    five_qi=None if auto else cursor.integer("five_qi"),
+                    five_qi_auto=auto,
+                    max_delay_ms=_float(cursor, "max_delay_ms"),
+                    loss=_float(cursor, "loss"),
+                    rate_hz=_float(cursor, "rate_hz"),
+                    max_message_size=cursor.integer("max_message_size"),
+                    transport=cursor.choice("transport", FlowTransport, FlowTransport.ANY),
+                    non_blocking_send=cursor.flag("non_blocking_send", default=False),
+                    lossy=cursor.flag("lossy", default=False) if "lossy" in cursor else None,
+                    quantities=quantities(cursor),
+                    at=cursor.key_at,
+                )
+            )
+    return needs
+
+
+_QUANTITIES = ("max_delay_ms", "loss", "rate_hz", "max_message_size", "five_qi")
+"""Numbers of a flow or a link that nothing but a measurement could prove."""
+
+
+def quantities(cursor: Cursor) -> tuple[Quantity, ...]:
+    """Return the numbers of a flow or a link that only a measurement could prove.
+
+    `five_qi: auto` is none: it follows from the others.
+    """
+    found = []
+    for name in _QUANTITIES:
+        value = cursor.get(name)
+        if value is not None and isinstance(value.scalar, (int, float)):
+            found.append(Quantity(name=name, value=value.scalar, at=value.at))
+    return tuple(found)
+
+
+def _float(cursor: Cursor, key: str) -> float | None:
+    number = cursor.number(key)
+    return None if number is None else float(number)
+
+
+def _dscp_word(cursor: Cursor) -> str | int:
+    assert isinstance(cursor.scalar, (str, int, float))
+    return cursor.scalar if isinstance(cursor.scalar, str) else int(cursor.scalar)
+
+
+def _written_paths(node: Cursor) -> Iterator[tuple[str, str]]:
+    """Yield the paths of a node as they are written, by place."""
+    for index, each in enumerate(node.items("parameter_files")):
+        yield f"parameter_files.{index}", each.value.text
+    run = node.get("run")
+    if run is not None and "working_directory" in run:
+        yield "run.working_directory", run.text("working_directory")
+
+
+def _positions(cursor: Cursor) -> list[tuple[str, Position]]:
+    """Return where the parts of a node stand that later checks point at."""
+    positions = []
+    for part in _POSITIONED:
+        value = cursor.get(part)
+        if value is not None:
+            positions.append((part, value.at))
+    run = cursor.get("run")
+    if run is not None:
+        # A program is looked for where its name stands; an `attach: true` has none.
+        positions += [(f"run.{name}", each.at) for name, each in run.entries() if name in _PROGRAMS]
+    positions += [(f"remap.{name}", each.key_at) for name, each in cursor.entries("remap")]
+    files = enumerate(cursor.items("parameter_files"))
+    return positions + [(f"parameter_files.{index}", each.at) for index, each in files]

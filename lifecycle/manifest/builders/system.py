@@ -1,0 +1,157 @@
+"""Validated document → frozen types: everything of a manifest but its nodes.
+
+Owns: `Fragment`, one document's share of a system before it is joined with others by `include`,
+and the findings that need more than a schema to be seen. Pure but for reading interfaces by
+reference.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import ipaddress
+from collections.abc import Collection, Mapping
+from pathlib import Path
+
+from lifecycle.manifest.builders.connections import (
+    build_data_layer,
+    build_discovery,
+    section_positions,
+)
+from lifecycle.manifest.builders.cursor import Cursor
+from lifecycle.manifest.builders.network import build_network
+from lifecycle.manifest.builders.node import Findings, build_node, quantities
+from lifecycle.manifest.diagnostics import Diagnostic, Position, Severity
+from lifecycle.manifest.model import (
+    TOLERATED_NODES,
+    DataLayer,
+    Discovery,
+    EndpointPolicy,
+    FlowTransport,
+    Link,
+    Machine,
+    Network,
+    Node,
+    Policy,
+    UniqueHow,
+)
+from lifecycle.manifest.yaml.document import Place, error
+from lifecycle.manifest.yaml.scalars import quote
+
+THIS_HOST = "local"
+"""Name of the machine of nodes that name none; declared implicitly, without address."""
+
+_SEVERITIES = {"error": Severity.ERROR, "warning": Severity.WARNING, "ignore": None}
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Fragment:
+    """What one document declares, its includes not yet joined.
+
+    Attributes:
+        diagnostics: errors and warnings found while building; with an error among them, what is
+            wrong is left out.
+        positions: as `Manifest.positions`.
+        lost: keys of nodes that are declared and left out; None if there may be any.
+    """
+
+    system: str
+    description: str
+    machines: tuple[Machine, ...]
+    discovery: Discovery
+    network: Network
+    data_layer: DataLayer
+    policy: Policy
+    nodes: tuple[Node, ...]
+    links: tuple[Link, ...]
+    diagnostics: tuple[Diagnostic, ...]
+    positions: tuple[tuple[str, Position], ...] = ()
+    lost: frozenset[str] | None = frozenset()
+
+
+def build_fragment(
+    root: Cursor,
+    *,
+    base: Path,
+    environment: Mapping[str, str],
+    unsound: Collection[Place] = (),
+) -> Fragment:
+    """Build what a document declares.
+
+    Args:
+        root: a document that fits the schema, or what is left of it without the parts that do not.
+        base: folder that its relative paths start from.
+        environment: for AMENT_PREFIX_PATH, where interfaces by reference are searched.
+        unsound: links to leave out, which keep their place in the list.
+    """
+    found: Findings = []
+    nodes = tuple(
+        build_node(key, cursor, base=base, machine=THIS_HOST, environment=environment, found=found)
+        for key, cursor in root.entries("nodes")
+    )
+    return Fragment(
+        system=root.text("system"),
+        description=root.text("description"),
+        machines=_machines(root, nodes, found),
+        discovery=build_discovery(root),
+        network=build_network(root, base=base, found=found),
+        data_layer=build_data_layer(root, found),
+        policy=_policy(root),
+        nodes=nodes,
+        links=tuple(_link(each) for each in root.items("links") if each.place not in unsound),
+        diagnostics=tuple(found),
+        positions=section_positions(root),
+    )
+
+
+def _machines(root: Cursor, nodes: tuple[Node, ...], found: Findings) -> tuple[Machine, ...]:
+    machines = []
+    for name, cursor in root.entries("machines"):
+        address = cursor.text("address")
+        if address and not _is_address(address):
+            at = root.document.at((*cursor.place, "address"))
+            message = f"cannot use {quote(address)} as an address; it must be IPv4 or IPv6"
+            hint = "look the name up: a plan must not depend on a name server"
+            found.append(error("manifest.address", at, message, hint))
+        machines.append(Machine(name=name, address=address, at=cursor.key_at))
+    if THIS_HOST not in {each.name for each in machines}:
+        here = next((node for node in nodes if node.machine == THIS_HOST), None)
+        if here is not None:
+            machines.append(Machine(name=THIS_HOST, at=here.at))
+    return tuple(machines)
+
+
+def _is_address(text: str) -> bool:
+    try:
+        ipaddress.ip_address(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _policy(root: Cursor) -> Policy:
+    cursor = root.get("policy")
+    if cursor is None:
+        return Policy()
+    return Policy(
+        undeclared_nodes=cursor.choice("undeclared_nodes", EndpointPolicy, EndpointPolicy.DECLARED),
+        tolerated_nodes=tuple(each.value.text for each in cursor.items("tolerated_nodes"))
+        if "tolerated_nodes" in cursor
+        else TOLERATED_NODES,
+        unverifiable_blocks=cursor.text("unverifiable") == "block",
+        unpublished=_SEVERITIES[cursor.text("unpublished", "error")],
+        unheard=_SEVERITIES[cursor.text("unheard", "warning")],
+    )
+
+
+def _link(cursor: Cursor) -> Link:
+    delay = cursor.number("max_delay_ms")
+    return Link(
+        topic=cursor.text("topic"),
+        from_node=cursor.text("from"),
+        to_node=cursor.text("to"),
+        unique=cursor.choice("unique", UniqueHow, UniqueHow.NOT),
+        max_delay_ms=None if delay is None else float(delay),
+        transport=cursor.choice("transport", FlowTransport, FlowTransport.ANY),
+        quantities=quantities(cursor),
+        at=cursor.at,
+    )

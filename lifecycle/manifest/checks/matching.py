@@ -1,0 +1,88 @@
+"""Checks of QoS: whether every publisher and subscription that meet will match.
+
+Owns: check.qos-incompatible, check.qos-doubtful. The rule itself is `lifecycle.manifest.qos`'s.
+Pure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from lifecycle.manifest.checks.system import Resolved, System
+from lifecycle.manifest.diagnostics import Diagnostic
+from lifecycle.manifest.model import EndpointKind, RunKind
+from lifecycle.manifest.qos import Certainty, Incompatibility, incompatibilities
+from lifecycle.manifest.yaml.document import error, warning
+
+_MANUAL = "MANUAL_BY_TOPIC"
+
+
+def check(system: System) -> Iterator[Diagnostic]:
+    """Yield findings about every pair of endpoints that the resolved names bring together."""
+    for name in system.names(EndpointKind.SUBSCRIPTION):
+        publishers = system.named(EndpointKind.PUBLISHER, name)
+        for requesting in system.named(EndpointKind.SUBSCRIPTION, name):
+            for offering in publishers:
+                yield from _judge(offering, requesting, "", at=requesting)
+    for name in system.names(EndpointKind.SERVICE_CLIENT):
+        servers = system.named(EndpointKind.SERVICE_SERVER, name)
+        for client in system.named(EndpointKind.SERVICE_CLIENT, name):
+            for server in servers:
+                # One profile holds for both directions of a service's end.
+                yield from _judge(client, server, " for requests", at=client)
+                yield from _judge(server, client, " for replies", at=client)
+
+
+def _judge(
+    offering: Resolved, requesting: Resolved, what: str, *, at: Resolved
+) -> Iterator[Diagnostic]:
+    offered, requested = offering.endpoint.qos, requesting.endpoint.qos
+    if offered is None or requested is None or offering.endpoint.type != requesting.endpoint.type:
+        return  # types that differ are `types`'s finding
+    other = requesting if at is offering else offering
+    doubtful = []
+    unknown = _left_open(offering) | _left_open(requesting)
+    for each in incompatibilities(offered, requested):
+        if each.policy in unknown:
+            continue
+        values = f"{each.policy} is offered {each.offered} and requested {each.requested}{what}"
+        if each.severity is Certainty.CERTAIN:
+            message = f"cannot match {other} on {at.name!r}: {values}"
+            yield error("check.qos-incompatible", at.at, message, _remedy(each))
+        elif not _is_settled(each):
+            doubtful.append(values)
+    if doubtful:
+        message = f"cannot tell whether this matches {other} on {at.name!r}: {', '.join(doubtful)}"
+        hint = "write the values at both ends"
+        yield warning("check.qos-doubtful", at.at, message, hint)
+
+
+def _left_open(end: Resolved) -> set[str]:
+    """Return the policies that only a node's own code knows: it is not ours, and nobody wrote them.
+
+    Whether they fit is judged when it runs (graph.qos-incompatible).
+    """
+    if end.node.run.kind is RunKind.PYTHON:
+        return set()
+    return {policy.removesuffix("_ns") for policy in end.endpoint.qos_defaults}
+
+
+def _is_settled(each: Incompatibility) -> bool:
+    """Whether an untold liveliness is no reason to doubt.
+
+    Every preset of rmw but one says SYSTEM_DEFAULT there, and DDS's default is AUTOMATIC (DDS 1.4
+    §2.2.3), which satisfies everything but a request for MANUAL_BY_TOPIC.
+    """
+    told = (each.offered, each.requested)
+    return each.policy == "liveliness" and _MANUAL not in told and "BEST_AVAILABLE" not in told
+
+
+def _remedy(each: Incompatibility) -> str:
+    if each.requested.endswith(" ns"):
+        here = (
+            "or request none here"
+            if each.offered == "infinite"
+            else (f"or request at least {each.offered} here")
+        )
+        return f"offer at most {each.requested} there, {here}"
+    return f"offer {each.requested} there, or request {each.offered} here"

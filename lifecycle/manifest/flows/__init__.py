@@ -1,0 +1,1 @@
+"""What flow needs come to: classes, marks."""

@@ -1,0 +1,1 @@
+"""NoDL v2 documents in place of an inline interface."""

@@ -1,0 +1,1 @@
+"""Interfaces that are installed: found, read and hashed without ROS."""

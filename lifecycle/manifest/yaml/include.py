@@ -1,0 +1,198 @@
+"""Joining manifests: which file an include names, and what becomes of what it declares.
+
+Owns: finding included files, refusing cycles, moving a fragment under a key prefix and a namespace,
+and joining fragments into one. Reading them is `load`'s. Looks at the file system for existence
+only.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+
+from lifecycle.errors import LifecycleError
+from lifecycle.manifest.builders.cursor import Cursor
+from lifecycle.manifest.builders.interface import Findings
+from lifecycle.manifest.builders.system import Fragment
+from lifecycle.manifest.diagnostics import Position
+from lifecycle.manifest.model import EndpointKind, Link, Machine, Node
+from lifecycle.manifest.names import resolve
+from lifecycle.manifest.schema.message_text import did_you_mean
+from lifecycle.manifest.yaml.document import error
+from lifecycle.manifest.yaml.scalars import quote
+
+MAX_DEPTH = 16
+"""Manifests that include each other in a row."""
+
+MAX_DOCUMENTS = 256
+"""Manifests of one system; included twice counts twice."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Origin:
+    """A manifest file in the chain of includes.
+
+    Attributes:
+        path: the file.
+        identity: its path without links, to recognise it again.
+    """
+
+    path: Path
+    identity: str
+
+    @property
+    def shown(self) -> str:
+        """How messages name the file: bytes that are no UTF-8 could be neither shown nor sent."""
+        return os.fsencode(self.path).decode("utf-8", errors="replace")
+
+    @classmethod
+    def of(cls, path: Path) -> Origin:
+        """Return the origin of a path as the user wrote it."""
+        try:
+            identity = os.path.realpath(path)
+        except (OSError, ValueError):  # a name that no file can have; opening it says so
+            identity = str(path)
+        return cls(path=path, identity=identity)
+
+
+def locate(entry: Cursor, chain: tuple[Origin, ...], found: Findings) -> Origin | None:
+    """Return the file that an entry of `include:` names; None after reporting why there is none.
+
+    Args:
+        entry: the entry.
+        chain: the including manifests, outermost first.
+        found: findings are appended here.
+    """
+    name = entry.text("manifest")
+    at = entry.document.at((*entry.place, "manifest"))
+    path = Path(os.path.normpath(chain[-1].path.parent / name))
+    origin = Origin.of(path)
+    identities = [each.identity for each in chain]
+    message, hint = "", ""
+    if origin.identity in identities:
+        round_trip = [*chain[identities.index(origin.identity) :], origin]
+        names = " → ".join(each.path.name for each in round_trip)
+        message = f"cannot include {quote(name)}: it would include itself, {names}"
+    elif len(chain) == MAX_DEPTH:
+        message = f"cannot include {quote(name)}: at most {MAX_DEPTH} manifests in a row"
+    elif not os.path.exists(path):  # noqa: PTH110 - Path.exists() raises for a name too long
+        message = f"cannot include {quote(name)}: there is no file {quote(str(path), limit=200)}"
+        hint = did_you_mean(path.name, _siblings(path))
+    elif path.is_dir():
+        message = f"cannot include {quote(name)}: it is a directory"
+    if not message:
+        return origin
+    found.append(error("manifest.include", at, message, hint))
+    return None
+
+
+def _siblings(path: Path) -> list[str]:
+    try:
+        return sorted(os.listdir(path.parent))  # noqa: PTH208 - names, not paths
+    except (OSError, ValueError):  # no such folder, or not ours to read: there is no suggestion
+        return []
+
+
+def move(fragment: Fragment, *, prefix: str, namespace: str) -> Fragment:
+    """Put a fragment under a key prefix and a namespace.
+
+    Names of nodes move with their namespace, and so do relative topic names; an absolute topic
+    name stays where it is. A link's topic goes where its publisher goes.
+    """
+    old = {node.key: node for node in fragment.nodes}
+    new = {node.key: _move_node(node, prefix, namespace) for node in fragment.nodes}
+    links = tuple(
+        dataclasses.replace(
+            link,
+            topic=_moved_topic(link, old, new),
+            from_node=_join_key(prefix, link.from_node),
+            to_node=_join_key(prefix, link.to_node),
+        )
+        for link in fragment.links
+    )
+    lost = fragment.lost
+    if lost is not None:
+        lost = frozenset(_join_key(prefix, key) for key in lost)
+    return dataclasses.replace(fragment, nodes=tuple(new.values()), links=links, lost=lost)
+
+
+def _move_node(node: Node, prefix: str, namespace: str) -> Node:
+    outer, inner = namespace.strip("/"), node.namespace.strip("/")
+    return dataclasses.replace(
+        node,
+        key=_join_key(prefix, node.key),
+        namespace="/" + "/".join(part for part in (outer, inner) if part),
+        process=_join_key(prefix, node.process) if node.process else "",
+        after=tuple(
+            dataclasses.replace(each, node=_join_key(prefix, each.node)) for each in node.after
+        ),
+    )
+
+
+def _join_key(prefix: str, key: str) -> str:
+    return f"{prefix}/{key}" if prefix else key
+
+
+def _moved_topic(link: Link, old: dict[str, Node], new: dict[str, Node]) -> str:
+    """Return where the endpoint has gone that a link names; the topic as it is if there is none."""
+    ends = ((link.from_node, EndpointKind.PUBLISHER), (link.to_node, EndpointKind.SUBSCRIPTION))
+    for key, kind in ends:
+        if key not in old:
+            continue
+        for endpoint in old[key].interface.endpoints:
+            if endpoint.kind is kind and _topic(old[key], endpoint.name) == link.topic:
+                return _topic(new[key], endpoint.name) or link.topic
+    return link.topic
+
+
+def _topic(node: Node, name: str) -> str:
+    """Return the topic of an endpoint; empty if a name is not legal, which `semantics` reports."""
+    try:
+        return resolve(name, node_name=node.name, namespace=node.namespace, remap=node.remap)
+    except LifecycleError:
+        return ""
+
+
+def join(outer: Fragment, inner: Fragment, at: Position, found: Findings) -> Fragment:
+    """Add an included fragment to the one that includes it.
+
+    The discovery, network, data layer and policy of the including one hold.
+
+    Args:
+        outer: the including fragment.
+        inner: the included one, moved to its place.
+        at: the include.
+        found: findings are appended here.
+    """
+    nodes = {node.key: node for node in outer.nodes}
+    for node in inner.nodes:
+        first = nodes.setdefault(node.key, node)
+        if first is not node:
+            message = (
+                f"cannot include the node {quote(node.key)}: {_place(first.at)} declares it too"
+            )
+            found.append(error("manifest.duplicate-node", at, message, "give the include a prefix"))
+    machines = {machine.name: machine for machine in outer.machines}
+    for machine in inner.machines:
+        _join_machine(machines.setdefault(machine.name, machine), machine, found)
+    return dataclasses.replace(
+        outer,
+        nodes=tuple(nodes.values()),
+        machines=tuple(machines.values()),
+        links=(*outer.links, *inner.links),
+        lost=None if outer.lost is None or inner.lost is None else outer.lost | inner.lost,
+    )
+
+
+def _join_machine(first: Machine, machine: Machine, found: Findings) -> None:
+    if first.address != machine.address:
+        message = (
+            f"cannot give machine {quote(machine.name)} the address {quote(machine.address)}: "
+            f"it has {quote(first.address)} at {_place(first.at)}"
+        )
+        found.append(error("manifest.machine", machine.at, message, "rename one of the two"))
+
+
+def _place(at: Position) -> str:
+    return f"{at.file}:{at.line}:{at.column}"

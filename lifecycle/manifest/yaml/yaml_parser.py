@@ -1,0 +1,317 @@
+"""YAML text → positioned values, on PyYAML's event stream.
+
+Owns: every limit on what a document may hold (values, depth, aliases, tags, keys). The limits
+are checked event by event, before anything is built or expanded, so that a hostile document
+costs no more than reading it up to the offence. No constructor of PyYAML ever runs. Pure.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Iterator, Mapping
+from typing import NoReturn
+
+import yaml
+
+from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position
+from lifecycle.manifest.yaml import scalars
+from lifecycle.manifest.yaml.document import Document, Place, Scalar, Value, error, spell_place
+
+MAX_VALUES = 100_000
+"""Values in one document, aliases expanded; 10,000 endpoints take about half of it."""
+
+MAX_DEPTH = 64
+"""Mappings and sequences inside each other, aliases expanded."""
+
+MAX_ALIASES = 1_000
+"""Aliases in one document."""
+
+_UNFIT = re.compile("[\0\ud800-\udfff]")
+# Escapes may spell what no file name, argument or message can hold.
+
+MAX_FINDINGS = 200
+"""Findings of one document; a document with more is given up."""
+
+_SHOWN_DEPTH = 8  # steps of a document path in a message that ends the reading
+
+_Loader: type[yaml.SafeLoader | yaml.CSafeLoader] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+@dataclasses.dataclass(slots=True)
+class _Frame:
+    """A collection that is still open."""
+
+    place: Place
+    line: int
+    column: int
+    anchor: str | None
+    mapping: dict[str, Value] | None  # None for a sequence
+    items: list[Value]
+    key: str | None = None
+    key_mark: tuple[int, int] = (1, 1)
+    skip: bool = False  # the key was refused: its value is read and dropped
+    values: int = 1  # with everything inside, aliases expanded
+    height: int = 1
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class _Anchored:
+    value: Value
+    values: int
+    height: int
+
+
+def compose(text: str, *, file: str) -> tuple[Document, tuple[Diagnostic, ...]]:
+    """Read one YAML document.
+
+    Args:
+        text: decoded, without byte order mark.
+        file: path for messages.
+
+    Returns:
+        The document, and what is wrong with single values and keys: tags, merge keys, keys that
+        are doubled or no strings, numbers out of range. Refused keys are left out.
+
+    Raises:
+        ManifestError: not YAML, over a limit, or more or less than one document; with what was
+            found up to there.
+    """
+    return _Composer(file).run(text)
+
+
+class _Composer:
+    """Builds values bottom-up from events; holds the open collections on a stack."""
+
+    def __init__(self, file: str) -> None:
+        self._file = file
+        self._stack: list[_Frame] = []
+        self._anchors: dict[str, _Anchored | None] = {}  # None while still open
+        self._found: list[Diagnostic] = []
+        self._values = 0
+        self._aliases = 0
+        self._root: Value | None = None
+
+    def run(self, text: str) -> tuple[Document, tuple[Diagnostic, ...]]:
+        for event in self._events(text):
+            start = event.start_mark
+            mark = (start.line + 1, start.column + 1) if start else (1, 1)
+            if isinstance(event, yaml.DocumentStartEvent) and self._root is not None:
+                self._stop(
+                    mark, "cannot read more than one document in a file", "remove this '---'"
+                )
+            elif isinstance(event, yaml.AliasEvent):
+                self._alias(event.anchor, mark)
+            elif isinstance(event, (yaml.MappingStartEvent, yaml.SequenceStartEvent)):
+                self._open(event, mark)
+            elif isinstance(event, (yaml.MappingEndEvent, yaml.SequenceEndEvent)):
+                self._close()
+            elif isinstance(event, yaml.ScalarEvent):
+                self._scalar(event, mark)
+        if self._root is None:
+            self._stop((1, 1), "cannot read an empty file", "start with 'manifest_version: 1'")
+        return Document(file=self._file, root=self._root), tuple(self._found)
+
+    def _events(self, text: str) -> Iterator[yaml.Event]:
+        try:
+            yield from yaml.parse(text, Loader=_Loader)
+        except yaml.YAMLError as problem:
+            mark = getattr(problem, "problem_mark", None) or getattr(problem, "context_mark", None)
+            line, column = (mark.line + 1, mark.column + 1) if mark else (1, 1)
+            why = getattr(problem, "problem", None) or str(problem)
+            self._stop((line, column), *_explain(why, text, line, column), rule="yaml.syntax")
+
+    # -- events
+
+    def _open(self, event: yaml.CollectionStartEvent, mark: tuple[int, int]) -> None:
+        self._refuse_tag(event.tag, mark)
+        mapping = isinstance(event, yaml.MappingStartEvent)
+        if self._wants_key():
+            self._stop(
+                mark, f"cannot use a {'mapping' if mapping else 'list'} as a key", "use a string"
+            )
+        if len(self._stack) >= MAX_DEPTH:
+            self._stop(mark, f"cannot read values nested deeper than {MAX_DEPTH} levels")
+        self._count(1, mark)
+        self._reserve(event.anchor)
+        frame = _Frame(
+            place=self._next_place(),
+            line=mark[0],
+            column=mark[1],
+            anchor=event.anchor,
+            mapping={} if mapping else None,
+            items=[],
+        )
+        self._stack.append(frame)
+
+    def _close(self) -> None:
+        frame = self._stack.pop()
+        data: tuple[Value, ...] | Mapping[str, Value] = (
+            tuple(frame.items) if frame.mapping is None else frame.mapping
+        )
+        value = Value(data=data, line=frame.line, column=frame.column)
+        self._finish(value, frame.anchor, frame.values, frame.height)
+
+    def _scalar(self, event: yaml.ScalarEvent, mark: tuple[int, int]) -> None:
+        self._refuse_tag(event.tag, mark)
+        self._count(1, mark)
+        self._reserve(event.anchor)
+        if _UNFIT.search(event.value):
+            message = f"cannot use {_cut(event.value)}: it holds a NUL or half a character"
+            self._note("yaml.character", mark, message, "remove the escape")
+        quoted = bool(event.style)  # libyaml says "" for a plain scalar, PyYAML None
+        data: Scalar = event.value
+        if not quoted:
+            try:
+                data = scalars.resolve(event.value)
+            except ValueError as problem:
+                self._note("yaml.number", mark, f"cannot use {_cut(event.value)}: {problem}")
+        if self._wants_key():
+            self._key(data, event, mark)
+            return
+        value = Value(data=data, line=mark[0], column=mark[1], text=event.value, quoted=quoted)
+        self._finish(value, event.anchor, 1, 0)
+
+    def _alias(self, anchor: str | None, mark: tuple[int, int]) -> None:
+        if self._wants_key():
+            self._stop(mark, f"cannot use the alias '*{anchor}' as a key", "write the key out")
+        self._aliases += 1
+        if self._aliases > MAX_ALIASES:
+            self._stop(mark, f"cannot read more than {MAX_ALIASES} aliases")
+        if anchor is None or anchor not in self._anchors:
+            self._stop(mark, f"cannot find the anchor '&{anchor}' above this alias")
+        anchored = self._anchors[anchor]
+        if anchored is None:
+            self._stop(mark, f"cannot use the alias '*{anchor}' inside its own anchor")
+        self._count(anchored.values, mark)
+        if len(self._stack) + anchored.height > MAX_DEPTH:
+            self._stop(mark, f"cannot read values nested deeper than {MAX_DEPTH} levels")
+        value = dataclasses.replace(anchored.value, line=mark[0], column=mark[1])
+        self._finish(value, None, anchored.values, anchored.height)
+
+    def _key(self, data: Scalar, event: yaml.ScalarEvent, mark: tuple[int, int]) -> None:
+        frame = self._stack[-1]
+        assert frame.mapping is not None
+        frame.key, frame.key_mark, frame.skip = event.value, mark, True
+        if event.value == "<<" and not event.style:
+            self._note(
+                "yaml.merge-key",
+                mark,
+                "cannot use the merge key '<<': YAML 1.2 has none",
+                "write the keys out, or use an alias for a whole value",
+            )
+        elif not isinstance(data, str):
+            hint = f'write "{event.value}"' if event.value else "write the key before the colon"
+            self._note("yaml.key", mark, f"cannot use {_cut(event.value)} as a key", hint)
+        elif event.value in frame.mapping:
+            first = frame.mapping[event.value].key
+            assert first is not None
+            self._note(
+                "yaml.duplicate-key",
+                mark,
+                f"cannot use the key {_cut(event.value)} twice",
+                f"remove one; the first stands at {self._file}:{first[0]}:{first[1]}",
+                (*frame.place, event.value),
+            )
+        else:
+            frame.skip = False
+
+    # -- the stack
+
+    def _finish(self, value: Value, anchor: str | None, values: int, height: int) -> None:
+        """Put a complete value where it belongs."""
+        if anchor is not None:
+            self._anchors[anchor] = _Anchored(value, values, height)
+        if not self._stack:
+            self._root = value
+            return
+        frame = self._stack[-1]
+        frame.values += values
+        frame.height = max(frame.height, height + 1)
+        if frame.mapping is None:
+            frame.items.append(value)
+            return
+        assert frame.key is not None
+        if not frame.skip:
+            frame.mapping[frame.key] = dataclasses.replace(value, key=frame.key_mark)
+        frame.key = None
+
+    def _wants_key(self) -> bool:
+        return (
+            bool(self._stack)
+            and self._stack[-1].mapping is not None
+            and self._stack[-1].key is None
+        )
+
+    def _next_place(self) -> Place:
+        if not self._stack:
+            return ()
+        frame = self._stack[-1]
+        if frame.mapping is None:
+            return (*frame.place, len(frame.items))
+        return frame.place if frame.key is None else (*frame.place, frame.key)
+
+    def _reserve(self, anchor: str | None) -> None:
+        if anchor is not None:
+            self._anchors[anchor] = None
+
+    def _count(self, values: int, mark: tuple[int, int]) -> None:
+        self._values += values
+        if self._values > MAX_VALUES:
+            self._stop(mark, f"cannot read more than {MAX_VALUES} values, aliases expanded")
+
+    # -- findings
+
+    def _refuse_tag(self, tag: str | None, mark: tuple[int, int]) -> None:
+        if tag is not None and tag != "!":
+            spelled = tag.replace("tag:yaml.org,2002:", "!!")
+            self._note(
+                "yaml.tag",
+                mark,
+                f"cannot use the tag {_cut(spelled)}: a manifest is data only",
+                "remove the tag; quotes make a string",
+            )
+
+    def _position(self, mark: tuple[int, int], place: Place | None = None) -> Position:
+        where = self._next_place() if place is None else place
+        return Position(file=self._file, line=mark[0], column=mark[1], path=spell_place(where))
+
+    def _note(
+        self,
+        rule: str,
+        mark: tuple[int, int],
+        message: str,
+        hint: str = "",
+        place: Place | None = None,
+    ) -> None:
+        """Record a finding and go on, unless there are too many."""
+        if len(self._found) == MAX_FINDINGS:
+            self._stop(mark, f"cannot list more than {MAX_FINDINGS} findings", "fix these first")
+        self._found.append(error(rule, self._position(mark, place), message, hint))
+
+    def _stop(
+        self, mark: tuple[int, int], message: str, hint: str = "", *, rule: str = "yaml.limit"
+    ) -> NoReturn:
+        """Give up at once, with everything found so far."""
+        # After a syntax error nobody knows which value this would have been.
+        place = () if rule == "yaml.syntax" else self._next_place()[:_SHOWN_DEPTH]
+        raise ManifestError([*self._found, error(rule, self._position(mark, place), message, hint)])
+
+
+def _cut(text: str) -> str:
+    return scalars.quote(text)
+
+
+def _explain(why: str, text: str, line: int, column: int) -> tuple[str, str]:
+    """Put a parser's reason into words and a hint; libyaml's and PyYAML's wordings differ."""
+    if "mapping values are not allowed" in why:
+        return "cannot read a second ': ' in this value", "put the value in quotes"
+    if "cannot start any token" in why:
+        rows = text.splitlines()
+        row = rows[line - 1] if line <= len(rows) else ""
+        character = row[column - 1] if column <= len(row) else ""
+        if character == "\t":
+            return "cannot use a tab for indentation", "indent with spaces"
+        return f"cannot start a value with {character!r}", "put the value in quotes"
+    hint = "look for a missing quote, bracket, colon or a wrong indentation here or just above"
+    return f"cannot read this as YAML: {why}", hint

@@ -1,0 +1,1 @@
+"""Who finds whom: ranges, servers, probes, liveliness, and finding each other again."""

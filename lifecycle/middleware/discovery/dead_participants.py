@@ -1,0 +1,136 @@
+"""Removing the DDS participants of a dead process from the graph at once, before their lease ends.
+
+Owns: the RTPS message by which a participant leaves (DDSI-RTPS 2.3 §8.5.3.3.2, §9.6.3.4, §9.6.3.9),
+written for one whose process was killed and cannot write it, and where it is sent. Must not import
+rclpy.
+
+Whoever knew the participant forgets it and all of its endpoints as if it had left properly (Fast
+DDS 2.14: PDPListener::onNewCacheChangeAdded; measured: within a millisecond). Without it, peers and
+observers show a killed process until its lease has run out, 20 s by default. There is no way to
+check in the message who wrote it, so callers must know that the process is dead, and that the
+participant was that process's.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ipaddress
+import socket
+import struct
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+from lifecycle.middleware.discovery.probe import HEADER, Door, send
+from lifecycle.middleware.discovery.probe_targets import doors_of
+from lifecycle.middleware.fastdds.url_families import UDPV4, UDPV6
+from lifecycle.middleware.sockets.sockets import own_udp_socket
+from lifecycle.middleware.sockets.url_check import open_sockets
+from lifecycle.network.connection_url import ConnectionUrl
+
+_SEQUENCE = 1 << 30
+"""Sequence number of the message: above all that the participant itself has written."""
+
+_SPDP_READER, _SPDP_WRITER = b"\x00\x01\x00\xc7", b"\x00\x01\x00\xc2"
+_PARTICIPANT = b"\x00\x00\x01\xc1"
+_DISPOSED_UNREGISTERED = b"\x00\x00\x00\x03"
+_PID_SENTINEL = struct.pack("<HH", 0x0001, 0)
+
+_HOST_DIGITS = slice(4, 8)
+_PID_DIGITS = slice(8, 12)
+PROCESS_DIGITS = 16
+"""Of a GUID prefix in hex: Fast DDS 2.14 writes vendor, host and process into it, and a number of
+its own behind them (GuidPrefix_t::create); all participants of a process share so many digits."""
+
+
+def is_of_process(prefix: str, pid: int, like: str) -> bool:
+    """Tell whether a participant may be one of a process of this host, by its GUID prefix.
+
+    Fast DDS keeps the lower 16 bits of a pid: False is certain, True is not.
+
+    Args:
+        prefix: 24 hex digits.
+        pid: of the process.
+        like: the prefix of a participant on this host.
+    """
+    written = (pid & 0xFFFF).to_bytes(2, "little").hex()
+    return prefix[: _HOST_DIGITS.stop] == like[: _HOST_DIGITS.stop] and (
+        prefix[_PID_DIGITS] == written
+    )
+
+
+def disposal(prefix: str) -> bytes:
+    """Return the RTPS message by which a participant leaves the graph.
+
+    Args:
+        prefix: its GUID prefix, 24 hex digits.
+    """
+    octets = bytes.fromhex(prefix)
+    guid = octets + _PARTICIPANT
+    inline_qos = (
+        struct.pack("<HH", 0x0070, len(guid))  # PID_KEY_HASH
+        + guid
+        + struct.pack("<HH", 0x0071, 4)  # PID_STATUS_INFO
+        + _DISPOSED_UNREGISTERED
+        + _PID_SENTINEL
+    )
+    key = b"\x00\x03\x00\x00" + struct.pack("<HH", 0x0050, len(guid)) + guid + _PID_SENTINEL
+    body = struct.pack("<HH", 0, 16) + _SPDP_READER + _SPDP_WRITER
+    body += struct.pack("<iI", 0, _SEQUENCE) + inline_qos + key
+    info_timestamp = struct.pack("<BBHII", 0x09, 0x01, 8, int(time.time()), 0)
+    flags = 0x01 | 0x02 | 0x08  # little endian, inline QoS, key
+    return HEADER + octets + info_timestamp + struct.pack("<BBH", 0x15, flags, len(body)) + body
+
+
+def remove_participants(
+    prefixes: Iterable[str],
+    domain_id: int,
+    urls: Sequence[ConnectionUrl],
+    environment: Mapping[str, str],
+    pids: Iterable[int] = (),
+) -> None:
+    """Have everybody forget participants whose process is dead.
+
+    It is sent to whom an observer with these URLs could meet by UDP, and to the UDP sockets of some
+    processes, whose participants may be connected by ports that only they know. Nothing is said to
+    those who are reached over shared memory or TCP alone: for them the lease has to run out. Our
+    own observer does not count what is dead (`Census.ignore`).
+
+    Args:
+        prefixes: GUID prefixes, 24 hex digits each.
+        domain_id: 0–232.
+        urls: of this process's observer.
+        environment: see `doors.knock_for`.
+        pids: of processes on this host that must forget them too.
+    """
+    messages = [disposal(each) for each in prefixes]
+    doors = {
+        kind: [*_asked(domain_id, urls, environment, kind), *_listening(pids, kind)]
+        for kind in (UDPV4, UDPV6)
+    }
+    output = next((url.output_port for url in urls if url.output_port), None)
+    for kind, family in ((UDPV4, socket.AF_INET), (UDPV6, socket.AF_INET6)):
+        if not doors[kind]:
+            continue
+        own = None if output is None else own_udp_socket(family, output)
+        with contextlib.suppress(OSError), own or socket.socket(family, socket.SOCK_DGRAM) as by:
+            for message in messages:
+                send(by, message, dict.fromkeys(doors[kind]))
+
+
+def _asked(
+    domain_id: int, urls: Sequence[ConnectionUrl], environment: Mapping[str, str], kind: str
+) -> Iterator[Door]:
+    for found, doors in doors_of(domain_id, urls, environment):
+        if found == kind:
+            yield from doors
+
+
+def _listening(pids: Iterable[int], kind: str) -> Iterator[Door]:
+    """Yield where processes of this host receive; those that are gone receive nothing."""
+    for pid in pids:
+        with contextlib.suppress(OSError):
+            for each in open_sockets(pid):
+                if each.kind == kind and not ipaddress.ip_address(each.address).is_multicast:
+                    any_ = ipaddress.ip_address(each.address).is_unspecified
+                    loopback = "::1" if kind == UDPV6 else "127.0.0.1"
+                    yield Door(address=loopback if any_ else each.address, port=each.port)

@@ -1,0 +1,199 @@
+"""Asking who is there: one discovery announcement, answered by every participant that hears it.
+
+Owns: the announcement of a participant that does not exist, as DDSI-RTPS 2.3 writes it (§8.3.5,
+§9.4, §9.6.2.2), and the list of those who answered. Must not import rclpy.
+
+Why: Fast DDS 2.14 sends a new participant's first announcement before it listens, so an answer on
+the same host comes too early and is lost; the one who answered stays quiet for its next 3 s
+(measured: in about half of all tries). A gate that opens meanwhile has not seen that participant.
+An announcement sent once we do listen, under a name of its own, is answered to our participant's
+port, and to a socket of ours that counts who is there.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import ipaddress
+import os
+import socket
+import struct
+import time
+from collections.abc import Iterable
+
+from lifecycle.middleware.sockets.sockets import own_udp_socket
+from lifecycle.middleware.sockets.url_check import open_sockets
+from lifecycle.network.ports import DG, participant_ports
+
+RANGE_VARIABLE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+
+_LEASE_S = 0.5
+"""Whoever answered forgets the participant that does not exist after so long."""
+
+_PREFIX_BYTES = 12
+HEADER = b"RTPS\x02\x03\x01\x0f"  # protocol 2.3, vendor eProsima: who else would be answered?
+_UDPV4, _UDPV6 = 1, 2
+"""LOCATOR_KIND_UDPv4 and LOCATOR_KIND_UDPv6 (DDSI-RTPS 9.3.1)."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Door:
+    """Where to knock: a discovery port of one participant, or a group that several hear.
+
+    Attributes:
+        address: IPv4 or IPv6.
+        port: 1–65535, UDP.
+        interface: name of the one by which a group is reached; empty otherwise.
+    """
+
+    address: str
+    port: int
+    interface: str = ""
+
+
+class Knock:
+    """One announcement and its answers; close it when they are not needed any more.
+
+    Args:
+        doors: where it is sent, all IPv4 or all IPv6.
+        addresses: own ones of that family, at which answers arrive.
+        receiver_ports: UDP ports on which our participant hears discovery, see `discovery_ports`.
+        output_port: the fixed source port of all that our participant sends, if it has one. Then
+            nothing may come from or go to any other: it is sent by the participant's own socket,
+            and answers are not counted.
+
+    Attributes:
+        counts: whether `answered` says who answered.
+    """
+
+    def __init__(
+        self,
+        doors: Iterable[Door],
+        addresses: Iterable[str],
+        receiver_ports: Iterable[int],
+        *,
+        output_port: int | None = None,
+    ) -> None:
+        self.counts = output_port is None
+        self._answers: dict[str, str] = {}
+        self._doors, self._addresses = tuple(doors), tuple(addresses)
+        self._ipv6 = any(":" in door.address for door in self._doors)
+        family = socket.AF_INET6 if self._ipv6 else socket.AF_INET
+        self._socket: socket.socket | None = None
+        self._receivers = tuple(receiver_ports)
+        own: tuple[int, ...] = ()
+        if output_port is not None:
+            self._socket = own_udp_socket(family, output_port)
+        else:
+            self._socket = socket.socket(family, socket.SOCK_DGRAM)
+            self._socket.bind(("", 0))  # answers come to every address we name
+            own = (self._socket.getsockname()[1],)
+        self._send((*own, *self._receivers))
+        if not self.counts:
+            self.close()
+
+    def ask_again(self, *, to_count: bool) -> None:
+        """Send one more announcement, of another participant that does not exist.
+
+        Not everybody answers to each address that an announcement has: Cyclone DDS chooses one, and
+        does not announce itself again for 8 s and more.
+
+        Args:
+            to_count: it is answered to us alone, so that it is known where everybody is; else to
+                our participant alone, so that it discovers who was only counted so far.
+        """
+        if self._socket is not None:
+            self._send((self._socket.getsockname()[1],) if to_count else self._receivers)
+
+    def _send(self, ports: Iterable[int]) -> None:
+        if self._socket is None:
+            return
+        send(
+            self._socket,
+            announcement([(a, p) for p in ports for a in self._addresses]),
+            self._doors,
+        )
+
+    def answered(self) -> frozenset[str]:
+        """Return the GUID prefixes (24 hex digits) of all participants that answered so far."""
+        return frozenset(self.addresses())
+
+    def addresses(self) -> dict[str, str]:
+        """Return the IP address from which each participant answered so far, by GUID prefix."""
+        with contextlib.suppress(BlockingIOError):
+            while self._socket is not None:
+                data, source = self._socket.recvfrom(65536, socket.MSG_DONTWAIT)
+                if data.startswith(b"RTPS") and len(data) > len(HEADER) + _PREFIX_BYTES:
+                    self._answers[data[8 : 8 + _PREFIX_BYTES].hex()] = source[0]
+        return dict(self._answers)
+
+    def close(self) -> None:
+        """Hear no more answers."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+
+def send(sender: socket.socket, message: bytes, doors: Iterable[Door]) -> None:
+    """Send a datagram to each door, without waiting.
+
+    A full buffer or an interface without a route costs one listener, not the sender.
+    """
+    for door in doors:
+        with contextlib.suppress(OSError):
+            if door.interface:
+                _send_by(sender, door.interface)
+            sender.sendto(message, socket.MSG_DONTWAIT, (door.address, door.port))
+
+
+def _send_by(sender: socket.socket, interface: str) -> None:
+    index = socket.if_nametoindex(interface)
+    if sender.family is socket.AF_INET6:
+        sender.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_MULTICAST_IF, index)
+        return
+    chosen = struct.pack("=4s4si", bytes(4), bytes(4), index)  # struct ip_mreqn of ip(7)
+    sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, chosen)
+
+
+def announcement(locators: Iterable[tuple[str, int]]) -> bytes:
+    """Return a DATA(p) of a new, random participant that can be answered at `locators`.
+
+    Args:
+        locators: (IP address, UDP port).
+    """
+    prefix = b"\x01\x0f" + os.urandom(_PREFIX_BYTES - 2)
+    parameters = [
+        (0x0015, b"\x02\x03\x00\x00"),  # PID_PROTOCOL_VERSION
+        (0x0016, b"\x01\x0f\x00\x00"),  # PID_VENDORID
+        (0x0050, prefix + b"\x00\x00\x01\xc1"),  # PID_PARTICIPANT_GUID
+        (0x0002, struct.pack("<iI", 0, int(_LEASE_S * 2**32))),  # PID_PARTICIPANT_LEASE_DURATION
+        (0x0058, struct.pack("<I", 0x3)),  # PID_BUILTIN_ENDPOINT_SET: announcer and detector only
+    ]
+    for address, port in locators:
+        packed = ipaddress.ip_address(address).packed
+        kind = _UDPV6 if len(packed) == 16 else _UDPV4
+        locator = struct.pack("<iI", kind, port) + packed.rjust(16, b"\0")
+        parameters.append((0x0032, locator))  # PID_METATRAFFIC_UNICAST_LOCATOR
+        parameters.append((0x0031, locator))  # PID_DEFAULT_UNICAST_LOCATOR
+    payload = b"\x00\x03\x00\x00"  # PL_CDR_LE
+    payload += b"".join(struct.pack("<HH", pid, len(value)) + value for pid, value in parameters)
+    payload += struct.pack("<HH", 0x0001, 0)  # PID_SENTINEL
+    reader, writer = b"\x00\x01\x00\xc7", b"\x00\x01\x00\xc2"  # SPDP builtin endpoints
+    body = struct.pack("<HH", 0, 16) + reader + writer + struct.pack("<iI", 0, 1) + payload
+    info_timestamp = struct.pack("<BBHII", 0x09, 0x01, 8, int(time.time()), 0)
+    return HEADER + prefix + info_timestamp + struct.pack("<BBH", 0x15, 0x05, len(body)) + body
+
+
+def discovery_ports(domain_id: int, kind: str = "udpv4") -> tuple[int, ...]:
+    """Return the UDP ports of this process on which participants hear discovery.
+
+    Read from the kernel, never inferred: a taken port moves a participant to another one.
+
+    Args:
+        domain_id: 0–232.
+        kind: "udpv4" or "udpv6".
+    """
+    first = participant_ports(domain_id, 0).discovery_unicast
+    last = participant_ports(domain_id, 0).discovery_multicast + DG
+    ports = {each.port for each in open_sockets() if each.kind == kind}
+    return tuple(sorted(p for p in ports if first <= p < last and (p - first) % 2 == 0))

@@ -1,0 +1,143 @@
+"""Finding each other again, soon after a link has come back.
+
+Owns: what is sent while somebody is out of reach, and what makes node names whole again. Two
+participants that lost each other for longer than their lease (20 s) forget one another, and then
+each announces itself once in 3 s. `call_out` makes both sides announce themselves at once: whoever
+hears the announcement of a participant that does not exist answers to where it seems to be (see
+probe.py). And rmw_dds_common keeps the name of a node that was forgotten out of the graph until
+its participant tells its entities anew, which `tell_names` makes it do.
+"""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterable, Mapping, Sequence
+
+from rcl_interfaces.msg import ParameterEvent
+from rclpy.event_handler import PublisherEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+
+from lifecycle.middleware.discovery.probe import (
+    RANGE_VARIABLE,
+    Door,
+    announcement,
+    discovery_ports,
+    send,
+)
+from lifecycle.middleware.discovery.probe_targets import (
+    addresses_of,
+    chosen_otherwise,
+    group_doors,
+    well_known_doors,
+)
+from lifecycle.middleware.fastdds.url_discovery import DISCOVERY_GROUP
+from lifecycle.middleware.fastdds.url_families import (
+    UDPV4,
+    UDPV6,
+    Family,
+    families,
+    leaves_discovery_open,
+)
+from lifecycle.middleware.sockets.sockets import own_udp_socket
+from lifecycle.network.connection_url import ConnectionUrl
+from lifecycle.network.ports import participant_ports
+
+_PARTICIPANTS = 32
+"""Of a host whose address is known; who has more of them is reached by multicast."""
+
+_ANSWERED_AT = 32
+"""Participants of this host that an announcement names; each is 56 bytes of one datagram."""
+
+_SOCKET = {UDPV4: socket.AF_INET, UDPV6: socket.AF_INET6}
+
+
+def call_out(
+    domain_id: int,
+    urls: Sequence[ConnectionUrl],
+    peers: Iterable[str],
+    environment: Mapping[str, str],
+) -> None:
+    """Make participants of other hosts announce themselves to ours, and ours to them.
+
+    Only as this participant's own discovery would: to its listed peers' ports where it has a list,
+    by multicast where that is how others are found, and not at all over TCP and shared memory or
+    behind a discovery server. Those announce themselves each 0.5 s anyway (url_discovery.py).
+
+    Args:
+        domain_id: 0–232.
+        urls: our participant's; none for what the RMW does by itself.
+        peers: addresses of the hosts that are out of reach, where nothing lists participants.
+        environment: where ROS_AUTOMATIC_DISCOVERY_RANGE and settings of Fast DDS are looked up.
+    """
+    if any(url.server for url in urls) or (not urls and chosen_otherwise(environment)):
+        return
+    found = [family for family in families(urls) if family.udp]
+    if urls and not leaves_discovery_open(urls):
+        for family in found:
+            _call_listed(domain_id, family)
+        return
+    if environment.get(RANGE_VARIABLE, "").upper() in ("LOCALHOST", "OFF"):
+        return  # nobody is looked for on another host
+    kinds = tuple(family.kind for family in found) if urls else (UDPV4,)
+    for kind in kinds:
+        _call_around(domain_id, kind, [each for each in peers if (":" in each) == (kind == UDPV6)])
+
+
+def _call_around(domain_id: int, kind: str, peers: Sequence[str]) -> None:
+    interfaces = addresses_of(kind)
+    group_port = participant_ports(domain_id, 0).discovery_multicast
+    ports = discovery_ports(domain_id, kind)
+    ours = [(a, port) for port in ports for found in interfaces.values() for a in found]
+    # Two that do not exist: an answer goes to only one kind of address.
+    calls = (announcement(ours), announcement([(DISCOVERY_GROUP[kind], group_port)]))
+    doors = [door for peer in peers for door in well_known_doors(domain_id, peer, _PARTICIPANTS)]
+    with socket.socket(_SOCKET[kind], socket.SOCK_DGRAM) as sender:
+        for call in calls:
+            send(sender, call, group_doors(domain_id, kind, interfaces))
+        send(sender, calls[0], doors)
+
+
+def _call_listed(domain_id: int, family: Family) -> None:
+    """Call the listed peers of other hosts, in the name of those of this one."""
+    here = {a for found in addresses_of(family.kind, loopback=True).values() for a in found}
+    listed = dict.fromkeys(peer for url in family.urls for peer in url.peers)
+    ours = [(url.address, url.metatraffic_port) for url in family.urls if url.address in here]
+    ours += [(peer.address, peer.port) for peer in listed if peer.address in here]
+    answered_at = [(address, port) for address, port in ours if port is not None]
+    doors: list[Door] = []
+    for peer in listed:
+        if peer.address in here:
+            continue
+        if peer.port is None:
+            doors += well_known_doors(domain_id, peer.address, _PARTICIPANTS)
+        else:
+            doors.append(Door(address=peer.address, port=peer.port))
+    if not answered_at or not doors:
+        return
+    output = next((url.output_port for url in family.urls if url.output_port), None)
+    kind = _SOCKET[family.kind]
+    # Where the plan says by which port this participant sends, nothing may come from another.
+    own = own_udp_socket(kind, output) if output else socket.socket(kind, socket.SOCK_DGRAM)
+    if own is None:
+        return
+    with own as sender:
+        send(sender, announcement(answered_at[:_ANSWERED_AT]), doors)
+
+
+def tell_names(nodes: Iterable[Node]) -> None:
+    """Have the participants of `nodes` tell anew which nodes and endpoints they have.
+
+    rmw_fastrtps does so whenever an entity is made or unmade. Take one node of each participant.
+    """
+    for node in nodes:
+        # Every node publishes parameter events: a second publisher of them, for a moment, is
+        # nothing new to anybody.
+        publisher = Node.create_publisher(
+            node,
+            ParameterEvent,
+            "/parameter_events",
+            QoSProfile(depth=1),
+            event_callbacks=PublisherEventCallbacks(use_default_callbacks=False),
+        )
+        Node.destroy_publisher(node, publisher)

@@ -1,0 +1,1 @@
+"""Fast DDS participants with settings of their own: profiles, URLs, flows."""

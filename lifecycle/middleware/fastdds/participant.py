@@ -1,0 +1,394 @@
+"""A DDS participant of its own: for a network flow of its own, or for a connection.
+
+Owns: the hidden node in its own rclpy context that such endpoints live on. Fast DDS opens sockets
+per participant, so a publisher is told apart on the network by getting a participant; see *Unique
+Network Flows*, "Alternatives". A connection (`connect_to` of *Topological Discovery and
+Communication Negotiation*) is one as well, made from connection URLs. One costs about 2.5 MB,
+7 threads, 6 sockets and 6–10 ms.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+import typing
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import rclpy
+from rclpy.callback_groups import CallbackGroup
+from rclpy.client import Client
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile, qos_profile_services_default
+from rclpy.service import Service
+from rclpy.subscription import Subscription
+
+from lifecycle.errors import MiddlewareError
+from lifecycle.manifest.qos import QosProfile
+from lifecycle.middleware.fastdds import default_qos, shared_executor
+from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
+from lifecycle.middleware.fastdds.participant_urls import (
+    fixed_sockets,
+    one_dscp,
+    uses_shared_memory,
+)
+from lifecycle.middleware.fastdds.static_discovery import endpoint_profiles, find_endpoint
+from lifecycle.middleware.rcl import unique as flows
+from lifecycle.middleware.rcl.hidden_node import forget_hidden, hidden_nodes, quiet_node
+from lifecycle.middleware.rcl.qos import to_rclpy
+from lifecycle.middleware.sockets import dscp as marks
+from lifecycle.middleware.sockets.nfe import get_network_flow_endpoints
+from lifecycle.middleware.sockets.sockets import never_wait
+from lifecycle.network.nfe import NetworkFlowEndpoint, UniqueRequirement
+from lifecycle.plan.model import ParticipantConnections
+
+__all__ = ["FlowParticipant", "hidden_nodes", "quiet_node"]
+
+_RELEASE_S = 0.2
+"""An executor that waits for endpoints lets go of them within a millisecond of being woken."""
+
+
+@typing.final
+class FlowParticipant:
+    """One participant, one hidden node, and the endpoints that were given to it.
+
+    Nothing but the RMW's own discovery shares its sockets: the hidden node has no rosout, no
+    parameter services, no type description service and no parameter events. Publishers on it need
+    no executor. `destroy` it (or use it in a `with`); it does not end with the node it serves.
+
+    Args:
+        name: base name of the hidden node; by ROS custom it starts with an underscore.
+        namespace: absolute.
+        domain_id: 0–232.
+        dscp: 0–63, set on its sender sockets before any user data can leave them; None leaves them.
+        transports: all that it may use, "udpv4", "udpv6"; empty leaves it to the RMW, which
+            prefers shared memory on one host. Both means that a peer with both gets data twice.
+        max_datagram_bytes: largest UDP payload it sends, 500–65500: longer messages are split by
+            RTPS, so that IP has nothing to fragment; 1400 fits Ethernet. None leaves it to the RMW.
+        non_blocking_send: never wait for room in a socket's buffer: what finds it full is dropped,
+            and lost unless the publisher is reliable.
+        arguments: ROS arguments of its context; none by default, because endpoint names come here
+            resolved and must not be remapped again.
+        connections: what it is connected to and by; then `transports` must be empty.
+        served: the node whose executor runs the callbacks of subscriptions, services and clients
+            made here, gated by its callback groups; None leaves them to whoever spins `node`.
+
+    Raises:
+        ConnectionUrlError: a URL that is none.
+        MiddlewareError: the participant could not be made, a port or address of its URLs is not to
+            be had, or `dscp` not applied, or the settings go against a profile of the user's;
+            nothing is left.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        namespace: str,
+        domain_id: int,
+        *,
+        dscp: int | None = None,
+        transports: Sequence[str] = (),
+        max_datagram_bytes: int | None = None,
+        non_blocking_send: bool = False,
+        arguments: Sequence[str] = (),
+        connections: ParticipantConnections | None = None,
+        served: Node | None = None,
+    ) -> None:
+        if dscp is not None:
+            marks.check_dscp(dscp)
+        settings = ParticipantSettings.of(
+            connections or ParticipantConnections(),
+            transports=tuple(transports),
+            max_datagram_bytes=max_datagram_bytes,
+            non_blocking_send=non_blocking_send,
+        )
+        dscp = one_dscp(dscp, settings)
+        self.name = name
+        self.settings = settings
+        self._served = served
+        self._guests: list[shared_executor.Guest] = []
+        self._dscp = dscp
+        self._context: rclpy.Context | None
+        self._nfes: tuple[NetworkFlowEndpoint, ...] = ()
+        before = fixed_sockets(settings)
+        self._context, self.node = quiet_node(
+            name, namespace, domain_id, settings=settings, arguments=arguments
+        )
+        self._fixed = fixed_sockets(settings) - before
+        try:
+            # Every publisher of a participant lists the same sender sockets; rclpy's parameter
+            # event publisher tells them before there is any publisher of the user's.
+            probe = next(iter(self.node.publishers))
+            self._nfes = get_network_flow_endpoints(probe)
+            if dscp is not None:
+                marks.set_dscp(self._nfes, dscp)
+            # It would share the sockets that are to be unique.
+            self.node.destroy_publisher(probe)
+            self.has_shared_memory = uses_shared_memory(self.node, settings)
+        except BaseException:
+            self.destroy()
+            raise
+
+    @property
+    def network_flow_endpoints(self) -> tuple[NetworkFlowEndpoint, ...]:
+        """The NFEs of every publisher on this participant, as rmw lists them.
+
+        rmw lists no shared memory for publishers; `has_shared_memory` says whether it is there.
+        """
+        return self._nfes
+
+    def create_publisher(
+        self,
+        type_: type[Any],
+        topic: str,
+        qos: QosProfile | QoSProfile,
+        *,
+        callback_group: CallbackGroup | None = None,
+        event_callbacks: PublisherEventCallbacks | None = None,
+        publisher_class: type[Publisher] = Publisher,
+    ) -> Publisher:
+        """Create a publisher on this participant; `topic` should be fully qualified.
+
+        Events (matched, deadline, …) are only handled if an executor spins `self.node`; without
+        `event_callbacks` none are set up.
+        """
+        with self._announced(type_, topic, writer=True):
+            publisher = self.node.create_publisher(
+                type_,
+                topic,
+                to_rclpy(qos),
+                callback_group=callback_group,
+                event_callbacks=event_callbacks
+                or PublisherEventCallbacks(use_default_callbacks=False),
+                publisher_class=publisher_class,
+            )
+        try:
+            self.ensure_dscp()
+        except BaseException:
+            self.node.destroy_publisher(publisher)
+            raise
+        return publisher
+
+    def create_subscription(
+        self,
+        type_: type[Any],
+        topic: str,
+        callback: Callable[..., Any],
+        qos: QosProfile | QoSProfile,
+        *,
+        unique: UniqueRequirement = UniqueRequirement.NOT_REQUIRED,
+        callback_group: CallbackGroup | None = None,
+        event_callbacks: SubscriptionEventCallbacks | None = None,
+    ) -> Subscription:
+        """Create a subscription on this participant; `topic` should be fully qualified.
+
+        Its callback runs in the executor of the node served, else of whoever spins `self.node`.
+        Its port is given back when the participant is destroyed, which is never for a unique
+        subscription on a node that stays (see `create_subscription` of this room).
+        """
+        with self._announced(type_, topic, writer=False):
+            subscription = flows.create_subscription(
+                self.node,
+                type_,
+                topic,
+                callback,
+                qos,
+                unique=unique,
+                callback_group=self._group(callback_group),
+                event_callbacks=event_callbacks,
+            )
+        try:
+            self.ensure_dscp()
+        except BaseException:
+            self.node.destroy_subscription(subscription)
+            raise
+        self._receive(subscription)
+        return subscription
+
+    def create_service(
+        self,
+        type_: type[Any],
+        name: str,
+        callback: Callable[..., Any],
+        *,
+        qos: QosProfile | QoSProfile = qos_profile_services_default,
+        callback_group: CallbackGroup | None = None,
+    ) -> Service:
+        """Create a service server on this participant; spun as a subscription is.
+
+        Raises:
+            MiddlewareError: the participant's endpoints are discovered statically.
+        """
+        self._refuse_static("service server", name)
+        service = self.node.create_service(
+            type_,
+            name,
+            callback,
+            qos_profile=to_rclpy(qos),
+            callback_group=self._group(callback_group),
+        )
+        self._receive(service)
+        return service
+
+    def create_client(
+        self,
+        type_: type[Any],
+        name: str,
+        *,
+        qos: QosProfile | QoSProfile = qos_profile_services_default,
+        callback_group: CallbackGroup | None = None,
+    ) -> Client:
+        """Create a service client on this participant; spun as a subscription is.
+
+        Raises:
+            MiddlewareError: the participant's endpoints are discovered statically.
+        """
+        self._refuse_static("service client", name)
+        client = self.node.create_client(
+            type_,
+            name,
+            qos_profile=to_rclpy(qos),
+            callback_group=self._group(callback_group),
+        )
+        self._receive(client)
+        return client
+
+    def create_action(
+        self, make: Callable[[Node], shared_executor.Action], what: str, name: str
+    ) -> Any:
+        """Create an action server or client on this participant; spun as a subscription is.
+
+        Args:
+            make: makes it on a node; its callback group is one of the node served.
+            what: kind of endpoint, for messages.
+            name: fully qualified, for messages.
+
+        Raises:
+            MiddlewareError: the participant's endpoints are discovered statically.
+        """
+        self._refuse_static(what, name)
+        action = make(self.node)
+        self._receive(action)
+        return action
+
+    def destroy_endpoint(self, entity: Publisher | shared_executor.Guest) -> None:
+        """Destroy an endpoint that was made here; again is harmless."""
+        if isinstance(entity, Publisher):
+            self.node.destroy_publisher(entity)
+            return
+        host = self._served or self.node
+        shared_executor.dismiss(entity, host)
+        if entity in self._guests:
+            self._guests.remove(entity)
+
+    def ensure_dscp(self) -> None:
+        """Mark sender sockets that came, or lost their mark, since the participant was made.
+
+        Half a millisecond. It is called before a publisher or subscription is handed out, and by
+        no reading: what reads and marks at once finds every mark in place. No socket of Fast DDS
+        2.14 is known to come later (see `lifecycle.middleware.sockets.dscp`).
+
+        Raises:
+            MiddlewareError: the mark cannot be set.
+        """
+        if self._context is None:
+            return  # nothing of the user's can be sent
+        changed = self._look_at_sockets()
+        if self._dscp is not None and (changed or marks.get_dscps(self._nfes) != {self._dscp}):
+            marks.set_dscp(self._nfes, self._dscp)
+
+    def read_dscp(self) -> int:
+        """Return the DSCP (0–63) the kernel puts on what this participant sends; marks nothing.
+
+        Of sockets that differ it is one that the participant was not to be marked with: all that
+        it sends must carry the mark, so a single socket without it is what counts.
+
+        Raises:
+            MiddlewareError: it has no socket, or its sockets differ and none was to be marked.
+        """
+        self._look_at_sockets()
+        if self._dscp is None:
+            return marks.get_dscp(self._nfes)
+        others = marks.get_dscps(self._nfes) - {self._dscp}
+        return min(others, default=self._dscp)
+
+    def _look_at_sockets(self) -> bool:
+        """List the sender sockets anew, as far as a publisher tells them; whether they changed."""
+        publisher = next(iter(self.node.publishers), None)
+        if self._context is None or publisher is None:
+            return False  # those that were there when it was made
+        nfes = get_network_flow_endpoints(publisher)
+        changed = nfes != self._nfes
+        self._nfes = nfes
+        return changed
+
+    def never_waits(self) -> bool:
+        """Return whether its sockets drop what finds their buffer full, asked of the kernel.
+
+        Raises:
+            MiddlewareError: it has no socket.
+        """
+        return never_wait(self._nfes)
+
+    def destroy(self) -> None:
+        """Destroy its endpoints, the hidden node and the participant; again is harmless.
+
+        When it returns, its fixed ports are free, if no callback blocks the executor that waits
+        for its endpoints.
+        """
+        self._nfes = ()  # its ports may belong to somebody else from now on
+        for entity in tuple(self._guests):
+            self.destroy_endpoint(entity)
+        forget_hidden(self.node)
+        self.node.destroy_node()
+        if self._context is not None:
+            self._context.try_shutdown()
+            self._context.destroy()
+            self._context = None
+        # An executor of another thread may still hold what it waits for.
+        deadline = time.monotonic() + _RELEASE_S
+        while self._fixed & fixed_sockets(self.settings) and time.monotonic() < deadline:
+            time.sleep(0.001)
+        self._fixed = set()
+
+    def _group(self, group: CallbackGroup | None) -> CallbackGroup | None:
+        if group is None and self._served is not None:
+            return self._served.default_callback_group
+        return group
+
+    def _receive(self, entity: shared_executor.Guest) -> None:
+        if self._served is not None:
+            shared_executor.move(entity, self.node, self._served)
+            self._guests.append(entity)
+
+    def _announced(
+        self, type_: type[Any], topic: str, *, writer: bool
+    ) -> contextlib.AbstractContextManager[None]:
+        """Tie an endpoint that is about to be made to its line of the static table, if any."""
+        endpoints = self.settings.static_endpoints
+        if not endpoints:
+            return contextlib.nullcontext()
+        package, kind = type_.__module__.split(".")[:2]
+        line = find_endpoint(
+            endpoints,
+            writer=writer,
+            profile=self.node.resolve_topic_name(topic),
+            type_name=f"{package}::{kind}::dds_::{type_.__name__}_",
+        )
+        return default_qos.endpoint_profiles(endpoint_profiles([line]))
+
+    def _refuse_static(self, what: str, name: str) -> None:
+        if self.settings.static_participants:
+            raise MiddlewareError(
+                f"cannot make {what} {name!r} on {self.name!r}: its endpoints are discovered "
+                "statically, which services and actions are not",
+                hint="map it to the node's own participant",
+            )
+
+    def __enter__(self) -> FlowParticipant:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.destroy()

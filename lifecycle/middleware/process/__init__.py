@@ -1,0 +1,1 @@
+"""The process itself: timers, threads, shared memory, and the way out of DDS."""

@@ -1,0 +1,167 @@
+"""Process control that Python's standard library lacks.
+
+Owns: prctl(2), the deadman timer of timer_create(2), both through ctypes, and whether threads can
+be started. Linux only. Must not import rclpy: a fork server uses it before rclpy is loaded.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import resource
+import signal
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+from lifecycle.errors import MiddlewareError
+from lifecycle.middleware.process.libc import CLOCK_MONOTONIC, TimerSpec, libc
+
+_PR_SET_CHILD_SUBREAPER = 36
+_SIGEV_SIGNAL = 0
+_SIGEV_THREAD = 2
+
+_KILLED_S = 0.5
+"""Between the end by `_exit` and that by SIGKILL, which comes where no thread can be started."""
+
+
+class _SignalEvent(ctypes.Structure):
+    # struct sigevent: glibc pads it to 64 bytes.
+    _fields_ = (
+        ("value", ctypes.c_int64),  # union sigval
+        ("signo", ctypes.c_int),
+        ("notify", ctypes.c_int),
+        ("function", ctypes.c_void_p),
+        ("attributes", ctypes.c_void_p),
+        ("padding", ctypes.c_char * 32),
+    )
+
+
+def adopt_orphans() -> None:
+    """Become the parent of every descendant whose own parent dies (PR_SET_CHILD_SUBREAPER).
+
+    They then can be found, signalled and waited for, also after a crash of what stood between.
+
+    Raises:
+        MiddlewareError: the kernel refused.
+    """
+    _prctl(_PR_SET_CHILD_SUBREAPER, 1)
+
+
+def exit_after(seconds: float, code: int) -> Callable[[], None]:
+    """End this process with `code` after `seconds`, whatever its threads do by then.
+
+    glibc runs `_exit(code)` itself on a thread of its own, without Python: it also ends a process
+    that hangs in C++ with the GIL held, which no Python thread or signal handler can. Where the
+    limit of threads is reached, the kernel ends it with SIGKILL instead.
+
+    Args:
+        seconds: > 0.
+        code: 0–255.
+
+    Returns:
+        A function that lets it live after all.
+
+    Raises:
+        MiddlewareError: the kernel refused.
+        ValueError: out of range.
+    """
+    if seconds <= 0 or not 0 <= code <= 0xFF:
+        raise ValueError(f"cannot exit with {code} after {seconds} s: 0–255 after more than 0 s")
+    ends = _SignalEvent(
+        value=code,
+        notify=_SIGEV_THREAD,
+        function=ctypes.cast(libc()._exit, ctypes.c_void_p),  # noqa: SLF001 - C's name
+    )
+    kills = _SignalEvent(notify=_SIGEV_SIGNAL, signo=signal.SIGKILL)
+    timers = [_Timer(kills, seconds + _KILLED_S)]
+    with contextlib.suppress(MiddlewareError):
+        timers.append(_Timer(ends, seconds))
+
+    def live_on() -> None:
+        for timer in timers:
+            timer.disarm()
+
+    return live_on
+
+
+class _Timer:
+    """A timer of the kernel that is armed, once."""
+
+    def __init__(self, event: _SignalEvent, seconds: float) -> None:
+        create, self._arm = _timer_functions()
+        self._timer = ctypes.c_void_p()
+        if create(CLOCK_MONOTONIC, ctypes.byref(event), ctypes.byref(self._timer)) != 0:
+            raise _failed("timer_create")
+        self._set(TimerSpec.once(round(seconds * 1e9)))
+
+    def disarm(self) -> None:
+        self._set(TimerSpec())
+
+    def _set(self, spec: TimerSpec) -> None:
+        if self._arm(self._timer, 0, ctypes.byref(spec), None) != 0:
+            raise _failed("timer_settime")
+
+
+def check_threads(count: int) -> None:
+    """Make sure that so many threads can be started now.
+
+    Raises:
+        MiddlewareError: they cannot; names the limits that hold.
+    """
+    over = threading.Event()
+    started: list[threading.Thread] = []
+    try:
+        for _ in range(count):
+            thread = threading.Thread(target=over.wait, daemon=True)
+            thread.start()
+            started.append(thread)
+    except RuntimeError as error:
+        raise no_room_for_threads(count) from error
+    finally:
+        over.set()
+        for thread in started:
+            thread.join()
+
+
+def no_room_for_threads(count: int) -> MiddlewareError:
+    """Return the error of a process that can have no more threads; names the limits that hold."""
+    threads = "the thread" if count == 1 else f"the {count} threads"
+    return MiddlewareError(
+        f"cannot start {threads} that this needs: the limit of processes and threads is "
+        f"reached{_limits()}",
+        hint="raise it (ulimit -u, TasksMax= or pids.max), or end other processes",
+    )
+
+
+def _limits() -> str:
+    """Name the limits that are known, getrlimit(2) and cgroups(7)."""
+    found = []
+    soft, _ = resource.getrlimit(resource.RLIMIT_NPROC)
+    if soft != resource.RLIM_INFINITY:
+        found.append(f"{soft} for this user")
+    with contextlib.suppress(OSError, StopIteration):
+        groups = Path("/proc/self/cgroup").read_text(encoding="utf-8").splitlines()
+        own = next(each for each in groups if each.startswith("0::"))[3:]
+        text = Path(f"/sys/fs/cgroup{own}/pids.max").read_text(encoding="ascii").strip()
+        if text != "max":
+            found.append(f"{text} for this control group")
+    return f" ({', '.join(found)})" if found else ""
+
+
+def _prctl(option: int, argument: int) -> None:
+    if libc().prctl(option, ctypes.c_ulong(argument), 0, 0, 0) != 0:
+        raise _failed("prctl")
+
+
+def _timer_functions() -> tuple[ctypes._NamedFuncPointer, ctypes._NamedFuncPointer]:
+    try:
+        return libc().timer_create, libc().timer_settime
+    except AttributeError:  # before glibc 2.34 they are in librt
+        librt = ctypes.CDLL("librt.so.1", use_errno=True)
+        return librt.timer_create, librt.timer_settime
+
+
+def _failed(call: str) -> MiddlewareError:
+    return MiddlewareError(f"cannot use {call}: {os.strerror(ctypes.get_errno())}")

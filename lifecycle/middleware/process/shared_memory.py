@@ -1,0 +1,276 @@
+"""Fast DDS's shared memory files that nobody uses any more.
+
+Owns: who owns which of them in /dev/shm, and removing what a killed process left: one segment of
+some 540 kB per participant and the files of its ports, which Fast DDS never reclaims. Must not
+import rclpy.
+
+A file belongs to a group, `fastrtps_<segment>` or `fastrtps_port<number>`, each with a lock file
+(`_el` exclusive, `_sl` shared) that the owner keeps open and locked, and a port with a named
+semaphore under which it is opened (sem_overview(7)).
+
+/proc hides the processes of other PID namespaces, which may share /dev/shm (containers with the
+host's IPC do). So it never proves that a file is unused; what the kernel grants to one holder does:
+
+- the lock file of the group, locked exclusively (flock(2)): no owner lives.
+- a write lease on every other file (fcntl(2), Leases): no process has it open or mapped, and none
+  can open it until the lease is given back. A port needs that too, a sender may be about to look
+  for it; a segment that has a lock file does not: its readers keep a dead owner's mapping for a
+  while, which removing the name does not touch.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import dataclasses
+import fcntl
+import os
+import re
+import signal
+import struct
+from collections.abc import Callable, Collection, Iterable, Iterator
+from pathlib import Path
+
+from lifecycle.errors import MiddlewareError
+from lifecycle.middleware.process.libc import libc
+
+_DIRECTORY = Path("/dev/shm")  # noqa: S108 - where shm_open(3) keeps them
+_FILE = re.compile(
+    r"(?P<semaphore>sem\.)?(?P<group>fastrtps_(?:port\d+|[0-9a-f]{16}))(?P<rest>_el|_sl|_mutex)?"
+)
+_IN_CREATE = 0x100
+_EVENT = struct.Struct("iIII")
+_EVENT_BYTES = 65536
+
+_Inode = tuple[int, int]
+"""(device, inode number)."""
+
+
+_LEAST_ROOM_BYTES = 1 << 15
+"""Measured: with 4 KiB a participant ends by SIGBUS, with 64 KiB it does without."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class _File:
+    path: Path
+    group: str
+    inode: _Inode
+    uid: int
+
+    @property
+    def is_lock(self) -> bool:
+        return self.path.name.endswith(("_el", "_sl"))
+
+    @property
+    def is_mutex(self) -> bool:
+        return self.path.name.startswith("sem.")
+
+    @property
+    def is_port(self) -> bool:
+        return self.group.startswith("fastrtps_port")
+
+
+def segments_of(pids: Iterable[int]) -> frozenset[str]:
+    """Return the names of the Fast DDS files that these processes own now.
+
+    Remember them while a process lives; `sweep` then removes what it left behind.
+    """
+    held = {inode for pid in pids for inode in _peek(_open_inodes, pid)}
+    files = _files() if held else []
+    owned = {file.group for file in files if file.is_lock and file.inode in held}
+    return frozenset(file.path.name for file in files if file.group in owned)
+
+
+class Creations:
+    """Notices that a process, ours or not, begins to own a segment or a port (inotify(7)).
+
+    Attributes:
+        descriptor: readable as soon as a lock file was created.
+    """
+
+    def __init__(self) -> None:
+        """Begin.
+
+        Raises:
+            OSError: there is no /dev/shm, or this user has too many inotify instances.
+        """
+        self.descriptor = libc().inotify_init1(os.O_NONBLOCK | os.O_CLOEXEC)
+        if self.descriptor < 0:
+            raise _failed()
+        path = os.fsencode(_DIRECTORY)
+        if libc().inotify_add_watch(self.descriptor, path, _IN_CREATE) < 0:
+            error = _failed()
+            os.close(self.descriptor)
+            raise error
+
+    def take(self) -> bool:
+        """Take what came; return whether a lock file was created."""
+        try:
+            data = os.read(self.descriptor, _EVENT_BYTES)
+        except BlockingIOError:
+            return False
+        return any(_group(name) and name.endswith(("_el", "_sl")) for name in _created(data))
+
+    def close(self) -> None:
+        """End it."""
+        os.close(self.descriptor)
+
+
+def _created(data: bytes) -> Iterator[str]:
+    start = 0
+    while start < len(data):
+        *_, length = _EVENT.unpack_from(data, start)
+        start += _EVENT.size
+        yield os.fsdecode(data[start : start + length].rstrip(b"\0"))
+        start += length
+
+
+def _failed() -> OSError:
+    return OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()), str(_DIRECTORY))
+
+
+def check_room() -> None:
+    """Make sure that there is some room in /dev/shm at all.
+
+    Raises:
+        MiddlewareError: there is so little that the kernel would end who uses it with SIGBUS.
+    """
+    with contextlib.suppress(OSError):
+        there = os.statvfs(_DIRECTORY)
+        free = there.f_bavail * there.f_frsize
+        if free < _LEAST_ROOM_BYTES:
+            raise MiddlewareError(
+                f"cannot share memory: {str(_DIRECTORY)!r} has {free} bytes left, and Fast DDS "
+                f"needs {_LEAST_ROOM_BYTES} at the very least",
+                hint="make room there, or give it more (mount -o remount,size=64m; in a container "
+                "--shm-size=64m)",
+            )
+
+
+def sweep(only: Collection[str]) -> tuple[str, ...]:
+    """Remove the files of this user in the groups of these names that are proven to be unused.
+
+    Args:
+        only: names that processes which have ended were seen to own.
+
+    Returns:
+        The names removed, sorted; empty where there is no /dev/shm.
+    """
+    return _unused(only, remove=True)
+
+
+def leftovers(*, only: Collection[str] | None = None) -> tuple[str, ...]:
+    """Return what `sweep` would remove, sorted, and remove nothing; None considers all groups."""
+    return _unused(only, remove=False)
+
+
+def _unused(only: Collection[str] | None, *, remove: bool) -> tuple[str, ...]:
+    groups: dict[str, list[_File]] = {}
+    for file in _files():
+        groups.setdefault(file.group, []).append(file)
+    wanted = groups if only is None else {_group(name) for name in only} & set(groups)
+    found = []
+    for group in sorted(wanted):
+        with _claimed(groups[group]) as claimed:
+            for file in groups[group] if claimed else ():
+                if remove:
+                    file.path.unlink(missing_ok=True)
+                found.append(file.path.name)
+    return tuple(sorted(found))
+
+
+@contextlib.contextmanager
+def _claimed(files: Collection[_File]) -> Iterator[bool]:
+    """Hold a group against all other processes for the length of the block.
+
+    Yields:
+        Whether it is: False where a file is in use, another user's, or not as it was listed.
+    """
+    if any(file.uid != os.getuid() for file in files):
+        yield False
+        return
+    locked = any(file.is_lock for file in files)
+    with contextlib.ExitStack() as claims:
+        try:
+            # The semaphore first: who opens the port after this waits until we are done.
+            for file in sorted(files, key=lambda each: not each.is_mutex):
+                if file.is_lock or file.is_port or not locked:
+                    claims.enter_context(_claim(file))
+            # What came meanwhile belongs to a process that just opens it.
+            same = set(_files(next(iter(files)).group)) == set(files)
+        except OSError:
+            same = False
+        yield same
+
+
+@contextlib.contextmanager
+def _claim(file: _File) -> Iterator[None]:
+    """Hold one file.
+
+    Raises:
+        OSError: another process uses it, or the kernel cannot tell.
+    """
+    mode = os.O_RDONLY if file.is_lock else os.O_RDWR
+    flags = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+    descriptor = os.open(file.path, mode | flags)
+    try:
+        if file.is_lock:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        else:
+            # Who then opens it is announced by a signal, by default one that kills.
+            fcntl.fcntl(descriptor, fcntl.F_SETSIG, signal.SIGURG)
+            fcntl.fcntl(descriptor, fcntl.F_SETLEASE, fcntl.F_WRLCK)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _files(group: str = "") -> list[_File]:
+    """Return the files of one group, or of all."""
+    found = []
+    for entry in _listing(_DIRECTORY):
+        of = _group(entry.name)
+        if not of or (group and of != group):
+            continue
+        with contextlib.suppress(FileNotFoundError):
+            status = entry.stat(follow_symlinks=False)
+            found.append(
+                _File(
+                    path=Path(entry.path),
+                    group=of,
+                    inode=(status.st_dev, status.st_ino),
+                    uid=status.st_uid,
+                )
+            )
+    return found
+
+
+def _listing(directory: Path) -> list[os.DirEntry[str]]:
+    try:
+        with os.scandir(directory) as entries:
+            return list(entries)
+    except FileNotFoundError:
+        return []
+
+
+def _group(name: str) -> str:
+    match = _FILE.fullmatch(name)
+    return match["group"] if match else ""
+
+
+def _peek(look: Callable[[int], set[_Inode]], pid: int) -> set[_Inode]:
+    """Look into a process; nothing where it has ended or belongs to another user."""
+    try:
+        return look(pid)
+    except (FileNotFoundError, PermissionError, ProcessLookupError):
+        return set()
+
+
+def _open_inodes(pid: int) -> set[_Inode]:
+    found: set[_Inode] = set()
+    for entry in _listing(Path(f"/proc/{pid}/fd")):
+        with contextlib.suppress(FileNotFoundError):
+            if os.readlink(entry.path).startswith(f"{_DIRECTORY}/"):  # noqa: PTH115 - hot loop
+                status = entry.stat()
+                found.add((status.st_dev, status.st_ino))
+    return found

@@ -1,0 +1,396 @@
+"""The ROS graph as discovery shows it, read in one go and watched without polling.
+
+Owns: the observer's participant, and the translation of graph queries into observation
+types. What tools bring along is left out by `lifecycle.verify.noise`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import threading
+import time
+import typing
+from collections.abc import Callable, Collection, Iterable, Iterator
+
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.middleware.discovery.dead_connections import give_up_dead_connections, is_used
+from lifecycle.middleware.discovery.dead_participants import (
+    PROCESS_DIGITS,
+    is_of_process,
+    remove_participants,
+)
+from lifecycle.middleware.discovery.probe_targets import knock_for
+from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
+from lifecycle.middleware.rcl.graph_guard import GraphGuard
+from lifecycle.middleware.rcl.graph_queries import endpoints_of, endpoints_of_node, topic_endpoints
+from lifecycle.middleware.rcl.hidden_node import quiet_node
+from lifecycle.middleware.rcl.stale_node_filter import Census
+from lifecycle.middleware.rcl.type_hash import with_service_hashes
+from lifecycle.network.connection_url import ConnectionTransport
+from lifecycle.plan.model import ParticipantConnections
+from lifecycle.verify.noise import (
+    NO_NAMES,
+    DeclaredNames,
+    fold_actions,
+    is_noise_endpoint,
+    known_node,
+    without_noise,
+)
+from lifecycle.verify.observation import ObservedEndpoint, ObservedNode
+
+ANSWER_S = 0.15
+"""Who hears a knock on this host or the next one answers within so long."""
+
+PATIENCE_S = 3.5
+"""What Fast DDS lost on the way it sends again every 3 s."""
+
+_UNASKED_S = 1.5
+"""Within so long everybody is seen where nobody can be asked, over shared memory or TCP.
+
+They announce themselves each 0.5 s, and TCP may lose the first of it (measured: up to 1.2 s).
+"""
+
+_UNCOUNTED_S = 0.6
+"""Within so long who is asked is seen, if its answer may not come to us (measured: up to 0.3 s)."""
+
+_TOLD_S = 2.5
+"""Within so long a discovery server has told of everybody (measured: up to 1.6 s)."""
+
+_AGREED_S = 5.0
+"""A server that listens agrees within 0.1 s, on a machine with both processors busy within 1 s."""
+
+_LOOK_S = 0.005
+_PREFIX_DIGITS = 24
+_CHANGE_STATE = "lifecycle_msgs/srv/ChangeState"
+_GET_STATE = "lifecycle_msgs/srv/GetState"
+
+Snapshot = tuple[tuple[ObservedNode, ...], tuple[ObservedEndpoint, ...]]
+
+
+@typing.final
+class GraphObserver:
+    """A hidden node that sees the whole graph of one domain.
+
+    Make it before starting what it is to see: a participant that is there already is found at
+    once. `destroy` it, or use it in a `with`. Every method may be called from any thread.
+
+    Args:
+        domain_id: 0–232.
+        connections: how it is connected; as a client of a discovery server it is a super client,
+            which is told of everything.
+
+    Attributes:
+        urls: of its connections; none where the RMW chooses.
+
+    Raises:
+        ConnectionUrlError: a URL that is none.
+        MiddlewareError: no participant could be made.
+    """
+
+    def __init__(self, domain_id: int, connections: ParticipantConnections | None = None) -> None:
+        self.domain_id = domain_id
+        settings = ParticipantSettings.of(
+            connections or ParticipantConnections(), super_client=True
+        )
+        self._context, self.node = quiet_node(
+            f"_lifecycle_observer_{os.getpid()}", "/", domain_id, settings=settings
+        )
+        self._name = self.node.get_fully_qualified_name()
+        self.urls = settings.urls
+        self._census = Census(self.node)
+        self._lock = threading.Lock()
+        self._callbacks: tuple[Callable[[], None], ...] = ()
+        self._destroyed = False
+        self._known: frozenset[str] = frozenset()
+        self._guard = GraphGuard(self.node, self._changed)
+        self._knocks = knock_for(domain_id, settings.urls, os.environ)
+        self._asked_for: set[str] = set()
+        self._limit_s = _TOLD_S if any(url.server for url in settings.urls) else _UNASKED_S
+        self._made_s = time.monotonic()
+
+    def on_change(self, callback: Callable[[], None]) -> Callable[[], None]:
+        """Have `callback` called in the guard's thread after each change of the graph.
+
+        It says that something changed, not what; changes that come together come as one. It must
+        be quick and must not destroy the observer.
+
+        Returns:
+            A function that takes the callback away again.
+        """
+        with self._lock:
+            self._callbacks += (callback,)
+
+        def remove() -> None:
+            with self._lock:
+                self._callbacks = tuple(each for each in self._callbacks if each is not callback)
+
+        return remove
+
+    def snapshot(
+        self, *, declared: Collection[str] = (), names: DeclaredNames = NO_NAMES
+    ) -> Snapshot:
+        """Return the nodes and the endpoints that discovery shows now, in a stable order.
+
+        All but ourselves. The housekeeping of client libraries is left out. Services are known by
+        their nodes, so those of nobody known are looked for by name.
+
+        Args:
+            declared: fully qualified names of nodes that are looked for.
+            names: of topics, services and actions that are looked for: whoever offers one of them
+                and is not `declared` is shown, whatever it looks like.
+
+        Raises:
+            MiddlewareError: the graph is no longer watched; the message says why.
+        """
+        if self._guard.failure is not None:
+            raise self._guard.failure
+        self._known = frozenset()
+        counts = self._census.count()
+        ourselves = {} if counts[self._name] > 1 else {self._name}
+        endpoints = [
+            each for each in self._topic_endpoints(declared, names) if each.node not in ourselves
+        ]
+        nodes, untold = [], {""}
+        for name in sorted(name for name in counts if known_node(name) and name not in ourselves):
+            services = self._services(name)
+            nodes.append(
+                ObservedNode(full_name=name, count=counts[name], managed=_managed(name, services))
+            )
+            if services is None:
+                untold.add(name)
+            endpoints += services or ()
+        endpoints += self._services_of_others(names, untold)
+        wanted = without_noise(each for each in endpoints if each.node in declared)
+        others = without_noise((each for each in endpoints if each.node not in declared), but=names)
+        kept = self._located(fold_actions(with_service_hashes(self.node, (*wanted, *others))))
+        return tuple(nodes), tuple(sorted(kept, key=_order))
+
+    def settling_s(self) -> float:
+        """Return for how many seconds a look may still miss who is there; 0 once it cannot.
+
+        A participant that answered our knock and whose node is not known is on its way into the
+        graph. Fast DDS needs 3 s at most for what it lost; who then still has no node has none.
+        Judged by the last `snapshot`. Where nobody can be asked, it is a time.
+        """
+        age_s = time.monotonic() - self._made_s
+        if not self._knocks:
+            return max(0.0, self._limit_s - age_s)
+        if not all(knock.counts for knock in self._knocks):
+            return max(0.0, _UNCOUNTED_S - age_s)
+        if age_s < ANSWER_S:
+            return ANSWER_S - age_s
+        unknown = frozenset().union(*(each.answered() for each in self._knocks)) - self._known
+        if not unknown:
+            return 0.0
+        if not unknown <= self._asked_for:
+            self._asked_for |= unknown
+            for knock in self._knocks:
+                knock.ask_again(to_count=False)
+        return max(0.0, PATIENCE_S - age_s)
+
+    def offers(self, node: str, service: str) -> bool:
+        """Tell whether discovery shows `service` (a fully qualified name) on `node`."""
+        return service in self.services_of(node)
+
+    def services_of(self, node: str) -> frozenset[str]:
+        """Return the fully qualified names of the services that discovery shows on `node`."""
+        return frozenset(
+            each.name
+            for each in self._services(node) or ()
+            if each.kind is EndpointKind.SERVICE_SERVER
+        )
+
+    def reaches_servers(self) -> bool:
+        """Wait, bounded, until the TCP discovery servers of its URLs can be asked; False if not.
+
+        What Fast DDS has not agreed on with a server by then it never will: make another observer,
+        on another port. Without such servers there is nothing to wait for.
+        """
+        deadline = time.monotonic() + _AGREED_S
+        servers = [
+            (server.address, server.port)
+            for url in self.urls
+            if url.transport is ConnectionTransport.TCPV4
+            for server in url.server
+            if server.port is not None
+        ]
+        for address, port in servers:
+            while not (used := is_used(address, port)):
+                if used is False or time.monotonic() > deadline:
+                    return False
+                time.sleep(_LOOK_S)  # the kernel tells nobody
+        return True
+
+    def participants_of(
+        self, pid: int, *, nodes: Iterable[str], reported: Iterable[str]
+    ) -> frozenset[str]:
+        """Return the GUID prefixes (24 hex digits) of a process's participants in the graph.
+
+        Args:
+            pid: of a process on this host.
+            nodes: fully qualified names of nodes that it runs.
+            reported: GUID prefixes that these nodes said are theirs. Of both only those count
+                that bear this host and this pid.
+        """
+        if self._destroyed:
+            return frozenset()
+        homes = self._census.homes()
+        own = next(iter(homes.get(self.node.get_fully_qualified_name(), ())), "")
+        claimed = {*reported, *(prefix for name in nodes for prefix in homes.get(name, ()))}
+        processes = {
+            each[:PROCESS_DIGITS] for each in claimed if own and is_of_process(each, pid, own)
+        }
+        processes.discard(own[:PROCESS_DIGITS])
+        return frozenset(
+            each for each in self._census.shown() if each[:PROCESS_DIGITS] in processes
+        )
+
+    def remove_participants(self, prefixes: Iterable[str], pids: Iterable[int]) -> None:
+        """Have everybody forget participants whose process is known to be dead.
+
+        Others are told over UDP only, see `discovery/dead_participants.py`; here they do
+        not count any more, whatever discovery shows until their lease has run out.
+
+        Args:
+            prefixes: GUID prefixes, 24 hex digits each.
+            pids: of processes on this host that run; they are reached wherever they listen.
+        """
+        self._census.ignore(prefixes := tuple(prefixes))
+        self._changed()
+        remove_participants(prefixes, self.domain_id, self.urls, os.environ, (os.getpid(), *pids))
+
+    def destroy(self) -> None:
+        """Stop watching and leave the graph; again is harmless."""
+        if self._destroyed:
+            return
+        self._destroyed = True
+        for knock in self._knocks:
+            knock.close()
+        self._guard.stop()
+        give_up_dead_connections()
+        self.node.destroy_node()
+        self._context.try_shutdown()
+        self._context.destroy()
+
+    def __enter__(self) -> GraphObserver:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.destroy()
+
+    def _changed(self) -> None:
+        for callback in self._callbacks:
+            callback()
+
+    def _topic_endpoints(
+        self, declared: Collection[str], names: DeclaredNames
+    ) -> Iterator[ObservedEndpoint]:
+        for kind, topic, info in topic_endpoints(self.node):
+            if self._census.ignores(info.gid):
+                continue
+            if info.node:
+                self._known |= {info.gid[:_PREFIX_DIGITS]}
+            node = known_node(info.node)
+            feeds = node not in declared and names.fed_by(kind, topic)
+            if not feeds and is_noise_endpoint(kind, node, topic, info.type, ours=False):
+                continue
+            yield ObservedEndpoint(
+                kind=kind,
+                node=node,
+                name=topic,
+                type=info.type,
+                qos=info.qos,
+                gid=info.gid,
+                type_hash=info.type_hash,
+            )
+
+    def _services_of_others(
+        self, names: DeclaredNames, untold: Collection[str]
+    ) -> Iterator[ObservedEndpoint]:
+        """Yield who offers or asks for declared services and is a node of which rcl does not tell.
+
+        A node that is about to be known has them too; a plain DDS program never is one, and no rcl
+        tells of a node whose name it would not give.
+        """
+        services = [
+            *names.of_kind(EndpointKind.SERVICE_SERVER),
+            *(
+                f"{action}/_action/{part}"
+                for action in names.of_kind(EndpointKind.ACTION_SERVER)
+                for part in ("send_goal", "cancel_goal", "get_result")
+            ),
+        ]
+        publishers, subscriptions = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
+        for service in services:
+            shown: set[tuple[EndpointKind, str]] = set()
+            for kind, side, topic in (
+                (EndpointKind.SERVICE_SERVER, subscriptions, f"rq{service}Request"),
+                (EndpointKind.SERVICE_SERVER, publishers, f"rr{service}Reply"),
+                (EndpointKind.SERVICE_CLIENT, publishers, f"rq{service}Request"),
+                (EndpointKind.SERVICE_CLIENT, subscriptions, f"rr{service}Reply"),
+            ):
+                for info in endpoints_of(self.node, side, topic, no_mangle=True):
+                    node = known_node(info.node)
+                    if node not in untold or (kind, info.gid[:_PREFIX_DIGITS]) in shown:
+                        continue
+                    if self._census.ignores(info.gid):
+                        continue
+                    shown.add((kind, info.gid[:_PREFIX_DIGITS]))
+                    type_ = _service_type(info.type)
+                    yield ObservedEndpoint(
+                        kind=kind, node=node, name=service, type=type_, gid=info.gid
+                    )
+
+    def _located(self, endpoints: Iterable[ObservedEndpoint]) -> Iterator[ObservedEndpoint]:
+        """Add where the participants of endpoints are that nobody is known to have.
+
+        One whose address is not known is asked for it: it answers within a moment, and the next
+        look has it.
+        """
+        known: dict[str, str] = {}
+        for knock in self._knocks:
+            known.update(knock.addresses())
+        for endpoint in endpoints:
+            prefix = endpoint.gid[:_PREFIX_DIGITS]
+            if endpoint.node or not prefix:
+                yield endpoint
+                continue
+            if prefix not in known and prefix not in self._asked_for:
+                self._asked_for.add(prefix)
+                for knock in self._knocks:
+                    knock.ask_again(to_count=True)
+            yield dataclasses.replace(endpoint, address=known.get(prefix, ""))
+
+    def _services(self, full_name: str) -> tuple[ObservedEndpoint, ...] | None:
+        """Return the service endpoints of a node; None if rcl does not tell them."""
+        found: list[ObservedEndpoint] = []
+        for kind in (EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT):
+            listed = endpoints_of_node(self.node, kind, full_name)
+            if listed is None:
+                return None
+            found += (
+                ObservedEndpoint(kind=kind, node=full_name, name=service, type=type_)
+                for service, type_ in listed
+            )
+        return tuple(found)
+
+
+def _managed(node: str, services: Iterable[ObservedEndpoint] | None) -> bool | None:
+    """Tell whether a node offers the services by which a managed node is driven."""
+    if services is None:
+        return None
+    offered = {
+        (each.name, each.type) for each in services if each.kind is EndpointKind.SERVICE_SERVER
+    }
+    return {(f"{node}/change_state", _CHANGE_STATE), (f"{node}/get_state", _GET_STATE)} <= offered
+
+
+def _service_type(dds_type: str) -> str:
+    """Return `std_srvs/srv/Trigger` for `std_srvs::srv::dds_::Trigger_Request_`."""
+    package, _, name = dds_type.replace("::dds_::", "::").replace("::", "/").rpartition("/")
+    return f"{package}/{name.removesuffix('_Request_').removesuffix('_Response_')}"
+
+
+def _order(endpoint: ObservedEndpoint) -> tuple[str, ...]:
+    return (endpoint.node, endpoint.kind.value, endpoint.name, endpoint.type, endpoint.gid)

@@ -1,0 +1,87 @@
+"""Hidden nodes: a participant of its own with nothing on it that the user did not ask for.
+
+Owns: how such a node and its context are made, and which of them this process has.
+"""
+
+from __future__ import annotations
+
+import os
+import weakref
+from collections.abc import Sequence
+
+import rclpy
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from lifecycle.errors import MiddlewareError
+from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
+from lifecycle.middleware.fastdds.settings import participant_settings
+
+_hidden: weakref.WeakSet[Node] = weakref.WeakSet()
+
+
+def quiet_node(
+    name: str,
+    namespace: str,
+    domain_id: int,
+    *,
+    settings: ParticipantSettings | None = None,
+    arguments: Sequence[str] = (),
+) -> tuple[rclpy.Context, Node]:
+    """Return a new context and on it a node with nothing of its own but parameter events.
+
+    Raises:
+        MiddlewareError: rcl refused; nothing is left.
+    """
+    settings = settings or ParticipantSettings()
+    enclave = ("--ros-args", "--enclave", settings.static_name) if settings.static_name else ()
+    context = rclpy.Context()
+    node: Node | None = None
+    try:
+        context.init(args=[*arguments, *enclave], domain_id=domain_id, initialize_logging=False)
+        with participant_settings(context, settings):
+            node = Node(
+                name,
+                namespace=namespace,
+                context=context,
+                enable_rosout=False,
+                start_parameter_services=False,
+                parameter_overrides=[Parameter("start_type_description_service", value=False)],
+            )
+    except Exception as error:
+        if node is not None:
+            node.destroy_node()
+        context.try_shutdown()
+        context.destroy()
+        hint = error.hint if isinstance(error, MiddlewareError) else _security_hint()
+        raise MiddlewareError(
+            f"cannot make a participant for {namespace.rstrip('/')}/{name} in domain {domain_id}: "
+            + (
+                error.message
+                if isinstance(error, MiddlewareError)
+                else " ".join(str(error).split())
+            ),
+            hint=hint,
+        ) from error
+    _hidden.add(node)
+    return context, node
+
+
+def _security_hint() -> str:
+    """Return where to look if ROS 2 security is on: rcl's reason may be `error not set`."""
+    if os.environ.get("ROS_SECURITY_ENABLE") != "true":
+        return ""
+    return (
+        "ROS_SECURITY_ENABLE is set: look at ROS_SECURITY_KEYSTORE and the enclave, and whether "
+        "the installed RMW has security at all (docs/security.md), or unset it"
+    )
+
+
+def hidden_nodes() -> tuple[Node, ...]:
+    """Return the hidden nodes of this process, each on a participant of its own."""
+    return tuple(_hidden)
+
+
+def forget_hidden(node: Node) -> None:
+    """No longer list a node that is about to be destroyed; again is harmless."""
+    _hidden.discard(node)

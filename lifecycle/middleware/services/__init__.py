@@ -1,0 +1,1 @@
+"""Services, actions and parameters of other nodes, and our own servers and clients of actions."""

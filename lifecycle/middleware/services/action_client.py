@@ -1,0 +1,164 @@
+"""rclpy's action client, whose waiting callers learn that it is gone and that they must not block.
+
+Owns: the private names of `rclpy.action.client` that this takes. Import it late: rclpy.action
+imports numpy, 100 ms.
+"""
+
+from __future__ import annotations
+
+import threading
+import typing
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from rclpy.action import ActionClient
+from rclpy.task import Future
+
+from lifecycle.errors import MiddlewareError
+from lifecycle.middleware.services.server_watch import ServerWatch
+
+if TYPE_CHECKING:
+    from rclpy.callback_groups import CallbackGroup
+    from rclpy.guard_condition import GuardCondition
+    from rclpy.node import Node
+
+
+class ActionClientGoneError(MiddlewareError):
+    """An answer that was awaited will not come: the action client it was asked with is gone."""
+
+
+@typing.final
+class GoalClient(ActionClient):  # type: ignore[misc]  # rclpy is not typed
+    """An action client that leaves nobody waiting for ever.
+
+    Args:
+        node: whose participant it is on.
+        action_type: action class.
+        name: as given to rcl, which expands it and applies the node's remapping rules.
+        group: callback group of its answers.
+        refuse_to_block: called with what blocks and what does not, before something blocks; raises
+            where that would wait for ever.
+
+    Attributes:
+        action_name: fully qualified, set by who made it; empty while unknown.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        action_type: type[Any],
+        name: str,
+        *,
+        group: CallbackGroup,
+        refuse_to_block: Callable[[str, str], None],
+    ) -> None:
+        self._refuse_to_block = refuse_to_block
+        self._participant = node  # `_node` becomes whose executor it is, on a connection another
+        self._group = group
+        self._lock = threading.Lock()  # of the next three
+        self._held: list[_Held] = []
+        self._watch: ServerWatch | None = None
+        self._matched: GuardCondition | None = None
+        self._destroyed = False
+        self.action_name = ""
+        super().__init__(node, action_type, name, callback_group=group)
+
+    def send_goal(self, goal: Any, **options: Any) -> Any:
+        """As rclpy's, outside of callbacks: it waits for the result."""
+        self._refuse_to_block(f"a result of action {self._action_name!r}", "send_goal_async(goal)")
+        return super().send_goal(goal, **options)
+
+    def send_goal_async(self, goal: Any, *arguments: Any, **options: Any) -> Future:
+        """As rclpy's; a goal is held until a server is matched, before which DDS would lose it."""
+        if self.server_is_ready() or not isinstance(goal, self._action_type.Goal):
+            return super().send_goal_async(goal, *arguments, **options)
+        held = _Held(
+            send=lambda: super(GoalClient, self).send_goal_async(goal, *arguments, **options)
+        )
+        with self._lock:
+            self._held.append(held)
+            if self._watch is None:
+                self._matched = self._node.create_guard_condition(self._send_held, self._group)
+                self._watch = ServerWatch(self._participant, self, self._matched.trigger)
+        return held.promised
+
+    def _send_held(self) -> None:
+        """Send what was held, if a server is matched now; in the executor."""
+        with self._lock:
+            if self._destroyed or not self.server_is_ready():
+                return
+            held = self._let_go()
+        for each in held:
+            each.send_on()
+
+    def _let_go(self) -> list[_Held]:
+        """Hold nothing any more, with the lock taken; return what was held."""
+        held, self._held = self._held, []
+        if self._watch is not None:
+            self._watch.stop()
+            self._watch = None
+        if self._matched is not None:
+            self._node.destroy_guard_condition(self._matched)
+            self._matched = None
+        return held
+
+    def destroy(self) -> None:
+        """As rclpy's; whoever awaits an answer gets an ActionClientGoneError. Again is harmless."""
+        if self._destroyed:
+            return
+        with self._lock:
+            self._destroyed = True
+            held = [each.promised for each in self._let_go()]
+        for pending, what in (
+            (held, "whether a goal is accepted"),
+            (self._pending_goal_requests.values(), "whether a goal is accepted"),
+            (self._pending_cancel_requests.values(), "whether a goal is cancelled"),
+            (self._pending_result_requests.values(), "the result of a goal"),
+        ):
+            for future in tuple(pending):
+                future.set_exception(
+                    ActionClientGoneError(
+                        f"cannot learn {what} of action {self._action_name!r}: the action client "
+                        "was disconnected"
+                    )
+                )
+        super().destroy()
+
+    def _cancel_goal(self, goal_handle: Any) -> Any:
+        self._refuse_to_block(
+            f"action {self._action_name!r} to cancel a goal", "goal_handle.cancel_goal_async()"
+        )
+        return super()._cancel_goal(goal_handle)
+
+    def _get_result(self, goal_handle: Any) -> Any:
+        self._refuse_to_block(
+            f"a result of action {self._action_name!r}", "goal_handle.get_result_async()"
+        )
+        return super()._get_result(goal_handle)
+
+
+@typing.final
+class _Held:
+    """A goal that waits for a server.
+
+    Args:
+        send: sends it; its future is the answer.
+
+    Attributes:
+        promised: the answer.
+    """
+
+    def __init__(self, *, send: Callable[[], Future]) -> None:
+        self._send = send
+        self.promised: Future = Future()
+
+    def send_on(self) -> None:
+        """Send it."""
+        self._send().add_done_callback(self._tell)
+
+    def _tell(self, sent: Future) -> None:
+        error = sent.exception()
+        if error is not None:
+            self.promised.set_exception(error)
+        else:
+            self.promised.set_result(sent.result())

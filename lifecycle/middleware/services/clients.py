@@ -1,0 +1,326 @@
+"""The lifecycle services and the node configuration of other processes' nodes.
+
+Owns: what is asked of a managed node that we reach only through its services, ours or foreign, and
+how an unanswered request is understood: a change_state without a reply is not a failed transition,
+so the state is read again (rcl_lifecycle, lifecycle_msgs/srv/*).
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable, Collection, Sequence
+
+from lifecycle_msgs.msg import TransitionEvent
+from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
+from rcl_interfaces.msg import Parameter, ParameterEvent, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
+from rclpy.qos import qos_profile_parameter_events
+from rclpy.subscription import Subscription
+from std_srvs.srv import Trigger
+
+from lifecycle.errors import MiddlewareError
+from lifecycle.export.captured import CapturedParameter
+from lifecycle.middleware.rcl.graph import GraphObserver
+from lifecycle.middleware.services.parameters import read_parameters, report_parameters
+from lifecycle.middleware.services.service_calls import ServiceCalls, ServiceUnansweredError
+from lifecycle.verify.observation import (
+    ConfigurationError,
+    NodeConfiguration,
+    ParameterReport,
+    decode_configuration,
+)
+
+TIMEOUT_S = 5.0
+"""For services that answer at once; a transition takes as long as the node's callback does."""
+
+_REREAD_S = 1.0
+_LEAST_S = 0.001
+_EVENT_DEPTH = 10
+_GOALS = {
+    "configure": "inactive",
+    "cleanup": "unconfigured",
+    "activate": "active",
+    "deactivate": "inactive",
+    "shutdown": "finalized",
+}
+"""Transition label → label of the state it leads to (lifecycle_msgs/Transition)."""
+
+_PARAMETER_SERVICES = ("list_parameters", "describe_parameters", "get_parameters")
+
+
+class NodeClients:
+    """Asks and drives nodes through their services. `destroy` it before the observer."""
+
+    def __init__(self, observer: GraphObserver) -> None:
+        self._observer = observer
+        self._calls = ServiceCalls(observer)
+        self._transitions: dict[str, Subscription] = {}
+        self._parameter_events: Subscription | None = None
+
+    async def get_state(self, node: str, *, timeout_s: float = TIMEOUT_S) -> str:
+        """Return the label of a managed node's state (lifecycle_msgs/State).
+
+        Args:
+            node: fully qualified name.
+            timeout_s: seconds, > 0.
+
+        Raises:
+            ServiceUnansweredError: no such service, or no answer.
+        """
+        response = await self._calls.call(
+            f"{node}/get_state", GetState, GetState.Request(), timeout_s=timeout_s, repeat=True
+        )
+        label: str = response.current_state.label
+        return label
+
+    async def get_available_transitions(
+        self, node: str, *, timeout_s: float = TIMEOUT_S
+    ) -> tuple[str, ...]:
+        """Return the labels of the transitions that may be asked for now.
+
+        Raises:
+            ServiceUnansweredError: no such service, or no answer.
+        """
+        response = await self._calls.call(
+            f"{node}/get_available_transitions",
+            GetAvailableTransitions,
+            GetAvailableTransitions.Request(),
+            timeout_s=timeout_s,
+            repeat=True,
+        )
+        return tuple(each.transition.label for each in response.available_transitions)
+
+    async def change_state(
+        self,
+        node: str,
+        transition: str,
+        *,
+        timeout_s: float,
+        before: Callable[[], Awaitable[None]] | None = None,
+    ) -> bool:
+        """Ask for one transition and wait until it is over.
+
+        The request is sent once. While the reply is missing, the state is read now and then: one
+        that has reached the transition's goal counts as the reply.
+
+        Args:
+            node: fully qualified name.
+            transition: label, "configure", "activate", …
+            timeout_s: seconds, > 0, for service, callback and reply together.
+            before: awaited when the request is about to leave; what it raises keeps it back.
+
+        Returns:
+            Whether the node accepted and completed it.
+
+        Raises:
+            ServiceUnansweredError: no such service, or neither reply nor goal state in time.
+        """
+        loop = asyncio.get_running_loop()
+        deadline = loop.time() + timeout_s
+        service = f"{node}/change_state"
+        if self._calls.open(service, ChangeState):
+            # The node drops its reply if it does not know this client's reader yet. It learns of
+            # our readers in order: a reply to one made later proves that it knows this one.
+            self._calls.forget(f"{node}/get_state")
+            await self.get_state(node, timeout_s=timeout_s)
+        request = ChangeState.Request()
+        request.transition.label = transition
+        left_s = max(deadline - loop.time(), _LEAST_S)
+        reply = asyncio.ensure_future(
+            self._calls.call(
+                service, ChangeState, request, timeout_s=left_s, repeat=False, before=before
+            )
+        )
+        try:
+            while not reply.done():
+                await asyncio.wait((reply,), timeout=_REREAD_S)
+                if not reply.done() and await self._reached(node, transition):
+                    # A reply that is under way comes before the next state would be read.
+                    await asyncio.wait((reply,), timeout=_REREAD_S)
+                    return bool(reply.result().success) if reply.done() else True
+            return bool(reply.result().success)
+        except ServiceUnansweredError as error:
+            if await self._reached(node, transition):
+                return True
+            raise ServiceUnansweredError(service, found=error.found, timeout_s=timeout_s) from error
+        finally:
+            reply.cancel()
+
+    async def get_configuration(
+        self, node: str, *, timeout_s: float = TIMEOUT_S
+    ) -> NodeConfiguration | None:
+        """Read the node configuration interface of `node`.
+
+        Returns:
+            None where discovery shows no such interface on the node.
+
+        Raises:
+            ServiceUnansweredError: it is there, but did not answer.
+            MiddlewareError: the node could not give it, or it is not what the schema says.
+        """
+        service = f"{node}/get_configuration"
+        if not self._observer.offers(node, service):
+            return None
+        response = await self._calls.call(
+            service, Trigger, Trigger.Request(), timeout_s=timeout_s, repeat=True
+        )
+        if not response.success:
+            raise MiddlewareError(
+                f"cannot read the configuration of {node!r}: it says {response.message!r}"
+            )
+        try:
+            return decode_configuration(response.message, node)
+        except ConfigurationError as error:
+            raise MiddlewareError(
+                f"cannot read the configuration of {node!r}: {error}",
+                hint="the node may run another version of lifecycle",
+            ) from error
+
+    async def get_parameters(
+        self, node: str, *, timeout_s: float = TIMEOUT_S
+    ) -> tuple[CapturedParameter, ...]:
+        """Read every parameter that `node` declares, with types, values and descriptions.
+
+        Raises:
+            ServiceUnansweredError: the node serves no parameters, or did not answer.
+        """
+        return await read_parameters(self._calls, node, timeout_s=timeout_s)
+
+    async def report_parameters(
+        self, node: str, names: Collection[str], *, timeout_s: float = TIMEOUT_S
+    ) -> tuple[ParameterReport, ...]:
+        """Read those parameters of `node` that are named and that it has.
+
+        Raises:
+            ServiceUnansweredError: the node serves no parameters, or did not answer.
+        """
+        return await report_parameters(self._calls, node, names, timeout_s=timeout_s)
+
+    def serves_parameters(self, node: str) -> bool | None:
+        """Tell whether `node` has parameter services; None while discovery may not show them yet.
+
+        Client libraries make them before the type description service, and discovery tells of one
+        participant's services in order: where it shows the latter alone, there are none.
+        """
+        offered = self._observer.services_of(node)
+        if {f"{node}/{each}" for each in _PARAMETER_SERVICES} <= offered:
+            return True
+        return False if f"{node}/get_type_description" in offered else None
+
+    def on_parameters(self, callback: Callable[[str, frozenset[str]], None]) -> None:
+        """Have `callback` called in the executor thread with each change of any node's parameters.
+
+        It is given the node's full name and the names of the parameters. Once: whoever asks again
+        changes nothing.
+        """
+        if self._parameter_events is None:
+
+            def arrived(event: ParameterEvent) -> None:
+                changed = (
+                    *event.new_parameters,
+                    *event.changed_parameters,
+                    *event.deleted_parameters,
+                )
+                callback(event.node, frozenset(each.name for each in changed))
+
+            self._parameter_events = self._observer.node.create_subscription(
+                ParameterEvent, "/parameter_events", arrived, qos_profile_parameter_events
+            )
+
+    async def connect_to(
+        self, node: str, name: str, urls: Sequence[str], *, timeout_s: float = TIMEOUT_S
+    ) -> None:
+        """Have a node make a connection, `~/connect_to`.
+
+        Args:
+            node: fully qualified name.
+            name: of the connection.
+            urls: connection URLs, at least one.
+            timeout_s: seconds, > 0; all of these.
+
+        Raises:
+            ServiceUnansweredError: no such service, or no answer; all of these.
+            MiddlewareError: the node refused, with its reason; all of these.
+        """
+        await self._tell(node, "connect_to", name, tuple(urls), timeout_s)
+
+    async def map_to(
+        self, node: str, endpoint: str, connection: str, *, timeout_s: float = TIMEOUT_S
+    ) -> None:
+        """Have a node carry an endpoint, `publishers/video`, by a connection; "" is its own."""
+        await self._tell(node, "map_to", endpoint, connection, timeout_s)
+
+    async def disconnect(self, node: str, connection: str, *, timeout_s: float = TIMEOUT_S) -> None:
+        """Have a node unmake a connection."""
+        await self._tell(node, "disconnect", connection, "", timeout_s)
+
+    async def remap(
+        self, node: str, endpoint: str, name: str, *, timeout_s: float = TIMEOUT_S
+    ) -> None:
+        """Have a node give an endpoint another topic or service name."""
+        await self._tell(node, "remap", endpoint, name, timeout_s)
+
+    async def alias(
+        self, node: str, endpoint: str, names: Sequence[str], *, timeout_s: float = TIMEOUT_S
+    ) -> None:
+        """Have a node give an endpoint these further names, and no others."""
+        await self._tell(node, "alias", endpoint, tuple(names), timeout_s)
+
+    async def _tell(
+        self, node: str, operation: str, name: str, value: str | tuple[str, ...], timeout_s: float
+    ) -> None:
+        """Call one of the services that take a name and a value, and say why if it is refused."""
+        if isinstance(value, str):
+            told = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=value)
+        else:
+            told = ParameterValue(
+                type=ParameterType.PARAMETER_STRING_ARRAY, string_array_value=list(value)
+            )
+        request = SetParameters.Request(parameters=[Parameter(name=name, value=told)])
+        # Each of them makes the same state again when it arrives twice.
+        response = await self._calls.call(
+            f"{node}/{operation}", SetParameters, request, timeout_s=timeout_s, repeat=True
+        )
+        if len(response.results) != 1:
+            raise MiddlewareError(
+                f"cannot {operation} {name!r} of {node!r}: it answered with "
+                f"{len(response.results)} results instead of one"
+            )
+        if not response.results[0].successful:
+            raise MiddlewareError(
+                f"cannot {operation} {name!r} of {node!r}: it says {response.results[0].reason!r}"
+            )
+
+    def on_transition(self, node: str, callback: Callable[[], None]) -> None:
+        """Have `callback` called in the executor thread when `node` tells of a transition.
+
+        One callback per node, until `forget`; asking again for the same node changes nothing.
+        """
+        if node not in self._transitions:
+            self._transitions[node] = self._observer.node.create_subscription(
+                TransitionEvent, f"{node}/transition_event", lambda _: callback(), _EVENT_DEPTH
+            )
+
+    def forget(self, node: str) -> None:
+        """Drop the clients and the subscription of a node that left the graph."""
+        self._calls.forget(f"{node}/")
+        if node in self._transitions:
+            self._observer.node.destroy_subscription(self._transitions.pop(node))
+
+    def destroy(self) -> None:
+        """Stop the executor thread and drop every client; again is harmless."""
+        self._calls.destroy()
+        for node in tuple(self._transitions):
+            self.forget(node)
+        if self._parameter_events is not None:
+            self._observer.node.destroy_subscription(self._parameter_events)
+            self._parameter_events = None
+
+    async def _reached(self, node: str, transition: str) -> bool:
+        goal = _GOALS.get(transition)
+        if goal is None:
+            return False
+        try:
+            return await self.get_state(node, timeout_s=_REREAD_S) == goal
+        except ServiceUnansweredError:
+            return False

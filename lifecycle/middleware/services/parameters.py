@@ -1,0 +1,126 @@
+"""The parameters of other processes' nodes, through their parameter services.
+
+Owns: what is asked of rcl_interfaces' services and how its types become ours, those of a node in
+this process too. Nodes that serve no parameters have none of these services.
+"""
+
+from __future__ import annotations
+
+import array
+import asyncio
+from collections.abc import Collection
+from typing import TYPE_CHECKING, Any
+
+from rcl_interfaces.msg import ParameterType
+from rcl_interfaces.msg import ParameterValue as ParameterValueMessage
+from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters
+
+from lifecycle.manifest.model import ParameterValue
+from lifecycle.verify.observation import ParameterReport
+
+if TYPE_CHECKING:
+    from lifecycle.export.captured import CapturedParameter
+    from lifecycle.middleware.services.service_calls import ServiceCalls
+
+_TYPES = {
+    ParameterType.PARAMETER_BOOL: ("bool", "bool_value"),
+    ParameterType.PARAMETER_INTEGER: ("int", "integer_value"),
+    ParameterType.PARAMETER_DOUBLE: ("double", "double_value"),
+    ParameterType.PARAMETER_STRING: ("string", "string_value"),
+    ParameterType.PARAMETER_BYTE_ARRAY: ("byte_array", "byte_array_value"),
+    ParameterType.PARAMETER_BOOL_ARRAY: ("bool_array", "bool_array_value"),
+    ParameterType.PARAMETER_INTEGER_ARRAY: ("int_array", "integer_array_value"),
+    ParameterType.PARAMETER_DOUBLE_ARRAY: ("double_array", "double_array_value"),
+    ParameterType.PARAMETER_STRING_ARRAY: ("string_array", "string_array_value"),
+}
+"""rcl_interfaces/msg/ParameterType → our word, and where ParameterValue holds the value."""
+
+
+async def read_parameters(
+    calls: ServiceCalls, node: str, *, timeout_s: float
+) -> tuple[CapturedParameter, ...]:
+    """Read every parameter that a node declares: its type, value and description.
+
+    Args:
+        calls: makes the requests.
+        node: fully qualified name.
+        timeout_s: seconds, > 0, for each request.
+
+    Raises:
+        ServiceUnansweredError: no such service, or no answer.
+    """
+    from lifecycle.export.captured import CapturedParameter
+
+    return tuple(
+        CapturedParameter(
+            name=name,
+            type=type_word(value.type),
+            value=_value(value),
+            description=descriptor.description if descriptor else "",
+            read_only=bool(descriptor and descriptor.read_only),
+        )
+        for name, descriptor, value in await _read(calls, node, None, timeout_s)
+    )
+
+
+async def report_parameters(
+    calls: ServiceCalls, node: str, names: Collection[str], *, timeout_s: float
+) -> tuple[ParameterReport, ...]:
+    """Read those parameters of a node that are named and that it has; as `read_parameters`."""
+    return tuple(
+        ParameterReport.of(
+            name,
+            type_word(value.type) or type_word(descriptor.type if descriptor else 0),
+            _value(value),
+            read_only=bool(descriptor and descriptor.read_only),
+        )
+        for name, descriptor, value in await _read(calls, node, names, timeout_s)
+    )
+
+
+async def _read(
+    calls: ServiceCalls, node: str, names: Collection[str] | None, timeout_s: float
+) -> list[tuple[str, Any, Any]]:
+    """Return name, descriptor (None if unknown) and value of parameters, sorted by name."""
+
+    async def ask(service: str, type_: type[Any], request: object) -> Any:
+        name = f"{node}/{service}"
+        return await calls.call(name, type_, request, timeout_s=timeout_s, repeat=True)
+
+    async def get(asked: list[str]) -> list[Any]:
+        request = GetParameters.Request(names=asked)
+        return list((await ask("get_parameters", GetParameters, request)).values)
+
+    listed = await ask("list_parameters", ListParameters, ListParameters.Request())
+    has = set(listed.result.names)
+    wanted = sorted(has if names is None else has.intersection(names))
+    if not wanted:
+        return []
+    described, values = await asyncio.gather(
+        ask("describe_parameters", DescribeParameters, DescribeParameters.Request(names=wanted)),
+        get(wanted),
+    )
+    if len(values) != len(wanted):
+        # One that is declared and not set makes rclpy and rclcpp answer with none at all.
+        alone = await asyncio.gather(*(get([name]) for name in wanted))
+        values = [each[0] if each else ParameterValueMessage() for each in alone]
+    found = {each.name: each for each in described.descriptors}
+    return [(name, found.get(name), value) for name, value in zip(wanted, values, strict=True)]
+
+
+def type_word(type_: int) -> str:
+    """Return our word for a rcl_interfaces/msg/ParameterType; empty for one that is not set."""
+    return _TYPES[type_][0] if type_ in _TYPES else ""
+
+
+def parameter_value(value: Any) -> ParameterValue | None:
+    """Return a value as rclpy has it in our types: arrays are tuples, bytes are integers."""
+    if isinstance(value, (bytes, list, tuple, array.array)):
+        return tuple(each[0] if isinstance(each, bytes) else each for each in value)
+    plain: ParameterValue | None = value
+    return plain
+
+
+def _value(message: Any) -> ParameterValue | None:
+    known = _TYPES.get(message.type)
+    return parameter_value(getattr(message, known[1])) if known else None

@@ -1,0 +1,188 @@
+"""Calling ROS services from asyncio.
+
+Owns: one executor thread on the observer's node, the bridge from rclpy's futures to asyncio's, and
+the rule for requests that stay unanswered. rmw_fastrtps drops a reply when the client's reader is
+not matched yet, so a request that may be repeated is repeated until its deadline.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from rclpy.client import Client
+from rclpy.task import Future
+
+from lifecycle.errors import MiddlewareError
+from lifecycle.middleware.rcl.graph import GraphObserver
+from lifecycle.middleware.rcl.spinning import Spinner
+
+_FIRST_ATTEMPT_S = 0.1
+"""So long a server of rmw_fastrtps waits for the client's reader before it drops its reply."""
+_LONGEST_ATTEMPT_S = 2.0
+_MATCH_CHECK_S = 0.02
+"""Discovery tells of a service a moment before the client is matched with it, and only once."""
+_UNMATCHED_S = 0.5
+"""So long a service that is in the graph may keep its client unmatched before it is asked anyway.
+
+rmw_fastrtps calls a client ready only while all servers of the name, in the whole graph, are seen
+and matched by both their endpoints (it compares totals, rmw_service_server_is_available.cpp). One
+that cannot be matched, or that died while it was discovered, would hide the one that answers.
+"""
+
+
+class ServiceUnansweredError(MiddlewareError):
+    """A service was not there or did not answer before the deadline.
+
+    Attributes:
+        service: fully qualified.
+        found: whether it was there, so that the request was sent.
+    """
+
+    def __init__(self, service: str, *, found: bool, timeout_s: float) -> None:
+        what = "it did not answer" if found else "nobody offers it"
+        super().__init__(f"cannot call service {service!r}: {what} within {timeout_s:g} s")
+        self.service = service
+        self.found = found
+
+
+class ServiceCalls:
+    """Calls services on the observer's node; the participant is the observer's.
+
+    Must be used from one asyncio loop; `destroy` it before the observer.
+    """
+
+    def __init__(self, observer: GraphObserver) -> None:
+        self._observer = observer
+        self._clients: dict[tuple[str, type[Any]], Client] = {}
+        self._spinner = Spinner(observer.node, thread="service-calls")
+
+    async def call(
+        self,
+        service: str,
+        type_: type[Any],
+        request: object,
+        *,
+        timeout_s: float,
+        repeat: bool,
+        before: Callable[[], Awaitable[None]] | None = None,
+    ) -> Any:
+        """Wait for `service`, send `request`, and return the response.
+
+        Args:
+            service: fully qualified name.
+            type_: service class.
+            request: of that class.
+            timeout_s: seconds, > 0, for all of it.
+            repeat: the request does no harm when it arrives twice.
+            before: awaited when the first request is about to leave; what it raises keeps it back.
+
+        Raises:
+            ServiceUnansweredError: at the deadline.
+        """
+        loop = asyncio.get_running_loop()
+        deadline = loop.time() + timeout_s
+        client = self._client(service, type_)
+        if not await self._found(client, service, deadline):
+            raise ServiceUnansweredError(service, found=False, timeout_s=timeout_s)
+        if before is not None:
+            await before()
+        answer: asyncio.Future[Any] = loop.create_future()
+
+        def arrived(pending: Future) -> None:
+            with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
+                loop.call_soon_threadsafe(_deliver, answer, pending)
+
+        attempt_s = _FIRST_ATTEMPT_S if repeat else timeout_s
+        sent = []
+        try:
+            while (left_s := deadline - loop.time()) > 0:
+                sent.append(client.call_async(request))
+                sent[-1].add_done_callback(arrived)
+                await asyncio.wait((answer,), timeout=min(attempt_s, left_s))
+                if answer.done():
+                    return answer.result()
+                attempt_s = min(2 * attempt_s, _LONGEST_ATTEMPT_S)
+        finally:
+            for pending in sent:
+                client.remove_pending_request(pending)
+            answer.cancel()
+        raise ServiceUnansweredError(service, found=True, timeout_s=timeout_s)
+
+    def open(self, service: str, type_: type[Any]) -> bool:
+        """Make the client of a service now; False if there is one already."""
+        if (service, type_) in self._clients:
+            return False
+        self._client(service, type_)
+        return True
+
+    def forget(self, prefix: str) -> None:
+        """Drop the clients of services whose name starts with `prefix`, of a node that left."""
+        for key in [key for key in self._clients if key[0].startswith(prefix)]:
+            self._observer.node.destroy_client(self._clients.pop(key))
+
+    def destroy(self) -> None:
+        """Stop the thread and drop the clients; again is harmless."""
+        self._spinner.stop()
+        self.forget("")
+
+    def _client(self, service: str, type_: type[Any]) -> Client:
+        client = self._clients.get((service, type_))
+        if client is None:
+            client = self._observer.node.create_client(type_, service)
+            self._clients[service, type_] = client
+        return client
+
+    async def _found(self, client: Client, service: str, deadline: float) -> bool:
+        """Wait until `client` may be used: matched with every server, or long enough with some.
+
+        Returns:
+            Whether it is in the graph; False only at the deadline.
+        """
+        loop = asyncio.get_running_loop()
+        if client.service_is_ready():
+            return True
+        changed: asyncio.Future[None] = loop.create_future()
+
+        def change() -> None:
+            if not changed.done():
+                changed.set_result(None)
+
+        def notify() -> None:
+            with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
+                loop.call_soon_threadsafe(change)
+
+        remove = self._observer.on_change(notify)
+        try:
+            check_s = _MATCH_CHECK_S
+            offered_s: float | None = None
+            while not client.service_is_ready():
+                now_s = loop.time()
+                if not self._observer.node.count_services(service):
+                    offered_s = None
+                elif offered_s is None:
+                    offered_s = now_s
+                if offered_s is not None and now_s - offered_s >= _UNMATCHED_S:
+                    return True
+                if now_s >= deadline:
+                    return offered_s is not None
+                wait_s = min(check_s, deadline - now_s)
+                # Not wait_for: of Python 3.10 and 3.11 it may swallow our cancellation.
+                await asyncio.wait((changed,), timeout=wait_s)
+                check_s = _MATCH_CHECK_S if changed.done() else min(2 * check_s, 1.0)
+                changed = loop.create_future()
+        finally:
+            remove()
+        return True
+
+
+def _deliver(answer: asyncio.Future[Any], pending: Future) -> None:
+    if answer.done() or pending.cancelled():
+        return
+    error = pending.exception()
+    if error is not None:
+        answer.set_exception(error)
+    else:
+        answer.set_result(pending.result())

@@ -1,0 +1,1 @@
+"""The sockets under participants: network flow endpoints, DSCP, what URLs opened."""

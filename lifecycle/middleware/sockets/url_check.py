@@ -1,0 +1,200 @@
+"""What a host must have for a connection URL, and what a participant must have got of it.
+
+Owns: addresses and interfaces before a participant is made, and its sockets afterwards. Fast DDS
+says nothing when a fixed port is taken or a whitelist matches nothing: the participant is there and
+deaf. Linux: sockets are read from proc(5). Must not import rclpy.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import ipaddress
+import socket
+import struct
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import psutil
+
+from lifecycle.errors import MiddlewareError
+from lifecycle.middleware.fastdds.url_families import Family, families
+from lifecycle.network.connection_url import ConnectionTransport, ConnectionUrl
+
+_TABLES = (
+    ("udp", "udpv4", socket.AF_INET),
+    ("udp6", "udpv6", socket.AF_INET6),
+    ("tcp", "tcpv4", socket.AF_INET),
+)
+_FAMILIES = {kind: family for _, kind, family in _TABLES}
+_LISTEN = "0A"  # TCP_LISTEN of linux/tcp_states.h
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class OpenSocket:
+    """A bound UDP or listening TCP socket of a process.
+
+    Attributes:
+        inode: tells it apart for as long as it is open.
+        kind: "udpv4", "udpv6" or "tcpv4".
+        address: what it is bound to.
+        port: 1–65535.
+    """
+
+    inode: int
+    kind: str
+    address: str
+    port: int
+
+
+def check_host(urls: Sequence[ConnectionUrl]) -> None:
+    """Refuse URLs whose own address or interface this host has not.
+
+    Raises:
+        MiddlewareError: names the URL and what there is.
+    """
+    addresses, names = set(), set()
+    for name, entries in psutil.net_if_addrs().items():
+        names.add(name)
+        for entry in entries:
+            if entry.family in (socket.AF_INET, socket.AF_INET6):
+                addresses.add(entry.address.partition("%")[0])
+    for url in urls:
+        wanted = [each for each in url.interfaces if each not in names]
+        group = url.transport is ConnectionTransport.UDPM
+        if url.address and not group and not ipaddress.ip_address(url.address).is_unspecified:
+            wanted.append(url.address)
+        for each in wanted:
+            if each.partition("%")[0] not in addresses:
+                there = ", ".join(sorted(addresses | (names if each in url.interfaces else set())))
+                raise MiddlewareError(
+                    f"cannot connect by {str(url)!r}: this host has no address {each!r}; it has "
+                    f"{there}",
+                    hint="`ip address` lists them; check the machine's address in the manifest",
+                )
+
+
+def check_free(urls: Sequence[ConnectionUrl]) -> None:
+    """Refuse URLs with a port that somebody has, before a participant is made of them.
+
+    Fast DDS 2.14 hangs for ever in the destruction of a participant that could not listen on its
+    TCP port, so that must not be found out afterwards.
+
+    Raises:
+        MiddlewareError: names the URL and the port.
+    """
+    for family in families(urls):
+        if family.kind not in _FAMILIES:
+            continue
+        for url, what, port in _ports(family):
+            group = url.transport is ConnectionTransport.UDPM
+            if group and port == url.port:
+                continue  # a group's port is shared
+            address = "" if group else url.address
+            if not _is_free(family.kind, address, port):
+                raise _taken(url, what, port)
+
+
+def check_sockets(urls: Sequence[ConnectionUrl], opened: Sequence[OpenSocket]) -> None:
+    """Refuse a participant that has not all the ports of its URLs.
+
+    Args:
+        urls: that it was made from.
+        opened: the sockets that were opened for it.
+
+    Raises:
+        MiddlewareError: names the URL and the port that somebody else has.
+    """
+    for family in families(urls):
+        mine = [each for each in opened if each.kind == family.kind]
+        ports = {each.port for each in mine}
+        for url, what, port in _ports(family):
+            if port not in ports:
+                raise _taken(url, what, port)
+        if family.udp and not mine:
+            raise MiddlewareError(
+                f"cannot connect by {str(family.urls[0])!r}: Fast DDS opened no socket for it"
+            )
+
+
+def open_sockets(pid: int | None = None) -> tuple[OpenSocket, ...]:
+    """Return the UDP and listening TCP sockets of a process in our network namespace.
+
+    Args:
+        pid: of the process; None for this one.
+
+    Raises:
+        OSError: there is no such process, or it is not ours to look at.
+    """
+    ours = set(_socket_inodes("self" if pid is None else str(pid)))
+    return tuple(each for each in _bound_sockets() if each.inode in ours)
+
+
+def _is_free(kind: str, address: str, port: int) -> bool:
+    stream = kind == "tcpv4"
+    any_ = "::" if kind == "udpv6" else "0.0.0.0"  # noqa: S104 - only to see whether it is free
+    with socket.socket(
+        _FAMILIES[kind], socket.SOCK_STREAM if stream else socket.SOCK_DGRAM
+    ) as probe:
+        if stream:  # as Fast DDS does: connections that are over are not in the way
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        if kind == "udpv6":
+            probe.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+        try:
+            probe.bind((address or any_, port))
+            if stream:
+                probe.listen()
+        except OSError:
+            return False
+    return True
+
+
+def _taken(url: ConnectionUrl, what: str, port: int) -> MiddlewareError:
+    where = f"{url.address}:{port}" if url.address else f"port {port}"
+    return MiddlewareError(
+        f"cannot connect by {str(url)!r}: {what} {where} is not free on this host",
+        hint="end who has it (`ss -lnp`), or choose another port",
+    )
+
+
+def _ports(family: Family) -> Iterator[tuple[ConnectionUrl, str, int]]:
+    protocol = "TCP" if family.kind == "tcpv4" else "UDP"
+    for url in family.urls:
+        for attribute in ("port", "metatraffic_port", "output_port"):
+            port = getattr(url, attribute)
+            if port is not None:
+                name = attribute.replace("_", " ") if attribute != "port" else "port"
+                what = protocol if name == "port" else f"{protocol} {name}"
+                yield url, what, port
+
+
+def _bound_sockets() -> Iterator[OpenSocket]:
+    for table, kind, family in _TABLES:
+        path = Path("/proc/thread-self/net") / table
+        with contextlib.suppress(FileNotFoundError):  # a kernel without IPv6
+            for line in path.read_text(encoding="ascii").splitlines()[1:]:
+                fields = line.split()
+                if kind == "tcpv4" and fields[3] != _LISTEN:
+                    continue
+                address, _, port = fields[1].partition(":")
+                if int(port, 16):
+                    yield OpenSocket(
+                        inode=int(fields[9]),
+                        kind=kind,
+                        address=_address(family, address),
+                        port=int(port, 16),
+                    )
+
+
+def _address(family: int, text: str) -> str:
+    """Spell an address of /proc/net, which stands there in words of the host's byte order."""
+    words = [int(text[at : at + 8], 16) for at in range(0, len(text), 8)]
+    return socket.inet_ntop(family, struct.pack(f"={len(words)}I", *words))
+
+
+def _socket_inodes(process: str) -> Iterator[int]:
+    for descriptor in Path("/proc", process, "fd").iterdir():
+        with contextlib.suppress(OSError):  # closed meanwhile
+            target = str(descriptor.readlink())
+            if target.startswith("socket:["):
+                yield int(target[len("socket:[") : -1])

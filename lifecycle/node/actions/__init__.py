@@ -1,0 +1,1 @@
+"""Goals of actions, and the handlers at work on them."""

@@ -1,0 +1,1 @@
+"""What people subclass and write: LifecycleNode, handlers, declarations in code."""

@@ -1,0 +1,160 @@
+"""Endpoints declared in code: the `declare_…` methods of a LifecycleNode, and hints on endpoints.
+
+Owns: their signatures, and the file and line that a declaration is known by. What becomes of one
+is declaring.py's to say.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+
+from lifecycle.errors import LifecycleError
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.manifest.qos import QosProfile
+from lifecycle.node.actions.action_names import resolve_action_name
+from lifecycle.node.author import declaring
+from lifecycle.node.author.handlers import ActionHandler
+from lifecycle.node.author.managed import Managed
+from lifecycle.node.author.spec import calling_position
+
+
+class Declarations(Node):  # type: ignore[misc]  # rclpy is not typed
+    """Declares endpoints: in `__init__`, or later where the manifest says `endpoints: open`."""
+
+    lifecycle: Managed
+
+    def declare_publisher(
+        self,
+        name: str,
+        msg_type: type[Any],
+        qos: QosProfile | QoSProfile | int = 10,
+        *,
+        lossy: bool | None = None,
+        size_bytes: int | None = None,
+    ) -> None:
+        """Declare a publisher; `self.publisher(name)` is its handle from on_configure on.
+
+        Args:
+            name: relative, absolute or private.
+            msg_type: message class.
+            qos: a number is a history depth.
+            lossy: hint for negotiation: the data bear an unreliable transport.
+            size_bytes: hint for negotiation: the largest serialized message, > 0.
+
+        Raises:
+            LifecycleError: declared already, or not allowed (any more).
+        """
+        profile = declaring.profile(qos)
+        hints = (lossy, size_bytes)
+        self._declare(EndpointKind.PUBLISHER, name, msg_type, profile, hints=hints)
+
+    def declare_subscription(
+        self,
+        name: str,
+        msg_type: type[Any],
+        qos: QosProfile | QoSProfile | int = 10,
+        *,
+        callback: Callable[..., Any] | None = None,
+        lossy: bool | None = None,
+        size_bytes: int | None = None,
+    ) -> None:
+        """Declare a subscription; a method decorated with `@on_message(name)` receives it.
+
+        One that is declared after configure needs its `callback` given here. Otherwise as
+        `declare_publisher`.
+        """
+        profile = declaring.profile(qos)
+        hints = (lossy, size_bytes)
+        self._declare(
+            EndpointKind.SUBSCRIPTION, name, msg_type, profile, callback=callback, hints=hints
+        )
+
+    def declare_service(
+        self, name: str, srv_type: type[Any], *, callback: Callable[..., Any] | None = None
+    ) -> None:
+        """Declare a service server; a method decorated with `@on_service(name)` answers.
+
+        One that is declared after configure needs its `callback` given here.
+        """
+        self._declare(EndpointKind.SERVICE_SERVER, name, srv_type, callback=callback)
+
+    def declare_client(self, name: str, srv_type: type[Any]) -> None:
+        """Declare a service client; `self.client(name)` from on_connect on."""
+        self._declare(EndpointKind.SERVICE_CLIENT, name, srv_type)
+
+    def declare_action(
+        self,
+        name: str,
+        action_type: type[Any],
+        *,
+        callback: Callable[..., Any] | None = None,
+        accept: Callable[..., Any] | None = None,
+    ) -> None:
+        """Declare an action server; a method decorated with `@on_action(name)` executes goals.
+
+        One that is declared after configure needs its `callback` given here, and with it `accept`,
+        which decides on goals as a method decorated with `@on_goal(name)` does.
+
+        Raises:
+            LifecycleError: as declare_publisher, or `accept` is given without `callback`.
+        """
+        if accept is not None and callback is None:
+            raise LifecycleError(
+                f"cannot decide on goals of action server {name!r} by accept= alone",
+                hint=f"give callback= too, or decorate a method with @on_goal({name!r})",
+            )
+        if callback is not None:
+            callback = ActionHandler(execute=callback, accept=accept)
+        self._declare(EndpointKind.ACTION_SERVER, name, action_type, callback=callback)
+
+    def declare_action_client(self, name: str, action_type: type[Any]) -> None:
+        """Declare an action client; `self.action_client(name)` from on_connect on."""
+        self._declare(EndpointKind.ACTION_CLIENT, name, action_type)
+
+    def hint(
+        self, endpoint: str, *, lossy: bool | None = None, size_bytes: int | None = None
+    ) -> None:
+        """Tell negotiation something about a declared endpoint; the manifest's `flows:` win.
+
+        Args:
+            endpoint: `video`, or `publishers/video` where another kind has the name too.
+            lossy: the data bear an unreliable transport.
+            size_bytes: the largest serialized message, > 0.
+
+        Raises:
+            UnknownEndpointError: nothing, or more than one thing, is declared so.
+        """
+        self.lifecycle.declared.hint(endpoint, lossy=lossy, size_bytes=size_bytes)
+
+    def _declare(
+        self,
+        kind: EndpointKind,
+        name: str,
+        interface: type[Any],
+        qos: QosProfile | None = None,
+        *,
+        callback: Callable[..., Any] | None = None,
+        hints: tuple[bool | None, int | None] = (None, None),
+    ) -> None:
+        self.lifecycle.declared.refuse(kind, name)
+        topic = kind in {EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION}
+        resolve: Callable[[str], str]
+        if kind in {EndpointKind.ACTION_SERVER, EndpointKind.ACTION_CLIENT}:
+            resolve = functools.partial(resolve_action_name, self)
+        else:
+            resolve = self.resolve_topic_name if topic else self.resolve_service_name
+        spec = declaring.add(
+            self.lifecycle.declared.now,
+            kind=kind,
+            name=name,
+            interface=interface,
+            resolved=resolve(name),
+            qos=qos,
+            at=calling_position(depth=2),
+        )
+        self.lifecycle.declared.declare(spec, (kind, name), callback=callback, hints=hints)

@@ -1,0 +1,320 @@
+"""What makes an rclpy node a managed one: everything that `LifecycleNode` has and does not show.
+
+Owns: putting controller, gate, data layer, parameters, timers and services of one node together.
+It is reached as `node.lifecycle`, so that authors have every other attribute name to themselves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.lifecycle import LifecycleState
+from rclpy.node import Node
+from rclpy.task import Future
+from rclpy.timer import Timer
+
+from lifecycle.errors import LifecycleError
+from lifecycle.manifest.model import EndpointKind, EndpointPolicy
+from lifecycle.node.author import parameters
+from lifecycle.node.author.declaring import DeclaredInCode
+from lifecycle.node.author.handlers import alternatives
+from lifecycle.node.author.spec import Mode
+from lifecycle.node.author.undeclared import Undeclared
+from lifecycle.node.connections.connection_events import ConnectionEvent, ConnectionEvents
+from lifecycle.node.connections.data_layer import DataLayer
+from lifecycle.node.connections.node_interface import NodeInterface
+from lifecycle.node.connections.remote_interface import RemoteInterface
+from lifecycle.node.lifecycle.controller import Controller
+from lifecycle.node.lifecycle.execution import SUCCESS, Result
+from lifecycle.node.lifecycle.executor_tasks import Turns
+from lifecycle.node.lifecycle.gate import Gate
+from lifecycle.node.lifecycle.machine import Change, NodeState, Outcome, RefusedError, Request
+from lifecycle.node.lifecycle.services import LifecycleServices
+from lifecycle.node.reporting import configuration
+from lifecycle.node.reporting.changes import ConfigurationChanges
+from lifecycle.node.reporting.graph_member import GraphMember
+from lifecycle.plan.model import PlannedNode
+from lifecycle.verify.observation import NodeConfiguration
+
+if TYPE_CHECKING:
+    from lifecycle.node.author.node import LifecycleNode
+
+_WITHOUT_DATA_LAYER = (NodeState.INACTIVE_DISCONNECTED, NodeState.UNCONFIGURED, NodeState.FINALIZED)
+"""A node that comes to one of these is not the one that was verified any more."""
+
+BRING_UP = (Request.CONFIGURE, Request.CONNECT, Request.ACTIVATE)
+
+
+class Managed:
+    """The managed half of one node.
+
+    Attributes:
+        mode: who drives the transitions.
+        gate: holds back what the node was made to send, receive and time.
+        data_layer: its endpoints.
+        declared: what its manifest and its code say of them.
+        interface: what may be asked of its data layer.
+        connection_events: what becomes of its connections and mappings.
+        configuration_changes: tells of each change of its configuration.
+        undeclared: endpoints that its code made with rclpy's factories.
+        client_group: reentrant callback group of its clients.
+        call_soon: runs a function, sync or async, in its executor; returns whether there is one.
+    """
+
+    def __init__(
+        self, node: LifecycleNode, spec: PlannedNode, mode: Mode, gate: Gate, supervisor: str = ""
+    ) -> None:
+        self._node = node
+        self._supervisor = supervisor
+        # By its supervisor, through the gate; a node without one needs nobody's leave.
+        self._let_through = not supervisor
+        self.mode = mode
+        self.gate = gate
+        # Reentrant: others may ask, and answers come in, while a transition's callback runs.
+        self.client_group = ReentrantCallbackGroup()
+        self._infrastructure = ReentrantCallbackGroup()
+        self._turns = Turns(node, self._infrastructure)
+        self.call_soon = self._turns.call_soon
+        self._listeners: list[Callable[[LifecycleNode], None]] = []
+        self._method_timers: list[Timer] = []
+        self._member: GraphMember | None = None
+        self.connection_events = ConnectionEvents(self.call_soon)
+        self.configuration_changes = ConfigurationChanges(
+            self.call_soon, self.get_configuration, failed=node.get_logger().error
+        )
+        node.add_post_set_parameters_callback(lambda _: self.configuration_changes.touch())
+        self.undeclared = Undeclared(self.configuration_changes.touch)
+        self.data_layer = DataLayer(
+            node,
+            gate=gate,
+            client_group=self.client_group,
+            event_group=self._infrastructure,
+            later=self.call_soon,
+            after=self._turns.call_after,
+            changed=self.configuration_changes.touch,
+            tell=self._tell_connection,
+        )
+        self.declared = DeclaredInCode(
+            spec, self.data_layer, node=self.full_name, state=lambda: self.state
+        )
+        self._controller = Controller(self, spec.timeouts, self._changed)
+        self.interface = NodeInterface(self.full_name, self.data_layer, lambda: self.state)
+        self._services = LifecycleServices(
+            node,
+            state_machine=self._controller.machine,
+            change=self._change_by_service,
+            refuse=node.get_logger().warning,
+            configuration=lambda: configuration.to_json(self.get_configuration()),
+            group=self._infrastructure,
+        )
+        self._remote = RemoteInterface(
+            node, self.interface, log=node.get_logger().error, group=self._infrastructure
+        )
+        if spec.events or spec.membership:
+            self._join()
+
+    @property
+    def full_name(self) -> str:
+        """Fully qualified node name."""
+        return str(self._node.get_fully_qualified_name())
+
+    @property
+    def spec(self) -> PlannedNode:
+        """What the node was planned to be, with the endpoints that its code declares."""
+        return self.declared.spec
+
+    @property
+    def state(self) -> NodeState:
+        """The state, nested ones told apart; `state.seen` is what other tools see."""
+        return self._controller.machine.state
+
+    def add_listener(self, listener: Callable[[LifecycleNode], None]) -> None:
+        """Call `listener(node)` after every change of state, whoever caused it."""
+        self._listeners.append(listener)
+
+    async def change(self, request: Request | str) -> Result:
+        """Run a transition from inside the executor: `await node.lifecycle.change("connect")`.
+
+        Raises:
+            RefusedError: not allowed in this state, another transition is running, or the gate of
+                the node's supervisor is closed.
+            LifecycleError: no such transition.
+        """
+        return await self._change(_known(request))
+
+    async def change_for_supervisor(self, request: Request | str) -> Result:
+        """Run a transition that the supervisor asked for; its activate is the gate's permit.
+
+        Whoever it lets through may be deactivated and activated again by anybody, until the
+        supervisor deactivates it or its data layer goes, which is what was verified. A node that
+        somebody else has deactivated already is where the supervisor wants it.
+
+        Raises:
+            RefusedError: as for `change`.
+            LifecycleError: likewise.
+        """
+        known = _known(request)
+        if self._supervisor and known is Request.DEACTIVATE:
+            self._let_through = False
+            if self.state is NodeState.INACTIVE_CONNECTED:
+                return SUCCESS
+        result = await self._controller.change(known)
+        if known is Request.ACTIVATE and result.outcome is Outcome.SUCCESS:
+            self._let_through = True
+        return result
+
+    async def bring_up(self) -> Result:
+        """Configure, connect and activate; stops at the first that does not succeed."""
+        result = SUCCESS
+        for request in BRING_UP:
+            result = await self._change(request)
+            if result.outcome is not Outcome.SUCCESS:
+                break
+        return result
+
+    def bring_up_when_spun(self) -> None:
+        """Bring the node up on the first turn of whatever executor spins it."""
+
+        async def once() -> None:
+            Node.destroy_timer(self._node, timer)
+            await self.bring_up()
+
+        timer = self._turns.timer(0.0, once)
+
+    def sleep(self, seconds: float) -> Future:
+        """Return what is done in `seconds`, in every state."""
+        future: Future = Future()
+        self._turns.call_after(seconds, lambda: future.set_result(None))
+        return future
+
+    def close(self) -> None:
+        """Leave the graph and take the data layer away: the node is being destroyed."""
+        self._turns.close()
+        self.data_layer.disconnect()
+        if self._member is not None:
+            self._member.close()
+            self._member = None
+
+    async def shut_down(self, reason: str) -> Result:
+        """Bring the node to finalized from any state; a running async callback is cancelled."""
+        return await self._controller.shut_down(reason)
+
+    @property
+    def is_marked(self) -> bool:
+        """Whether the plan says what DSCP any of its endpoints sends with."""
+        return any(each.dscp is not None for each in self.spec.endpoints)
+
+    def get_configuration(self) -> NodeConfiguration:
+        """Return who this node is and what its endpoints really are."""
+        undeclared: tuple[tuple[EndpointKind, Any], ...] = ()
+        if self.spec.endpoint_policy is EndpointPolicy.OPEN:
+            undeclared = self.undeclared.beside(self.data_layer.entities)
+        return configuration.collect(self._node, self.state, self.spec, self.data_layer, undeclared)
+
+    # What the controller asks for (controller.Node).
+
+    def prepare(self) -> None:
+        """Declare parameters and endpoints, and make the timers of `@on_timer` methods."""
+        matched = self.declared.match(type(self._node))
+        parameters.declare(self._node, self.spec)
+        self.declared.enact(self._node, matched)
+        for timer in matched.timers:
+            method = getattr(self._node, timer.method)
+            self._method_timers.append(self._node.create_timer(timer.period_s, method))
+
+    def unprepare(self) -> None:
+        """Undo `prepare`; parameters stay declared."""
+        while self._method_timers:
+            self._node.destroy_timer(self._method_timers.pop())
+        self.data_layer.undeclare()
+
+    def make_data_layer(self) -> None:
+        """Make every endpoint or none."""
+        self.data_layer.connect(self.spec)
+
+    def remove_data_layer(self) -> None:
+        """Remove every endpoint."""
+        self.data_layer.disconnect()
+
+    def callback(self, name: str) -> Callable[..., Any]:
+        """Return the author's `on_…` method."""
+        method: Callable[..., Any] = getattr(self._node, name)
+        return method
+
+    def callback_argument(self, state: NodeState) -> LifecycleState:
+        """Return what rclpy's callbacks are given: the state before the transition."""
+        return LifecycleState(label=state.seen.label, state_id=state.seen.id)
+
+    def wake_at_deadline(self, deadline_s: float) -> Callable[[], None]:
+        """Wake the executor in `deadline_s`; returns what calls that off."""
+        return self._turns.wake_at_deadline(deadline_s)
+
+    def wake(self) -> None:
+        """Make the executor look at its waiting tasks again."""
+        self._turns.wake()
+
+    def report(self, result: Result) -> None:
+        """Log why a step did not succeed, with the traceback where there is one."""
+        logger = self._node.get_logger()
+        if result.trace:
+            logger.error(result.trace)
+        logger.error(result.error)
+
+    # Inside.
+
+    def _join(self) -> None:
+        self._member = GraphMember(self._node, self._infrastructure)
+        now = self.configuration_changes.collect()
+        self._member.joined(self.state, now.checksum if now is not None else "")
+        self.configuration_changes.listen(self._tell_checksum)
+
+    def _tell_checksum(self, now: NodeConfiguration) -> None:
+        if self._member is not None:
+            self._member.configuration_changed(now.checksum)
+
+    def _tell_connection(self, event: ConnectionEvent) -> None:
+        if self._member is not None and self.spec.events:
+            self._member.connection_event(event)
+        self.connection_events.tell(event)
+
+    async def _change(self, request: Request) -> Result:
+        if request is Request.ACTIVATE and not self._let_through:
+            raise RefusedError(
+                f"cannot activate {self.full_name}: the gate of its supervisor is closed",
+                hint=f"it is activated once {self._supervisor!r} is verified; a paused system: "
+                f"lifecycle resume {self._supervisor}",
+            )
+        return await self._controller.change(request)
+
+    async def _change_by_service(self, request: Request) -> bool:
+        try:
+            result = await self._change(request)
+        except RefusedError as refused:
+            self._node.get_logger().warning(str(refused))
+            return False
+        return result.outcome is Outcome.SUCCESS
+
+    def _changed(self, change: Change) -> None:
+        """Follow a change of the machine: the gate first, then tell the world."""
+        if change.goal is NodeState.ACTIVE:
+            self.gate.open()
+        elif change.start is NodeState.ACTIVE:
+            self.gate.close()
+        if self._supervisor and change.goal in _WITHOUT_DATA_LAYER:
+            self._let_through = False
+        if change.event is not None:
+            self._services.publish(change.event)
+        if self._member is not None:
+            self._member.state_changed(change.goal)
+        for listener in self._listeners:
+            listener(self._node)
+
+
+def _known(request: Request | str) -> Request:
+    try:
+        return Request(request)
+    except ValueError as error:
+        hint = alternatives(str(request), [each.value for each in Request])
+        raise LifecycleError(f"cannot take transition {request!r}", hint=hint) from error

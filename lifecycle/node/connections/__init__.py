@@ -1,0 +1,1 @@
+"""The node interface and the connections it makes."""

@@ -1,0 +1,138 @@
+"""How connections and mappings stand: which have peers, which are established, and telling so.
+
+Owns: the rules by which a connection counts as established or lost, and every connection event.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from collections.abc import Mapping as AbstractMapping
+
+from lifecycle.node.connections.connection_events import ConnectionEvent, ConnectionEventKind
+from lifecycle.node.connections.connections import Connection, Connections
+from lifecycle.node.endpoints.endpoint_names import Key
+from lifecycle.node.endpoints.mapping import Mapping
+from lifecycle.node.endpoints.matches import count_peers
+
+
+class Standing:
+    """The standing of one node's connections and mappings.
+
+    Args:
+        connections: of the node.
+        mappings: every declared endpoint, as it is at any time.
+        tell: given each event.
+    """
+
+    def __init__(
+        self,
+        connections: Connections,
+        mappings: AbstractMapping[Key, Mapping],
+        tell: Callable[[ConnectionEvent], None],
+    ) -> None:
+        self._connections = connections
+        self._mappings = mappings
+        self._tell = tell
+        self._established: set[Connection] = set()
+
+    def on(self, connection: Connection) -> tuple[Mapping, ...]:
+        """Return what is mapped onto a connection; flows of their own are the node's own."""
+        known = self._known(connection)
+        return tuple(
+            mapping
+            for mapping in self._mappings.values()
+            if mapping.connection is not None and self._known(mapping.connection) is known
+        )
+
+    def established(self, connection: Connection) -> bool:
+        """Tell whether a connection exists and every topic endpoint on it has a peer."""
+        topics = (each for each in self.on(connection) if each.endpoint.kind.is_topic)
+        return not connection.error and all(each.peers for each in topics)
+
+    def opened(self, connection: Connection) -> None:
+        """A connection was made, or is there already."""
+        self._judge(connection, lost=False)
+
+    def closed(self, connection: Connection) -> None:
+        """A connection with a name was unmade."""
+        self._established.discard(connection)
+        self._tell(
+            ConnectionEvent(
+                kind=ConnectionEventKind.CONNECTION_LOST,
+                connection=connection.name,
+                urls=connection.urls,
+                unmade=True,
+            )
+        )
+
+    def mapped(self, mapping: Mapping) -> None:
+        """An endpoint was mapped."""
+        self._count(mapping)
+        self._tell_mapping(mapping, ConnectionEventKind.MAPPING_ESTABLISHED)
+        assert mapping.connection is not None
+        self._judge(mapping.connection, lost=False)
+
+    def unmapped(self, mapping: Mapping, connection: Connection) -> None:
+        """An endpoint was taken off a connection."""
+        self._tell(
+            ConnectionEvent(
+                kind=ConnectionEventKind.MAPPING_LOST,
+                connection=connection.name,
+                urls=connection.urls,
+                endpoint=mapping.spelling,
+                unmade=True,
+            )
+        )
+
+    def matched(self, mapping: Mapping) -> None:
+        """Count the peers of a mapping again, and tell if they are more or fewer."""
+        before = mapping.peers or 0
+        self._count(mapping)
+        now = mapping.peers or 0
+        if mapping.connection is None or now == before:
+            return
+        kind = ConnectionEventKind.MAPPING_ESTABLISHED
+        if now < before:
+            kind = ConnectionEventKind.MAPPING_LOST
+        self._tell_mapping(mapping, kind)
+        self._judge(mapping.connection, lost=now < before)
+
+    def _known(self, connection: Connection) -> Connection:
+        """Return the connection as which others know it."""
+        return connection if connection.name else self._connections.own
+
+    def _count(self, mapping: Mapping) -> None:
+        if mapping.endpoint.kind.is_topic and mapping.placement is not None:
+            mapping.peers = sum(count_peers(each) for each in mapping.placement.entities)
+
+    def _tell_mapping(self, mapping: Mapping, kind: ConnectionEventKind) -> None:
+        connection = mapping.connection
+        assert connection is not None
+        self._tell(
+            ConnectionEvent(
+                kind=kind,
+                connection=connection.name,
+                urls=connection.urls,
+                endpoint=mapping.spelling,
+                peers=mapping.peers,
+            )
+        )
+
+    def _judge(self, connection: Connection, *, lost: bool) -> None:
+        """Tell of a connection that it is established, or no longer.
+
+        What is mapped onto it and has no peer yet is no loss, and is not told.
+        """
+        known = self._known(connection)
+        is_own_and_empty = known is self._connections.own and not self.on(known)
+        established = self.established(known) and not is_own_and_empty
+        if established == (known in self._established):
+            return
+        kind = ConnectionEventKind.CONNECTION_ESTABLISHED
+        if established:
+            self._established.add(known)
+        else:
+            self._established.discard(known)
+            kind = ConnectionEventKind.CONNECTION_LOST
+        if established or lost:
+            self._tell(ConnectionEvent(kind=kind, connection=known.name, urls=known.urls))

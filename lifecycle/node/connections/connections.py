@@ -1,0 +1,248 @@
+"""The connections of one node: participants that its endpoints can be mapped onto.
+
+Owns: making and unmaking participants beside the node's own, their names, and having their
+callbacks run where the node's own run. `connect_to` of *Topological Discovery and Communication
+Negotiation*; which endpoint is on which connection is data_layer.py's.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+from lifecycle.errors import LifecycleError, MiddlewareError
+from lifecycle.middleware import FlowParticipant, has_shared_memory
+from lifecycle.network.connection_url import ConnectionUrl
+from lifecycle.node.author.handlers import nearest
+from lifecycle.plan.model import ParticipantConnections, PlannedParticipant
+
+if TYPE_CHECKING:
+    from rclpy.node import Node
+
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+_LONGEST_NODE_NAME = 255  # rmw/validate_node_name.h
+
+
+class UnknownConnectionError(LifecycleError, KeyError):
+    """Code named a connection that the node has not."""
+
+
+class ConnectError(LifecycleError):
+    """A connection or an endpoint could not be made as asked; none was left."""
+
+
+@dataclasses.dataclass(slots=True, kw_only=True, eq=False)
+class Connection:
+    """One participant that endpoints are mapped onto; what `connect_to` returns.
+
+    Attributes:
+        name: as `connect_to` named it; empty for the node's own participant, and for one that only
+            gives a publisher its own flow.
+        urls: what it was told, as text; empty if the RMW chose.
+        node_name: base name of the hidden node that owns the participant; empty for the node's own.
+        participant: None for the node's own, and once disconnected.
+        has_shared_memory: it has that transport; None where the RMW cannot tell.
+        warning: what of it could not be made as asked, while the rest was; empty otherwise.
+        error: why it could not be made; empty if it was.
+    """
+
+    name: str
+    urls: tuple[str, ...] = ()
+    node_name: str = ""
+    participant: FlowParticipant | None = None
+    has_shared_memory: bool | None = None
+    warning: str = ""
+    error: str = ""
+
+    def read_dscp(self) -> int | None:
+        """Return the DSCP on the participant's sender sockets, 0–63; None for the node's own."""
+        return None if self.participant is None else self.participant.read_dscp()
+
+
+class Connections:
+    """All connections of one node; its own participant is always one of them."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self.own = Connection(name="")
+        self._made: dict[str, Connection] = {}  # by name of the hidden node
+        self._failed: dict[str, Connection] = {}  # by name
+
+    @property
+    def named(self) -> tuple[Connection, ...]:
+        """Those with a name of their own, in the order in which they were made."""
+        return tuple(each for each in self._made.values() if each.name)
+
+    @property
+    def unnamed(self) -> tuple[Connection, ...]:
+        """Those that only give a publisher its own flow."""
+        return tuple(each for each in self._made.values() if not each.name)
+
+    @property
+    def failed(self) -> tuple[Connection, ...]:
+        """Those that were asked for and could not be made."""
+        return tuple(self._failed.values())
+
+    def find(self, connection: Connection | str) -> Connection:
+        """Return the connection that is meant; the empty name is the node's own participant.
+
+        Raises:
+            UnknownConnectionError: there is none, or no longer.
+        """
+        name = connection if isinstance(connection, str) else connection.name
+        if isinstance(connection, Connection):
+            if connection is self.own or any(each is connection for each in self._made.values()):
+                return connection
+        elif not name:
+            return self.own
+        else:
+            for each in self.named:
+                if each.name == name:
+                    return each
+        names = [each.name for each in self.named]
+        near = nearest(name, names)
+        listed = ", ".join(repr(each) for each in names) or "none but its own participant, ''"
+        raise UnknownConnectionError(
+            f"cannot find connection {name!r} of {self._node.get_fully_qualified_name()}",
+            hint=(f"did you mean {near!r}? " if near else "") + f"connected: {listed}",
+        )
+
+    def named_so(self, name: str) -> Connection | None:
+        """Return the connection of that name, or None."""
+        return next((each for each in self.named if each.name == name), None)
+
+    def free_name(self) -> str:
+        """Return a name that no connection has."""
+        taken = {each.name for each in self.named}
+        number = 1
+        while f"connection_{number}" in taken:
+            number += 1
+        return f"connection_{number}"
+
+    def connect_to(
+        self, name: str, how: ParticipantConnections, planned: PlannedParticipant | None
+    ) -> Connection:
+        """Make the participant of a named connection; one that exists so already is returned.
+
+        Args:
+            name: letters, digits and underscores.
+            how: at least one URL.
+            planned: what the plan says of a connection of that name, beside its URLs.
+
+        Raises:
+            ConnectError: not a name, a URL that is none, a name in use for other URLs, or the
+                participant could not be made.
+        """
+        what = f"cannot connect {self._node.get_fully_qualified_name()} to {name!r}"
+        if not _NAME.fullmatch(name):
+            raise ConnectError(
+                f"{what}: a connection's name is made of letters, digits and underscores, and "
+                "begins with a letter"
+            )
+        if not how.urls:
+            raise ConnectError(f"{what}: no URL was given", hint="udpv4://, tcpv4://…:5100, shm://")
+        found = self.named_so(name)
+        if found is not None:
+            if found.urls == how.urls:
+                return found
+            raise ConnectError(
+                f"{what} ({', '.join(how.urls)}): it is connected to {', '.join(found.urls)}",
+                hint="disconnect it first, or choose another name",
+            )
+        try:
+            return self._make(name, how, planned or self._unplanned(name))
+        except LifecycleError as error:
+            message = f"{what} ({', '.join(how.urls)}): {error.message}"
+            self._failed[name] = Connection(name=name, urls=how.urls, error=message)
+            raise ConnectError(message, hint=error.hint) from error
+
+    def carrier(self, planned: PlannedParticipant) -> Connection:
+        """Return the connection on a participant that the plan has; make it at first use.
+
+        Raises:
+            LifecycleError: it could not be made.
+        """
+        if planned.connection:
+            return self.connect_to(planned.connection, planned.connections, planned)
+        made = self._made.get(planned.name)
+        return made or self._make("", planned.connections, planned)
+
+    def close(self, connection: Connection) -> None:
+        """Unmake a connection that nothing is mapped onto any more."""
+        self._made.pop(connection.node_name, None)
+        participant, connection.participant = connection.participant, None
+        if participant is not None:
+            participant.destroy()
+
+    def forget(self, name: str) -> bool:
+        """Forget a connection that could not be made; returns whether there was one."""
+        return self._failed.pop(name, None) is not None
+
+    def close_all(self) -> None:
+        """Unmake every connection but the node's own."""
+        for connection in reversed(tuple(self._made.values())):
+            self.close(connection)
+        self._failed.clear()
+
+    def look_at_shared_memory(self) -> None:
+        """Find out whether the node's own participant has it; cheaper once it has endpoints."""
+        try:
+            self.own.has_shared_memory = has_shared_memory(self._node)
+        except MiddlewareError:
+            # "the RMW cannot tell" is a value here, and the verifier's to judge.
+            self.own.has_shared_memory = None
+
+    def _unplanned(self, name: str) -> PlannedParticipant:
+        base = f"_{self._node.get_name()}_{name}"
+        return PlannedParticipant(name=base[:_LONGEST_NODE_NAME], dscp=None, reason="connect_to")
+
+    def _make(
+        self, name: str, how: ParticipantConnections, planned: PlannedParticipant
+    ) -> Connection:
+        """Make a participant; without its DSCP where that cannot be applied.
+
+        An unmarked flow is the verifier's to judge (`enforce`), so it is reported, not fatal here.
+        """
+        warning = ""
+        participant = None
+        if planned.dscp is not None:
+            try:
+                participant = self._participant(how, planned, planned.dscp)
+            except MiddlewareError as error:
+                warning = str(error)
+                self._node.get_logger().warning(warning)
+        if participant is None:
+            participant = self._participant(how, planned, None)
+        connection = Connection(
+            name=name,
+            urls=how.urls,
+            node_name=planned.name,
+            participant=participant,
+            has_shared_memory=participant.has_shared_memory,
+            warning=warning,
+        )
+        self._failed.pop(name, None)
+        self._made[planned.name] = connection
+        return connection
+
+    def _participant(
+        self, how: ParticipantConnections, planned: PlannedParticipant, dscp: int | None
+    ) -> FlowParticipant:
+        return FlowParticipant(
+            planned.name,
+            self._node.get_namespace(),
+            self._node.context.get_domain_id(),
+            dscp=dscp,
+            transports=planned.transports,
+            max_datagram_bytes=planned.max_datagram_bytes,
+            non_blocking_send=planned.non_blocking_send,
+            connections=how,
+            served=self._node,
+        )
+
+
+def connections_of(urls: Iterable[ConnectionUrl | str]) -> ParticipantConnections:
+    """Return what `connect_to(*urls)` asks for; a URL's text is kept as it was written."""
+    return ParticipantConnections(urls=tuple(str(url) for url in urls))

@@ -1,0 +1,294 @@
+"""The data layer of one node: declared endpoints, and which connection each is mapped onto.
+
+Owns: the order in which connections and mappings are made and unmade, and what is told of it.
+*configure* declares endpoints, *connect* maps those that nobody has mapped yet onto the connection
+that the plan says, *disconnect* takes everything away. In between `connect_to`, `map_to`,
+`disconnect_from`, `remap` and `alias` change single ones. See *Topological Discovery and
+Communication Negotiation*, "Node Interface".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+from rclpy.node import Node
+from rclpy.task import Future
+
+from lifecycle.errors import LifecycleError
+from lifecycle.manifest.model import Authority, EndpointKind
+from lifecycle.node.connections.connection_events import ConnectionEvent
+from lifecycle.node.connections.connection_status import Standing
+from lifecycle.node.connections.connections import ConnectError, Connection, Connections
+from lifecycle.node.endpoints.endpoint_table import EndpointTable
+from lifecycle.node.endpoints.handover import After
+from lifecycle.node.endpoints.making import Maker
+from lifecycle.node.endpoints.mapper import Mapper
+from lifecycle.node.endpoints.mapping import Mapping
+from lifecycle.node.endpoints.placing import Placer
+from lifecycle.node.endpoints.planned_places import PlannedPlaces
+from lifecycle.plan.model import ParticipantConnections, PlannedEndpoint, PlannedNode
+
+if TYPE_CHECKING:
+    from rclpy.callback_groups import CallbackGroup
+
+    from lifecycle.node.lifecycle.gate import Gate, Later
+
+_ALIASED = (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION, EndpointKind.SERVICE_SERVER)
+
+HandlerOf = Callable[[PlannedEndpoint], Callable[..., Any] | None]
+
+
+class DataLayer:
+    """Declared endpoints of one node and their mapping onto connections.
+
+    Args:
+        node: whose endpoints these are.
+        gate: holds back its publishers and subscriptions.
+        client_group: reentrant, so that an answer can come in while a callback awaits it.
+        event_group: reentrant, of the events that tell of peers.
+        later: runs a coroutine function in the node's executor.
+        after: calls back once in the node's executor.
+        changed: told that the node configuration is another now, match counts included.
+        tell: given what becomes of connections and mappings.
+
+    Attributes:
+        endpoints: what is declared.
+        connections: what endpoints may be mapped onto.
+        standing: which of them have peers.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        *,
+        gate: Gate,
+        client_group: CallbackGroup,
+        event_group: CallbackGroup,
+        later: Later,
+        after: After,
+        changed: Callable[[], None],
+        tell: Callable[[ConnectionEvent], None],
+    ) -> None:
+        self._name = node.get_fully_qualified_name()
+        self._changed = changed
+        self._maker = Maker(node, gate=gate, client_group=client_group, later=later)
+        self._is_made = False
+        self.endpoints = EndpointTable(node, gate, changed)
+        mappings = self.endpoints.mappings
+        self.connections = Connections(node)
+        self.standing = Standing(self.connections, mappings, tell)
+        self._mapper = Mapper(
+            node,
+            Placer(node, self._maker, gate=gate, event_group=event_group, later=later, after=after),
+            mappings=mappings,
+            handles=self.endpoints.handles,
+            connections=self.connections,
+            standing=self.standing,
+            after=after,
+            changed=changed,
+        )
+        self._places = PlannedPlaces(
+            self._name,
+            mappings=mappings,
+            connections=self.connections,
+            mapper=self._mapper,
+            standing=self.standing,
+        )
+
+    @property
+    def mappings(self) -> tuple[Mapping, ...]:
+        """Every declared endpoint, in the order of declaration."""
+        return tuple(self.endpoints.mappings.values())
+
+    @property
+    def entities(self) -> tuple[Any, ...]:
+        """Every rclpy object that stands for a declared endpoint."""
+        return self._mapper.entities
+
+    # Declarations.
+
+    def declare(self, spec: PlannedNode, handler: HandlerOf) -> None:
+        """Import every type and make the publishers' handles; no endpoint exists yet.
+
+        Raises:
+            LifecycleError: types that are not installed, all of them at once.
+        """
+        self._places.spec = spec
+        problems: list[str] = []
+        for endpoint in spec.endpoints:
+            try:
+                self.endpoints.add(endpoint, handler(endpoint))
+            except LifecycleError as error:  # noqa: PERF203 - all of them at once
+                problems.append(str(error))
+        if problems:
+            self.undeclare()
+            raise LifecycleError("\n".join(problems))
+
+    def add_now(self, endpoint: PlannedEndpoint, handler: Callable[..., Any] | None) -> None:
+        """Declare one more endpoint, and map it if the others are mapped by the node itself.
+
+        Raises:
+            LifecycleError: declared already, its type is not installed, or it cannot be made.
+        """
+        mapping = self.endpoints.add(endpoint, handler)
+        if not self._is_made or self._places.mapped_by_others:
+            return
+        try:
+            self._mapper.map(mapping, self._places.default(endpoint))
+        except BaseException:
+            self.endpoints.remove(mapping)
+            raise
+
+    def undeclare(self) -> None:
+        """Forget the declarations, and unmake what was mapped before a connect."""
+        self.disconnect()
+        for mapping in tuple(self.endpoints.mappings.values()):
+            self.endpoints.remove(mapping)
+        self._changed()
+
+    # The transitions.
+
+    def connect(self, spec: PlannedNode) -> None:
+        """Map every endpoint that is mapped nowhere onto what the plan says, or none.
+
+        Under an authority nothing is mapped here: it must have been done.
+
+        Raises:
+            ConnectError: the first endpoint that could not be made, with the RMW's reason; or all
+                that nobody mapped.
+        """
+        for mapping in self.endpoints.mappings.values():
+            mapping.error = ""
+        if spec.authority is Authority.SUPERVISOR:
+            self._places.refuse_unmapped()
+        else:
+            self._places.map_all(spec)
+            self._changed()
+        # Last, because a subscription of the node saves making one to find out.
+        self.connections.look_at_shared_memory()
+        self._is_made = True
+
+    def disconnect(self) -> None:
+        """Remove every endpoint and every connection but the node's own participant."""
+        for mapping in reversed(tuple(self.endpoints.mappings.values())):
+            self._mapper.unmap(mapping)
+        for handle in self.endpoints.handles.values():
+            handle.forget()
+        for connection in reversed(self.connections.named):
+            self._mapper.close(connection)
+        self.connections.close_all()
+        self._is_made = False
+        self._changed()
+
+    # The node interface.
+
+    def connect_to(self, name: str, how: ParticipantConnections) -> Connection:
+        """Make a connection, or return the one of that name and those URLs.
+
+        Raises:
+            ConnectError: it cannot be made; nothing is left but the report of it.
+        """
+        try:
+            connection = self.connections.connect_to(name, how, self._places.planned(name))
+        finally:
+            self._changed()
+        self.standing.opened(connection)
+        return connection
+
+    def map_to(self, spelling: str, connection: Connection | str) -> Future:
+        """Map an endpoint onto a connection, or hand it over from the one that it is on.
+
+        Args:
+            spelling: `video` or `publishers/video`.
+            connection: what `connect_to` returned, or its name; the empty name is where the plan
+                would have it: the node's own participant, or the one that gives a publisher its
+                own flow.
+
+        Returns:
+            Done once the endpoint is on the new connection alone; it may be ignored.
+
+        Raises:
+            UnknownEndpointError: no such declaration.
+            UnknownConnectionError: no such connection.
+            ConnectError: it cannot be made there; where it was it still is.
+        """
+        mapping = self.endpoints.find(spelling)
+        target = self.connections.find(connection)
+        noun = mapping.endpoint.kind.noun
+        try:
+            if target is self.connections.own:
+                target = self._places.own_flow(mapping.endpoint) or target
+            return self._mapper.move(mapping, target)
+        except LifecycleError as error:
+            message = (
+                f"cannot map {noun} {mapping.endpoint.name!r} of {self._name} to "
+                f"{target.name!r}: {error.message}"
+            )
+            if mapping.placement is None:
+                mapping.error = message
+            raise ConnectError(message, hint=error.hint) from error
+        finally:
+            self._mapper.tidy()
+            self._changed()
+
+    def disconnect_from(self, connection: Connection | str) -> None:
+        """Unmake a connection; what was mapped onto it is then mapped nowhere.
+
+        Raises:
+            UnknownConnectionError: no such connection.
+            ConnectError: it is the node's own participant.
+        """
+        name = connection if isinstance(connection, str) else connection.name
+        if self.connections.forget(name):
+            self._changed()
+            return
+        found = self.connections.find(connection)
+        if found is self.connections.own:
+            raise ConnectError(
+                f"cannot disconnect {self._name} from its own participant: its services are on it",
+                hint="map its endpoints onto another connection, or take transition 'disconnect'",
+            )
+        for mapping in self.endpoints.mappings.values():
+            self._mapper.take_off(mapping, found)
+        self._mapper.close(found)
+        self._changed()
+
+    def remap(self, spelling: str, name: str) -> None:
+        """Call an endpoint otherwise from now on; an empty name gives it its declared one again.
+
+        Raises:
+            UnknownEndpointError: no such declaration.
+            LifecycleError: not a name, or the endpoint cannot be made so; it is as it was.
+        """
+        mapping = self.endpoints.find(spelling)
+        expanded = self._maker.expand(mapping.endpoint, name) if name else ""
+        self._mapper.rename(mapping, expanded)
+
+    def alias(self, spelling: str, names: Sequence[str]) -> None:
+        """Give an endpoint these further names, instead of those that it has.
+
+        A publisher publishes on all of them, a subscription's or service server's handler is given
+        what comes on any.
+
+        Raises:
+            UnknownEndpointError: no such declaration.
+            LifecycleError: not a name, a kind that can have one name only, or the endpoint cannot
+                be made so; it is as it was.
+        """
+        mapping = self.endpoints.find(spelling)
+        endpoint = mapping.endpoint
+        if endpoint.kind not in _ALIASED:
+            kinds = ", ".join(kind.noun + "s" for kind in _ALIASED)
+            raise LifecycleError(
+                f"cannot give {endpoint.kind.noun} {endpoint.name!r} of {self._name} an alias: "
+                f"it can have one name only; allowed: {kinds}"
+            )
+        expanded = tuple(dict.fromkeys(self._maker.expand(endpoint, name) for name in names))
+        own = mapping.name or self._maker.resolve(endpoint)
+        if own in expanded:
+            raise LifecycleError(
+                f"cannot give {endpoint.kind.noun} {endpoint.name!r} of {self._name} the alias "
+                f"{own!r}: it is its name"
+            )
+        self._mapper.realias(mapping, expanded)

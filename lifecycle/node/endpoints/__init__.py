@@ -1,0 +1,1 @@
+"""Declared endpoints: the entities that stand for them, and where these are."""

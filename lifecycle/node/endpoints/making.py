@@ -1,0 +1,365 @@
+"""From a declared endpoint to the rclpy entity that stands for it on a connection, and back.
+
+Owns: which factory makes which kind, with which QoS, callback group and gate. It keeps nothing:
+what exists where is data_layer.py's.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from rclpy.exceptions import InvalidHandle
+from rclpy.node import Node
+
+from lifecycle.errors import LifecycleError
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.manifest.qos import QosProfile
+from lifecycle.middleware import create_publisher, create_subscription, to_rclpy
+from lifecycle.node.actions.action_names import resolve_action_name
+from lifecycle.node.actions.goals import ActionWords, Goals
+from lifecycle.node.lifecycle.execution import positional_count
+from lifecycle.plan.model import PlannedEndpoint
+
+if TYPE_CHECKING:
+    from rclpy.callback_groups import CallbackGroup
+
+    from lifecycle.node.connections.connections import Connection
+    from lifecycle.node.lifecycle.gate import Gate, Later
+
+CLIENTS = frozenset({EndpointKind.SERVICE_CLIENT, EndpointKind.ACTION_CLIENT})
+_ACTIONS = frozenset({EndpointKind.ACTION_SERVER, EndpointKind.ACTION_CLIENT})
+
+
+class Maker:
+    """Makes and unmakes the entities of one node.
+
+    Args:
+        node: whose endpoints they are, and whose executor runs their callbacks.
+        gate: holds subscriptions back; publishers are held back by their handles.
+        client_group: reentrant, so that an answer can come in while a callback awaits it.
+        later: runs a coroutine function in the node's executor.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        *,
+        gate: Gate,
+        client_group: CallbackGroup,
+        later: Later,
+    ) -> None:
+        self._node = node
+        self._gate = gate
+        self._client_group = client_group
+        self._later = later
+        self._goals: dict[int, Goals] = {}  # by id of the action server
+
+    def make(
+        self,
+        endpoint: PlannedEndpoint,
+        interface: type[Any],
+        connection: Connection,
+        *,
+        handler: Callable[..., Any] | None,
+        name: str = "",
+    ) -> Any:
+        """Return a new rclpy entity for `endpoint` on `connection`.
+
+        Args:
+            endpoint: as declared.
+            interface: its message, service or action class.
+            connection: that carries it.
+            handler: takes messages, requests or goals; None where the kind has no handler.
+            name: fully qualified name instead of the declared one.
+
+        Raises:
+            LifecycleError: the RMW refused, with its reason; nothing is left.
+        """
+        make = {
+            EndpointKind.PUBLISHER: self._publisher,
+            EndpointKind.SUBSCRIPTION: self._subscription,
+            EndpointKind.SERVICE_SERVER: self._service,
+            EndpointKind.SERVICE_CLIENT: self._client,
+            EndpointKind.ACTION_SERVER: self._action_server,
+            EndpointKind.ACTION_CLIENT: self._action_client,
+        }[endpoint.kind]
+        entity = make(endpoint, interface, connection, handler, name)
+        made = wire_name(entity)
+        if name and made and made != name:
+            self.unmake(endpoint, entity, connection)
+            raise LifecycleError(
+                f"cannot call {endpoint.kind.noun} {endpoint.name!r} {name!r}: a remapping rule "
+                f"that the node was started with makes it {made!r}",
+                hint="take the rule out of the manifest's `remap:`, or choose another name",
+            )
+        return entity
+
+    def unmake(self, endpoint: PlannedEndpoint, entity: Any, connection: Connection) -> None:
+        """Destroy an entity that `make` returned for `endpoint` on `connection`."""
+        participant = connection.participant
+        goals = self._goals.pop(id(entity), None)
+        if goals is not None:
+            goals.interrupt("it was taken off where it was mapped")
+            self._gate.remove(entity)
+        if participant is not None:
+            self._gate.remove(entity)
+            participant.destroy_endpoint(entity)
+        elif endpoint.kind in _ACTIONS:
+            entity.destroy()
+        elif endpoint.kind is EndpointKind.PUBLISHER:
+            self._node.destroy_publisher(entity)
+        elif endpoint.kind is EndpointKind.SUBSCRIPTION:
+            self._node.destroy_subscription(entity)
+        elif endpoint.kind is EndpointKind.SERVICE_SERVER:
+            self._node.destroy_service(entity)
+        else:
+            self._node.destroy_client(entity)
+
+    def resolve(self, endpoint: PlannedEndpoint) -> str:
+        """Return the fully qualified name of an endpoint after namespace and remapping rules.
+
+        The hidden nodes of other participants resolve nothing: remaps belong to our node.
+
+        Raises:
+            LifecycleError: rules tear an action apart.
+        """
+        if endpoint.kind.is_topic:
+            return str(self._node.resolve_topic_name(endpoint.name))
+        if endpoint.kind in _ACTIONS:
+            return resolve_action_name(self._node, endpoint.name)
+        return str(self._node.resolve_service_name(endpoint.name))
+
+    def expand(self, endpoint: PlannedEndpoint, name: str) -> str:
+        """Return a new name for an endpoint fully qualified; no remapping rule applies.
+
+        Raises:
+            LifecycleError: it cannot be a name.
+        """
+        resolve = self._node.resolve_service_name
+        if endpoint.kind.is_topic:
+            resolve = self._node.resolve_topic_name
+        try:
+            return str(resolve(name, only_expand=True))
+        except Exception as error:
+            reason = str(error).splitlines()[0].partition(", at /")[0]  # rcl's source file
+            raise LifecycleError(
+                f"cannot call {endpoint.kind.noun} {endpoint.name!r} {name!r}: {reason}"
+            ) from error
+
+    def _publisher(
+        self,
+        endpoint: PlannedEndpoint,
+        interface: type[Any],
+        connection: Connection,
+        handler: Callable[..., Any] | None,  # noqa: ARG002 - it has none
+        name: str,
+    ) -> Any:
+        qos = endpoint.qos or QosProfile()
+        if connection.participant is not None:
+            topic = name or self.resolve(endpoint)
+            return connection.participant.create_publisher(interface, topic, qos)
+        entity = create_publisher(
+            self._node, interface, name or endpoint.name, qos, unique=endpoint.unique
+        )
+        self._gate.release(entity)  # the handle is the gate
+        return entity
+
+    def _subscription(
+        self,
+        endpoint: PlannedEndpoint,
+        interface: type[Any],
+        connection: Connection,
+        handler: Callable[..., Any] | None,
+        name: str,
+    ) -> Any:
+        assert handler is not None
+        qos = endpoint.qos or QosProfile()
+        if connection.participant is not None:
+            entity = connection.participant.create_subscription(
+                interface, name or self.resolve(endpoint), handler, qos, unique=endpoint.unique
+            )
+        else:
+            entity = create_subscription(
+                self._node,
+                interface,
+                name or endpoint.name,
+                handler,
+                qos,
+                unique=endpoint.unique,
+            )
+        self._gate.add_subscription(entity, self._later)
+        return entity
+
+    def _service(
+        self,
+        endpoint: PlannedEndpoint,
+        interface: type[Any],
+        connection: Connection,
+        handler: Callable[..., Any] | None,
+        name: str,
+    ) -> Any:
+        assert handler is not None
+        if connection.participant is not None:
+            entity = connection.participant.create_service(
+                interface, name or self.resolve(endpoint), _answering(handler), **_qos(endpoint)
+            )
+        else:
+            entity = self._node.create_service(
+                interface, name or endpoint.name, _answering(handler), **_qos_profile(endpoint)
+            )
+        self._survive_late_answers(entity, endpoint)
+        return entity
+
+    def _client(
+        self,
+        endpoint: PlannedEndpoint,
+        interface: type[Any],
+        connection: Connection,
+        handler: Callable[..., Any] | None,  # noqa: ARG002 - it has none
+        name: str,
+    ) -> Any:
+        if connection.participant is None:
+            return self._node.create_client(
+                interface, name or endpoint.name, **_qos_profile(endpoint)
+            )
+        from lifecycle.node.author.blocking import refuse_to_deadlock
+
+        client = connection.participant.create_client(
+            interface,
+            name or self.resolve(endpoint),
+            callback_group=self._client_group,
+            **_qos(endpoint),
+        )
+        refuse_to_deadlock(client)
+        return client
+
+    def _action_server(
+        self,
+        endpoint: PlannedEndpoint,
+        interface: type[Any],
+        connection: Connection,
+        handler: Callable[..., Any] | None,
+        name: str,
+    ) -> Any:
+        from lifecycle.middleware.services.action_server import GoalServer  # late: numpy, 100 ms
+
+        assert handler is not None
+        logger = self._node.get_logger()
+        words = ActionWords(
+            action=endpoint.name,
+            node=self._node.get_fully_qualified_name(),
+            error=logger.error,
+            warn=logger.warning,
+        )
+        goals = Goals(handler, interface, words, is_open=lambda: self._gate.is_open)
+
+        server = goals.server = self._action(
+            endpoint,
+            connection,
+            name,
+            lambda node, called: GoalServer(
+                node,
+                interface,
+                called,
+                goals.execute,
+                accept=goals.accept,
+                group=self._node.default_callback_group,
+            ),
+        )
+        self._goals[id(server)] = goals
+        self._gate.add_worker(server, goals)
+        return server
+
+    def _action_client(
+        self,
+        endpoint: PlannedEndpoint,
+        interface: type[Any],
+        connection: Connection,
+        handler: Callable[..., Any] | None,  # noqa: ARG002 - it has none
+        name: str,
+    ) -> Any:
+        from lifecycle.middleware.services.action_client import GoalClient
+        from lifecycle.node.author.blocking import refuse_to_block
+
+        return self._action(
+            endpoint,
+            connection,
+            name,
+            lambda node, called: GoalClient(
+                node,
+                interface,
+                called,
+                group=self._client_group,
+                refuse_to_block=refuse_to_block,
+            ),
+        )
+
+    def _action(
+        self,
+        endpoint: PlannedEndpoint,
+        connection: Connection,
+        name: str,
+        make: Callable[[Node, str], Any],
+    ) -> Any:
+        """Make an action server or client where it belongs, and have it know its name."""
+        participant = connection.participant
+        if participant is None:
+            # rcl applies rules to the hidden names itself; torn apart, the action is not made.
+            resolved = resolve_action_name(self._node, name or endpoint.name)
+            action = make(self._node, name or endpoint.name)
+        else:
+            resolved = name or self.resolve(endpoint)
+            noun = endpoint.kind.noun
+            action = participant.create_action(lambda node: make(node, resolved), noun, resolved)
+        action.action_name = resolved
+        return action
+
+    def _survive_late_answers(self, service: Any, endpoint: PlannedEndpoint) -> None:
+        """Let an answer that comes after its server was unmade be lost, not end the process."""
+        send = service.send_response
+        warn = self._node.get_logger().warning
+
+        @functools.wraps(send)
+        def send_response(response: Any, header: Any) -> None:
+            try:
+                send(response, header)
+            except InvalidHandle:
+                warn(
+                    f"cannot send the answer of service server {endpoint.name!r}: it was "
+                    "disconnected while its handler worked on it"
+                )
+
+        service.send_response = send_response
+
+
+def wire_name(entity: Any) -> str:
+    """Return an entity's name on the wire, as rcl resolved it; empty if it does not tell."""
+    for attribute in ("topic_name", "service_name", "action_name"):
+        name = getattr(entity, attribute, None)
+        if name is not None:
+            return str(name)
+    return ""
+
+
+def _qos(endpoint: PlannedEndpoint) -> dict[str, Any]:
+    """Return the keyword for a declared QoS; nothing keeps the default for services."""
+    return {} if endpoint.qos is None else {"qos": endpoint.qos}
+
+
+def _qos_profile(endpoint: PlannedEndpoint) -> dict[str, Any]:
+    """Return `_qos` as rclpy wants it."""
+    return {} if endpoint.qos is None else {"qos_profile": to_rclpy(endpoint.qos)}
+
+
+def _answering(handler: Callable[..., Any]) -> Callable[[Any, Any], Any]:
+    """Let a service handler return None once it has filled in the response."""
+
+    async def answer(request: Any, response: Any) -> Any:
+        returned = handler(*(request, response)[: positional_count(handler, 2)])
+        if hasattr(returned, "__await__"):
+            returned = await returned
+        return response if returned is None else returned
+
+    return answer

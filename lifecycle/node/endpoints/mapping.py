@@ -1,0 +1,107 @@
+"""One declared endpoint and what stands for it now. Owns: the type, no behaviour of its own."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from lifecycle.node.connections.connections import Connection
+from lifecycle.node.endpoints.endpoint_names import Key
+from lifecycle.node.endpoints.making import wire_name
+from lifecycle.node.endpoints.matches import MatchWatch
+from lifecycle.plan.model import PlannedEndpoint
+
+if TYPE_CHECKING:
+    from lifecycle.middleware.services.server_watch import ServerWatch
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Part:
+    """One entity of an endpoint: the one of its own name, or of an alias.
+
+    Attributes:
+        name: fully qualified; empty for the one of the declared name.
+        entity: the rclpy object.
+        watch: tells of its peers or its server; None for service and action servers.
+    """
+
+    name: str
+    entity: Any
+    watch: MatchWatch | ServerWatch | None = None
+
+
+@dataclasses.dataclass(slots=True, kw_only=True, eq=False)
+class Placement:
+    """What stands for an endpoint on one connection.
+
+    Attributes:
+        parts: the one of its own name first.
+    """
+
+    connection: Connection
+    parts: tuple[Part, ...]
+
+    @property
+    def entity(self) -> Any:
+        """The rclpy object of its own name."""
+        return self.parts[0].entity
+
+    @property
+    def entities(self) -> tuple[Any, ...]:
+        """All of them, the one of the endpoint's own name first."""
+        return tuple(part.entity for part in self.parts)
+
+
+@dataclasses.dataclass(slots=True, kw_only=True, eq=False)
+class Mapping:
+    """One declared endpoint and what stands for it now.
+
+    Attributes:
+        interface: the message, service or action class.
+        handler: takes messages, requests or goals; None where the kind has no handler.
+        placement: where it is; None while it is mapped nowhere.
+        error: why it could not be made as asked; empty if it was.
+        name: fully qualified, given by `remap`; empty for the name that was declared.
+        aliases: fully qualified, given by `alias`.
+        peers: matched remote endpoints; None while mapped nowhere, and for services and actions.
+        lossy: the author's hint: the data bear an unreliable transport; None without one.
+        size_bytes: the author's hint: its largest serialized message; None without one.
+    """
+
+    endpoint: PlannedEndpoint
+    interface: type[Any]
+    handler: Callable[..., Any] | None = None
+    placement: Placement | None = None
+    error: str = ""
+    name: str = ""
+    aliases: tuple[str, ...] = ()
+    peers: int | None = None
+    lossy: bool | None = None
+    size_bytes: int | None = None
+
+    @property
+    def key(self) -> Key:
+        """Kind and declared name."""
+        return self.endpoint.kind, self.endpoint.name
+
+    @property
+    def spelling(self) -> str:
+        """`publishers/video`."""
+        return self.endpoint.kind.spell(self.endpoint.name)
+
+    @property
+    def wire_name(self) -> str:
+        """Fully qualified name as it is now, or will be once it is mapped."""
+        made = "" if self.placement is None else wire_name(self.placement.entity)
+        return made or self.name or self.endpoint.resolved
+
+    @property
+    def entity(self) -> Any:
+        """The rclpy object; None while it is mapped nowhere."""
+        return None if self.placement is None else self.placement.entity
+
+    @property
+    def connection(self) -> Connection | None:
+        """Where it is mapped; None while it is nowhere."""
+        return None if self.placement is None else self.placement.connection

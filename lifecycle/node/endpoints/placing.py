@@ -1,0 +1,240 @@
+"""All that stands for one endpoint on one connection: its entity, its aliases', their watches.
+
+Owns: that a placement is made whole or not at all, that a strictly unique flow is not shared, and
+how a new placement takes over from an old one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING, Any
+
+from rclpy.duration import Duration
+
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.middleware import ServerWatch
+from lifecycle.network.nfe import UniqueRequirement
+from lifecycle.node.connections.connections import ConnectError, Connection
+from lifecycle.node.endpoints.handover import STRAGGLE_S, After, Overlap, drain
+from lifecycle.node.endpoints.making import CLIENTS
+from lifecycle.node.endpoints.mapping import Mapping, Part, Placement
+from lifecycle.node.endpoints.matches import MatchWatch
+
+if TYPE_CHECKING:
+    from rclpy.callback_groups import CallbackGroup
+    from rclpy.node import Node
+
+    from lifecycle.node.endpoints.making import Maker
+    from lifecycle.node.lifecycle.gate import Gate, Later
+
+_STRICT = UniqueRequirement.STRICTLY_REQUIRED
+_ACKNOWLEDGED = Duration(seconds=0.1)
+"""How long a reliable publisher that is handed over is waited for; on one network a millisecond."""
+_DRAINED = 1000  # messages
+
+
+class Placer:
+    """Places the endpoints of one node.
+
+    Args:
+        node: whose executor runs the callbacks.
+        maker: makes single entities.
+        gate: holds subscriptions back.
+        event_group: reentrant, of the events that tell of peers.
+        later: runs a function in the node's executor.
+        after: calls back once in the node's executor.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        maker: Maker,
+        *,
+        gate: Gate,
+        event_group: CallbackGroup,
+        later: Later,
+        after: After,
+    ) -> None:
+        self._node = node
+        self._maker = maker
+        self._gate = gate
+        self._event_group = event_group
+        self._later = later
+        self._after = after
+
+    def place(
+        self,
+        mapping: Mapping,
+        connection: Connection,
+        *,
+        beside: Iterable[Mapping],
+        matched: Callable[[Mapping], None],
+    ) -> Placement:
+        """Make everything that stands for an endpoint on a connection, or nothing.
+
+        Args:
+            mapping: the endpoint; where it is now is left alone.
+            connection: where it shall be.
+            beside: every endpoint of the node.
+            matched: told when the peers of this placement, or its server, change.
+
+        Raises:
+            LifecycleError: it cannot be made so.
+        """
+        _refuse_shared_flow(mapping, connection, beside)
+        parts: list[Part] = []
+        try:
+            for name in (mapping.name, *mapping.aliases):
+                parts.append(self._part(mapping, connection, name, matched))  # noqa: PERF401
+        except BaseException:
+            self._unmake(mapping, connection, parts)
+            raise
+        return Placement(connection=connection, parts=tuple(parts))
+
+    def unplace(self, mapping: Mapping, placement: Placement) -> None:
+        """Unmake what `place` returned."""
+        self._unmake(mapping, placement.connection, placement.parts)
+
+    def realias(
+        self,
+        mapping: Mapping,
+        placement: Placement,
+        aliases: Sequence[str],
+        *,
+        matched: Callable[[Mapping], None],
+    ) -> None:
+        """Have one part for each alias; those that stay are left alone. Arguments as `place`."""
+        connection = placement.connection
+        _refuse_alias(mapping, connection, aliases)
+        own, *further = placement.parts
+        kept = {part.name: part for part in further}
+        made: list[Part] = []
+        try:
+            for name in aliases:
+                if name not in kept:
+                    made.append(self._part(mapping, connection, name, matched))  # noqa: PERF401
+        except BaseException:
+            self._unmake(mapping, connection, made)
+            raise
+        known = {**kept, **{part.name: part for part in made}}
+        placement.parts = (own, *(known.pop(name) for name in aliases))
+        self._unmake(mapping, connection, tuple(known.values()))
+
+    def overlap(self, mapping: Mapping, old: Placement, new: Placement) -> Overlap | None:
+        """Let the old placement of a subscription deliver and the new one wait for its turn."""
+        if mapping.endpoint.kind is not EndpointKind.SUBSCRIPTION:
+            return None
+        assert mapping.handler is not None
+        overlap = Overlap(mapping.handler)
+        for entity in old.entities:
+            self._gate.hand_to(entity, overlap.from_old)
+        for entity in new.entities:
+            self._gate.hand_to(entity, overlap.from_new)
+        return overlap
+
+    def switch(
+        self, mapping: Mapping, old: Placement, new: Placement, overlap: Overlap | None
+    ) -> None:
+        """Let the new placement do what the old one did until now, which is about to be unmade."""
+        if mapping.endpoint.kind is EndpointKind.PUBLISHER:
+            qos = mapping.endpoint.qos
+            if qos is None or qos.reliability.name != "BEST_EFFORT":
+                for entity in old.entities:
+                    entity.wait_for_all_acked(_ACKNOWLEDGED)
+        elif overlap is not None:
+            for entity in (*old.entities, *new.entities):
+                drain(entity, self._await_later, at_most=_DRAINED)
+            overlap.release(self._await_later if self._gate.is_open else None)
+            for entity in new.entities:
+                self._gate.hand_to(entity, overlap.alone)
+            self._after(STRAGGLE_S, lambda: self._hand_back(mapping, new, overlap))
+
+    def _hand_back(self, mapping: Mapping, placement: Placement, overlap: Overlap) -> None:
+        """Let rclpy call the handler itself again, unless something else has come meanwhile."""
+        assert mapping.handler is not None
+        for entity in placement.entities:
+            if self._gate.callback_of(entity) == overlap.alone:
+                self._gate.hand_to(entity, mapping.handler)
+
+    def _part(
+        self,
+        mapping: Mapping,
+        connection: Connection,
+        name: str,
+        matched: Callable[[Mapping], None],
+    ) -> Part:
+        entity = self._maker.make(
+            mapping.endpoint, mapping.interface, connection, handler=mapping.handler, name=name
+        )
+        return Part(
+            name=name, entity=entity, watch=self._watch(mapping, connection, entity, matched)
+        )
+
+    def _watch(
+        self,
+        mapping: Mapping,
+        connection: Connection,
+        entity: Any,
+        matched: Callable[[Mapping], None],
+    ) -> MatchWatch | ServerWatch | None:
+        kind = mapping.endpoint.kind
+        if kind.is_topic:
+            return MatchWatch(self._node, entity, self._event_group, lambda _: matched(mapping))
+        if kind not in CLIENTS:
+            return None
+
+        def changed() -> None:
+            self._later(lambda: matched(mapping))
+
+        hidden = connection.participant
+        return ServerWatch(self._node if hidden is None else hidden.node, entity, changed)
+
+    def _unmake(self, mapping: Mapping, connection: Connection, parts: Iterable[Part]) -> None:
+        for part in parts:
+            if part.watch is not None:
+                part.watch.stop()
+            self._maker.unmake(mapping.endpoint, part.entity, connection)
+
+    def _await_later(self, awaitable: Any) -> None:
+        async def run() -> None:
+            await awaitable
+
+        self._later(run)
+
+
+def _refuse_shared_flow(
+    mapping: Mapping, connection: Connection, beside: Iterable[Mapping]
+) -> None:
+    """Keep a strictly unique publisher alone: a participant's publishers share its sockets.
+
+    On the node's own participant the RMW refuses such a publisher itself.
+    """
+    publisher = EndpointKind.PUBLISHER
+    if connection.participant is None or mapping.endpoint.kind is not publisher:
+        return
+    _refuse_alias(mapping, connection, mapping.aliases)
+    for other in beside:
+        if other is mapping or other.endpoint.kind is not publisher:
+            continue
+        if other.connection is not connection:
+            continue
+        for one, two in ((mapping, other), (other, mapping)):
+            if one.endpoint.unique is _STRICT:
+                raise ConnectError(
+                    f"publisher {one.endpoint.name!r} must have a network flow for itself "
+                    f"(strictly_required), and would share it with publisher "
+                    f"{two.endpoint.name!r}",
+                    hint="give each a connection of its own",
+                )
+
+
+def _refuse_alias(mapping: Mapping, connection: Connection, aliases: Iterable[str]) -> None:
+    """An alias of a publisher is one more publisher beside it."""
+    if connection.participant is None or mapping.endpoint.kind is not EndpointKind.PUBLISHER:
+        return
+    for alias in aliases:
+        if mapping.endpoint.unique is _STRICT:
+            raise ConnectError(
+                f"publisher {mapping.endpoint.name!r} must have a network flow for itself "
+                f"(strictly_required), and would share it with its alias {alias!r}"
+            )

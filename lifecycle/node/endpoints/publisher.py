@@ -1,0 +1,138 @@
+"""The publisher a node's code holds: one object per declared name, whatever the data layer does.
+
+Owns: the handle that `self.publisher("video")` returns. It exists from configure until cleanup;
+the rclpy publisher behind it comes with connect and goes with disconnect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+from lifecycle.errors import LifecycleError
+
+if TYPE_CHECKING:
+    from rclpy.publisher import Publisher
+
+    from lifecycle.node.endpoints.transient_local_cache import Kept
+
+
+class DeclaredPublisher:
+    """Publishes on a declared topic while the node is active; drops otherwise.
+
+    While the node is active `publish` is rclpy's own bound method: an open gate costs nothing. Only
+    a TRANSIENT_LOCAL publisher keeps what it sends, to take it along to another connection.
+
+    Example:
+        >>> def on_configure(self):
+        ...     self.video = self.publisher("video")
+        >>> @on_timer(period_s=0.05)
+        ... def tick(self):
+        ...     self.video.publish(self.camera.read())
+
+    Args:
+        name: as declared.
+        warn: told what is dropped.
+        kept: keeps what is sent; None where nothing is kept.
+
+    Attributes:
+        name: as declared.
+        publish: takes a message of the declared type, or serialized bytes.
+    """
+
+    publish: Callable[[Any], None]
+
+    def __init__(self, name: str, warn: Callable[[str], None], kept: Kept | None = None) -> None:
+        self.name = name
+        self._warn = warn
+        self._kept = kept
+        self._warned = False
+        self._is_open = False
+        self._entity: Publisher | None = None
+        self._further: tuple[Publisher, ...] = ()
+        self.publish = self._drop
+
+    @property
+    def entity(self) -> Publisher:
+        """The rclpy publisher, for everything beside `publish`.
+
+        Raises:
+            LifecycleError: the node is not connected.
+        """
+        if self._entity is None:
+            raise LifecycleError(
+                f"cannot reach publisher {self.name!r}: the node is not connected; "
+                "endpoints exist from connect until disconnect"
+            )
+        return self._entity
+
+    def get_subscription_count(self) -> int:
+        """Return how many subscriptions are matched; 0 while not connected."""
+        return self._entity.get_subscription_count() if self._entity is not None else 0
+
+    def prepare(self, entities: Sequence[Publisher]) -> None:
+        """Give entities that this will stand for what was sent, before anybody is matched.
+
+        Not while the gate is closed: what is inactive stays silent until it is opened.
+        """
+        if self._kept is not None and self._is_open:
+            self._kept.catch_up(entities)
+
+    def attach(self, entity: Publisher, further: Sequence[Publisher] = ()) -> None:
+        """Stand for `entity`, and for those of its aliases, from now on."""
+        self._entity = entity
+        self._further = tuple(further)
+        self._warned = False
+        if self._is_open:
+            self.open()
+
+    def detach(self) -> None:
+        """The rclpy publisher is being destroyed."""
+        self._entity = None
+        self._further = ()
+        self.publish = self._drop
+
+    def forget(self) -> None:
+        """Whoever comes later is not told what was sent so far."""
+        if self._kept is not None:
+            self._kept.forget()
+
+    def open(self) -> None:
+        """Let `publish` be rclpy's own method, as far as there is one."""
+        self._is_open = True
+        self._warned = False
+        if self._entity is None:
+            return
+        if self._kept is not None:
+            self._kept.catch_up((self._entity, *self._further))
+            self.publish = self._publish_and_keep
+        else:
+            self.publish = self._publish_all if self._further else self._entity.publish
+
+    def close(self) -> None:
+        """Drop what is published; say so once until the gate has been open again."""
+        self._is_open = False
+        self._warned = False
+        self.publish = self._drop
+
+    def _publish_all(self, msg: Any) -> None:
+        assert self._entity is not None
+        self._entity.publish(msg)
+        for each in self._further:
+            each.publish(msg)
+
+    def _publish_and_keep(self, msg: Any) -> None:
+        assert self._entity is not None
+        assert self._kept is not None
+        self._kept.publish(msg, (self._entity, *self._further))
+
+    def _drop(self, msg: Any) -> None:  # noqa: ARG002 - the signature of Publisher.publish
+        if not self._warned:
+            self._warned = True
+            why, until = "the node is not active", "active"
+            if self._is_open:
+                why, until = "it is mapped onto no connection", "mapped onto one"
+            self._warn(
+                f"cannot publish on {self.name!r}: {why}, so the message is dropped, and so are "
+                f"those that follow until it is {until}"
+            )

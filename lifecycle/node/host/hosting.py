@@ -1,0 +1,179 @@
+"""The nodes of one process and the supervisor that is told of them and commands them.
+
+Owns: the order of a host's life: construct every node, say "ready", obey, and at end of file shut
+down and leave; and what is told unasked. It holds no state of its nodes. While the user's modules
+are imported there is nothing to shut down: then it ends at once, and silently.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import signal
+import threading
+from collections.abc import Iterator
+from typing import NoReturn
+
+from rclpy.context import Context
+from rclpy.node import Node
+
+from lifecycle import codec
+from lifecycle.middleware.discovery.retransmission import send_again_soon
+from lifecycle.middleware.process.busy_timer import BusySign
+from lifecycle.middleware.process.teardown import leave_and_exit
+from lifecycle.node.author.node import LifecycleNode
+from lifecycle.node.host.constructing import Participants, class_of, construct
+from lifecycle.node.host.control import Command, Event, HostSpec, Operation
+from lifecycle.node.host.host_channel import HostChannel, report_failure
+from lifecycle.node.host.host_commands import HostCommands
+from lifecycle.node.host.loop import NodeLoop, on_signal
+from lifecycle.node.host.watchdog import Watchdog
+from lifecycle.plan.model import PlannedNode
+from lifecycle.verify.observation import NodeConfiguration
+
+_LEAVE_S = 0.5
+"""For the participants of nodes that were constructed while another's module is imported."""
+
+
+class Host:
+    """The nodes of one process and the commands to them."""
+
+    def __init__(self, spec: HostSpec, context: Context, channel: HostChannel) -> None:
+        self._spec = spec
+        self._context = context
+        self._channel = channel
+        watchdog = None
+        if channel.descriptors:
+            sign = BusySign(*channel.descriptors)
+            watchdog = Watchdog(sign, lambda _: channel.write(Event(kind="beat")))
+        self._loop = NodeLoop(context, watchdog)
+        self._lock = threading.Lock()
+        self._imports = False
+        self._ended = False
+        self._nodes: dict[str, LifecycleNode] = {}
+        self._commands = HostCommands(
+            self._nodes,
+            {
+                Operation.SEND_AGAIN_SOON: send_again_soon,
+                Operation.TELL_NAMES: self._loop.tell_names,
+            },
+        )
+
+    def run(self) -> NoReturn:
+        """Construct, say ready, obey; never returns."""
+        # Both before any constructor of the user's: whatever it does, the process can be ended.
+        threading.Thread(target=self._obey, name="control", daemon=True).start()
+        with on_signal(lambda number: self._end(number.name)):
+            participants = Participants(self._context)
+            for index, planned in enumerate(self._spec.nodes):
+                failure: Exception | None = None
+                try:
+                    node_class = self._import(planned)
+                    with participants.carrying(planned) as context:
+                        node = construct(planned, node_class, context, self._spec.system)
+                        self._add(planned, node)
+                except Exception as error:  # noqa: BLE001 - reported to the supervisor
+                    failure = error
+                if failure is not None:
+                    # Outside the handler: what fails next is not a consequence of this.
+                    self._give_up(index, failure)
+            self._loop.call_soon(self._ready)
+            self._loop.spin_and_exit()
+        raise AssertionError("spin_and_exit returned")
+
+    def _import(self, planned: PlannedNode) -> type[Node]:
+        """Import a node's class; whoever ends the process meanwhile need not wait."""
+        with self._importing():
+            return class_of(planned, alone=len(self._spec.nodes) == 1)
+
+    @contextlib.contextmanager
+    def _importing(self) -> Iterator[None]:
+        with self._lock:
+            self._imports = True
+            if self._ended:
+                self._leave()
+        # The kernel ends a process whose import keeps the interpreter's lock.
+        quiet = () if self._loop.nodes else (signal.SIGINT, signal.SIGTERM)
+        before = {number: signal.signal(number, signal.SIG_DFL) for number in quiet}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+            with self._lock:
+                self._imports = False
+
+    def _give_up(self, index: int, error: Exception) -> NoReturn:
+        """Report the node that failed, and whatever else cannot be imported here, and leave."""
+        report_failure(self._channel, self._spec.nodes[index].full_name, error)
+        for planned in self._spec.nodes[index + 1 :]:
+            try:
+                self._import(planned)
+            except Exception as another:  # noqa: BLE001, PERF203 - told to the supervisor
+                report_failure(self._channel, planned.full_name, another)
+        self._leave(1)
+
+    def _end(self, reason: str) -> None:
+        """Shut down and leave; from any thread but the main one."""
+        with self._lock:
+            self._ended = True
+            if self._imports:
+                self._leave()
+        self._loop.stop(reason, code=0)
+
+    def _leave(self, code: int = 0) -> NoReturn:
+        """Leave without shutting nodes down: none of them has been configured."""
+        nodes = self._loop.nodes
+        leave_and_exit(
+            code,
+            nodes=nodes,
+            contexts=dict.fromkeys([self._context, *(node.context for node in nodes)]),
+            deadline_s=_LEAVE_S,
+        )
+
+    def _add(self, planned: PlannedNode, node: Node) -> None:
+        if isinstance(node, LifecycleNode):
+            self._nodes[planned.full_name] = node
+            node.lifecycle.add_listener(self._tell_state)
+            node.lifecycle.configuration_changes.listen(self._tell_configuration)
+        self._loop.add(node)
+
+    async def _ready(self) -> None:
+        self._channel.write(Event(kind="ready"))
+
+    def _tell_state(self, node: LifecycleNode) -> None:
+        state = node.lifecycle.state
+        self._channel.write(
+            Event(
+                kind="state",
+                node=node.lifecycle.full_name,
+                state=state.seen.label,
+                connected=state.connected,
+            )
+        )
+
+    def _tell_configuration(self, configuration: NodeConfiguration) -> None:
+        self._channel.write(
+            Event(
+                kind="configuration",
+                node=configuration.name,
+                state=configuration.state,
+                connected=configuration.connected,
+                configuration=configuration,
+            )
+        )
+
+    def _obey(self) -> None:
+        """Read commands until the supervisor ends the channel; runs in its own thread."""
+        while (line := self._channel.read()) is not None:
+            try:
+                command = codec.from_json(line, Command)
+            except ValueError:
+                # Both ends are ours: this is a bug, and the log is where it can be found.
+                logging.getLogger(__name__).exception("cannot read command %r", line)
+                continue
+            self._loop.call_soon(self._execute, command)
+        self._end("end of the control channel")
+
+    async def _execute(self, command: Command) -> None:
+        self._channel.write(await self._commands.execute(command))

@@ -1,0 +1,195 @@
+"""Spins the nodes of one process and ends them well: in a host and in a terminal alike.
+
+Owns: the executor's thread, signals, and the bounded way down (shutdown transitions, then leaving
+DDS). rclpy's own signal handlers are not used: they end the context under the nodes' feet, and
+nothing could be said or done after that.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import sys
+import threading
+import traceback
+from collections.abc import Callable, Coroutine, Iterator
+from typing import Any
+
+from rclpy.context import Context
+from rclpy.executors import (
+    ConditionReachedException,
+    ShutdownException,
+    SingleThreadedExecutor,
+    TimeoutException,
+)
+from rclpy.node import Node
+
+from lifecycle.middleware.discovery.rediscovery import tell_names
+from lifecycle.middleware.fastdds.participant import hidden_nodes
+from lifecycle.middleware.process.teardown import leave_and_exit
+from lifecycle.node.author.node import LifecycleNode
+from lifecycle.node.host.watchdog import Watchdog
+from lifecycle.node.lifecycle.execution import hint
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_LEAVE_S = 2.0
+
+
+class NodeLoop:
+    """One process's executor, its nodes, and their end.
+
+    Args:
+        context: of the executor; nodes may have others.
+        watchdog: told when a callback begins and ends.
+
+    Example:
+        >>> loop = NodeLoop(context)
+        >>> loop.add(Camera())
+        >>> with on_signal(lambda number: loop.stop(f"signal {number}", code=0)):
+        ...     loop.spin_and_exit()
+    """
+
+    def __init__(self, context: Context, watchdog: Watchdog | None = None) -> None:
+        self._context = context
+        self._watchdog = watchdog
+        self._executor = SingleThreadedExecutor(context=context)
+        self._nodes: list[Node] = []
+        self._lock = threading.Lock()
+        self._stopping = False
+        self._done = False
+        self._code = 0
+
+    @property
+    def nodes(self) -> tuple[Node, ...]:
+        """Those that were added."""
+        return tuple(self._nodes)
+
+    def add(self, node: Node) -> None:
+        """Spin a node from now on; shut down in reverse order of addition."""
+        self._nodes.append(node)
+        if self._watchdog is not None and isinstance(node, LifecycleNode):
+            self._watchdog.add(node)
+        self._executor.add_node(node)
+
+    def tell_names(self) -> None:
+        """Have every participant of this process tell anew which nodes and endpoints it has."""
+        by_context = {id(node.context): node for node in self._nodes}
+        tell_names((*by_context.values(), *hidden_nodes()))
+
+    def call_soon(self, task: Callable[..., Coroutine[Any, Any, None]], *arguments: object) -> None:
+        """Run an `async def` in the executor's thread; from any thread. It must not raise."""
+        self._executor.create_task(task, *arguments)
+
+    def stop(self, reason: str, *, code: int) -> None:
+        """Shut every node down and leave with `code`; from any thread, the first call counts.
+
+        Bounded: each node has its shutdown deadline. When a callback blocks the executor beyond
+        all of them, the process ends without it.
+        """
+        with self._lock:
+            if self._stopping:
+                return
+            self._stopping = True
+            self._code = code
+        managed = [node for node in self._nodes if isinstance(node, LifecycleNode)]
+        bound_s = sum(node.lifecycle.spec.timeouts.shutdown_s for node in managed) + _LEAVE_S
+        guard = threading.Thread(
+            target=self._give_up, args=(bound_s, reason), name="give-up", daemon=True
+        )
+        # At the limit of threads it goes without: a supervisor ends what does not end by itself.
+        with contextlib.suppress(RuntimeError):
+            guard.start()
+        self.call_soon(self._shut_down, reason)
+
+    def spin_and_exit(self) -> None:
+        """Spin until stopped, then end the process; never returns.
+
+        An exception in a message, service or timer callback ends the process, as in rclpy: its
+        traceback is printed, then all nodes are shut down.
+        """
+        while not self._done:
+            try:
+                self._turn()
+            except Exception as error:  # noqa: BLE001, PERF203 - the user's code: reported
+                traceback.print_exc()
+                if todo := hint(error):
+                    sys.stderr.write(f"{todo}\n")
+                self.stop("a callback raised an exception", code=1)
+        self._executor.shutdown()
+        contexts = dict.fromkeys([self._context, *(node.context for node in self._nodes)])
+        leave_and_exit(self._code, nodes=self._nodes, contexts=contexts)
+
+    def _turn(self) -> None:
+        """Run the next callback, as the executor's own spin_once does, under the watchdog."""
+        try:
+            handler, _, _ = self._executor.wait_for_ready_callbacks()
+        except (ShutdownException, TimeoutException, ConditionReachedException):
+            return
+        if self._watchdog is None:
+            handler()
+        else:
+            self._watchdog.begin()
+            try:
+                handler()
+            finally:
+                self._watchdog.end()
+        if (error := handler.exception()) is not None:
+            raise error
+
+    async def _shut_down(self, reason: str) -> None:
+        for node in reversed(self._nodes):
+            if isinstance(node, LifecycleNode):
+                try:
+                    await node.lifecycle.shut_down(reason)
+                except Exception:  # noqa: BLE001 - the other nodes must still be shut down
+                    traceback.print_exc()
+        self._done = True
+
+    def _give_up(self, bound_s: float, reason: str) -> None:
+        """End the process when a blocking callback keeps the executor from doing so."""
+        threading.Event().wait(bound_s)
+        names = ", ".join(node.get_fully_qualified_name() for node in self._nodes)
+        sys.stderr.write(
+            f"cannot shut down {names} within {bound_s:g} s after {reason}: "
+            "a callback blocks; the process ends without it\n"
+        )
+        sys.stderr.flush()
+        os._exit(self._code or 1)
+
+
+@contextlib.contextmanager
+def on_signal(handler: Callable[[signal.Signals], None]) -> Iterator[None]:
+    """Call `handler` in a thread of its own for each SIGINT and SIGTERM.
+
+    A Python signal handler runs only when the main thread runs Python, and the main thread sits
+    in rcl's wait. The wake-up descriptor is written by the C handler, so a thread can read it.
+    Must be entered in the main thread.
+    """
+    receiver, sender = socket.socketpair()
+    sender.setblocking(False)
+    before = {number: signal.signal(number, _arrived) for number in _SIGNALS}
+    before_descriptor = signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
+
+    def read() -> None:
+        while data := receiver.recv(16):
+            for number in data:
+                if number in _SIGNALS:
+                    handler(signal.Signals(number))
+
+    reader = threading.Thread(target=read, name="signals", daemon=True)
+    reader.start()
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(before_descriptor)
+        for number, previous in before.items():
+            signal.signal(number, previous)
+        sender.close()
+        reader.join()
+        receiver.close()
+
+
+def _arrived(number: int, frame: object) -> None:
+    """Replace the default action; the reading thread acts."""

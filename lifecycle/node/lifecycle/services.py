@@ -1,0 +1,161 @@
+"""The managed node's face to ROS: five lifecycle_msgs services and `~/transition_event`.
+
+Owns: translation between messages and the state machine, nothing else. Names, types and QoS are
+rcl_lifecycle's (rcl_lifecycle/src/com_interface.c). A request that the state does not allow is
+answered with success=False; it never raises.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable, Coroutine, Iterable
+from typing import TYPE_CHECKING, Any
+
+from lifecycle_msgs import msg, srv
+from rclpy.node import Node
+from std_srvs.srv import Trigger
+
+from lifecycle.node.lifecycle import machine
+from lifecycle.node.lifecycle.machine import LifecycleMachine, Request
+
+if TYPE_CHECKING:
+    from rclpy.callback_groups import CallbackGroup
+
+_TRANSITION_EVENT_DEPTH = 10  # rmw_qos_profile_default
+
+
+class LifecycleServices:
+    """Serves one node's state machine to `ros2 lifecycle`, launch_ros, nav2 and everyone else."""
+
+    def __init__(
+        self,
+        node: Node,
+        *,
+        state_machine: LifecycleMachine,
+        change: Callable[[Request], Coroutine[Any, Any, bool]],
+        refuse: Callable[[str], None],
+        configuration: Callable[[], str],
+        group: CallbackGroup,
+    ) -> None:
+        """Create the services and the event publisher on `node`.
+
+        Args:
+            node: the node to be seen as managed.
+            state_machine: its state; only read.
+            change: runs a transition, returns whether it succeeded.
+            refuse: told why a request that names no available transition was refused.
+            configuration: returns the node configuration document, JSON.
+            group: must be reentrant, so that others can ask while a transition runs.
+        """
+        self._machine = state_machine
+        self._change = change
+        self._refuse = refuse
+        self._configuration = configuration
+        # Not through our node's own create_publisher: this one must work in every state.
+        self._events = Node.create_publisher(
+            node, msg.TransitionEvent, "~/transition_event", _TRANSITION_EVENT_DEPTH
+        )
+        for type_, name, callback in (
+            (srv.ChangeState, "change_state", self._change_state),
+            (srv.GetState, "get_state", self._get_state),
+            (srv.GetAvailableStates, "get_available_states", self._get_available_states),
+            (
+                srv.GetAvailableTransitions,
+                "get_available_transitions",
+                self._get_available_transitions,
+            ),
+            (srv.GetAvailableTransitions, "get_transition_graph", self._get_transition_graph),
+            (Trigger, "get_configuration", self._get_configuration),
+        ):
+            Node.create_service(node, type_, f"~/{name}", callback, callback_group=group)
+
+    def publish(self, transition: machine.Transition) -> None:
+        """Tell the world of a transition, with the fields that rcl_lifecycle fills in.
+
+        rcl leaves `timestamp` and `transition` empty. Connect and disconnect fill in `transition`:
+        start and goal are the same there, so nothing else tells the two apart.
+        """
+        event = msg.TransitionEvent(
+            start_state=_state(transition.start), goal_state=_state(transition.goal)
+        )
+        if transition.start == transition.goal:
+            event.transition = msg.Transition(id=transition.id, label=transition.label)
+        self._events.publish(event)
+
+    async def _change_state(
+        self, request: srv.ChangeState.Request, response: srv.ChangeState.Response
+    ) -> srv.ChangeState.Response:
+        asked = request.transition
+        resolved = self._machine.resolve(asked.id, asked.label)
+        if resolved is None:
+            name = repr(asked.label) if asked.label else f"number {asked.id}"
+            allowed = ", ".join(each.value for each in self._machine.allowed()) or "nothing"
+            self._refuse(
+                f"cannot take transition {name} in state {self._machine.state.value!r}; "
+                f"allowed here: {allowed}"
+            )
+            response.success = False
+            return response
+        response.success = await self._change(resolved)
+        return response
+
+    def _get_state(
+        self,
+        request: srv.GetState.Request,  # noqa: ARG002
+        response: srv.GetState.Response,
+    ) -> srv.GetState.Response:
+        response.current_state = _state(self._machine.state.seen)
+        return response
+
+    def _get_available_states(
+        self,
+        request: srv.GetAvailableStates.Request,  # noqa: ARG002
+        response: srv.GetAvailableStates.Response,
+    ) -> srv.GetAvailableStates.Response:
+        response.available_states = [_state(each) for each in machine.AVAILABLE_STATES]
+        return response
+
+    def _get_available_transitions(
+        self,
+        request: srv.GetAvailableTransitions.Request,  # noqa: ARG002
+        response: srv.GetAvailableTransitions.Response,
+    ) -> srv.GetAvailableTransitions.Response:
+        response.available_transitions = _descriptions(self._machine.available_transitions())
+        return response
+
+    def _get_transition_graph(
+        self,
+        request: srv.GetAvailableTransitions.Request,  # noqa: ARG002
+        response: srv.GetAvailableTransitions.Response,
+    ) -> srv.GetAvailableTransitions.Response:
+        response.available_transitions = _descriptions(machine.TRANSITION_GRAPH)
+        return response
+
+    def _get_configuration(
+        self,
+        request: Trigger.Request,  # noqa: ARG002
+        response: Trigger.Response,
+    ) -> Trigger.Response:
+        try:
+            response.message = self._configuration()
+        except Exception as error:  # noqa: BLE001 - asking must not end the node
+            self._refuse(traceback.format_exc())
+            response.message = f"cannot describe this node: {error!r}"
+            return response
+        response.success = True
+        return response
+
+
+def _state(state: machine.State) -> msg.State:
+    return msg.State(id=state.id, label=state.label)
+
+
+def _descriptions(edges: Iterable[machine.Transition]) -> list[msg.TransitionDescription]:
+    return [
+        msg.TransitionDescription(
+            transition=msg.Transition(id=edge.id, label=edge.label),
+            start_state=_state(edge.start),
+            goal_state=_state(edge.goal),
+        )
+        for edge in edges
+    ]

@@ -1,0 +1,263 @@
+"""The node configuration document: who a node is and what its endpoints really are.
+
+Owns: collecting a NodeConfiguration (schema: schemas/node_configuration.v1.schema.json) from a
+live node. It is served at `~/get_configuration` and sent to a supervisor.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+from rclpy.utilities import get_rmw_implementation_identifier
+
+from lifecycle import codec
+from lifecycle.errors import MiddlewareError
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.manifest.qos import QosProfile
+from lifecycle.middleware import (
+    SHARED_MEMORY,
+    EndpointInfo,
+    endpoints_of,
+    from_rclpy,
+    get_network_flow_endpoints,
+    guid_of,
+    is_server_matched,
+    matched_with,
+)
+from lifecycle.network.nfe import (
+    InternetProtocol,
+    NetworkFlowEndpoint,
+    TransportProtocol,
+)
+from lifecycle.node.author import parameters
+from lifecycle.node.author.declaring import interface_name
+from lifecycle.node.connections import supported
+from lifecycle.node.connections.connections import Connection
+from lifecycle.node.connections.data_layer import DataLayer
+from lifecycle.node.endpoints.making import CLIENTS, wire_name
+from lifecycle.node.endpoints.mapping import Mapping
+from lifecycle.node.endpoints.matches import count_peers
+from lifecycle.node.lifecycle.machine import NodeState
+from lifecycle.node.reporting.checksum import checksum
+from lifecycle.node.reporting.machine_id import machine_id
+from lifecycle.plan.model import PlannedNode
+from lifecycle.verify.observation import (
+    ConnectionReport,
+    EndpointReport,
+    Identity,
+    NodeConfiguration,
+)
+
+if TYPE_CHECKING:
+    from rclpy.node import Node
+
+_OTHER = {
+    EndpointKind.PUBLISHER: EndpointKind.SUBSCRIPTION,
+    EndpointKind.SUBSCRIPTION: EndpointKind.PUBLISHER,
+}
+_GID_PREFIX_DIGITS = 24
+"""A DDS GUID is a 12-byte participant prefix and a 4-byte entity id (DDSI-RTPS §9.3.1)."""
+
+
+def collect(
+    node: Node,
+    state: NodeState,
+    spec: PlannedNode,
+    data_layer: DataLayer,
+    undeclared: Iterable[tuple[EndpointKind, Any]],
+) -> NodeConfiguration:
+    """Return the configuration of `node` as it is now.
+
+    Args:
+        node: the node itself.
+        state: of its state machine.
+        spec: what it was planned to be.
+        data_layer: its declared endpoints and what stands for them.
+        undeclared: kind and rclpy object of endpoints that its code made by itself.
+    """
+    endpoints = (
+        *(_report(node, mapping) for mapping in data_layer.mappings),
+        *(_undeclared_report(node, kind, entity) for kind, entity in undeclared),
+    )
+    name = node.get_fully_qualified_name()
+    configuration = NodeConfiguration(
+        identity=Identity(
+            machine_id=machine_id(),
+            process_id=os.getpid(),
+            node_id=f"{name}@{_gid_prefix(node)}",
+        ),
+        name=name,
+        state=state.seen.label,
+        connected=state.connected,
+        rmw=get_rmw_implementation_identifier(),
+        transports=supported.transports() or _transports(endpoints),
+        serializations=supported.SERIALIZATIONS,
+        paradigms=supported.PARADIGMS,
+        endpoints=endpoints,
+        connections=connection_reports(spec, data_layer),
+        parameters=parameters.reports(node),
+    )
+    return dataclasses.replace(configuration, checksum=checksum(configuration))
+
+
+def connection_reports(spec: PlannedNode, data_layer: DataLayer) -> tuple[ConnectionReport, ...]:
+    """Return every connection that exists or was asked for, the node's own participant first."""
+    connections = data_layer.connections
+    made = tuple(
+        ConnectionReport(
+            name=each.name,
+            urls=each.urls or (spec.connections.urls if each is connections.own else ()),
+            node_name=each.node_name,
+            established=data_layer.standing.established(each),
+            mappings=tuple(mapping.spelling for mapping in data_layer.standing.on(each)),
+        )
+        for each in (connections.own, *connections.named)
+    )
+    failed = tuple(
+        ConnectionReport(name=each.name, urls=each.urls, error=each.error)
+        for each in connections.failed
+    )
+    return (*made, *failed)
+
+
+def to_json(configuration: NodeConfiguration) -> str:
+    """Return the document that `~/get_configuration` answers with."""
+    document: bytes = codec.to_json(configuration)
+    return document.decode()
+
+
+def _report(node: Node, mapping: Mapping) -> EndpointReport:
+    endpoint, entity, connection = mapping.endpoint, mapping.entity, mapping.connection
+    carrier = connection.node_name if connection is not None else ""
+    report = EndpointReport(
+        kind=endpoint.kind,
+        name=endpoint.name,
+        resolved=mapping.wire_name,
+        type=endpoint.type,
+        qos=endpoint.qos,
+        unique=endpoint.unique,
+        participant=carrier if connection is not None else endpoint.participant,
+        error=mapping.error,
+        connection=connection.name if connection is not None else "",
+        mapped=connection is not None,
+        aliases=mapping.aliases,
+        lossy=mapping.lossy,
+        size_bytes=mapping.size_bytes,
+    )
+    if entity is None:
+        return report
+    if endpoint.kind in CLIENTS:
+        return dataclasses.replace(report, server_matched=is_server_matched(entity))
+    if not endpoint.kind.is_topic:
+        return report
+    # A participant knows its own endpoints; the node's own need not know those of another.
+    hidden = connection.participant if connection is not None else None
+    witness = node if hidden is None else hidden.node
+    report = _with_matches(report, witness, entity)
+    return dataclasses.replace(
+        report, nfes=_nfes(endpoint.kind, entity, connection), dscp=_dscp(mapping)
+    )
+
+
+def _undeclared_report(node: Node, kind: EndpointKind, entity: Any) -> EndpointReport:
+    """Report an endpoint that no interface declares; it has no name but the one on the wire."""
+    resolved = wire_name(entity)
+    interface = entity.msg_type if kind.is_topic else entity.srv_type
+    report = EndpointReport(
+        kind=kind, name="", resolved=resolved, type=interface_name(interface), mapped=True
+    )
+    if not kind.is_topic:
+        return report
+    return dataclasses.replace(_with_matches(report, node, entity), nfes=_nfes(kind, entity, None))
+
+
+def _with_matches(report: EndpointReport, witness: Node, entity: Any) -> EndpointReport:
+    """Add to the report on a publisher or subscription its GID, QoS, type hash and matched peers.
+
+    Args:
+        report: the topic's name and the kind count.
+        witness: the node whose participant carries it.
+        entity: its rclpy object.
+    """
+    info = _own_endpoint(witness, report.resolved, report.kind, guid_of(entity))
+    # Counted before the peers are asked for: who comes meanwhile must not count as unknown.
+    matched = count_peers(entity)
+    others = endpoints_of(witness, _OTHER[report.kind], report.resolved)
+    return dataclasses.replace(
+        report,
+        qos=_actual_qos(entity, info),
+        gid=info.gid if info is not None else "",
+        matched=matched,
+        peers=matched_with(entity, (each.gid for each in others)),
+        type_hash=info.type_hash if info is not None else None,
+    )
+
+
+def _own_endpoint(node: Node, topic: str, kind: EndpointKind, gid: str = "") -> EndpointInfo | None:
+    """Return what this process's graph cache says of the node's own endpoint on `topic`.
+
+    It knows own endpoints at once, discovery has no part in it. None if there is none, or if
+    there are several and no GID tells which is which.
+    """
+    name = node.get_fully_qualified_name()
+    own = [info for info in endpoints_of(node, kind, topic) if info.node == name]
+    if len(own) > 1 and gid:
+        own = [info for info in own if info.gid == gid]
+    return own[0] if len(own) == 1 else None
+
+
+def _gid_prefix(node: Node) -> str:
+    """Return the participant's part of the node's GIDs in hex; empty if unknown."""
+    topic = node.resolve_topic_name("~/transition_event")
+    info = _own_endpoint(node, topic, EndpointKind.PUBLISHER)
+    return info.gid[:_GID_PREFIX_DIGITS] if info is not None else ""
+
+
+def _nfes(
+    kind: EndpointKind, entity: Any, connection: Connection | None
+) -> tuple[NetworkFlowEndpoint, ...] | None:
+    """Return all NFEs of a connected endpoint, shared memory included.
+
+    rmw_fastrtps lists shared memory for subscriptions only, but what carries a flow depends on
+    both ends having it.
+    """
+    try:
+        nfes = get_network_flow_endpoints(entity)
+    except MiddlewareError:
+        return None  # "the RMW cannot tell" is a value here, and the verifier's to judge
+    publishes = kind is EndpointKind.PUBLISHER
+    if publishes and connection is not None and connection.has_shared_memory:
+        return (*nfes, SHARED_MEMORY)
+    return nfes
+
+
+def _dscp(mapping: Mapping) -> int | None:
+    try:
+        return None if mapping.connection is None else mapping.connection.read_dscp()
+    except MiddlewareError:
+        return None  # likewise: sockets that cannot be read are "not read"
+
+
+def _actual_qos(entity: Any, info: EndpointInfo | None) -> QosProfile:
+    """Return the QoS in force; history and depth, which the graph lacks, as they were asked for."""
+    asked = from_rclpy(entity.qos_profile)
+    if info is None:
+        return asked
+    actual = info.qos
+    return dataclasses.replace(actual, history=asked.history, depth=asked.depth)
+
+
+def _transports(endpoints: tuple[EndpointReport, ...]) -> tuple[str, ...]:
+    """Return what the node can be reached by, as far as its endpoints' NFEs tell."""
+    found = {_transport(nfe) for endpoint in endpoints for nfe in endpoint.nfes or ()}
+    return tuple(sorted(found))
+
+
+def _transport(nfe: NetworkFlowEndpoint) -> str:
+    if nfe.transport_protocol is TransportProtocol.UNKNOWN:
+        return "shm"
+    version = {InternetProtocol.IPV4: "v4", InternetProtocol.IPV6: "v6"}
+    return f"{nfe.transport_protocol.value}{version.get(nfe.internet_protocol, '')}"

@@ -1,0 +1,1 @@
+"""How participants are connected and find each other, and whether that is possible."""

@@ -1,0 +1,235 @@
+"""How the nodes' own participants and the supervisors' observers find each other.
+
+Owns: what `discovery:` comes to: the transport of the control plane, the discovery server, and for
+every own participant the connection URLs with ports that are given out in the plan's order
+(metatraffic, user data, source port; observers first, then processes, then extra participants).
+Pure.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+from lifecycle.manifest.model import Discovery, DiscoveryMode, FlowTransport, RunKind
+from lifecycle.network.connection_url import ConnectionTransport, ConnectionUrl, Peer
+from lifecycle.plan.connections.contacts import Contact, contacts_of, fixed_url
+from lifecycle.plan.connections.hosts import Hosts, PortPool
+from lifecycle.plan.model import (
+    ParticipantConnections,
+    PlannedNode,
+    PlannedParticipant,
+    PlannedServer,
+)
+
+DEFAULT_PREFIX = ConnectionUrl(transport=ConnectionTransport.TCPV4).server_prefix
+_SHM = ParticipantConnections(urls=(str(ConnectionUrl(transport=ConnectionTransport.SHM)),))
+_FIXED = (DiscoveryMode.STATIC, DiscoveryMode.STATIC_ENDPOINTS)
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Control:
+    """The control plane of a system.
+
+    Attributes:
+        transport: of own participants; ANY leaves it to the RMW.
+        server: the discovery server, if there is one.
+        observers: how each host's observer is connected so far, (host, connections).
+        observer_ports: given out to each host's observer where it needs them: metatraffic, user
+            data and source port of UDP, and a listening port of TCP.
+    """
+
+    transport: FlowTransport
+    server: PlannedServer | None = None
+    observers: tuple[tuple[str, ParticipantConnections], ...] = ()
+    observer_ports: tuple[tuple[str, tuple[int, ...]], ...] = ()
+
+
+def control_transport(discovery: Discovery, hosts: Hosts) -> FlowTransport:
+    """Return what own participants use: as declared, else what the mode needs.
+
+    ANY leaves it to the RMW. With endpoints known without being told, one host needs no more than
+    shared memory for everything else.
+    """
+    if discovery.transport is not FlowTransport.ANY or discovery.mode is DiscoveryMode.DYNAMIC:
+        return discovery.transport
+    if discovery.mode is DiscoveryMode.SERVER:
+        return FlowTransport.TCPV4
+    if discovery.mode is DiscoveryMode.STATIC_ENDPOINTS and not hosts.several:
+        return FlowTransport.SHM
+    return FlowTransport.UDPV6 if any(":" in host for host in hosts.used) else FlowTransport.UDPV4
+
+
+def is_fixed(discovery: Discovery) -> bool:
+    """Whether participants have planned ports and find nobody but planned peers."""
+    return discovery.mode in _FIXED
+
+
+def connect_control(
+    nodes: Sequence[PlannedNode], discovery: Discovery, hosts: Hosts, pool: PortPool
+) -> tuple[tuple[PlannedNode, ...], Control]:
+    """Connect own participants, extra ones without connection, and observers.
+
+    Args:
+        nodes: of the whole system; a participant that stands for a declared connection has its URLs
+            already and is left alone, and so are all extra ones where endpoints are static: they
+            carry data and become connections (`static_endpoints`).
+        discovery: as declared.
+        hosts: of the system.
+        pool: what is left of each host's ports.
+
+    Returns:
+        The nodes with `connections` filled in, and what the rest of the plan must know.
+
+    Raises:
+        PlanError: a host has no address, or too few ports.
+    """
+    transport = control_transport(discovery, hosts)
+    extra = discovery.mode is not DiscoveryMode.STATIC_ENDPOINTS
+    server = None
+    if discovery.mode is DiscoveryMode.SERVER:
+        server = _server(discovery, hosts, pool, tcp=transport is FlowTransport.TCPV4)
+    ports = tuple((host, pool.take(host, 4)) for host in hosts.used)
+    control = Control(transport=transport, server=server, observer_ports=ports)
+    if transport is FlowTransport.ANY:
+        return tuple(nodes), control
+    if transport is FlowTransport.SHM:
+        return _everywhere(nodes, _SHM, extra=extra), dataclasses.replace(
+            control, observers=tuple((host, _SHM) for host in hosts.used)
+        )
+    kind = ConnectionTransport(transport.value)
+    if discovery.mode is DiscoveryMode.DYNAMIC:
+        same = ParticipantConnections(urls=(str(ConnectionUrl(transport=kind)),))
+        return _everywhere(nodes, same, extra=extra), dataclasses.replace(
+            control, observers=tuple((host, same) for host in hosts.used)
+        )
+    return _with_ports(nodes, control, kind, hosts, pool, extra=extra)
+
+
+def _server(discovery: Discovery, hosts: Hosts, pool: PortPool, *, tcp: bool) -> PlannedServer:
+    machine = discovery.server_machine or next((each.name for each in hosts.machines), "")
+    host = hosts.host(machine)
+    return PlannedServer(
+        machine=machine,
+        address=hosts.address(host),
+        port=pool.take(host)[0],
+        tcp=tcp,
+        prefix=DEFAULT_PREFIX,
+    )
+
+
+def _everywhere(
+    nodes: Sequence[PlannedNode], connections: ParticipantConnections, *, extra: bool
+) -> tuple[PlannedNode, ...]:
+    """Connect all own participants and the extra ones that stand for no connection alike."""
+    return tuple(
+        dataclasses.replace(
+            node,
+            transports=(),
+            connections=connections,
+            participants=tuple(
+                each
+                if each.connections.urls or not extra
+                else dataclasses.replace(each, transports=(), connections=connections)
+                for each in node.participants
+            ),
+        )
+        if node.run.kind is RunKind.PYTHON
+        else node
+        for node in nodes
+    )
+
+
+def _with_ports(
+    nodes: Sequence[PlannedNode],
+    control: Control,
+    kind: ConnectionTransport,
+    hosts: Hosts,
+    pool: PortPool,
+    *,
+    extra: bool,
+) -> tuple[tuple[PlannedNode, ...], Control]:
+    """Give each participant its own ports, and all the others as peers or the server."""
+    count = 1 if kind is ConnectionTransport.TCPV4 else 3
+    slots: dict[tuple[str, str, str], tuple[str, tuple[int, ...]]] = {}
+    for host, ports in control.observer_ports:
+        slots["observer", host, ""] = (host, ports[3:] if count == 1 else ports[:3])
+    ours = [node for node in nodes if node.run.kind is RunKind.PYTHON]
+    for node in ours:
+        key = ("process", node.process, "")
+        host = hosts.host(node.machine)
+        if key not in slots:
+            slots[key] = (host, pool.take(host, count))
+    for node in ours:
+        for each in node.participants:
+            if extra and not each.connections.urls:
+                host = hosts.host(node.machine)
+                slots["extra", node.key, each.name] = (host, pool.take(host, count))
+    urls = _urls(slots, kind, control.server, hosts)
+
+    def connected(key: tuple[str, str, str]) -> ParticipantConnections:
+        return ParticipantConnections(
+            urls=(urls[key],), super_client=control.server is not None and key[0] == "observer"
+        )
+
+    def connect_extra(node: PlannedNode, each: PlannedParticipant) -> PlannedParticipant:
+        if ("extra", node.key, each.name) not in slots:
+            return each
+        return dataclasses.replace(
+            each, transports=(), connections=connected(("extra", node.key, each.name))
+        )
+
+    connected_nodes = tuple(
+        dataclasses.replace(
+            node,
+            transports=(),
+            connections=connected(("process", node.process, "")),
+            participants=tuple(connect_extra(node, each) for each in node.participants),
+        )
+        if node.run.kind is RunKind.PYTHON
+        else node
+        for node in nodes
+    )
+    observers = tuple((host, connected(("observer", host, ""))) for host in hosts.used)
+    return connected_nodes, dataclasses.replace(control, observers=observers)
+
+
+def _urls(
+    slots: dict[tuple[str, str, str], tuple[str, tuple[int, ...]]],
+    kind: ConnectionTransport,
+    server: PlannedServer | None,
+    hosts: Hosts,
+) -> dict[tuple[str, str, str], str]:
+    """Spell each participant's URL."""
+    v6 = kind is ConnectionTransport.UDPV6
+    alone = {
+        key: fixed_url(kind, hosts.address(host, ipv6=v6), ports, ())
+        for key, (host, ports) in slots.items()
+    }
+    if server is not None:
+        at = (Peer(address=server.address, port=server.port),)
+        return {
+            key: str(dataclasses.replace(url, server=at, multicast=True))
+            for key, url in alone.items()
+        }
+    contacts: dict[tuple[str, str, str], Contact] = {
+        key: contacts_of(slots[key][0], (str(url),))[0] for key, url in alone.items()
+    }
+    order = {key: index for index, key in enumerate(alone)}
+
+    def looks_for(key: tuple[str, str, str], other: tuple[str, str, str]) -> bool:
+        # Two ends that dial each other refuse both connections (Fast DDS 2.14). Observers come
+        # first, so whoever dials them finds them there.
+        return order[other] < order[key] if kind is ConnectionTransport.TCPV4 else other != key
+
+    return {
+        key: str(
+            dataclasses.replace(
+                url,
+                peers=tuple(
+                    sorted(each.peer for other, each in contacts.items() if looks_for(key, other))
+                ),
+            )
+        )
+        for key, url in alone.items()
+    }

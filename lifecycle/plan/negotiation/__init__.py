@@ -1,0 +1,1 @@
+"""From parties, wishes and terms to the data layer graph."""

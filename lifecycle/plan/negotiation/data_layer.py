@@ -1,0 +1,179 @@
+"""The data layer graph: who takes part, what was negotiated, and what changes between two of them.
+
+Owns: `Party`, `Terms` and `DataLayerGraph`. The rules are `media`'s, and `negotiate`
+applies them. Pure.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+from lifecycle.manifest.model import EndpointKind, FlowTransport
+from lifecycle.manifest.qos import QosProfile
+from lifecycle.network.connection_url import Peer
+from lifecycle.plan.connections.contacts import Contact
+
+TRANSPORTS = ("shm", "udpv4", "udpv6", "udpm", "tcpv4")
+"""All that a connection can be made of."""
+
+RMW_DEFAULT = ("shm", "udpv4")
+"""What a participant has if nobody says anything (Fast DDS 2.14)."""
+
+PARADIGMS = ("publish-subscribe", "request-response")
+"""Topics; services, and actions, which consist of both."""
+
+SERIALIZATIONS = ("cdr",)
+"""OMG's Common Data Representation, the one wire format of ROS 2's DDS and zenoh RMWs."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class PartyEndpoint:
+    """One publisher or subscription that takes part.
+
+    Attributes:
+        kind: PUBLISHER or SUBSCRIPTION.
+        name: as declared, or the resolved name of one that no interface declares.
+        resolved: fully qualified topic.
+        by: transports of the participant that carries it anyway; empty for the node's own. A group
+            is spelled `udpm@239.255.1.9:7901`.
+        fixed: it cannot be mapped elsewhere.
+        alone: it shares its participant with no other.
+        group: endpoints that may share a participant have the same.
+        transport: what its node's manifest asks for.
+        lossy: the data bear an unreliable transport; None if nobody said.
+        size_bytes: largest serialized message; None if not known.
+    """
+
+    kind: EndpointKind
+    name: str
+    resolved: str
+    type: str
+    qos: QosProfile | None = None
+    by: tuple[str, ...] = ()
+    fixed: bool = False
+    alone: bool = False
+    group: str = ""
+    transport: FlowTransport = FlowTransport.ANY
+    lossy: bool | None = None
+    size_bytes: int | None = None
+
+    @property
+    def label(self) -> str:
+        """How `map_to` knows it, `publishers/video`."""
+        return f"{self.kind.value}/{self.name}"
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Party:
+    """One node, as negotiation sees it.
+
+    Attributes:
+        key: manifest key; the full name of a node that no manifest declares.
+        full_name: `/robot/camera`.
+        host: its host, see `lifecycle.plan.connections.hosts`; parties of equal hosts share memory.
+        process: unique on the host.
+        transports: all that it can be connected by.
+        own: transports of its own participant; empty if nobody knows them.
+        connectable: `connect_to` is there to be called.
+        connections: names that are taken.
+        contacts: where its own participant is reached.
+    """
+
+    key: str
+    full_name: str
+    host: str
+    process: str
+    transports: tuple[str, ...] = TRANSPORTS
+    own: tuple[str, ...] = RMW_DEFAULT
+    connectable: bool = True
+    serializations: tuple[str, ...] = SERIALIZATIONS
+    paradigms: tuple[str, ...] = PARADIGMS
+    endpoints: tuple[PartyEndpoint, ...] = ()
+    connections: tuple[str, ...] = ()
+    contacts: tuple[Contact, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Terms:
+    """What a system's data layer is made under.
+
+    Attributes:
+        fixed: every port is planned, and nobody is found by multicast.
+        server: the discovery server that every connection must know; None without.
+        server_tcp: it listens on TCP; else on UDP.
+        first_port: first of the ports given out, per host.
+        taken: by host, ports that are not given out.
+        multicast_group: first of the groups given out.
+        max_datagram_bytes: UDP payload that the path carries unfragmented; None assumes Ethernet.
+        observers: where the supervisors' observers are reached: every connection looks for them.
+    """
+
+    fixed: bool = False
+    server: Peer | None = None
+    server_tcp: bool = True
+    first_port: int = 7910
+    taken: tuple[tuple[str, tuple[int, ...]], ...] = ()
+    multicast_group: str = "239.255.1.1"
+    max_datagram_bytes: int | None = None
+    observers: tuple[Contact, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True, order=True)
+class NegotiatedFlow:
+    """What carries one topic from one node to another.
+
+    Attributes:
+        publisher: key of the publishing party.
+        subscription: key of the subscribing party.
+        medium: as `PlannedFlow.medium`; empty where the RMW decides and nobody knows.
+        reason: one phrase for people.
+    """
+
+    topic: str
+    publisher: str
+    subscription: str
+    medium: str
+    reason: str
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class NegotiatedConnection:
+    """One connection that a node must have because its own participant does not do it.
+
+    Attributes:
+        node: key of the party.
+        name: unique in the node.
+        urls: what `connect_to` is told.
+        map: labels of the endpoints that it carries, `publishers/video`, sorted.
+        reason: one phrase for people.
+    """
+
+    node: str
+    name: str
+    urls: tuple[str, ...]
+    map: tuple[str, ...]
+    reason: str
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class NegotiationProblem:
+    """A pair that cannot be connected.
+
+    Attributes:
+        message: starts with "cannot" and names what each end can.
+    """
+
+    topic: str
+    publisher: str
+    subscription: str
+    message: str
+    hint: str = ""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class DataLayerGraph:
+    """Everything that was negotiated; sorted throughout."""
+
+    flows: tuple[NegotiatedFlow, ...] = ()
+    connections: tuple[NegotiatedConnection, ...] = ()
+    problems: tuple[NegotiationProblem, ...] = ()

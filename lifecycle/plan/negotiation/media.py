@@ -1,0 +1,304 @@
+"""What carries data between two nodes: the rules of negotiation for one pair.
+
+Owns: `carried`, what Fast DDS does with two participants, and `choose`, which medium a pair gets
+and why. Pure.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Collection
+
+from lifecycle.manifest.model import FlowTransport
+from lifecycle.network.datagram import is_fragmented, max_unfragmented
+from lifecycle.plan.negotiation.data_layer import Party, PartyEndpoint
+
+INTRAPROCESS = "intraprocess"
+MULTICAST = "udpm"
+_IP = ("udpv4", "udpv6", "tcpv4", MULTICAST)
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Pair:
+    """A publisher and a subscription of one topic.
+
+    Attributes:
+        link: what a link says must carry it.
+    """
+
+    publisher: Party
+    writer: PartyEndpoint
+    subscription: Party
+    reader: PartyEndpoint
+    link: FlowTransport = FlowTransport.ANY
+
+    @property
+    def same_host(self) -> bool:
+        """Whether both are on one host."""
+        return self.publisher.host == self.subscription.host
+
+    @property
+    def same_process(self) -> bool:
+        """Whether both are in one process."""
+        return self.same_host and self.publisher.process == self.subscription.process
+
+    @property
+    def lossy(self) -> bool | None:
+        """Whether the data bear an unreliable transport: either end can deny it."""
+        said = (self.writer.lossy, self.reader.lossy)
+        return False if False in said else True if True in said else None
+
+    @property
+    def subject(self) -> str:
+        """Spell it for a message."""
+        return f"{self.writer.resolved!r} from {self.publisher.key!r} to {self.subscription.key!r}"
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Choice:
+    """What a pair gets.
+
+    Attributes:
+        medium: as `PlannedFlow.medium`; empty if nobody knows, or with a problem.
+        reason: one phrase for people.
+        problem: why nothing can carry it; starts with "cannot".
+        hint: what may help.
+    """
+
+    medium: str = ""
+    reason: str = ""
+    problem: str = ""
+    hint: str = ""
+
+
+def carried(writer: Collection[str], reader: Collection[str], *, same_host: bool) -> list[str]:
+    """Return by what Fast DDS 2.14 sends from a participant with some transports to another.
+
+    Shared memory wins on one host. Of IP transports all that are common carry every sample, so
+    more than one means that it arrives twice.
+
+    Args:
+        writer: transports of one participant, "shm", "udpv4", "udpv6", "tcpv4" or a group
+            `udpm@239.255.1.9:7901`.
+        reader: of the other one.
+        same_host: whether they share memory and loopback.
+
+    Returns:
+        Media, sorted; empty if they never meet.
+    """
+    if same_host and "shm" in writer and "shm" in reader:
+        return ["shm"]
+    found = set()
+    groups = {each for each in writer if each.startswith(MULTICAST)}
+    if same_host and groups & {*reader}:
+        found.add(MULTICAST)
+    elif _has_ipv4(writer, same_host=same_host) and _has_ipv4(reader, same_host=same_host):
+        # A group with TTL 0 also receives what comes to loopback by unicast.
+        found.add("udpv4")
+    found |= {each for each in ("udpv6", "tcpv4") if each in writer and each in reader}
+    return sorted(found)
+
+
+def _has_ipv4(transports: Collection[str], *, same_host: bool) -> bool:
+    return "udpv4" in transports or (
+        same_host and any(each.startswith(MULTICAST) for each in transports)
+    )
+
+
+def satisfies(medium: str, wish: FlowTransport) -> bool:
+    """Return whether a medium is what was asked for."""
+    if wish is FlowTransport.ANY:
+        return True
+    if wish is FlowTransport.NETWORK:
+        return medium in _IP
+    if wish is FlowTransport.SHM:
+        return medium in ("shm", INTRAPROCESS)
+    if wish is FlowTransport.MULTICAST:
+        return medium in (MULTICAST, INTRAPROCESS, "tcpv4")
+    return bool(medium == wish.value)
+
+
+def wish_of(pair: Pair) -> tuple[FlowTransport, str]:
+    """Return what is asked for and who asks: a link, else the publisher, else the subscription."""
+    for wish, who in (
+        (pair.link, "a link says so"),
+        (pair.writer.transport, "the publisher asks for it"),
+        (pair.reader.transport, "the subscription asks for it"),
+    ):
+        if wish is not FlowTransport.ANY:
+            return wish, who
+    return FlowTransport.ANY, ""
+
+
+def choose(
+    pair: Pair, *, by_multicast: bool, listeners: int, max_datagram_bytes: int | None
+) -> Choice:
+    """Return what carries a pair.
+
+    Args:
+        pair: the pair.
+        by_multicast: another subscription of this publisher gets its data from a group.
+        listeners: processes of the publisher's host, but its own, that subscribe to the topic.
+        max_datagram_bytes: UDP payload that the path carries unfragmented; None assumes Ethernet.
+    """
+    unable = _common_ground(pair)
+    if unable:
+        return Choice(problem=unable)
+    wish, who = wish_of(pair)
+    if pair.same_process:
+        if wish in (FlowTransport.ANY, FlowTransport.SHM, FlowTransport.MULTICAST):
+            return Choice(medium=INTRAPROCESS, reason="same process")
+        return Choice(
+            problem=f"cannot carry {pair.subject} by {wish.value}: both are in process "
+            f"{pair.publisher.process!r}, and inside a process no transport is used",
+            hint="give one of the two another 'process:'",
+        )
+    if not (pair.publisher.own and pair.subscription.own) and wish is FlowTransport.ANY:
+        return Choice(reason="its RMW chooses")
+    choice = (
+        _unasked(pair, by_multicast, listeners, max_datagram_bytes)
+        if wish is FlowTransport.ANY
+        else _asked(pair, wish, who, by_multicast=by_multicast)
+    )
+    other = pair.reader.transport
+    if pair.link is FlowTransport.ANY and choice.medium and not satisfies(choice.medium, other):
+        return Choice(
+            problem=f"cannot carry {pair.subject}: the publisher asks for "
+            f"{pair.writer.transport.value}, the subscription for {other.value}",
+            hint="ask for the same at both ends, or let a link decide with 'transport:'",
+        )
+    return choice
+
+
+def _common_ground(pair: Pair) -> str:
+    """Return why the two cannot talk whatever carries it; empty if they can."""
+    one, other = pair.publisher, pair.subscription
+    for word, mine, theirs in (
+        ("wire format", one.serializations, other.serializations),
+        ("communication paradigm", one.paradigms, other.paradigms),
+    ):
+        common = {*mine} & {*theirs}
+        if not common or (word == "communication paradigm" and "publish-subscribe" not in common):
+            return (
+                f"cannot carry {pair.subject}: no {word} is common; {one.key!r} has "
+                f"{_list(mine)}; {other.key!r} has {_list(theirs)}"
+            )
+    return ""
+
+
+def _list(words: Collection[str]) -> str:
+    return ", ".join(words) or "none"
+
+
+def _none_common(pair: Pair, what: str) -> Choice:
+    one, other = pair.publisher, pair.subscription
+    return Choice(
+        problem=f"cannot carry {pair.subject}{what}: {one.key!r} can be connected by "
+        f"{_list(_able(one))}; {other.key!r} by {_list(_able(other))}",
+        hint="" if pair.same_host else "they are on different hosts, where shared memory is none",
+    )
+
+
+def _able(party: Party) -> tuple[str, ...]:
+    return party.transports if party.connectable else party.own
+
+
+def _common(pair: Pair) -> set[str]:
+    """Return media that both ends can have."""
+    common = {*_able(pair.publisher)} & {*_able(pair.subscription)}
+    if not pair.same_host:
+        common -= {"shm", MULTICAST}
+        families = {":" in each for each in (pair.publisher.host, pair.subscription.host) if each}
+        common -= {"udpv4", "tcpv4"} if True in families else set()
+        common -= {"udpv6"} if False in families else set()
+    return common
+
+
+def _asked(pair: Pair, wish: FlowTransport, who: str, *, by_multicast: bool) -> Choice:
+    common = _common(pair)
+    if wish is FlowTransport.NETWORK:
+        present = carried(
+            _by(pair.publisher, pair.writer),
+            _by(pair.subscription, pair.reader),
+            same_host=pair.same_host,
+        )
+        if len(present) == 1 and present[0] in _IP:
+            return Choice(medium=present[0], reason=who)
+        order = _ip_order(pair)
+        medium = next((each for each in order if each in common), "")
+        return (
+            Choice(medium=medium, reason=who) if medium else _none_common(pair, " by the network")
+        )
+    if wish is FlowTransport.MULTICAST and not pair.same_host:
+        wish, who = FlowTransport.TCPV4, "multicast stays on its host"
+    medium = MULTICAST if wish is FlowTransport.MULTICAST else wish.value
+    if medium not in common:
+        return _none_common(pair, f" by {wish.value}, as {who}")
+    if by_multicast and not pair.same_host and medium == "udpv4":
+        return Choice(
+            problem=f"cannot carry {pair.subject} by udpv4: the publisher sends by multicast with "
+            "TTL 0 on its own host, and one participant has one TTL for UDP",
+            hint="let it go by tcpv4",
+        )
+    return Choice(medium=medium, reason=who)
+
+
+def _by(party: Party, endpoint: PartyEndpoint) -> tuple[str, ...]:
+    return endpoint.by or party.own
+
+
+def _ip_order(pair: Pair) -> tuple[str, ...]:
+    ipv6 = ":" in pair.publisher.host or ":" in pair.subscription.host
+    return ("udpv6", "udpv4", "tcpv4") if ipv6 else ("udpv4", "udpv6", "tcpv4")
+
+
+def _unasked(
+    pair: Pair, by_multicast: bool, listeners: int, max_datagram_bytes: int | None
+) -> Choice:
+    present = carried(
+        _by(pair.publisher, pair.writer),
+        _by(pair.subscription, pair.reader),
+        same_host=pair.same_host,
+    )
+    default = present[0] if len(present) == 1 else ""
+    if pair.same_host:
+        return _near(pair, default, listeners)
+    common = _common(pair)
+    tcp = _why_tcp(pair, by_multicast=by_multicast, max_datagram_bytes=max_datagram_bytes)
+    if tcp and "tcpv4" in {*common, default}:
+        return Choice(medium="tcpv4", reason=tcp)
+    if by_multicast:
+        return _none_common(pair, " by tcpv4, as multicast stays on its host")
+    medium = default or next((each for each in _ip_order(pair) if each in common), "")
+    if not medium:
+        return _none_common(pair, "")
+    usual = medium in (default, "udpv4")
+    return Choice(
+        medium=medium, reason="other host" if usual else "other host, and no UDP over IPv4 between"
+    )
+
+
+def _near(pair: Pair, default: str, listeners: int) -> Choice:
+    """Choose on one host: what is there anyway, shared memory, one datagram for all, unicast."""
+    common = _common(pair)
+    if default or "shm" in common:
+        return Choice(medium=default or "shm", reason="same host")
+    if listeners > 1 and MULTICAST in common:
+        reason = f"{listeners} processes of the host listen, and not by shared memory"
+        return Choice(medium=MULTICAST, reason=reason)
+    medium = next((each for each in _ip_order(pair) if each in common), "")
+    if medium:
+        return Choice(medium=medium, reason="same host, and no common shared memory")
+    return _none_common(pair, "")
+
+
+def _why_tcp(pair: Pair, *, by_multicast: bool, max_datagram_bytes: int | None) -> str:
+    """Return why a pair of two hosts should use TCP; empty if it need not."""
+    if by_multicast:
+        return "multicast stays on its host"
+    size = pair.writer.size_bytes
+    ipv6 = ":" in pair.publisher.host
+    limit = max_datagram_bytes or max_unfragmented(ipv6=ipv6)
+    if pair.lossy is False and size is not None and is_fragmented(size, limit):
+        return f"not lossy, and {size} bytes are more than one datagram"
+    return ""

@@ -1,0 +1,173 @@
+"""Nodes of a plan as parties of a negotiation, and what was negotiated back in the plan.
+
+Owns: `party_of_node`, `place_negotiated` and the wishes that links make. Pure.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
+
+from lifecycle.manifest.model import EndpointKind, FlowTransport, RunKind
+from lifecycle.network.connection_url import ConnectionTransport, ConnectionUrl, parse
+from lifecycle.network.nfe import UniqueRequirement
+from lifecycle.plan.connections.contacts import contacts_of
+from lifecycle.plan.connections.declared_connections import participant_name
+from lifecycle.plan.connections.hosts import Hosts
+from lifecycle.plan.model import (
+    ParticipantConnections,
+    PlannedEndpoint,
+    PlannedFlow,
+    PlannedNode,
+    PlannedParticipant,
+)
+from lifecycle.plan.negotiation.data_layer import (
+    RMW_DEFAULT,
+    TRANSPORTS,
+    NegotiatedConnection,
+    Party,
+    PartyEndpoint,
+)
+
+_OWN_FLOW = (UniqueRequirement.STRICTLY_REQUIRED, UniqueRequirement.OPTIONALLY_REQUIRED)
+FAST_DDS = "rmw_fastrtps"
+"""What the identifiers of the RMWs begin with whose participants we can make."""
+
+
+def transports_of(urls: Iterable[str]) -> tuple[str, ...]:
+    """Return the transports of a participant with these URLs; a group as `udpm@ADDRESS:PORT`."""
+    return tuple(dict.fromkeys(_transport(parse(text)) for text in urls))
+
+
+def _transport(url: ConnectionUrl) -> str:
+    if url.transport is ConnectionTransport.UDPM:
+        return f"udpm@{url.address}:{url.port}"
+    return str(url.transport.value)
+
+
+def wishes_of(flows: Iterable[PlannedFlow]) -> Mapping[tuple[str, str, str], FlowTransport]:
+    """Return what links say must carry each pair."""
+    return {
+        (each.topic, each.publisher, each.subscription): each.transport
+        for each in flows
+        if each.transport is not FlowTransport.ANY
+    }
+
+
+_NO_VARIABLES: Mapping[str, str] = MappingProxyType({})
+
+
+def party_of_node(
+    node: PlannedNode, hosts: Hosts, *, rmw: str, variables: Mapping[str, str] = _NO_VARIABLES
+) -> Party:
+    """Return a node as a party, from what its manifest declares alone.
+
+    Args:
+        node: its participants that are declared or tell flows apart in place, no negotiated ones.
+        hosts: of the system.
+        rmw: the RMW identifier that it runs with.
+        variables: what a COMMAND node's process gets beside its own.
+    """
+    host = hosts.host(node.machine)
+    known = rmw.startswith(FAST_DDS)
+    ours = node.run.kind is RunKind.PYTHON and known
+    own = transports_of(node.connections.urls) or node.transports or _by_variable(node, variables)
+    return Party(
+        key=node.key,
+        full_name=node.full_name,
+        host=host,
+        process=node.process,
+        transports=TRANSPORTS if ours else own if known else (),
+        own=own if known else (),
+        connectable=ours,
+        endpoints=tuple(endpoint_of(node, each) for each in node.endpoints if each.kind.is_topic),
+        connections=tuple(each.connection for each in node.participants if each.connection),
+        contacts=contacts_of(host, node.connections.urls),
+    )
+
+
+_BUILTIN = {
+    "DEFAULT": RMW_DEFAULT,
+    "SHM": ("shm",),
+    "UDPv4": ("udpv4",),
+    "UDPv6": ("udpv6",),
+    "LARGE_DATA": ("shm", "tcpv4", "udpv4"),
+    "NONE": ("tcpv4",),
+}
+
+
+def _by_variable(node: PlannedNode, variables: Mapping[str, str]) -> tuple[str, ...]:
+    """Return the transports that variables give a node; () for a word of another kind."""
+    environment = dict(node.run.environment)
+    if node.run.kind is RunKind.COMMAND:
+        environment = {**variables, **environment}
+    word = environment.get("FASTDDS_BUILTIN_TRANSPORTS", "").partition("?")[0]
+    return _BUILTIN.get(word or "DEFAULT", ())
+
+
+def endpoint_of(node: PlannedNode, each: PlannedEndpoint) -> PartyEndpoint:
+    """Return an endpoint as the manifest declares it, on the participant that the plan puts it."""
+    carrier = next((one for one in node.participants if one.name == each.participant), None)
+    by: tuple[str, ...] = ()
+    if carrier is not None:
+        by = transports_of(carrier.connections.urls) or carrier.transports or RMW_DEFAULT
+    publishes = each.kind is EndpointKind.PUBLISHER
+    return PartyEndpoint(
+        kind=each.kind,
+        name=each.name,
+        resolved=each.resolved,
+        type=each.type,
+        qos=each.qos,
+        by=by,
+        fixed=carrier is not None and bool(carrier.connection),
+        alone=publishes and each.unique in _OWN_FLOW,
+        # Who shares a participant already may share a connection; who does not may not.
+        group=each.participant if carrier and not carrier.connection else "",
+        transport=each.transport,
+        lossy=each.lossy,
+        size_bytes=each.max_message_size,
+    )
+
+
+def place_negotiated(node: PlannedNode, connections: Sequence[NegotiatedConnection]) -> PlannedNode:
+    """Give a node the connections that were negotiated for it.
+
+    An extra participant that told a publisher's flow apart and carries none any more goes; what it
+    was to do, the publisher's connection does.
+    """
+    places: dict[str, NegotiatedConnection] = {
+        label: each for each in connections for label in each.map
+    }
+    endpoints = []
+    carriers: dict[str, PlannedParticipant] = {each.name: each for each in node.participants}
+    takes: dict[str, list[PlannedParticipant]] = {}
+    for each in node.endpoints:
+        connection = places.get(f"{each.kind.value}/{each.name}")
+        if connection is None:
+            endpoints.append(each)
+            continue
+        if each.participant in carriers:
+            takes.setdefault(connection.name, []).append(carriers[each.participant])
+        name = participant_name(node.name, connection.name)
+        endpoints.append(dataclasses.replace(each, participant=name))
+    used = {each.participant for each in endpoints}
+    kept = [each for each in node.participants if each.connection or each.name in used]
+    made = [_participant(node.name, each, takes.get(each.name, ())) for each in connections]
+    return dataclasses.replace(node, endpoints=tuple(endpoints), participants=(*kept, *made))
+
+
+def _participant(
+    node_name: str, connection: NegotiatedConnection, replaced: Sequence[PlannedParticipant]
+) -> PlannedParticipant:
+    sizes = [each.max_datagram_bytes for each in replaced if each.max_datagram_bytes is not None]
+    told = ", ".join(dict.fromkeys(each.reason for each in replaced))
+    return PlannedParticipant(
+        name=participant_name(node_name, connection.name),
+        dscp=next((each.dscp for each in replaced), None),
+        reason=f"connection {connection.name}, {connection.reason}{f'; {told}' if told else ''}",
+        max_datagram_bytes=min(sizes, default=None),
+        non_blocking_send=any(each.non_blocking_send for each in replaced),
+        connection=connection.name,
+        connections=ParticipantConnections(urls=connection.urls),
+    )

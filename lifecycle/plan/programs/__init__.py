@@ -1,0 +1,1 @@
+"""What nodes run, found and read without running it."""

@@ -1,0 +1,218 @@
+"""A plan as text for people.
+
+Owns: what `lifecycle plan` prints. JSON is `lifecycle.codec`'s, pictures are export/'s. Pure.
+"""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable
+
+from lifecycle.manifest.model import FlowTransport, RunKind, UniqueHow
+from lifecycle.manifest.qos import BEST_AVAILABLE_NS, History, Liveliness, QosProfile
+from lifecycle.network.dscp import describe
+from lifecycle.network.nfe import UniqueRequirement
+from lifecycle.network.ports import unique_flow_ports
+from lifecycle.plan.connections.demand import demand
+from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedNode, PlannedProcess
+from lifecycle.plan.render import connections, network
+from lifecycle.plan.render.table import table
+
+
+def render_text(plan: Plan, *, width: int = 100) -> str:
+    """Print processes, order, nodes with endpoints, extra participants, flows, notes and ports.
+
+    Args:
+        plan: what to print.
+        width: columns to fit into where words allow it, >= 40.
+
+    Returns:
+        Lines, each ended by a newline.
+    """
+    width = max(width, 40)
+    sections: tuple[tuple[str, Callable[[Plan, int], list[str]]], ...] = (
+        ("processes", _processes),
+        ("order", _order),
+        ("data layer", connections.data_layer),
+        ("nodes", _nodes),
+        ("connections", connections.connections),
+        ("extra participants", network.participants),
+        ("middleware", network.middleware),
+        ("flows", _flows),
+        ("notes", network.notes),
+        ("ports, if participants start in this order and none is taken", _ports),
+    )
+    lines = [_headline(plan)]
+    for title, section in sections:
+        body = section(plan, width)
+        if body:
+            lines += ["", title, *body]
+    return "\n".join(lines) + "\n"
+
+
+def _headline(plan: Plan) -> str:
+    counts = (
+        _count(len(plan.nodes), "node"),
+        _count(len(plan.processes), "process", "processes"),
+        _count(len(plan.flows), "flow"),
+    )
+    return (
+        f"system {plan.system}: {', '.join(counts)};"
+        f" domain {plan.domain_id}, discovery range {plan.discovery_range.value}"
+    )
+
+
+def _count(number: int, word: str, plural: str = "") -> str:
+    return f"{number} {word if number == 1 else plural or word + 's'}"
+
+
+def _processes(plan: Plan, width: int) -> list[str]:
+    rows = [
+        (process.name, process.machine, process.run.kind.value, _started_as(plan, process))
+        for process in plan.processes
+    ]
+    return table(rows, width=width)
+
+
+def _started_as(plan: Plan, process: PlannedProcess) -> str:
+    if process.run.kind is RunKind.COMMAND:
+        return shlex.join(process.argv)
+    if process.run.kind is RunKind.ATTACH:
+        return "started by others"
+    return ", ".join(plan.node(key).run.python for key in process.nodes)
+
+
+def _order(plan: Plan, width: int) -> list[str]:
+    return table(
+        [
+            (f"{number}.", ", ".join(_waiting(plan.node(key)) for key in level))
+            for number, level in enumerate(plan.levels, start=1)
+        ],
+        width=width,
+    )
+
+
+def _waiting(node: PlannedNode) -> str:
+    waits = " and ".join(f"{each.node} {each.condition.value}" for each in node.after)
+    return f"{node.key} (after {waits})" if waits else node.key
+
+
+def _nodes(plan: Plan, width: int) -> list[str]:
+    lines: list[str] = []
+    for node in plan.nodes:
+        facts = [
+            "managed" if node.managed else "not managed",
+            f"process {node.process}",
+            *([f"machine {node.machine}"] if node.machine else []),
+            f"endpoints {node.endpoint_policy.value}",
+        ]
+        lines.append(f"  {node.full_name} ({', '.join(facts)})")
+        lines += _endpoints(node, width)
+    return lines
+
+
+def _endpoints(node: PlannedNode, width: int) -> list[str]:
+    """One line each where all of them fit, else what it is and below it what it needs."""
+    rows = [
+        (each.kind.noun, each.resolved, each.type, _endpoint_facts(each)) for each in node.endpoints
+    ]
+    lines = table(rows, indent=4, width=width)
+    if len(lines) == len(rows) and all(len(line) <= width for line in lines):
+        return lines
+    lines = []
+    heads = table([row[:3] for row in rows], indent=4, width=width)
+    for head, row in zip(heads, rows, strict=True):
+        lines += [head, *table([row[3:]], indent=8, width=width)] if row[3] else [head]
+    return lines
+
+
+def _endpoint_facts(endpoint: PlannedEndpoint) -> str:
+    facts = [spell_qos(endpoint.qos)] if endpoint.qos else []
+    if endpoint.unique is not UniqueRequirement.NOT_REQUIRED:
+        facts.append(f"unique {endpoint.unique.value}")
+    if endpoint.dscp is not None:
+        facts.append(describe(endpoint.dscp) + ("" if endpoint.enforce_dscp else ", not enforced"))
+    if endpoint.five_qi is not None:
+        facts.append(f"5QI {endpoint.five_qi}" + (" (auto)" if endpoint.five_qi_reason else ""))
+    if endpoint.transport is FlowTransport.NETWORK:
+        facts.append("by the network only")
+    facts += [
+        text
+        for value, text in (
+            (endpoint.max_delay_ms, f"at most {endpoint.max_delay_ms or 0:g} ms"),
+            (endpoint.loss, f"loss at most {endpoint.loss or 0:g}"),
+            (endpoint.rate_hz, f"{endpoint.rate_hz or 0:g} Hz"),
+            (endpoint.max_message_size, f"at most {endpoint.max_message_size} bytes"),
+        )
+        if value is not None
+    ]
+    if endpoint.participant:
+        facts.append(f"in {endpoint.participant}")
+    return "; ".join(facts)
+
+
+def spell_qos(qos: QosProfile) -> str:
+    """Spell a profile in one line: `BEST_EFFORT VOLATILE KEEP_LAST(1), deadline 100 ms`."""
+    history = qos.history.value
+    if qos.history is History.KEEP_LAST:
+        history += f"({qos.depth})"
+    text = f"{qos.reliability.value} {qos.durability.value} {history}"
+    extras = [
+        f"{word} {_duration(value)}"
+        for word, value in (
+            ("deadline", qos.deadline_ns),
+            ("lifespan", qos.lifespan_ns),
+            ("lease", qos.liveliness_lease_duration_ns),
+        )
+        if value
+    ]
+    if qos.liveliness not in (Liveliness.AUTOMATIC, Liveliness.SYSTEM_DEFAULT):
+        extras.append(f"liveliness {qos.liveliness.value}")
+    return ", ".join([text, *extras])
+
+
+def _duration(duration_ns: int) -> str:
+    return "BEST_AVAILABLE" if duration_ns == BEST_AVAILABLE_NS else f"{duration_ns / 1e6:g} ms"
+
+
+def _flows(plan: Plan, width: int) -> list[str]:
+    rows = []
+    for flow in plan.flows:
+        needs = []
+        if flow.unique is not UniqueHow.NOT:
+            needs.append(f"{flow.unique.value} unique")
+        if flow.max_delay_ms is not None:
+            needs.append(f"at most {flow.max_delay_ms:g} ms")
+        if flow.linked and not needs:
+            needs.append("linked")
+        ends = f"{plan.node(flow.publisher).full_name} → {plan.node(flow.subscription).full_name}"
+        told = filter(None, (connections.medium(flow), ", ".join(needs)))
+        rows.append((flow.topic, ends, "; ".join(told)))
+    return table(rows, width=width)
+
+
+def _ports(plan: Plan, width: int) -> list[str]:
+    lines: list[str] = []
+    for machine in demand(plan):
+        if machine.machine:
+            lines.append(f"  machine {machine.machine}")
+        rows = [
+            (
+                str(each.index),
+                each.owner,
+                f"discovery {each.discovery_port}, user {each.user_port}"
+                if each.user_port
+                else "none: shared memory alone"
+                if each.shared_memory
+                else "no port left in this domain",
+            )
+            for each in machine.participants
+        ]
+        lines += table(rows, indent=4, width=width)
+        if machine.unique_subscriptions:
+            ports = unique_flow_ports()
+            lines.append(
+                f"    {_count(machine.unique_subscriptions, 'unique subscription')}:"
+                f" the first free of {ports[0]}–{ports[-1]}"
+            )
+    return lines

@@ -1,0 +1,1 @@
+"""The authority over connections: desired state and reconciling; networks; discovery server."""

@@ -1,0 +1,397 @@
+"""The authority: makes every node's connections and mappings, and keeps them made.
+
+Owns: when nodes are wired and how often again. What each node must have comes from a `Source`
+(the plan, or a negotiation); what is missing from desired_state.py; how a node is told from
+driver.py. Everything is level-triggered: each look compares what must be with what is, so that a
+lost connection, a new endpoint and the first wiring are one case. Must not import rclpy.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+from collections.abc import Callable, Collection, Iterable, Mapping
+from typing import Protocol
+
+from lifecycle.errors import BringUpError
+from lifecycle.graph.waiting import set_within
+from lifecycle.manifest.model import Authority as AuthorityKind
+from lifecycle.manifest.model import Condition, DataLayerSource
+from lifecycle.node.host.control import Operation
+from lifecycle.plan.model import Plan
+from lifecycle.supervisor.connections.desired_state import (
+    Instructions,
+    Step,
+    Wired,
+    planned_instructions,
+    steps,
+    wired,
+)
+from lifecycle.supervisor.connections.negotiation import NegotiatedSource
+from lifecycle.supervisor.connections.unwired import not_wired
+from lifecycle.supervisor.nodes.configured_first import configured_before_any_connect
+from lifecycle.supervisor.nodes.driver import ACTIVE, INACTIVE
+from lifecycle.supervisor.nodes.system import NodeRun, System
+from lifecycle.supervisor.run.events import Emitter, Notice, WiringChanged, WiringLost
+from lifecycle.supervisor.run.tasks import ended
+from lifecycle.verify.observation import NodeConfiguration, Observation
+from lifecycle.verify.verdict import Finding
+
+AGAIN_S = 0.1
+"""What was lost is made again at once; the next try comes so long after, then twice as long ..."""
+
+AGAIN_AT_MOST_S = 5.0
+"""... up to this, ..."""
+
+TRIES = 8
+"""... and after so many it is given up until the node's configuration changes."""
+
+RELEASE_S = 2.0
+"""For disconnecting a node that is not declared: it is not waited for longer at the end."""
+
+CALM_S = 10.0
+"""A node that stayed wired for so long has its tries back."""
+
+
+class Reaching(Protocol):
+    """How nodes that are not ours are reached, see eyes.Eyes."""
+
+    def hand(self, node: str) -> Hand:
+        """Return the hand on any node that has a node interface, by full name."""
+
+
+def authority_of(system: System, emit: Emitter, reaching: Reaching) -> Authority | None:
+    """Return who wires `system`; None if its nodes do it themselves."""
+    layer = system.plan.data_layer
+    if layer.authority is not AuthorityKind.SUPERVISOR:
+        return None
+    dynamic = layer.source is DataLayerSource.DYNAMIC
+    source = NegotiatedSource(system.plan) if dynamic else PlannedSource(system.plan)
+    return Authority(system, source, emit, hand_of=reaching.hand)
+
+
+class Source(Protocol):
+    """Where instructions come from.
+
+    Attributes:
+        expected: the plan as it must be seen now.
+        problems: what cannot be connected at all, in whole sentences with both capability lists.
+    """
+
+    expected: Plan
+    problems: tuple[str, ...]
+
+    def instructions(self, known: Mapping[str, NodeConfiguration]) -> Mapping[str, Instructions]:
+        """Return what each node must have, by full name, given what nodes report."""
+
+    def replan(self, plan: Plan, names: Collection[str]) -> None:
+        """Take the plan as it is now that these nodes are started again."""
+
+
+class Hand(Protocol):
+    """How one node is told, see driver.NodeDriver."""
+
+    async def interface(self) -> NodeConfiguration | None:
+        """Read what the node can be wired by; None where it has no node interface."""
+
+    async def wire(self, step: Step) -> NodeConfiguration | None:
+        """Make one step; raises BringUpError."""
+
+
+class PlannedSource:
+    """The manifest alone: instructions never change."""
+
+    def __init__(self, plan: Plan) -> None:
+        self.problems: tuple[str, ...] = ()
+        self.replan(plan, ())
+
+    def replan(self, plan: Plan, names: Collection[str]) -> None:
+        """Take the plan's word, for every node."""
+        del names
+        self.expected = plan
+        self._instructions = {
+            each.full_name: planned_instructions(each) for each in plan.nodes if each.managed
+        }
+
+    def instructions(self, known: Mapping[str, NodeConfiguration]) -> Mapping[str, Instructions]:
+        """Return the plan's."""
+        del known
+        return self._instructions
+
+
+@dataclasses.dataclass(slots=True)
+class _Wiring:
+    """What the authority knows of one node that it wires."""
+
+    told: Wired = dataclasses.field(default_factory=Wired)
+    ours: list[str] = dataclasses.field(default_factory=list)
+    settled: tuple[Instructions, str] | None = None  # with this configuration nothing was missing
+    rounds: int = 0
+    last_s: float = float("-inf")
+    error: str = ""
+    given_up: str = ""  # checksum of the configuration with which the tries were used up
+
+
+class Authority:
+    """Wires the nodes of one supervisor, and those that joined without being declared.
+
+    Args:
+        system: whose nodes.
+        source: what they must have.
+        emit: where events go.
+        hand_of: the hand on a node that is not declared, by full name.
+    """
+
+    def __init__(
+        self, system: System, source: Source, emit: Emitter, *, hand_of: Callable[[str], Hand]
+    ) -> None:
+        self._system = system
+        self._source = source
+        self._emit = emit
+        self._hand_of = hand_of
+        self._wirings: dict[str, _Wiring] = {}
+        self._others: dict[str, NodeConfiguration] = {}
+        self._instructions: Mapping[str, Instructions] = {}
+        self._wake = asyncio.Event()
+        self._following: asyncio.Task[None] | None = None
+        layer = system.plan.data_layer
+        self._dynamic = layer.source is DataLayerSource.DYNAMIC
+        self._repairs = layer.events
+        self._early = configured_before_any_connect(system) if self._dynamic else frozenset()
+
+    async def wire(self, node: NodeRun) -> None:
+        """Make everything that a configured node must have before it connects.
+
+        Raises:
+            BringUpError: the first step that failed, with node, connection, endpoint and reason;
+                or the nodes' capabilities do not fit.
+        """
+        assert node.driver is not None
+        configuration = await node.driver.interface()
+        node.learn(configuration)
+        wanted = self._negotiate().get(node.name)
+        if self._source.problems:
+            raise BringUpError("\n".join(self._source.problems))
+        if wanted is None:
+            return
+        if configuration is None:
+            if wanted.connections:
+                name, how = wanted.connections[0]
+                raise BringUpError(
+                    f"cannot connect {node.name!r} to {name!r} ({', '.join(how.urls)}): "
+                    "it offers no ~/connect_to",
+                    hint="only nodes of ours can be wired; give it no connection",
+                )
+            return  # it makes its endpoints itself
+        wiring = self._wirings.setdefault(node.name, _Wiring())
+        wiring.told = wired(configuration)
+        there = {connection for connection, _ in wiring.told.connections}
+        wiring.ours = [connection for connection in wiring.ours if connection in there]
+        await self._make(wiring, node.driver, steps(wanted, wiring.told), node)
+
+    def replan(self, plan: Plan, names: Collection[str]) -> None:
+        """Forget what these nodes were told: they are started again, by this plan."""
+        self._source.replan(plan, names)
+        for name in names:
+            self._wirings.pop(name, None)
+        self._instructions = {}
+
+    async def ready(self, node: NodeRun) -> None:
+        """Wait until everybody is configured whose interface this node's wiring may depend on."""
+        for key in self._early:
+            other = self._system.nodes[key]
+            while not other.has_reached(Condition.CONFIGURED):
+                node.doing = f"waits to connect until {other.name} is configured"
+                await other.changed.wait()
+        node.doing = ""
+
+    def look(self, observation: Observation) -> None:
+        """Take what was seen: negotiate again, and have what is missing made."""
+        own = self._system.nodes.values()
+        names = {each.name for each in own}
+        self._others = {
+            each.name: each for each in observation.configurations if each.name not in names
+        }
+        for each in observation.configurations:
+            node = self._system.node_named(each.name)
+            if node is not None and node.process is None:
+                node.configuration = each
+        if not (self._dynamic or self._repairs):
+            return
+        before = self._source.problems
+        self._negotiate()
+        for problem in self._source.problems:
+            if problem not in before:
+                self._emit(Notice(message=problem))
+        self._wake.set()
+        if self._following is None:
+            self._following = asyncio.ensure_future(self._follow())
+
+    async def close(self) -> None:
+        """Stop following, and disconnect what was made on nodes that are not declared."""
+        if self._following is not None:
+            if self._following.done():
+                self._following.result()
+            await ended(self._following)
+            self._following = None
+        await self._release()
+
+    async def _follow(self) -> None:
+        """Make what is missing at every look."""
+        while True:
+            self._wake.clear()
+            again_s = await self._repair()
+            await set_within(self._wake, again_s)
+
+    async def _release(self) -> None:
+        for name, wiring in self._wirings.items():
+            if self._system.node_named(name) is not None or name not in self._others:
+                continue
+            unmade = steps(Instructions(node=name), wiring.told, ours=wiring.ours)
+            making = self._make(wiring, self._hand_of(name), unmade, None)
+            try:
+                await asyncio.wait_for(making, RELEASE_S)
+            except (BringUpError, asyncio.TimeoutError):
+                continue  # the step's own event said why; the node is not ours to wait for
+
+    def findings(self) -> tuple[Finding, ...]:
+        """Return what could not be wired while the system runs."""
+        found = [
+            not_wired(name, wiring.error)
+            for name, wiring in self._wirings.items()
+            if wiring.error and wiring.rounds >= TRIES
+        ]
+        system = self._system.plan.system
+        found += [not_wired(system, each) for each in self._source.problems]
+        return tuple(found)
+
+    def _negotiate(self) -> Mapping[str, Instructions]:
+        known = dict(self._others)
+        for node in self._system.nodes.values():
+            if node.configuration is not None:
+                known[node.name] = node.configuration
+        self._instructions = self._source.instructions(known)
+        self._system.expected = self._source.expected
+        return self._instructions
+
+    async def _repair(self) -> float | None:
+        """Wire every node that lacks something; return after how many seconds to try again."""
+        waits = [
+            again
+            for name, hand, node, configuration in self._wirable()
+            if (again := await self._repair_node(name, hand, node, configuration)) is not None
+        ]
+        return min(waits, default=None)
+
+    def _wirable(
+        self,
+    ) -> Iterable[tuple[str, Hand, NodeRun | None, NodeConfiguration]]:
+        dead = self._system.dead()
+        for name in self._instructions:
+            node = self._system.node_named(name)
+            if node is not None:
+                configuration = node.configuration
+                if node.driver is None or node.stuck or name in dead or configuration is None:
+                    continue
+                if configuration.connected and configuration.state in (INACTIVE, ACTIVE):
+                    yield name, node.driver, node, configuration
+            elif name in self._others and name not in self._remote():
+                configuration = self._others[name]
+                if configuration.state in (INACTIVE, ACTIVE):
+                    yield name, self._hand_of(name), None, configuration
+
+    def _remote(self) -> frozenset[str]:
+        """Nodes of the plan that another supervisor wires."""
+        return frozenset(each.name for each in self._system.remote.values())
+
+    async def _repair_node(
+        self, name: str, hand: Hand, node: NodeRun | None, configuration: NodeConfiguration
+    ) -> float | None:
+        wanted = self._instructions[name]
+        wiring = self._wirings.setdefault(name, _Wiring())
+        if wiring.settled == (wanted, configuration.checksum):
+            return None
+        has = wired(configuration) if self._repairs or node is None else wiring.told
+        missing = steps(wanted, has, ours=wiring.ours)
+        if not missing:
+            wiring.settled = (wanted, configuration.checksum)
+            wiring.told, wiring.error = has, ""
+            return None
+        now_s = asyncio.get_running_loop().time()
+        if wiring.rounds >= TRIES:
+            if configuration.checksum == wiring.given_up:
+                return None
+            wiring.rounds = 0
+        elif now_s - wiring.last_s > CALM_S:
+            wiring.rounds = 0
+        due_s = wiring.last_s + _backoff_s(wiring.rounds)
+        if now_s < due_s:
+            return due_s - now_s
+        self._tell_lost(wiring, has, name)
+        wiring.rounds += 1
+        wiring.last_s = now_s
+        wiring.told = has
+        try:
+            await self._make(wiring, hand, missing, node)
+        except BringUpError as error:
+            wiring.error = error.message
+        else:
+            wiring.error = ""
+        if wiring.rounds >= TRIES:
+            wiring.given_up = configuration.checksum
+            return None
+        # Also after a success: one that does not show in the node's own report is none.
+        return _backoff_s(wiring.rounds)
+
+    def _tell_lost(self, wiring: _Wiring, has: Wired, name: str) -> None:
+        """Say what the node had been given and has no more."""
+        there = {connection for connection, _ in has.connections}
+        for connection, _ in wiring.told.connections:
+            if connection in wiring.ours and connection not in there:
+                self._emit(WiringLost(node=name, connection=connection))
+        mapped = dict(has.mappings)
+        for endpoint, connection in wiring.told.mappings:
+            if endpoint not in mapped and (connection in there or not connection):
+                self._emit(WiringLost(node=name, connection=connection, endpoint=endpoint))
+
+    async def _make(
+        self, wiring: _Wiring, hand: Hand, missing: Iterable[Step], node: NodeRun | None
+    ) -> None:
+        """Make steps in order; the first that fails ends it."""
+        for step in missing:
+            event = WiringChanged(
+                node=step.node,
+                operation=step.operation,
+                connection=step.connection,
+                endpoint=step.endpoint,
+                urls=step.connections.urls,
+                attempt=max(1, wiring.rounds),
+            )
+            if node is not None:
+                node.doing = f"is told to {step}"
+            try:
+                configuration = await hand.wire(step)
+            except BringUpError as error:
+                self._emit(dataclasses.replace(event, error=error.message))
+                raise
+            finally:
+                if node is not None:
+                    node.doing = ""
+            wiring.told = wiring.told.after(step)
+            if step.operation is Operation.CONNECT_TO and step.connection not in wiring.ours:
+                wiring.ours.append(step.connection)
+            elif step.operation is Operation.DISCONNECT_FROM and step.connection in wiring.ours:
+                wiring.ours.remove(step.connection)
+            if node is not None:
+                node.connections = tuple(wiring.ours)
+            if configuration is not None:
+                if node is not None:
+                    node.learn(configuration)
+                else:
+                    self._others[configuration.name] = configuration
+            self._emit(event)
+        self._system.touched.set()
+
+
+def _backoff_s(rounds: int) -> float:
+    return 0.0 if rounds == 0 else min(AGAIN_AT_MOST_S, AGAIN_S * 2 ** (rounds - 1))

@@ -1,0 +1,164 @@
+"""What an authority tells one node, and what is left to tell it.
+
+Owns: `Instructions`, the connections and mappings that a node must have; `Wired`, those that it
+has; and `steps`, the difference in the order in which it is made. Comparing what must be with what
+is makes one and the same thing of the first wiring, of a change and of making again what was lost.
+Pure.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Collection, Mapping
+
+from lifecycle.node.host.control import Operation
+from lifecycle.plan.model import ParticipantConnections, PlannedNode
+from lifecycle.verify.observation import NodeConfiguration
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Instructions:
+    """What one node must have.
+
+    Attributes:
+        node: fully qualified name.
+        connections: (name, how it is connected), in the order in which they are made.
+        mappings: (endpoint as `publishers/video`, name of its connection); an empty name is the
+            node's own participant.
+    """
+
+    node: str
+    connections: tuple[tuple[str, ParticipantConnections], ...] = ()
+    mappings: tuple[tuple[str, str], ...] = ()
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Wired:
+    """What one node has.
+
+    Attributes:
+        connections: (name, its URLs as text).
+        mappings: (endpoint, name of its connection).
+    """
+
+    connections: tuple[tuple[str, tuple[str, ...]], ...] = ()
+    mappings: tuple[tuple[str, str], ...] = ()
+
+    def after(self, step: Step) -> Wired:
+        """Return what the node has once `step` was made."""
+        connections, mappings = dict(self.connections), dict(self.mappings)
+        if step.operation is Operation.CONNECT_TO:
+            connections[step.connection] = step.connections.urls
+        elif step.operation is Operation.MAP_TO:
+            mappings[step.endpoint] = step.connection
+        else:
+            connections.pop(step.connection, None)
+            mappings = {end: name for end, name in mappings.items() if name != step.connection}
+        return Wired(connections=tuple(connections.items()), mappings=tuple(mappings.items()))
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Step:
+    """One request to one node: CONNECT_TO, MAP_TO or DISCONNECT_FROM."""
+
+    node: str
+    operation: Operation
+    connection: str
+    connections: ParticipantConnections = ParticipantConnections()
+    endpoint: str = ""
+
+    def __str__(self) -> str:
+        """Return the step in words, as it follows "cannot"."""
+        if self.operation is Operation.CONNECT_TO:
+            urls = ", ".join(self.connections.urls) or "no URL"
+            return f"connect {self.node!r} to {self.connection!r} ({urls})"
+        if self.operation is Operation.MAP_TO:
+            where = f"connection {self.connection!r}" if self.connection else "its own participant"
+            return f"map {self.endpoint!r} of {self.node!r} to {where}"
+        return f"disconnect {self.node!r} from {self.connection!r}"
+
+
+def planned_instructions(node: PlannedNode) -> Instructions:
+    """Return what the plan has a node told.
+
+    A participant that is no connection, made only to tell a publisher's flow apart, is the node's
+    own to make: for its publisher, the node's own participant stands for it.
+    """
+    named = {each.name: each for each in node.participants if each.connection}
+    return Instructions(
+        node=node.full_name,
+        connections=tuple((each.connection, each.connections) for each in named.values()),
+        mappings=tuple(
+            (
+                each.kind.spell(each.name),
+                named[each.participant].connection if each.participant in named else "",
+            )
+            for each in node.endpoints
+        ),
+    )
+
+
+def wired(configuration: NodeConfiguration) -> Wired:
+    """Return what a node says that it has; what it could not make it has not."""
+    return Wired(
+        connections=tuple(
+            (each.name, each.urls)
+            for each in configuration.connections
+            if each.name and not each.error
+        ),
+        mappings=tuple(
+            (each.kind.spell(each.name or each.resolved), each.connection)
+            for each in configuration.endpoints
+            if each.mapped
+        ),
+    )
+
+
+def steps(wanted: Instructions, has: Wired, *, ours: Collection[str] = ()) -> tuple[Step, ...]:
+    """Return what is missing, in the order in which it is made: make before break.
+
+    A connection whose URLs differ cannot be had twice under one name: it alone is broken first.
+
+    Args:
+        wanted: what must be.
+        has: what is.
+        ours: names of connections that this authority made; others are not its to break.
+    """
+    connections = dict(has.connections)
+    made: list[Step] = []
+    stale: set[str] = set()
+    for name, how in wanted.connections:
+        if connections.get(name) == how.urls:
+            continue
+        if name in connections:
+            stale.add(name)
+            made.append(_step(wanted, Operation.DISCONNECT_FROM, name))
+        made.append(_step(wanted, Operation.CONNECT_TO, name, connections=how))
+    mappings: Mapping[str, str] = dict(has.mappings)
+    for endpoint, name in wanted.mappings:
+        if name in stale or mappings.get(endpoint) != name:
+            made.append(_step(wanted, Operation.MAP_TO, name, endpoint=endpoint))
+    needed = {name for name, _ in wanted.connections}
+    made += [
+        _step(wanted, Operation.DISCONNECT_FROM, name)
+        for name in connections
+        if name in ours and name not in needed
+    ]
+    return tuple(made)
+
+
+def _step(
+    wanted: Instructions,
+    operation: Operation,
+    connection: str,
+    *,
+    connections: ParticipantConnections = ParticipantConnections(),
+    endpoint: str = "",
+) -> Step:
+    return Step(
+        node=wanted.node,
+        operation=operation,
+        connection=connection,
+        connections=connections,
+        endpoint=endpoint,
+    )

@@ -1,0 +1,162 @@
+"""The discovery server of a system: started before any node, watched like any process, ended last.
+
+Owns: who starts it and when it counts as started. What it is and how it is run is middleware's.
+Must not import rclpy.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+
+from lifecycle.errors import BringUpError, MiddlewareError
+from lifecycle.manifest.model import Run, RunKind
+from lifecycle.middleware import discovery_server_command, discovery_server_listens
+from lifecycle.plan.model import PlannedProcess, PlannedServer
+from lifecycle.supervisor.nodes.bring_up import died
+from lifecycle.supervisor.nodes.system import System
+from lifecycle.supervisor.processes.process import COMMAND_ESCALATION, ManagedProcess
+from lifecycle.supervisor.processes.spawn import Spawner
+from lifecycle.supervisor.processes.states import ProcessState
+from lifecycle.supervisor.run.failure import DEADLINE, START_FAILED, StepFailedError, finding_of
+from lifecycle.verify.verdict import Finding
+
+NAME = "discovery_server"
+"""Its process; no node can be called so, as keys of processes are manifest keys."""
+
+START_S = 10.0
+"""It listens within 50 ms; a loaded machine takes longer."""
+
+KNOCK_S = 0.02
+"""Between two looks whether it listens: a process that is not ours to change tells nobody."""
+
+
+async def begin(system: System, spawner: Spawner, *, ours: bool) -> None:
+    """Start the plan's discovery server, or wait for the one of another machine.
+
+    Args:
+        system: gets it as `system.server`.
+        spawner: starts it.
+        ours: it runs on a machine of this supervisor.
+
+    Raises:
+        StepFailedError: it cannot be started or ended again, or does not listen in time.
+    """
+    planned = system.plan.server
+    if planned is None:
+        return
+    if not ours:
+        await _heard(planned, None)
+        return
+    if discovery_server_listens(planned):
+        # Fast DDS's server goes on without the port, and whoever has it seems to be the server.
+        raise StepFailedError(
+            f"cannot start the discovery server at {_where(planned)}: that port is not free on "
+            "this host; end who has it (`ss -lnp`), or choose another 'discovery: first_port'",
+            rule=START_FAILED,
+            subject=NAME,
+        )
+    try:
+        argv, environment = discovery_server_command(planned, {**os.environ})
+    except MiddlewareError as error:
+        raise StepFailedError(error.message, rule=START_FAILED, subject=NAME) from error
+    # What it must not have would be inherited: `env` takes it away and becomes the program.
+    without = [f"--unset={name}" for name in os.environ if name not in environment]
+    argv = ("env", *without, *argv)
+    process = system.make_process(
+        PlannedProcess(
+            name=NAME,
+            machine=planned.machine,
+            run=Run(kind=RunKind.COMMAND, command=argv),
+            nodes=(),
+            argv=argv,
+            environment=tuple(environment.items()),
+        )
+    )
+    system.server = process
+    try:
+        await process.spawn(spawner, None)
+    except (BringUpError, OSError) as error:
+        raise StepFailedError(
+            f"cannot start the discovery server: {error}", rule=START_FAILED, subject=NAME
+        ) from error
+    await _heard(planned, process)
+    process.running()
+
+
+async def end(system: System, hurry: asyncio.Event) -> None:
+    """End it, if it is ours; nothing of the system may need it any more."""
+    if system.server is not None:
+        ended = system.server.state is ProcessState.EXITED
+        await system.server.end(() if ended else COMMAND_ESCALATION, hurry)
+
+
+def findings(system: System) -> tuple[Finding, ...]:
+    """Return that it died; until the system is started again nobody new is found.
+
+    Another one in its place does not mend that: Fast DDS 2.14 does not tell super clients, as our
+    observer is one, of anybody who comes after it (0 of 4 tries; other clients 10 of 12).
+    """
+    server = system.server
+    if server is None or server.state is not ProcessState.EXITED:
+        return ()
+    return (finding_of(died(server)),)
+
+
+async def _heard(planned: PlannedServer, process: ManagedProcess | None) -> None:
+    """Wait until it listens.
+
+    Over UDP nothing tells that from another machine: then there is nothing to wait for.
+    """
+    looking = _answering(planned) if process is None else _listening(planned, process.pid)
+    listening = asyncio.ensure_future(looking)
+    waits: set[asyncio.Future[object]] = {listening}  # type: ignore[arg-type]
+    if process is not None:
+        waits.add(process.ended)  # type: ignore[arg-type]
+    try:
+        await asyncio.wait(waits, timeout=START_S, return_when=asyncio.FIRST_COMPLETED)
+        if process is not None and process.state is ProcessState.EXITED:
+            raise StepFailedError(
+                f"cannot start the discovery server at {_where(planned)}: {process.ended.result()}",
+                rule=START_FAILED,
+                subject=NAME,
+                process=NAME,
+                log=str(process.log.path),
+            )
+        if not listening.done():
+            machine = f" of machine {planned.machine!r}" if planned.machine else ""
+            whose = "" if process is not None else f"{machine}, whose supervisor starts it,"
+            raise StepFailedError(
+                f"cannot reach the discovery server{whose} at {_where(planned)}: nobody listened "
+                f"for {START_S:g} s",
+                rule=DEADLINE,
+                subject=NAME,
+                log="" if process is None else str(process.log.path),
+            )
+        listening.result()
+    finally:
+        listening.cancel()
+        await asyncio.gather(listening, return_exceptions=True)
+
+
+async def _listening(planned: PlannedServer, pid: int) -> None:
+    """Wait until its port is open, as the kernel says; it has no way to tell us."""
+    while not discovery_server_listens(planned, pid):  # noqa: ASYNC110 - there is no event
+        await asyncio.sleep(KNOCK_S)
+
+
+async def _answering(planned: PlannedServer) -> None:
+    """Wait until it takes a connection from here."""
+    while planned.tcp:
+        with contextlib.suppress(OSError):
+            _, writer = await asyncio.open_connection(planned.address, planned.port)
+            writer.close()
+            with contextlib.suppress(OSError):
+                await writer.wait_closed()
+            return
+        await asyncio.sleep(KNOCK_S)
+
+
+def _where(planned: PlannedServer) -> str:
+    return f"{'tcp' if planned.tcp else 'udp'} {planned.address}:{planned.port}"

@@ -1,0 +1,1 @@
+"""The control socket: status and orders from outside, and asking for them."""

@@ -1,0 +1,181 @@
+"""Talking to a supervisor that runs: which one a word means, its status, its end.
+
+Owns: `find_run`, `status`, `look`, `differences`, `order`, `down`. Must not import rclpy.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+from lifecycle.errors import ExitCode, UsageError
+from lifecycle.middleware.process.shared_memory import sweep
+from lifecycle.plan.model import Plan
+from lifecycle.rundir import RunDirectory, is_held, new_run_id, read_record
+from lifecycle.supervisor.connections.networks import remove_programmed
+from lifecycle.supervisor.control.server import Answer, Ask, Look, Question, ask, strange
+from lifecycle.supervisor.control.status import SystemStatus
+from lifecycle.supervisor.processes.orphans import end_run
+
+STATUS_S = 5.0
+_SOCKET = "control"
+
+
+def running(root: Path) -> tuple[str, ...]:
+    """Return the names of all runs that a supervisor holds, sorted."""
+    if not root.is_dir():
+        return ()
+    return tuple(sorted(entry.name for entry in root.iterdir() if is_held(entry)))
+
+
+def find_run(root: Path, word: str) -> Path:
+    """Return the directory of the run that `word` means.
+
+    Args:
+        root: see rundir.runtime_root.
+        word: a run's name, `teleop@7`, or its system, `teleop`, where only one such run is there.
+
+    Raises:
+        UsageError: no such run, or more than one.
+    """
+    names = running(root)
+    found = [name for name in names if word in (name, name.rpartition("@")[0])]
+    if len(found) == 1:
+        return root / found[0]
+    if found:
+        raise UsageError(f"cannot tell which {word!r} is meant; running: {', '.join(found)}")
+    left = [
+        entry.name
+        for entry in (root.iterdir() if root.is_dir() else ())
+        if word in (entry.name, entry.name.rpartition("@")[0]) and read_record(entry) is not None
+    ]
+    if left:
+        return root / left[0]
+    raise UsageError(
+        f"cannot find a running system {word!r}; running: {', '.join(names) or 'none'}",
+        hint="start it: lifecycle up MANIFEST",
+    )
+
+
+def status(path: Path) -> SystemStatus:
+    """Ask a supervisor for its status.
+
+    Raises:
+        UsageError: it runs no more.
+        TimeoutError: it does not answer.
+    """
+    answer = _asked(path, Question(ask=Ask.STATUS), STATUS_S)
+    if answer is None:
+        raise _killed(path)
+    if answer.status is None:
+        raise strange(path / _SOCKET, "it has no status")
+    return answer.status
+
+
+def look(path: Path) -> Look:
+    """Ask a supervisor for its plan, what it sees and its verdict.
+
+    Raises:
+        UsageError: it runs no more.
+        TimeoutError: it does not answer.
+    """
+    answer = _asked(path, Question(ask=Ask.LOOK), STATUS_S)
+    if answer is None:
+        raise _killed(path)
+    if answer.look is None:
+        raise strange(path / _SOCKET, "it shows nothing")
+    return answer.look
+
+
+def differences(path: Path, plan: Plan) -> tuple[str, ...]:
+    """Ask a supervisor how `plan` differs from what it runs, one line each.
+
+    Returns:
+        Nothing where they do not differ, or nobody answers in time: a notice is not worth a wait.
+    """
+    question = Question(ask=Ask.DIFFERENCES, plan=plan)
+    try:
+        answer = _asked(path, question, STATUS_S)
+    except TimeoutError:
+        return ()
+    return () if answer is None else answer.differences
+
+
+_ANSWERED = frozenset(ExitCode) - {ExitCode.INTERNAL}
+"""Exit codes that may be passed on; of an error of its own a supervisor tells no client."""
+
+
+def order(path: Path, question: Question, timeout_s: float) -> Answer:
+    """Have a supervisor pause, resume or restart its system, or one node of it.
+
+    Returns:
+        Its exit code and, where it is not OK, why.
+
+    Raises:
+        UsageError: it runs no more.
+        TimeoutError: it is not done after `timeout_s`; it goes on all the same.
+    """
+    answer = _asked(path, question, timeout_s)
+    if answer is None:
+        raise _killed(path)
+    if answer.exit_code not in _ANSWERED:
+        code = answer.exit_code
+        why = "it has no exit code" if code is None else f"its exit code is {code}"
+        raise strange(path / _SOCKET, why)
+    return answer
+
+
+def _asked(path: Path, question: Question, timeout_s: float) -> Answer | None:
+    """Return the answer of a supervisor; None if it is not there any more."""
+    try:
+        return ask(path / _SOCKET, question, timeout_s)
+    except (FileNotFoundError, ConnectionError):
+        return None
+
+
+def _killed(path: Path) -> UsageError:
+    return UsageError(
+        f"cannot ask {path.name!r}: its supervisor was killed",
+        hint=f"clean up after it: lifecycle down {path.name}",
+    )
+
+
+def down(path: Path, timeout_s: float) -> ExitCode:
+    """End a system, and clean up where its supervisor cannot any more.
+
+    Returns:
+        OK once nothing of it runs.
+
+    Raises:
+        TimeoutError: it still runs after `timeout_s`.
+        UsageError: what answers is no supervisor of this version.
+        ProgrammingError: nothing runs, but something of it could not be removed from a network.
+    """
+    deadline = time.monotonic() + timeout_s
+    answer = _asked(path, Question(ask=Ask.DOWN), timeout_s)
+    if answer is not None and answer.exit_code is None:
+        raise strange(path / _SOCKET, "it has no exit code")
+    if answer is not None and _released(path, deadline):
+        return ExitCode.OK
+    directory = RunDirectory.acquire(path.parent, path.name, new_run_id())
+    try:
+        if directory.previous is not None:
+            _, segments = end_run(directory.previous)
+            sweep(segments)
+        remove_programmed(path, max(1.0, deadline - time.monotonic()))
+    finally:
+        directory.release()
+    return ExitCode.OK
+
+
+def _released(path: Path, deadline: float) -> bool:
+    """Wait until the supervisor, which has answered already, has let go of its directory."""
+    while is_held(path):
+        if time.monotonic() > deadline:
+            raise TimeoutError
+        time.sleep(_LOCK_CHECK_S)
+    return True
+
+
+_LOCK_CHECK_S = 0.01
+"""A lock cannot be waited for with a deadline; it is released within milliseconds."""

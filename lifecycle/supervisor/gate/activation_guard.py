@@ -1,0 +1,137 @@
+"""Deactivates managed nodes that somebody else activates while the gate is closed for them.
+
+Owns: `ActivationGuard`: which active nodes were not asked to be, how often they are deactivated
+again, and the finding that keeps the gate closed until they are inactive. Nodes in our hosts refuse
+by themselves (node/author/managed.py); others do what anybody asks of them. Must not import rclpy.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+from collections.abc import Iterable
+from typing import Protocol
+
+from lifecycle.errors import BringUpError
+from lifecycle.node.host.control import Operation
+from lifecycle.plan.model import Plan
+from lifecycle.supervisor.nodes.driver import ACTIVE
+from lifecycle.supervisor.nodes.system import NodeRun, System
+from lifecycle.supervisor.run.events import Notice, Reach
+from lifecycle.supervisor.run.tasks import ended
+from lifecycle.verify.observation import Observation
+from lifecycle.verify.rules.state import ACTIVATED_AT_CLOSED_GATE
+from lifecycle.verify.verdict import Finding, Outcome
+
+TRIES = 5
+"""Somebody who activates a node again and again is not fought for ever: its finding stays."""
+
+
+class Seeing(Protocol):
+    """Sees the graph, see lifecycle.graph.Observer."""
+
+    async def observe(self, plan: Plan) -> Observation:
+        """Return what the graph holds now, the states of planned nodes included."""
+
+
+class Changing(Protocol):
+    """When it is worth looking again, see judge.Changes."""
+
+    @property
+    def count(self) -> int:
+        """Changes so far."""
+
+    async def beyond(self, count: int, timeout_s: float | None) -> bool:
+        """Wait for a change after `count`."""
+
+
+class ActivationGuard:
+    """Watches over the managed nodes that were brought up, and not asked to activate."""
+
+    def __init__(self, system: System) -> None:
+        self._system = system
+        self._tries: dict[str, int] = {}
+        self._deactivating: dict[str, asyncio.Task[None]] = {}
+
+    def look(self, observation: Observation) -> None:
+        """Deactivate at once what is active without the gate having let it through."""
+        states = {each.full_name: each.state for each in observation.nodes}
+        for node in self._system.nodes.values():
+            if node.planned.managed and Operation.ACTIVATE in node.undo:
+                self._tries.pop(node.name, None)
+            elif states.get(node.name) == ACTIVE and _is_held(node):
+                self._deactivate(node)
+
+    def findings(self) -> tuple[Finding, ...]:
+        """Return a finding for each node whose deactivation is not over."""
+        return tuple(
+            ACTIVATED_AT_CLOSED_GATE.on_node(
+                Outcome.VIOLATED,
+                node.planned,
+                expected="inactive",
+                observed="activated by somebody else",
+                message=f"cannot accept node {node.name}: somebody else activated it while the "
+                "gate is closed; it is being deactivated",
+            )
+            for node in self._system.nodes.values()
+            if node.name in self._deactivating
+        )
+
+    async def follow(self, observer: Seeing, changes: Changing) -> None:
+        """Look at every change, for as long as nobody judges: until this is cancelled."""
+        while True:
+            count = changes.count
+            foreign = _foreign(self._system.plan, self._system.nodes.values())
+            if foreign is None:
+                return
+            self.look(await observer.observe(foreign))
+            await changes.beyond(count, None)
+
+    async def close(self) -> None:
+        """Stop deactivating: the system is taken down."""
+        await ended(*self._deactivating.values())
+
+    def _deactivate(self, node: NodeRun) -> None:
+        tries = self._tries.get(node.name, 0)
+        if node.name in self._deactivating or tries >= TRIES:
+            return
+        self._tries[node.name] = tries + 1
+        text = f"{node.name!r} was activated by somebody else while the gate is closed: "
+        if tries + 1 < TRIES:
+            text += "it is deactivated"
+        else:
+            text += f"it is deactivated for the last time, after {tries} times in vain"
+        self._system.emit(Notice(message=text))
+        self._deactivating[node.name] = asyncio.ensure_future(self._ask(node))
+        # No verdict of before holds: whoever has a permit asks again.
+        self._system.touched.set()
+
+    async def _ask(self, node: NodeRun) -> None:
+        limit_s = node.planned.timeouts.deactivate_s
+        try:
+            standing = await asyncio.wait_for(node.perform(Operation.DEACTIVATE), limit_s)
+            node.report(standing.state, connected=standing.connected)
+        except asyncio.TimeoutError:
+            what = f"cannot deactivate {node.name!r} within {limit_s:g} s"
+            self._system.emit(Notice(message=what))
+        except BringUpError as error:
+            self._system.emit(Notice(message=error.message))
+        finally:
+            self._deactivating.pop(node.name, None)
+            # Judged again: its finding is gone, and where it is active still it is asked again.
+            self._system.touched.set()
+
+
+def _is_held(node: NodeRun) -> bool:
+    """Whether we brought a node up, and it waits for the gate."""
+    return node.driver is not None and node.reach in (Reach.CONFIGURED, Reach.CONNECTED)
+
+
+def _foreign(plan: Plan, nodes: Iterable[NodeRun]) -> Plan | None:
+    """Return the plan of the managed nodes that are not in our hosts; None without any."""
+    found = tuple(
+        each.planned
+        for each in nodes
+        if each.planned.managed and (each.process is None or each.process.channel is None)
+    )
+    return dataclasses.replace(plan, nodes=found) if found else None

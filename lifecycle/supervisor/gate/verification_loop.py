@@ -1,0 +1,350 @@
+"""Judging the running system: level-triggered, debounced, until it is clear.
+
+Owns: when `verify` is called again and how long a verdict that closes the gate is waited out.
+Nothing is polled: the graph, or a node over its control channel, says when to look again. Must not
+import rclpy.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+from collections.abc import Callable, Collection
+from typing import Protocol
+
+from lifecycle.graph.waiting import set_within
+from lifecycle.plan.model import Plan
+from lifecycle.supervisor.connections import discovery_server
+from lifecycle.supervisor.gate.activation_guard import ActivationGuard
+from lifecycle.supervisor.gate.gate import closes
+from lifecycle.supervisor.gate.grace_period import Settling
+from lifecycle.supervisor.health.agreement import Agreement
+from lifecycle.supervisor.health.liveliness import Presence
+from lifecycle.supervisor.nodes.system import GraphObserver, System
+from lifecycle.supervisor.run.events import Emitter, VerdictChanged
+from lifecycle.supervisor.run.tasks import ended
+from lifecycle.verify import verify
+from lifecycle.verify.observation import Observation
+from lifecycle.verify.rules import About, Heals, rule
+from lifecycle.verify.rules.configuration import MISSING_REPORT
+from lifecycle.verify.verdict import Finding, Outcome, Stage, Verdict
+
+QUIET_S = 0.005
+"""Changes come in bursts: look again once it was quiet for so long ..."""
+
+BURST_S = 0.05
+"""... or a burst lasts longer than this."""
+
+SETTLED_S = 0.5
+"""A finding that time does not heal stands once it is unchanged for so long."""
+
+UNVERIFIABLE_S = 3.5
+"""What cannot be verified may be unseen yet; Fast DDS announces a late participant every 3 s."""
+
+AGAIN_S = 5.0
+"""For what changed behind an open gate to be judged clear; Fast DDS announces every 3 s."""
+
+ASK_AGAIN_S = 0.02
+"""Two other participants match without our graph changing, so while only that is missing the nodes
+are asked again: after this long, then twice as long each time, ..."""
+
+ASK_AGAIN_AT_MOST_S = 0.5
+"""... up to this."""
+
+
+class Changes:
+    """Counts the moments at which it is worth looking again: the graph's and the nodes'."""
+
+    def __init__(self, system: System, observer: GraphObserver) -> None:
+        self._system = system
+        self._observer = observer
+        self._count = 0
+        self._touches = 0
+        self._event = asyncio.Event()
+        self._tasks = (
+            asyncio.ensure_future(self._follow_graph()),
+            asyncio.ensure_future(self._follow_nodes()),
+        )
+
+    @property
+    def count(self) -> int:
+        """Changes so far."""
+        return self._count
+
+    @property
+    def mark(self) -> tuple[int, int]:
+        """A moment, as far as anything has changed: equal to a later one if nothing did since.
+
+        It knows of a change as soon as it is noticed, where `count` lets a burst pass.
+        """
+        return self._observer.changes, self._touches + self._system.touched.is_set()
+
+    async def beyond(self, count: int, timeout_s: float | None) -> bool:
+        """Wait for a change after `count`; False if none came within `timeout_s`."""
+        while self._count <= count:
+            for task in self._tasks:
+                if task.done():
+                    task.result()
+            if not await set_within(self._event, timeout_s):
+                return False
+        return True
+
+    async def close(self) -> None:
+        """Stop listening."""
+        await ended(*self._tasks)
+
+    async def _follow_graph(self) -> None:
+        while True:
+            await self._observer.wait_change()
+            self._note()
+
+    async def _follow_nodes(self) -> None:
+        while True:
+            await self._system.touched.wait()
+            self._system.touched.clear()
+            self._touches += 1
+            self._note()
+
+    def _note(self) -> None:
+        self._count += 1
+        self._event.set()
+        self._event = asyncio.Event()
+
+
+class Looker(Protocol):
+    """Who else acts on what is seen, and what is wrong with that; see wiring.Authority."""
+
+    def look(self, observation: Observation) -> None:
+        """Take what was seen, before it is judged."""
+
+    def findings(self) -> tuple[Finding, ...]:
+        """Return what the observation alone does not tell."""
+
+
+class Judge:
+    """Judges one system.
+
+    Attributes:
+        latest: the verdict that stands; None before the first.
+        seen: what was seen last.
+        ahead: names of the nodes that an earlier gate let through, which are active before it.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        observer: GraphObserver,
+        changes: Changes,
+        emit: Emitter,
+        *,
+        strict: bool,
+        verify_: Callable[..., Verdict] = verify,
+        looker: Looker | None = None,
+        agreement: Agreement | None = None,
+        guard: ActivationGuard | None = None,
+    ) -> None:
+        self._system = system
+        self._observer = observer
+        self._changes = changes
+        self._emit = emit
+        self._strict = strict
+        self._verify = verify_
+        self._looker = looker
+        self._agreement = agreement
+        self._guard = guard
+        self.latest: Verdict | None = None
+        self._mark: tuple[int, int] | None = None
+        self.seen = Observation()
+        self._presence = Presence(emit)
+        self._settling = Settling()
+        self.ahead: frozenset[str] = frozenset()
+
+    async def once(self, stage: Stage) -> Verdict:
+        """Look and judge now."""
+        mark = self._changes.mark
+        verdict = await self._look(stage)
+        self._stands(stage, verdict)
+        self._mark = mark
+        return verdict
+
+    def is_current(self, verdict: Verdict) -> bool:
+        """Whether nothing changed since the look that `verdict`, the latest one, came from."""
+        return verdict is self.latest and self._mark == self._changes.mark
+
+    async def again(self, ahead: frozenset[str]) -> Verdict:
+        """Judge a system behind an open gate again because it changed.
+
+        Args:
+            ahead: names of the nodes that were asked to activate since the gate opened.
+
+        Returns:
+            The latest verdict; whether it keeps the gate open is the gate's to say.
+        """
+        self.ahead |= ahead
+        await self.until_clear(Stage.CONNECTED, AGAIN_S)
+        assert self.latest is not None
+        return self.latest
+
+    async def settled(self, stage: Stage) -> tuple[Verdict, float | None]:
+        """Look and judge now, and give what may pass by itself a moment to do so (grace_period.py).
+
+        Returns:
+            The verdict that stands, and after how many seconds it must be judged again if it is
+            not what was found now.
+        """
+        found = await self._look(stage)
+        now_s = asyncio.get_running_loop().time()
+        verdict, again_s = self._settling.standing(self.latest, found, self._system.expected, now_s)
+        self._stands(stage, verdict)
+        return verdict, again_s
+
+    def _stands(self, stage: Stage, verdict: Verdict) -> None:
+        if verdict != self.latest:
+            self.latest = verdict
+            self._emit(VerdictChanged(stage=stage, verdict=verdict))
+
+    async def _look(self, stage: Stage) -> Verdict:
+        await self._system.refresh(self._observer)
+        asked = without_nodes(self._system.plan, self._system.liveliness.silent)
+        observation = without(await self._observer.observe(asked), self._system.dead())
+        self.seen = observation
+        self._presence.see(observation)
+        self._system.present = self._presence.present
+        if self._looker is not None:
+            self._looker.look(observation)
+        if self._guard is not None:
+            self._guard.look(observation)
+        verdict = self._verify(
+            self._system.expected,
+            observation,
+            stage=stage,
+            machines=self._system.machines,
+            ahead=self.ahead,
+        )
+        if self._looker is not None:
+            verdict = with_findings(verdict, self._looker.findings())
+        if self._guard is not None:
+            verdict = with_findings(verdict, self._guard.findings())
+        verdict = with_findings(verdict, self._system.liveliness.findings())
+        if self._agreement is not None:
+            verdict = self._agreement.explained(verdict)
+            verdict = with_findings(verdict, self._agreement.findings(observation))
+        return with_findings(verdict, discovery_server.findings(self._system))
+
+    async def until_clear(
+        self, stage: Stage, timeout_s: float, *, unchanged_s: float | None = None
+    ) -> Verdict:
+        """Judge until the gate may open, a finding that cannot heal stands, or time is up.
+
+        Args:
+            stage: what the system has come to.
+            timeout_s: seconds, for all of it.
+            unchanged_s: seconds after which findings stand that have not changed, even if they
+                could heal; None waits for these until time is up.
+
+        Returns:
+            The last verdict; whether it opens the gate is the gate's to say.
+        """
+        loop = asyncio.get_running_loop()
+        deadline = loop.time() + timeout_s
+        standing: frozenset[tuple[str, str]] = frozenset()
+        since = loop.time()
+        again = ASK_AGAIN_S
+        while True:
+            count = self._changes.count
+            verdict = await self.once(stage)
+            if not closes(verdict, strict=self._strict):
+                return verdict
+            now = loop.time()
+            found = frozenset((each.rule, each.subject) for each in verdict.findings)
+            if found != standing:
+                standing, since = found, now
+            patience = _patience(verdict)
+            if unchanged_s is not None:
+                patience = unchanged_s if patience is None else min(patience, unchanged_s)
+            until = deadline if patience is None else min(deadline, since + patience)
+            if now >= until:
+                return verdict
+            wait_s = until - now
+            if self._waits_for_match(verdict) or self._waits_for_others(verdict):
+                wait_s, again = min(wait_s, again), min(again * 2, ASK_AGAIN_AT_MOST_S)
+            if await self._changes.beyond(count, wait_s):
+                await self.quiet()
+
+    def _waits_for_match(self, verdict: Verdict) -> bool:
+        """Whether a match is missing that nobody would tell us of: hosts tell of theirs."""
+        telling = {each.name for each in self._system.nodes.values() if each.tells}
+        return any(
+            each.outcome is Outcome.VIOLATED
+            and rule(each.rule).about is About.MATCH
+            and telling.isdisjoint(each.nodes)
+            for each in verdict.findings
+        )
+
+    def _waits_for_others(self, verdict: Verdict) -> bool:
+        """Whether a node that another supervisor brings up has a step to go: nobody tells us."""
+        others = {each.name for each in self._system.remote.values()}
+        return any(
+            rule(each.rule).about is About.PROGRESS and each.node in others
+            for each in verdict.findings
+        )
+
+    async def quiet(self) -> None:
+        """Let a burst of changes pass."""
+        loop = asyncio.get_running_loop()
+        end = loop.time() + BURST_S
+        while loop.time() < end and await self._changes.beyond(self._changes.count, QUIET_S):
+            pass
+
+
+def with_findings(verdict: Verdict, findings: tuple[Finding, ...]) -> Verdict:
+    """Return `verdict` with what the supervisor itself found."""
+    if not findings:
+        return verdict
+    outcomes = [each.outcome for each in findings]
+    return dataclasses.replace(
+        verdict,
+        verdict=Outcome.worst((verdict.verdict, *outcomes)),
+        blocking=verdict.blocking or Outcome.VIOLATED in outcomes,
+        findings=(*findings, *verdict.findings),
+    )
+
+
+def without(observation: Observation, dead: frozenset[str]) -> Observation:
+    """Return `observation` without the ghosts of dead nodes; a second node of the name stays."""
+    if not dead:
+        return observation
+    alive = {
+        node.full_name for node in observation.nodes if node.full_name in dead and node.count > 1
+    }
+    gone = dead - alive
+    return Observation(
+        nodes=tuple(
+            dataclasses.replace(node, count=node.count - 1) if node.full_name in alive else node
+            for node in observation.nodes
+            if node.full_name not in gone
+        ),
+        endpoints=tuple(each for each in observation.endpoints if each.node not in gone),
+        configurations=tuple(each for each in observation.configurations if each.name not in gone),
+        parameters=tuple(each for each in observation.parameters if each.node not in gone),
+    )
+
+
+def without_nodes(plan: Plan, silent: Collection[str]) -> Plan:
+    """Return `plan` without the nodes that would not answer, so that nobody waits for them."""
+    if not silent:
+        return plan
+    nodes = tuple(each for each in plan.nodes if each.full_name not in silent)
+    return dataclasses.replace(plan, nodes=nodes)
+
+
+def _patience(verdict: Verdict) -> float | None:
+    """How long the findings of `verdict` may stand unchanged; None for as long as there is time."""
+    violated = [rule(each.rule) for each in verdict.findings if each.outcome is Outcome.VIOLATED]
+    if any(each.heals is not Heals.WITH_TIME for each in violated):
+        return SETTLED_S
+    if all(each.awaits is MISSING_REPORT for each in violated):
+        # A foreign node may report yet, or never will: that is not worth the whole time.
+        stays = any(rule(each.rule).heals is Heals.NEVER for each in verdict.findings)
+        return SETTLED_S if stays and not violated else UNVERIFIABLE_S
+    return None

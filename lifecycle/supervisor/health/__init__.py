@@ -1,0 +1,1 @@
+"""Who is alive: processes, nodes and other supervisors of the system."""

@@ -1,0 +1,282 @@
+"""Whether the supervisors of one system planned the same, and which of them was shut down.
+
+Owns: announcing our plan, comparing those of others with it, and the findings that come of it. A
+manifest with another node, another argument or another flow need on one of the hosts passes every
+check of the running graph there: only the plans tell. Nothing here polls. Must not import rclpy.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import dataclasses
+import logging
+import os
+from collections.abc import Callable, Iterator
+from typing import Protocol
+
+from lifecycle.manifest.model import DiscoveryRange, RunKind
+from lifecycle.node.reporting.machine_id import machine_id
+from lifecycle.plan.comparison import differences, plan_checksum
+from lifecycle.plan.model import Plan
+from lifecycle.plan.notice import (
+    PlanNotice,
+    PlanNoticeError,
+    announced_plan,
+    concerns,
+    decode,
+    encode,
+    notice_of,
+)
+from lifecycle.supervisor.nodes.system import System
+from lifecycle.verify.observation import Observation
+from lifecycle.verify.rules import nodes, rule, run
+from lifecycle.verify.verdict import Finding, Outcome, Verdict
+
+ANNOUNCED_S = 5.0
+"""A supervisor that is there has announced its plan within so long: with its first matched
+endpoints, and where Fast DDS lost that, 3 s later."""
+
+_SHOWN = 5
+"""Differences that a message names."""
+
+_MOST = 64
+"""Supervisors whose notices are kept."""
+
+_logger = logging.getLogger(__name__)
+
+
+class Notices(Protocol):
+    """One PlanNotices of lifecycle.middleware."""
+
+    def announce(self, text: str) -> None:
+        """Announce to all who are there and who come later."""
+
+    def destroy(self) -> None:
+        """Announce and receive nothing any more."""
+
+
+class Air(Protocol):
+    """What carries notices, see eyes.Eyes."""
+
+    def plan_notices(self, on_notice: Callable[[str], None]) -> Notices:
+        """Take part in the exchange of plans; the callback comes from any thread."""
+
+
+class Connected(Protocol):
+    """Who knows which supervisors are connected, see neighbours.Neighbours."""
+
+    @property
+    def machines(self) -> frozenset[str]:
+        """Machines whose supervisor is connected now."""
+
+
+class Agreement:
+    """Compares our plan with those of the other supervisors; `open` it in a loop and `close` it.
+
+    Args:
+        system: ours.
+        air: carries the notices.
+        connected: who is there.
+    """
+
+    def __init__(self, system: System, air: Air, connected: Connected) -> None:
+        self._system = system
+        self._air = air
+        self._connected = connected
+        self._loop = asyncio.get_running_loop()
+        self._plan = system.first
+        self._own = tuple(
+            machine
+            for machine in dict.fromkeys(each.planned.machine for each in system.nodes.values())
+            if machine
+        )
+        self._notices: Notices | None = None
+        self._run = os.urandom(8).hex()
+        self._known: list[PlanNotice] = []
+        self._compared: dict[PlanNotice, tuple[str, ...]] = {}
+        self._since: dict[str, float] = {}
+        self._again: asyncio.TimerHandle | None = None
+
+    def open(self) -> None:
+        """Announce our plan where another supervisor may be, and take notice of others'."""
+        near = self._plan.discovery_range in (DiscoveryRange.LOCALHOST, DiscoveryRange.OFF)
+        if near and not self._system.remote:
+            return
+        self._notices = self._air.plan_notices(self._arrived)
+        self.announce(self._plan)
+
+    def announce(self, plan: Plan) -> None:
+        """Say that this is what we plan from now on."""
+        self._plan = plan
+        self._compared.clear()
+        if self._notices is not None:
+            self._notices.announce(encode(self._notice()))
+
+    def leave(self, reason: str) -> None:
+        """Say that what comes is an orderly end, and why."""
+        if self._notices is not None:
+            notice = dataclasses.replace(self._notice(), left=True, reason=" ".join(reason.split()))
+            self._notices.announce(encode(notice))
+
+    def close(self) -> None:
+        """Announce and compare no more."""
+        if self._again is not None:
+            self._again.cancel()
+        if self._notices is not None:
+            self._notices.destroy()
+            self._notices = None
+
+    @property
+    def shut_down(self) -> dict[str, str]:
+        """Machines of our plan whose supervisor has said that it ends, and why."""
+        ours = (each for each in self._known if each.system == self._plan.system and each.left)
+        return {machine: each.reason[:80] for each in ours for machine in each.machines}
+
+    def follows_from_shut_down(self, verdict: Verdict) -> bool:
+        """Whether nothing is violated but the absence of machines that were shut down properly."""
+        machines = self.shut_down
+        gone = {each.full_name for each in self._plan.nodes if each.machine in machines}
+        violated = [each for each in verdict.findings if each.outcome is Outcome.VIOLATED]
+        return bool(violated) and all(
+            rule(each.rule).about is not None and not gone.isdisjoint(each.nodes)
+            for each in violated
+        )
+
+    def findings(self, observation: Observation) -> tuple[Finding, ...]:
+        """Return what is wrong with what others planned, and who did not say it."""
+        return (*self._different(), *self._unknown(observation))
+
+    def explained(self, verdict: Verdict) -> Verdict:
+        """Return `verdict` with the reason of nodes that are missing since their host ended."""
+        machines = {each.full_name: each.machine for each in self._plan.nodes}
+        gone = self.shut_down
+
+        def explain(finding: Finding) -> Finding:
+            machine = machines.get(finding.node)
+            if finding.rule != nodes.MISSING_NODE.id or machine not in gone:
+                return finding
+            why = f" ({gone[machine]})" if gone[machine] else ""
+            return dataclasses.replace(
+                finding,
+                observed=f"machine {machine!r} was shut down",
+                message=f"{finding.message}: machine {machine!r} was shut down by its supervisor"
+                f"{why}",
+            )
+
+        if not gone:
+            return verdict
+        return dataclasses.replace(verdict, findings=tuple(map(explain, verdict.findings)))
+
+    def _notice(self) -> PlanNotice:
+        return notice_of(self._plan, run=self._run, host=machine_id(), machines=self._own)
+
+    def _arrived(self, text: str) -> None:
+        with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
+            self._loop.call_soon_threadsafe(self._take, text)
+
+    def _take(self, text: str) -> None:
+        if self._notices is None:
+            return
+        try:
+            notice = decode(text)
+        except PlanNoticeError as error:
+            _logger.warning("passed over: %s", error)
+            return
+        own = frozenset(self._own)
+        if notice.run == self._run or notice in self._known:
+            return
+        if not concerns(self._plan, own, notice):
+            return
+        if notice.left and not any(each.run == notice.run for each in self._known):
+            return  # it left before we came
+        others = (each for each in self._known if not notice.replaces(each))
+        self._known = [*others, notice][-_MOST:]
+        self._compared = {
+            each: self._compared[each] for each in self._known if each in self._compared
+        }
+        self._system.touched.set()
+
+    def _different(self) -> Iterator[Finding]:
+        ours = plan_checksum(self._plan)
+        for notice in self._known:
+            found = self._compare(notice, ours)
+            if not found:
+                continue
+            who = _who(notice, self._plan.system)
+            shown = "; ".join((*found[:_SHOWN], *(("and more",) if found[_SHOWN:] else ())))
+            yield run.PLANS_DIFFER.finding(
+                Outcome.VIOLATED,
+                subject=who,
+                expected=f"plan {ours}",
+                observed=f"plan {notice.checksum[: len(ours)]}",
+                message=f"cannot rely on {who}: it planned another system than this supervisor: "
+                f"{shown}",
+            )
+
+    def _compare(self, notice: PlanNotice, ours: str) -> tuple[str, ...]:
+        """Return how the plan of a notice differs from ours."""
+        if notice not in self._compared:
+            self._compared[notice] = self._differences(notice, ours)
+        return self._compared[notice]
+
+    def _differences(self, notice: PlanNotice, ours: str) -> tuple[str, ...]:
+        if notice.checksum == ours:
+            return ()
+        plan = announced_plan(notice)
+        found = () if plan is None else differences(self._plan, plan, words=("here", "there"))
+        if found:
+            return found
+        return ("in what cannot be read here; compare 'lifecycle plan MANIFEST' of both",)
+
+    def _unknown(self, observation: Observation) -> Iterator[Finding]:
+        """Yield a finding for each machine that is there and has not said what it planned."""
+        seen = {each.full_name for each in observation.nodes}
+        remote: dict[str, list[tuple[str, bool]]] = {}
+        for each in self._system.remote.values():
+            attached = each.planned.run.kind is RunKind.ATTACH
+            remote.setdefault(each.planned.machine, []).append((each.name, attached))
+        waits_s: list[float] = []
+        for machine, found in remote.items():
+            names = {name for name, _ in found}
+            runs = {name for name, attached in found if not attached}
+            there = machine in self._connected.machines or bool(runs & seen)
+            if not machine or not there or self._says(machine, names):
+                self._since.pop(machine, None)
+                continue
+            left_s = self._since.setdefault(machine, self._loop.time()) + ANNOUNCED_S
+            left_s -= self._loop.time()
+            if left_s > 0:
+                waits_s.append(left_s)
+            who = f"the supervisor of machine {machine!r}"
+            yield run.PLAN_UNKNOWN.finding(
+                Outcome.VIOLATED if left_s > 0 else Outcome.UNVERIFIABLE,
+                subject=who,
+                expected=f"plan {plan_checksum(self._plan)}",
+                observed="not announced yet" if left_s > 0 else "not announced",
+                message=f"cannot tell whether {who} planned the same system: it has not said"
+                + (" so yet" if left_s > 0 else f" what it planned within {ANNOUNCED_S:g} s"),
+            )
+        if waits_s:
+            self._look_again(min(waits_s))
+
+    def _says(self, machine: str, names: set[str]) -> bool:
+        """Whether some notice is of a supervisor that runs the machine, or its nodes."""
+        return any(
+            machine in each.machines
+            or (each.system != self._plan.system and not names.isdisjoint(each.nodes))
+            for each in self._known
+        )
+
+    def _look_again(self, after_s: float) -> None:
+        if self._again is not None:
+            self._again.cancel()
+        self._again = self._loop.call_later(after_s, self._system.touched.set)
+
+
+def _who(notice: PlanNotice, system: str) -> str:
+    machines = " and ".join(repr(each[:80]) for each in notice.machines[:3])
+    of = f"machine {machines}" if machines else f"host {notice.host[:40]!r}"
+    if notice.system == system:
+        return f"the supervisor of {of}"
+    return f"the supervisor of system {notice.system[:80]!r} on {of}"

@@ -1,0 +1,217 @@
+"""Which nodes are silent: stopped, hung, or out of reach.
+
+Owns: `Liveliness`, which turns what is noticed of processes and machines into events, findings and
+the status of nodes. Nothing here waits or asks: the kernel says that a process was stopped or that
+an executor hangs (middleware/process/busy_timer.py), DDS that a machine is not heard any more. A
+process that ended is not silent but dead, see watch.py. Must not import rclpy.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+from collections.abc import Callable, Iterable, Mapping
+from typing import TYPE_CHECKING
+
+from lifecycle.middleware.process.busy_timer import Overdue
+from lifecycle.supervisor.run.events import (
+    Emitter,
+    NodeAlive,
+    NodeJoined,
+    NodeLeft,
+    NodeSilent,
+)
+from lifecycle.verify.hidden import is_hidden_node
+from lifecycle.verify.noise import is_noise_node
+from lifecycle.verify.observation import Observation
+from lifecycle.verify.rules import run
+from lifecycle.verify.verdict import Finding, Outcome
+
+if TYPE_CHECKING:
+    from lifecycle.supervisor.processes.process import ManagedProcess
+
+
+class Cause(enum.Enum):
+    """Why nothing can be expected of a node; a node may have several at once."""
+
+    STOPPED = "stopped"
+    HUNG = "hung"
+    UNSERVED = "unserved"
+    LOST = "lost"
+    TOLD = "told"
+
+
+@dataclasses.dataclass(slots=True)
+class _Silence:
+    since_s: float
+    causes: dict[Cause, str]
+
+
+class Liveliness:
+    """Knows the silent nodes of a system.
+
+    Args:
+        emit: where events go.
+        changed: called whenever a node fell silent or came back: time to judge again.
+        is_there: whether a node has started, and is in the graph as far as that is known.
+    """
+
+    def __init__(
+        self,
+        emit: Emitter,
+        changed: Callable[[], None],
+        is_there: Callable[[str], bool] = lambda _: True,
+    ) -> None:
+        self._emit = emit
+        self._is_there = is_there
+        self._listeners = [changed]
+        self._silent: dict[str, _Silence] = {}
+
+    @property
+    def silent(self) -> Mapping[str, str]:
+        """Fully qualified names of the silent nodes, and why each is."""
+        return {name: _why(silence) for name, silence in self._silent.items()}
+
+    def causes(self, cause: Cause) -> Mapping[str, str]:
+        """Return the nodes that are silent because of `cause`, and its details."""
+        return {
+            name: silence.causes[cause]
+            for name, silence in self._silent.items()
+            if cause in silence.causes
+        }
+
+    def is_out_of_reach(self, node: str) -> bool:
+        """Whether asking the node for anything is in vain; one that hangs may come back in time."""
+        silence = self._silent.get(node)
+        return silence is not None and bool({Cause.STOPPED, Cause.LOST} & silence.causes.keys())
+
+    def fell_silent(self, nodes: Iterable[str], cause: Cause, detail: str) -> None:
+        """Note that nodes are silent; `detail` is half a sentence."""
+        news = False
+        for name in nodes:
+            silence = self._silent.get(name)
+            if silence is None:
+                silence = self._silent[name] = _Silence(self._emit.elapsed_s, {cause: detail})
+                self._emit(NodeSilent(node=name, cause=cause.value, message=_message(name, detail)))
+                news = True
+            elif cause not in silence.causes:
+                silence.causes[cause] = detail
+                news = True
+        if news:
+            self._tell()
+
+    def came_back(self, nodes: Iterable[str], cause: Cause) -> None:
+        """Note that a cause is gone; a node without another one is alive."""
+        news = False
+        for name in nodes:
+            silence = self._silent.get(name)
+            if silence is None or silence.causes.pop(cause, None) is None:
+                continue
+            news = True
+            if not silence.causes:
+                del self._silent[name]
+                silent_s = self._emit.elapsed_s - silence.since_s
+                there = self._is_there(name)
+                self._emit(NodeAlive(node=name, silent_s=silent_s, there=there))
+        if news:
+            self._tell()
+
+    def forget(self, nodes: Iterable[str]) -> None:
+        """Drop what is known of nodes whose process ended."""
+        for name in nodes:
+            self._silent.pop(name, None)
+
+    def watch_over(
+        self, process: ManagedProcess, nodes: Iterable[str]
+    ) -> Callable[[Overdue | None], None]:
+        """Follow a process that is about to be spawned.
+
+        Returns:
+            What its control channel calls when its executor is busy for too long, or came back.
+        """
+        names = tuple(nodes)
+
+        def stopped(is_stopped: bool) -> None:
+            if is_stopped:
+                detail = f"its process {process.name!r} (pid {process.pid}) was stopped by a signal"
+                self.fell_silent(names, Cause.STOPPED, detail)
+            else:
+                self.came_back(names, Cause.STOPPED)
+
+        def hung(why: Overdue | None) -> None:
+            assert process.channel is not None
+            where = f"its process {process.name!r} (pid {process.pid})"
+            if why is Overdue.HANGS:
+                limit_s = process.channel.silent_s
+                detail = f"a callback in {where} has been running for {limit_s:g} s"
+                self.fell_silent(names, Cause.HUNG, detail)
+            elif why is Overdue.UNSERVED:
+                detail = f"{where} gets no processor for its callback: the machine is overloaded"
+                self.fell_silent(names, Cause.UNSERVED, detail)
+            if why is not Overdue.HANGS:
+                self.came_back(names, Cause.HUNG)
+            if why is not Overdue.UNSERVED:
+                self.came_back(names, Cause.UNSERVED)
+
+        process.on_stop = stopped
+        process.ended.add_done_callback(lambda _: self.forget(names))
+        return hung
+
+    def listen(self, listener: Callable[[], None]) -> None:
+        """Have `listener` called whenever a node fell silent or came back."""
+        self._listeners.append(listener)
+
+    def _tell(self) -> None:
+        for listener in self._listeners:
+            listener()
+
+    def findings(self) -> tuple[Finding, ...]:
+        """Return one finding for each silent node."""
+        return tuple(
+            run.SILENT_NODE.finding(
+                Outcome.VIOLATED,
+                subject=name,
+                expected="alive",
+                observed=", ".join(cause.value for cause in silence.causes),
+                message=_message(name, _why(silence)),
+                node=name,
+            )
+            for name, silence in sorted(self._silent.items())
+        )
+
+
+class Presence:
+    """Tells which nodes joined and left the graph between two observations.
+
+    Hidden nodes, whose names begin with an underscore, are left out, as are tools: the one are
+    participants of nodes that are told of anyway, of the other a verdict tells.
+    """
+
+    def __init__(self, emit: Emitter) -> None:
+        self._emit = emit
+        self._present: frozenset[str] = frozenset()
+
+    @property
+    def present(self) -> frozenset[str]:
+        """Names of the nodes that were in the graph when it was last looked at."""
+        return self._present
+
+    def see(self, observation: Observation) -> None:
+        """Compare with what was seen before."""
+        names = (each.full_name for each in observation.nodes)
+        present = frozenset(
+            each for each in names if not is_hidden_node(each) and not is_noise_node(each)
+        )
+        for name in sorted(present - self._present):
+            self._emit(NodeJoined(node=name))
+        for name in sorted(self._present - present):
+            self._emit(NodeLeft(node=name))
+        self._present = present
+
+
+def _why(silence: _Silence) -> str:
+    return ", and ".join(silence.causes.values())
+
+
+def _message(name: str, why: str) -> str:
+    return f"cannot rely on {name!r}: {why}"

@@ -1,0 +1,300 @@
+"""Who runs the plan's other nodes: whether they are heard, and what they say of those nodes.
+
+Owns: being heard by the supervisors of other machines, hearing them and the attached nodes that
+tell that they are there, and calling out while somebody is missing. Event driven but for the calls,
+which end with the silence. Must not import rclpy.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import dataclasses
+from collections.abc import Callable, Coroutine, Iterable, Mapping
+from typing import Any, Protocol
+
+from lifecycle.errors import BringUpError
+from lifecycle.manifest.model import RunKind
+from lifecycle.node.host.control import Operation
+from lifecycle.supervisor.health.liveliness import Cause
+from lifecycle.supervisor.nodes.system import System
+from lifecycle.supervisor.processes.control_channel import ControlChannel
+from lifecycle.supervisor.run.events import MachineConnection
+from lifecycle.supervisor.run.tasks import ended
+
+CALL_EACH_S = 0.25
+"""While somebody is missing."""
+
+SAID_AGAIN_S = (0.1, 0.3)
+"""Fast DDS repeats what was lost after up to 3 s: too late for a silence."""
+
+
+class Ear(Protocol):
+    """One AliveSubscription of lifecycle.middleware."""
+
+    def destroy(self) -> None:
+        """Hear no more."""
+
+
+class Voice(Protocol):
+    """One AlivePublisher of lifecycle.middleware."""
+
+    def tell(self, silent: Mapping[str, str]) -> None:
+        """Say which of our nodes are silent."""
+
+    def destroy(self) -> None:
+        """Leave."""
+
+
+class Air(Protocol):
+    """What carries voices, see eyes.Eyes."""
+
+    def machine_voice(self, system: str, machine: str) -> Voice:
+        """Be heard as the supervisor of a machine."""
+
+    def machine_ear(self, system: str, machine: str, to: Listener) -> Ear:
+        """Hear the supervisor of a machine; callbacks come from any thread."""
+
+    def node_ear(self, node: str, to: Listener) -> Ear:
+        """Hear a node that somebody runs by itself."""
+
+    def call_out(self, addresses: Iterable[str]) -> None:
+        """Make everybody announce themselves; a few datagrams."""
+
+    def send_again_soon(self) -> None:
+        """Have what waits for a link to come back be sent soon when it does."""
+
+    def tell_names(self) -> None:
+        """Tell the graph anew that we are here."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Listener:
+    """What an ear calls, from any thread.
+
+    Attributes:
+        heard: with True when it is heard, with False when not any more.
+        left: it left properly.
+        told: what it says of silent nodes.
+    """
+
+    heard: Callable[[bool], None]
+    left: Callable[[], None]
+    told: Callable[[Mapping[str, str]], None]
+
+
+@dataclasses.dataclass(slots=True)
+class _Neighbour:
+    """One who should be heard.
+
+    Attributes:
+        what: for messages, "the supervisor of machine 'robot'".
+        machine: empty for an attached node.
+        nodes: fully qualified names of the nodes that are lost with it.
+    """
+
+    what: str
+    machine: str
+    nodes: tuple[str, ...]
+    heard: bool = False
+    lost_at_s: float | None = None
+
+
+class Neighbours:
+    """Hears whom a system depends on; `open` it in a loop and `close` it."""
+
+    def __init__(self, system: System, air: Air) -> None:
+        self._system = system
+        self._air = air
+        self._loop = asyncio.get_running_loop()
+        self._closed = False
+        self._known: list[_Neighbour] = []
+        self._machines: list[_Neighbour] = []
+        self._ears: list[Ear] = []
+        self._attached: tuple[str, ...] = ()
+        self._voices: list[Voice] = []
+        self._said: Mapping[str, str] = {}
+        self._missing: dict[str, _Neighbour] = {}
+        self._calling: asyncio.Task[None] | None = None
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    def open(self) -> None:
+        """Begin to hear, and to be heard where there is somebody to hear us."""
+        plan = self._system.plan
+        remote: dict[str, list[str]] = {}
+        for each in self._system.remote.values():
+            remote.setdefault(each.planned.machine, []).append(each.name)
+        for machine, nodes in remote.items():
+            if machine:
+                what = f"the supervisor of machine {machine!r}"
+                self._machines.append(_Neighbour(what, machine, tuple(nodes)))
+                listener = self._listener(self._machines[-1])
+                self._ears.append(self._air.machine_ear(plan.system, machine, listener))
+        self._attached = self._attached_nodes()
+        for name in self._attached:
+            listener = self._listener(_Neighbour(repr(name), "", (name,)))
+            self._ears.append(self._air.node_ear(name, listener))
+        if remote:
+            own = dict.fromkeys(node.planned.machine for node in self._system.nodes.values())
+            self._voices = [self._air.machine_voice(plan.system, each) for each in own if each]
+            self._system.liveliness.listen(self._tell)
+
+    def renew(self) -> None:
+        """Follow the attached nodes of the plan as it is now, where they are others."""
+        if self._attached == self._attached_nodes():
+            return
+        for each in (*self._ears, *self._voices):
+            each.destroy()
+        self._ears.clear()
+        self._voices.clear()
+        self._machines.clear()
+        self._missing.clear()
+        for neighbour in self._known:
+            # Of who is not planned any more nobody tells that it came back.
+            for cause in (Cause.LOST, Cause.TOLD):
+                self._system.liveliness.came_back(neighbour.nodes, cause)
+        self._known.clear()
+        self.open()
+
+    def _attached_nodes(self) -> tuple[str, ...]:
+        return tuple(
+            node.name
+            for node in self._system.nodes.values()
+            if node.planned.run.kind is RunKind.ATTACH
+        )
+
+    @property
+    def machines(self) -> frozenset[str]:
+        """Machines whose supervisor is connected now."""
+        return frozenset(each.machine for each in self._machines if each.heard)
+
+    async def close(self) -> None:
+        """Leave, and hear no more."""
+        self._closed = True
+        tasks = [*self._tasks, *([self._calling] if self._calling else [])]
+        await ended(*tasks)
+        for each in (*self._ears, *self._voices):
+            each.destroy()
+        self._ears.clear()
+        self._voices.clear()
+
+    def _listener(self, neighbour: _Neighbour) -> Listener:
+        self._known.append(neighbour)
+
+        def soon(do: Callable[..., None]) -> Callable[..., None]:
+            def in_loop(*arguments: object) -> None:
+                # An ear that was destroyed may have had its say on the way here.
+                if any(each is neighbour for each in self._known):
+                    do(neighbour, *arguments)
+
+            def call(*arguments: object) -> None:
+                with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
+                    self._loop.call_soon_threadsafe(in_loop, *arguments)
+
+            return call
+
+        return Listener(heard=soon(self._heard), left=soon(self._left), told=soon(self._told))
+
+    def _heard(self, neighbour: _Neighbour, heard: bool) -> None:
+        if self._closed or heard is neighbour.heard:
+            return
+        neighbour.heard = heard
+        if heard:
+            self._found(neighbour)
+        else:
+            self._lost(neighbour)
+
+    def _lost(self, neighbour: _Neighbour) -> None:
+        neighbour.lost_at_s = self._loop.time()
+        if neighbour.machine:
+            self._system.emit(MachineConnection(machine=neighbour.machine, established=False))
+        detail = f"{neighbour.what} is not heard any more"
+        self._system.liveliness.fell_silent(neighbour.nodes, Cause.LOST, detail)
+        self._missing[neighbour.what] = neighbour
+        self._air.send_again_soon()
+        self._start(self._have_hosts(Operation.SEND_AGAIN_SOON))
+        if self._calling is None:
+            self._calling = asyncio.ensure_future(self._call())
+
+    def _found(self, neighbour: _Neighbour) -> None:
+        lost_s = 0.0
+        if neighbour.lost_at_s is not None:
+            lost_s = self._loop.time() - neighbour.lost_at_s
+            self._missing.pop(neighbour.what, None)
+            # DDS may have forgotten the names of those whom it lost for long.
+            self._air.tell_names()
+            self._start(self._have_hosts(Operation.TELL_NAMES))
+        neighbour.lost_at_s = None
+        if neighbour.machine:
+            self._system.emit(
+                MachineConnection(machine=neighbour.machine, established=True, lost_s=lost_s)
+            )
+        self._system.liveliness.came_back(neighbour.nodes, Cause.LOST)
+
+    def _left(self, neighbour: _Neighbour) -> None:
+        """It left properly, or DDS forgot it after it was lost."""
+        if self._closed or not neighbour.heard:
+            return
+        neighbour.heard = False
+        if neighbour.machine:
+            self._system.emit(
+                MachineConnection(machine=neighbour.machine, established=False, left=True)
+            )
+        self._system.liveliness.came_back(neighbour.nodes, Cause.TOLD)
+
+    def _told(self, neighbour: _Neighbour, silent: Mapping[str, str]) -> None:
+        if self._closed:
+            return
+        for name in neighbour.nodes:
+            if name in silent:
+                self._system.liveliness.fell_silent((name,), Cause.TOLD, silent[name])
+            else:
+                self._system.liveliness.came_back((name,), Cause.TOLD)
+
+    def _tell(self) -> None:
+        """Our own nodes fell silent or came back: say so."""
+        liveliness = self._system.liveliness
+        causes = (Cause.UNSERVED, Cause.HUNG, Cause.STOPPED)
+        said = {name: why for cause in causes for name, why in liveliness.causes(cause).items()}
+        if said != self._said and not self._closed:
+            self._said = said
+            self._start(self._say(said))
+
+    async def _say(self, silent: Mapping[str, str]) -> None:
+        for pause_s in (*SAID_AGAIN_S, None):
+            if silent is not self._said:
+                return
+            for voice in self._voices:
+                voice.tell(silent)
+            if pause_s is not None:
+                await asyncio.sleep(pause_s)
+
+    async def _call(self) -> None:
+        """Call out until nobody is missing."""
+        machines = {each.name: each.address for each in self._system.plan.machines}
+        while self._missing:
+            names = (each.machine for each in self._missing.values())
+            self._air.call_out([a for name in names if (a := machines.get(name, ""))])
+            await asyncio.sleep(CALL_EACH_S)
+        self._calling = None
+
+    async def _have_hosts(self, operation: Operation) -> None:
+        """Have our hosts do something with all of their process; one that hangs holds up none."""
+
+        async def have(channel: ControlChannel, node: str) -> None:
+            # One that ends meanwhile has nothing to do any more.
+            with contextlib.suppress(BringUpError):
+                await channel.request(node, operation)
+
+        await asyncio.gather(
+            *(
+                have(each.channel, self._system.nodes[each.planned.nodes[0]].name)
+                for each in self._system.processes.values()
+                if each.channel is not None and not each.ended.done()
+            )
+        )
+
+    def _start(self, doing: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.ensure_future(doing)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)

@@ -1,0 +1,516 @@
+"""Bring-up: start, configure, connect along the dependency DAG; after the gate, activate.
+
+Owns: the order of steps and their deadlines. Each node walks by itself and waits only for what
+its `after:` names, everything else runs in parallel. The first failure ends it all: no step begins
+any more, and those in progress have a moment to fail for reasons of their own, so that one run
+names them all. What is judged when is gate/verification_loop.py's; activating takes the gate's
+permit. Must not import rclpy.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterable, Iterator
+from typing import Any, Protocol, TypeVar
+
+from lifecycle.errors import BringUpError
+from lifecycle.manifest.model import Condition, RunKind
+from lifecycle.node.host.control import HostSpec, Operation
+from lifecycle.plan.model import PlannedNode
+from lifecycle.supervisor.gate.gate import Permit
+from lifecycle.supervisor.nodes.driver import ControlDriver, NodeDriver, Standing
+from lifecycle.supervisor.nodes.system import NodeRun, System
+from lifecycle.supervisor.processes.control_channel import (
+    ChannelClosedError,
+    ControlChannel,
+    HostFailedError,
+)
+from lifecycle.supervisor.processes.process import ManagedProcess
+from lifecycle.supervisor.processes.spawn import Spawner
+from lifecycle.supervisor.processes.states import ProcessState
+from lifecycle.supervisor.run.events import Reach
+from lifecycle.supervisor.run.failure import (
+    DEADLINE,
+    NOT_WIRED,
+    PROCESS_DIED,
+    START_FAILED,
+    TRANSITION_FAILED,
+    StepFailedError,
+)
+from lifecycle.supervisor.run.tasks import ended
+
+T = TypeVar("T")
+
+_DEATH_S = 0.5
+"""A closed channel usually means a dying process; its end tells more than the channel did."""
+
+_WORDS_S = 0.1
+"""For what a process wrote to its channel just before it ended."""
+
+_OWN_S = 0.5
+"""Our nodes keep the same limits themselves and know more: let them speak first."""
+
+ALSO_S = 0.5
+"""For steps in progress to fail, too, once one has failed; processes that start side by side and
+cannot import something fail within a tenth of a second of each other."""
+
+_ING = {
+    Operation.CONFIGURE: "configuring",
+    Operation.CONNECT: "connecting",
+    Operation.ACTIVATE: "activating",
+    Operation.DEACTIVATE: "deactivating",
+}
+
+
+_TO_UNDO = (Operation.CONFIGURE, Operation.CONNECT)
+"""What is left to undo of a node that was deactivated."""
+
+
+class Wirer(Protocol):
+    """Who makes the nodes' connections and mappings, see wiring.Authority."""
+
+    async def ready(self, node: NodeRun) -> None:
+        """Wait until everybody is configured whose interface this node's wiring depends on."""
+
+    async def wire(self, node: NodeRun) -> None:
+        """Make all that a configured node must have before it connects; raises BringUpError."""
+
+
+class BringUp:
+    """Brings one system up.
+
+    Args:
+        system: what to bring up.
+        spawner_of: the spawner for a process.
+        services: makes the driver of a managed node that is not ours.
+        appears: waits until a node of this name is in the graph.
+        recorded: called after each spawn, to keep the record of children true.
+        wirer: wires each node between its configure and its connect; None leaves it to the nodes.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        *,
+        spawner_of: Callable[[ManagedProcess], Spawner],
+        services: Callable[[PlannedNode], NodeDriver],
+        appears: Callable[[str], Awaitable[None]],
+        recorded: Callable[[], None],
+        wirer: Wirer | None = None,
+    ) -> None:
+        self._system = system
+        self._spawner_of = spawner_of
+        self._services = services
+        self._appears = appears
+        self._recorded = recorded
+        self._wirer = wirer
+        self._starts: dict[str, asyncio.Task[None]] = {}
+        self._appearing: list[asyncio.Task[None]] = []
+        self._failures: list[StepFailedError] = []
+        self._in_progress = 0
+        self._step_over = asyncio.Event()
+
+    async def connect(self, timeout_s: float, nodes: Iterable[NodeRun] | None = None) -> None:
+        """Start, configure and connect every node, or some.
+
+        Raises:
+            StepFailedError: the steps that failed, or what was missing after `timeout_s`.
+        """
+        try:
+            await asyncio.wait_for(self._connect_all(self._some(nodes)), timeout_s)
+        except asyncio.TimeoutError:
+            raise self._failure() or self._late(timeout_s) from None
+
+    async def activate(
+        self, permit: Permit, timeout_s: float, nodes: Iterable[NodeRun] | None = None
+    ) -> None:
+        """Activate every managed node, or some, as `permit` allows.
+
+        Raises:
+            StepFailedError: as for `connect`.
+            VerificationError: something changed after the verdict, and what it is now keeps the
+                gate closed for all that were not asked yet.
+        """
+        managed = [node for node in self._some(nodes) if node.planned.managed]
+        try:
+            await asyncio.wait_for(
+                self._side_by_side(self._activate(node, permit) for node in managed), timeout_s
+            )
+        except asyncio.TimeoutError:
+            raise self._failure() or self._late(timeout_s) from None
+
+    async def deactivate(self, nodes: Iterable[NodeRun] | None = None) -> None:
+        """Deactivate every active node, those first that stand on others.
+
+        Args:
+            nodes: only these, which were asked to activate; None for all that are active.
+
+        Raises:
+            StepFailedError: those that failed.
+        """
+        active = tuple(
+            node
+            for node in self._some(nodes)
+            if node.planned.managed and (nodes is not None or node.reach is Reach.ACTIVE)
+        )
+        await self._side_by_side(self._deactivate(node, active) for node in active)
+
+    def _some(self, nodes: Iterable[NodeRun] | None) -> tuple[NodeRun, ...]:
+        return tuple(self._system.nodes.values() if nodes is None else nodes)
+
+    def unfinished(self) -> str:
+        """Say what every node is doing, or waits for, that is in a step; empty if none is."""
+        busy = [node for node in self._system.nodes.values() if node.doing]
+        return "; ".join(f"{node.name} {_is(node.doing)}" for node in busy)
+
+    async def close(self) -> None:
+        """Stop waiting for plain nodes that have not appeared."""
+        for task in self._appearing:
+            task.cancel()
+        await asyncio.gather(*self._appearing, return_exceptions=True)
+
+    async def _connect_all(self, nodes: Iterable[NodeRun]) -> None:
+        try:
+            await self._side_by_side(self._walk(node) for node in nodes)
+        finally:
+            for start in self._starts.values():
+                start.cancel()
+            await asyncio.gather(*self._starts.values(), return_exceptions=True)
+            # A process that is started again later is another one.
+            self._starts.clear()
+
+    async def _side_by_side(self, walks: Iterable[Coroutine[Any, Any, None]]) -> None:
+        """Run all of them to their end, or until one fails; then none of them goes on.
+
+        Raises:
+            StepFailedError: the first that failed, with those that did so until all had stopped.
+        """
+        self._failures = []
+        tasks = [asyncio.ensure_future(self._noting(each)) for each in walks]
+        if not tasks:
+            return
+        try:
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_EXCEPTION)
+            if any(each.exception() is not None for each in done if not each.cancelled()):
+                await self._others_over()
+        finally:
+            await ended(*tasks)
+        if (failure := self._failure()) is not None:
+            raise failure
+        for task in tasks:
+            if not task.cancelled():
+                task.result()
+
+    async def _noting(self, walk: Coroutine[Any, Any, None]) -> None:
+        try:
+            await walk
+        except StepFailedError as failure:
+            self._failures.append(failure)
+            raise
+
+    async def _others_over(self) -> None:
+        """Wait, bounded, until no step is in progress and no host reports failures any more."""
+        loop = asyncio.get_running_loop()
+        deadline = loop.time() + ALSO_S
+        while (left_s := deadline - loop.time()) > 0:
+            self._step_over.clear()
+            ends: set[asyncio.Future[Any]] = {
+                asyncio.ensure_future(asyncio.shield(each.ended))
+                for each in self._system.processes.values()
+                if each.channel is not None and each.channel.failures and not each.ended.done()
+            }
+            if not self._in_progress and not ends:
+                return
+            ends.add(asyncio.ensure_future(self._step_over.wait()))
+            try:
+                await asyncio.wait(ends, timeout=left_s, return_when=asyncio.FIRST_COMPLETED)
+            finally:
+                await ended(*ends)
+
+    def _failure(self) -> StepFailedError | None:
+        """Return the first failure with all others, also those that hosts reported since."""
+        if not self._failures:
+            return None
+        first, *others = self._failures
+        reported = [
+            _not_hosted(self._system.nodes[process.planned.nodes[0]], each)
+            for process in self._system.processes.values()
+            if process.channel is not None
+            for each in process.channel.failures
+        ]
+        return first.joined([*others, *reported])
+
+    async def _may_begin(self) -> None:
+        """Hold a step for good once another has failed: who waits for it will be cancelled."""
+        if self._failures:
+            await asyncio.get_running_loop().create_future()
+
+    @contextlib.contextmanager
+    def _progressing(self) -> Iterator[None]:
+        self._in_progress += 1
+        try:
+            yield
+        finally:
+            self._in_progress -= 1
+            self._step_over.set()
+
+    async def _walk(self, node: NodeRun) -> None:
+        await self._start(node)
+        if node.planned.managed:
+            await self._connect(node)
+        elif node.process is not None and node.process.channel is not None:
+            await self._step(
+                node, node.process.channel.ready(), node.planned.timeouts.start_s, rule=START_FAILED
+            )
+            self._started(node)
+        else:
+            # A plain node says nothing of itself. Whoever stands on it waits until it is in the
+            # graph; if it never is, verification says so.
+            node.doing = "waiting to appear in the graph"
+            self._appearing.append(asyncio.ensure_future(self._appear(node)))
+
+    async def _appear(self, node: NodeRun) -> None:
+        await self._appears(node.name)
+        self._started(node)
+
+    def _started(self, node: NodeRun, standing: Standing | None = None) -> None:
+        node.doing = ""
+        node.advance(Reach.STARTED, standing)
+        if node.process is not None:
+            node.process.running()
+
+    async def _connect(self, node: NodeRun) -> None:
+        assert node.driver is not None
+        node.doing = "starting"
+        limit_s = node.planned.timeouts.start_s
+        standing = await self._step(node, node.driver.start(), limit_s, rule=START_FAILED)
+        self._started(node, standing)
+        await self._system.reached(node, Condition.CONFIGURED, "configure")
+        await self._operate(node, Operation.CONFIGURE, Reach.CONFIGURED)
+        await self._system.reached(node, Condition.CONNECTED, "connect")
+        if self._wirer is not None:
+            await self._wirer.ready(node)
+            await self._may_begin()
+            node.doing = "being wired"
+            limit_s = node.planned.timeouts.connect_s
+            await self._step(node, self._wirer.wire(node), limit_s, rule=NOT_WIRED)
+        await self._operate(node, Operation.CONNECT, Reach.CONNECTED)
+
+    async def _activate(self, node: NodeRun, permit: Permit) -> None:
+        await self._system.reached(node, Condition.ACTIVE, "activate")
+        node.doing = "waits to activate until what changed is verified"
+        # Here, too: how long it takes is not the node's to answer for.
+        # A gate that was closed fails the step itself.
+        with contextlib.suppress(BringUpError):
+            await permit.renewed()
+        await self._operate(node, Operation.ACTIVATE, Reach.ACTIVE, permit)
+
+    async def _deactivate(self, node: NodeRun, others: Collection[NodeRun]) -> None:
+        for dependent in self._system.dependents(node.planned.key):
+            while dependent in others and Operation.ACTIVATE in dependent.undo:
+                await dependent.changed.wait()
+        await self._operate(node, Operation.DEACTIVATE, Reach.CONNECTED)
+        node.undo = [each for each in node.undo if each in _TO_UNDO]
+        node.stuck = False
+
+    async def _operate(
+        self, node: NodeRun, operation: Operation, reach: Reach, permit: Permit | None = None
+    ) -> None:
+        limit_s = {
+            Operation.CONFIGURE: node.planned.timeouts.configure_s,
+            Operation.CONNECT: node.planned.timeouts.connect_s,
+            Operation.ACTIVATE: node.planned.timeouts.activate_s,
+            Operation.DEACTIVATE: node.planned.timeouts.deactivate_s,
+        }[operation]
+        await self._may_begin()
+        node.doing = _ING[operation]
+        # Noted before it is sent: a request without an answer may have been carried out.
+        if operation is not Operation.DEACTIVATE:
+            node.undo.append(operation)
+        standing = await self._step(
+            node, node.perform(operation, permit), limit_s, rule=TRANSITION_FAILED
+        )
+        node.doing = ""
+        node.advance(reach, standing)
+
+    async def _start(self, node: NodeRun) -> None:
+        """Have the node's process started, or for a node of somebody else's, find it."""
+        process = node.process
+        if process is None:
+            await self._hold_start(node)
+        else:
+            if process.name not in self._starts:
+                self._starts[process.name] = asyncio.ensure_future(self._start_process(process))
+            await asyncio.shield(self._starts[process.name])
+        limit_s = node.planned.timeouts.start_s
+        node.doing = "starting"
+        if process is not None and process.channel is not None:
+            if node.planned.managed:
+                node.driver = ControlDriver(process.channel, node.name)
+        elif node.planned.managed:
+            node.doing = "waiting to appear in the graph"
+            await self._step(node, self._appears(node.name), limit_s, rule=START_FAILED)
+            node.driver = self._services(node.planned)
+
+    async def _start_process(self, process: ManagedProcess) -> None:
+        nodes = [self._system.nodes[key] for key in process.planned.nodes]
+        for node in nodes:
+            await self._hold_start(node)
+            node.doing = "starting"
+        await self._may_begin()
+        channel = None
+        hung = self._system.liveliness.watch_over(process, [node.name for node in nodes])
+        if process.planned.run.kind is RunKind.PYTHON:
+            channel = ControlChannel(
+                HostSpec(
+                    system=self._system.plan.system,
+                    process=process.name,
+                    domain_id=self._system.plan.domain_id,
+                    discovery_range=self._system.plan.discovery_range,
+                    nodes=tuple(node.planned for node in nodes),
+                ),
+                self._system.on_host_event,
+                hung,
+            )
+        try:
+            await process.spawn(self._spawner_of(process), channel)
+        except (BringUpError, OSError) as error:
+            text = error.message if isinstance(error, BringUpError) else str(error)
+            message = (
+                text if text.startswith("cannot") else f"cannot start {process.name!r}: {text}"
+            )
+            raise StepFailedError(message, rule=START_FAILED, subject=nodes[0].name) from error
+        self._recorded()
+
+    async def _hold_start(self, node: NodeRun) -> None:
+        """Wait for what holds a start; a node that is not managed has no later step to hold."""
+        conditions = (Condition.STARTED,) if node.planned.managed else tuple(Condition)
+        for condition in conditions:
+            await self._system.reached(node, condition, "start")
+
+    async def _step(self, node: NodeRun, doing: Awaitable[T], limit_s: float, *, rule: str) -> T:
+        """Await one step within its limit, and say in whole sentences why it failed.
+
+        The end of the node's process ends the step: nothing else would, for a node that is
+        awaited in the graph.
+        """
+        with self._progressing():
+            return await self._stepping(node, doing, limit_s, rule=rule)
+
+    async def _stepping(
+        self, node: NodeRun, doing: Awaitable[T], limit_s: float, *, rule: str
+    ) -> T:
+        step = asyncio.ensure_future(doing)
+        waits: set[asyncio.Future[object]] = {step}  # type: ignore[arg-type]
+        if node.process is not None:
+            waits.add(node.process.ended)  # type: ignore[arg-type]
+        try:
+            own_s = _OWN_S if rule is TRANSITION_FAILED else 0.0
+            await asyncio.wait(waits, timeout=limit_s + own_s, return_when=asyncio.FIRST_COMPLETED)
+            if node.process is not None and node.process.ended.done() and not step.done():
+                # Its last words may still be on the way.
+                await asyncio.wait({step}, timeout=_WORDS_S)
+            if step.done():
+                return step.result()
+            if node.process is not None and node.process.ended.done():
+                raise died(node.process, node)
+            raise _too_late(node, limit_s)
+        except StepFailedError:
+            raise
+        except BringUpError as error:
+            if isinstance(error, HostFailedError):
+                raise _not_hosted(node, error) from error
+            if isinstance(error, ChannelClosedError):
+                await self._death(node)
+                if node.process is not None and node.process.ended.done():
+                    raise died(node.process, node) from error
+            raise StepFailedError(
+                error.message
+                if rule is not START_FAILED or error.message.startswith("cannot")
+                else f"cannot start {node.name!r}: {error.message}",
+                rule=rule,
+                subject=node.name,
+                **_process_of(node),
+            ) from error
+        finally:
+            if not step.done():
+                node.stuck = True
+                step.cancel()
+                await asyncio.gather(step, return_exceptions=True)
+
+    async def _death(self, node: NodeRun) -> None:
+        """Give a process whose channel closed the time to show how it ended."""
+        process = node.process
+        if process is not None and process.state is not ProcessState.EXITED:
+            await asyncio.wait([asyncio.shield(process.ended)], timeout=_DEATH_S)
+
+    def _late(self, timeout_s: float) -> StepFailedError:
+        """The whole bring-up took too long: say what every unfinished node was doing."""
+        missing = [node for node in self._system.nodes.values() if node.doing]
+        for node in missing:
+            node.stuck = node.stuck or node.doing in _ING.values()
+        culprit = next((node for node in missing if not node.doing.startswith("waits")), None)
+        return StepFailedError(
+            f"cannot bring up {self._system.plan.system!r} within {timeout_s:.3g} s: "
+            f"{self.unfinished()}",
+            rule=DEADLINE,
+            subject=culprit.name if culprit else self._system.plan.system,
+            **(_process_of(culprit) if culprit else {}),
+        )
+
+
+def died(process: ManagedProcess, node: NodeRun | None = None) -> StepFailedError:
+    """The failure that an unexpected end of `process` is."""
+    names = process.planned.nodes
+    doing = f" while {node.doing}" if node is not None and node.doing else ""
+    subject = node.name if node is not None else process.name
+    what = f"process {process.name!r}" if node is None else repr(node.name)
+    holds = "" if node is None or (len(names) == 1) else f" with its process {process.name!r}"
+    return StepFailedError(
+        f"cannot keep {what} running{holds}: pid {process.pid} died{doing}: "
+        f"{process.ended.result()}{_not_run(process)}",
+        rule=PROCESS_DIED,
+        subject=subject,
+        process=process.name,
+        log=str(process.log.path),
+    )
+
+
+def _not_run(process: ManagedProcess) -> str:
+    """Name the program of a command where its status says, as of a shell, that it cannot be run."""
+    why = {126: "may not be run", 127: "is not there"}.get(process.ended.result().status or 0)
+    if why is None or process.planned.run.kind is not RunKind.COMMAND or not process.planned.argv:
+        return ""
+    return f", as of a program that {why}: {process.planned.argv[0]!r}"
+
+
+def _not_hosted(node: NodeRun, error: HostFailedError) -> StepFailedError:
+    """The failure of a process to host one of its nodes, which need not be `node`."""
+    name = error.node or node.name
+    message = error.message
+    return StepFailedError(
+        message if message.startswith("cannot") else f"cannot start {name!r}: {message}",
+        rule=START_FAILED,
+        subject=name,
+        **_process_of(node),
+    )
+
+
+def _too_late(node: NodeRun, limit_s: float) -> StepFailedError:
+    return StepFailedError(
+        f"cannot bring up {node.name!r}: it was still {node.doing} after {limit_s:g} s",
+        rule=DEADLINE,
+        subject=node.name,
+        **_process_of(node),
+    )
+
+
+def _is(doing: str) -> str:
+    return doing if doing.startswith("waits") else f"is still {doing}"
+
+
+def _process_of(node: NodeRun) -> dict[str, str]:
+    """Return what a failure says of the process of its node."""
+    process = node.process
+    return {} if process is None else {"process": process.name, "log": str(process.log.path)}

@@ -1,0 +1,316 @@
+"""How one managed node is driven: over our control channel, or through its lifecycle services.
+
+Owns: `NodeDriver` and its two kinds. The order of operations is bring_up.py's. Must not import
+rclpy; the services come from middleware/ behind a Protocol.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Awaitable, Callable, Sequence
+from typing import Protocol
+
+from lifecycle.errors import BringUpError, MiddlewareError
+from lifecycle.node.host.control import Operation
+from lifecycle.plan.model import PlannedNode
+from lifecycle.supervisor.connections.desired_state import Step
+from lifecycle.supervisor.gate.gate import Permit
+from lifecycle.supervisor.processes.control_channel import ControlChannel
+from lifecycle.verify.observation import NodeConfiguration
+
+ACTIVE = "active"
+INACTIVE = "inactive"
+UNCONFIGURED = "unconfigured"
+FINALIZED = "finalized"
+"""lifecycle_msgs/State labels."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Standing:
+    """Where a node stands after an operation.
+
+    Attributes:
+        state: lifecycle_msgs/State label.
+        connected: the data layer is made.
+        configuration: as the node reports it; None where it does not.
+    """
+
+    state: str
+    connected: bool = False
+    configuration: NodeConfiguration | None = None
+
+
+class NodeDriver(Protocol):
+    """Drives one managed node. Deadlines are the caller's: every call may be cancelled."""
+
+    async def start(self) -> Standing:
+        """Wait until the node can be driven, and say where it stands."""
+
+    async def perform(self, operation: Operation, permit: Permit | None = None) -> Standing:
+        """Do one operation.
+
+        Raises:
+            BringUpError: the node refused or failed, or cannot be reached.
+        """
+
+    async def configuration(self) -> NodeConfiguration | None:
+        """Read the node's configuration afresh; None where the node has no such interface."""
+
+    async def interface(self) -> NodeConfiguration | None:
+        """Read what the node can be wired by; None where it has no node interface."""
+
+    async def wire(self, step: Step) -> NodeConfiguration | None:
+        """Make one connection or mapping, or unmake one.
+
+        Returns:
+            The node's configuration after it, where the answer carries it.
+
+        Raises:
+            BringUpError: the node refused or failed, or cannot be reached.
+        """
+
+
+class ControlDriver:
+    """Drives a node of our own host over the process's control channel."""
+
+    def __init__(self, channel: ControlChannel, node: str) -> None:
+        self._channel = channel
+        self._node = node
+
+    async def start(self) -> Standing:
+        """Wait for the host's "ready"."""
+        await self._channel.ready()
+        return Standing(state=UNCONFIGURED)
+
+    async def perform(self, operation: Operation, permit: Permit | None = None) -> Standing:
+        """Send the operation and wait for the reply."""
+        reply = await self._channel.request(self._node, operation, permit)
+        if not reply.ok:
+            reason = reply.error or f"the node is {reply.state or 'in an unknown state'}"
+            raise BringUpError(f"cannot {operation.value} {self._node!r}: {reason}")
+        return Standing(
+            state=reply.state, connected=reply.connected, configuration=reply.configuration
+        )
+
+    async def configuration(self) -> NodeConfiguration | None:
+        """Ask the host."""
+        return (await self.perform(Operation.GET_CONFIGURATION)).configuration
+
+    async def interface(self) -> NodeConfiguration | None:
+        """Ask the host."""
+        return await self.configuration()
+
+    async def wire(self, step: Step) -> NodeConfiguration | None:
+        """Send the step and wait for the reply."""
+        reply = await self._channel.request(
+            self._node,
+            step.operation,
+            connection=step.connection,
+            connections=step.connections,
+            endpoint=step.endpoint,
+        )
+        if not reply.ok:
+            raise BringUpError(f"cannot {step}: {reply.error or 'the node gives no reason'}")
+        return reply.configuration
+
+
+class LifecycleServices(Protocol):
+    """Clients of other nodes' services, see lifecycle.middleware.NodeClients."""
+
+    async def get_state(self, node: str, *, timeout_s: float) -> str:
+        """Return the label of the node's state."""
+
+    async def get_available_transitions(self, node: str, *, timeout_s: float) -> tuple[str, ...]:
+        """Return the labels of the transitions that may be asked for now."""
+
+    async def change_state(
+        self,
+        node: str,
+        transition: str,
+        *,
+        timeout_s: float,
+        before: Callable[[], Awaitable[None]] | None = None,
+    ) -> bool:
+        """Ask for one transition; whether the node accepted and completed it.
+
+        Args:
+            node: fully qualified name.
+            transition: label.
+            timeout_s: seconds, > 0.
+            before: awaited when the request is about to leave; what it raises keeps it back.
+        """
+
+    async def get_configuration(self, node: str, *, timeout_s: float) -> NodeConfiguration | None:
+        """Return the node's configuration; None where it has no such interface."""
+
+    async def connect_to(
+        self, node: str, name: str, urls: Sequence[str], *, timeout_s: float
+    ) -> None:
+        """Make a connection; raises MiddlewareError with the node's reason."""
+
+    async def map_to(self, node: str, endpoint: str, connection: str, *, timeout_s: float) -> None:
+        """Map `publishers/video` onto a connection; raises MiddlewareError with the reason."""
+
+    async def disconnect(self, node: str, name: str, *, timeout_s: float) -> None:
+        """Unmake a connection; raises MiddlewareError with the node's reason."""
+
+
+_REACHED = {
+    Operation.CONFIGURE: INACTIVE,
+    Operation.ACTIVATE: ACTIVE,
+    Operation.DEACTIVATE: INACTIVE,
+    Operation.CLEANUP: UNCONFIGURED,
+    Operation.SHUTDOWN: FINALIZED,
+}
+_REQUEST_S = 5.0
+"""For one request to a node of which no plan says how long it may take."""
+
+_NESTED = (Operation.CONNECT, Operation.DISCONNECT)
+"""Only our own nodes have these; a foreign node makes its data layer inside configure."""
+
+
+class ServiceDriver:
+    """Drives a managed node that we do not host, wherever it stands already.
+
+    A request that was refused or not answered is judged by the state that is read afterwards.
+    """
+
+    def __init__(self, services: LifecycleServices, node: PlannedNode) -> None:
+        self._services = services
+        self._node = node.full_name
+        self._timeouts = node.timeouts
+        self._hand = ServiceHand(services, node.full_name, node.timeouts.connect_s)
+
+    async def start(self) -> Standing:
+        """Wait until the services answer."""
+        return await self._told(self._start())
+
+    async def perform(self, operation: Operation, permit: Permit | None = None) -> Standing:
+        """Change the state unless the node is there already."""
+        return await self._told(self._perform(operation, permit))
+
+    async def configuration(self) -> NodeConfiguration | None:
+        """Say None: observers read it from the graph where there is one."""
+        return None
+
+    async def interface(self) -> NodeConfiguration | None:
+        """Ask `~/get_configuration`."""
+        return await self._hand.interface()
+
+    async def wire(self, step: Step) -> NodeConfiguration | None:
+        """Call the node interface's service, and read what came of it."""
+        return await self._hand.wire(step)
+
+    async def _start(self) -> Standing:
+        return _standing(await self._state(self._timeouts.start_s))
+
+    async def _perform(self, operation: Operation, permit: Permit | None) -> Standing:
+        limit_s = self._limit_s(operation)
+        state = await self._state(limit_s)
+        if operation in _NESTED:
+            offered = await self._services.get_available_transitions(self._node, timeout_s=limit_s)
+            if operation.value in offered and not await self._change(operation, limit_s):
+                raise BringUpError(f"cannot {operation.value} {self._node!r}: it refused")
+            return _standing(state)
+        wanted = _REACHED[operation]
+        if state == wanted:
+            if operation is Operation.ACTIVATE and permit is not None:
+                await permit.use(self._node)
+            return _standing(state)
+        if operation is Operation.CONFIGURE and state == ACTIVE:
+            raise BringUpError(
+                f"cannot configure {self._node!r}: it is active already, and nobody verified it",
+                hint=f"deactivate it first: ros2 lifecycle set {self._node} deactivate",
+            )
+        if operation is Operation.ACTIVATE:
+            if permit is None:
+                raise BringUpError(f"cannot activate {self._node!r} without a permit from the gate")
+            accepted = await self._services.change_state(
+                self._node,
+                operation.value,
+                timeout_s=limit_s,
+                before=functools.partial(permit.use, self._node),
+            )
+        else:
+            accepted = await self._change(operation, limit_s)
+        state = await self._state(limit_s)
+        if state != wanted:
+            reason = "it stayed" if accepted else "it refused and is"
+            raise BringUpError(f"cannot {operation.value} {self._node!r}: {reason} {state}")
+        return _standing(state)
+
+    async def _change(self, operation: Operation, limit_s: float) -> bool:
+        return await self._services.change_state(self._node, operation.value, timeout_s=limit_s)
+
+    async def _state(self, limit_s: float) -> str:
+        return await self._services.get_state(self._node, timeout_s=limit_s)
+
+    async def _told(self, doing: Awaitable[Standing]) -> Standing:
+        """Turn the middleware's errors into a failed step."""
+        try:
+            return await doing
+        except MiddlewareError as error:
+            raise BringUpError(error.message, hint=error.hint) from error
+
+    def _limit_s(self, operation: Operation) -> float:
+        limits = self._timeouts
+        return {
+            Operation.CONFIGURE: limits.configure_s,
+            Operation.CONNECT: limits.connect_s,
+            Operation.ACTIVATE: limits.activate_s,
+            Operation.DEACTIVATE: limits.deactivate_s,
+            Operation.SHUTDOWN: limits.shutdown_s,
+        }.get(operation, limits.cleanup_s)
+
+
+class ServiceHand:
+    """Wires a node through its node interface, whoever hosts it.
+
+    Args:
+        services: clients.
+        node: fully qualified name.
+        timeout_s: seconds, > 0, for each request.
+    """
+
+    def __init__(
+        self, services: LifecycleServices, node: str, timeout_s: float = _REQUEST_S
+    ) -> None:
+        self._services = services
+        self._node = node
+        self._timeout_s = timeout_s
+
+    async def interface(self) -> NodeConfiguration | None:
+        """Ask `~/get_configuration`; None where the node has none.
+
+        Raises:
+            BringUpError: it has one, which does not answer or cannot be read.
+        """
+        try:
+            return await self._services.get_configuration(self._node, timeout_s=self._timeout_s)
+        except MiddlewareError as error:
+            raise BringUpError(error.message, hint=error.hint) from error
+
+    async def wire(self, step: Step) -> NodeConfiguration | None:
+        """Call the node interface's service, and read what came of it.
+
+        Raises:
+            BringUpError: the node refused or failed, or did not answer.
+        """
+        services, limit_s = self._services, self._timeout_s
+        try:
+            if step.operation is Operation.CONNECT_TO:
+                urls = step.connections.urls
+                await services.connect_to(self._node, step.connection, urls, timeout_s=limit_s)
+            elif step.operation is Operation.MAP_TO:
+                end = step.endpoint
+                await services.map_to(self._node, end, step.connection, timeout_s=limit_s)
+            else:
+                await services.disconnect(self._node, step.connection, timeout_s=limit_s)
+        except MiddlewareError as error:
+            raise BringUpError(f"cannot {step}: {error.message}", hint=error.hint) from error
+        return await self.interface()
+
+
+def _standing(state: str) -> Standing:
+    return Standing(state=state, connected=state in {INACTIVE, ACTIVE})

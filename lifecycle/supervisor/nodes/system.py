@@ -1,0 +1,382 @@
+"""The running system: its processes and nodes, and how far each has come.
+
+Owns: `System`, `NodeRun` and the waits on "this node has reached that condition". What is done
+with them is bring_up.py's, watch.py's and shutdown.py's. Must not import rclpy.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import functools
+from collections.abc import Collection, Iterable
+from pathlib import Path
+from typing import Protocol
+
+from lifecycle.errors import BringUpError
+from lifecycle.manifest.model import Condition, RunKind
+from lifecycle.node.host.control import Event as HostEvent
+from lifecycle.node.host.control import Operation
+from lifecycle.plan.model import Plan, PlannedNode, PlannedProcess
+from lifecycle.supervisor.gate.gate import Permit
+from lifecycle.supervisor.health.liveliness import Liveliness
+from lifecycle.supervisor.nodes.driver import NodeDriver, Standing
+from lifecycle.supervisor.nodes.remote_nodes import RemoteNode
+from lifecycle.supervisor.processes.logs import LogDirectory
+from lifecycle.supervisor.processes.process import ManagedProcess
+from lifecycle.supervisor.processes.states import ProcessState
+from lifecycle.supervisor.run.events import Emitter, NodeChanged, Notice, Reach, RequestSent
+from lifecycle.verify.observation import NodeConfiguration, Observation
+
+_ORDER = list(Reach)
+_CONDITIONS = {
+    Condition.STARTED: Reach.STARTED,
+    Condition.CONFIGURED: Reach.CONFIGURED,
+    Condition.CONNECTED: Reach.CONNECTED,
+    Condition.ACTIVE: Reach.ACTIVE,
+}
+
+_REFRESH_S = 1.0
+"""A host answers from its executor within a millisecond; this long it is busy or hung."""
+
+
+class GraphObserver(Protocol):
+    """The eyes of a supervisor, see lifecycle.graph.Observer."""
+
+    async def observe(self, plan: Plan) -> Observation:
+        """Return what the graph holds now, with the configurations put here and read there."""
+
+    @property
+    def changes(self) -> int:
+        """Changes of the graph so far, each counted as soon as it is noticed."""
+
+    async def wait_change(self) -> None:
+        """Wait until the graph may have changed since the last `observe`."""
+
+    def put_configuration(self, configuration: NodeConfiguration) -> None:
+        """Give what a node reported over its control channel."""
+
+
+class NodeRun:
+    """One node of the plan as it runs.
+
+    Attributes:
+        driver: None for a node that is not managed.
+        process: None for a node that somebody else starts.
+        reach: how far it has come.
+        doing: what it does or waits for at this moment, for messages; empty when nothing.
+        undo: what has to be undone, oldest first.
+        stuck: an operation on it was given up: a polite request would wait behind it.
+        connections: names of what the authority connected it to, oldest first.
+        tells: its host tells unasked when its configuration changes.
+    """
+
+    def __init__(self, planned: PlannedNode, emit: Emitter) -> None:
+        self.planned = planned
+        self.driver: NodeDriver | None = None
+        self.process: ManagedProcess | None = None
+        self.reach = Reach.WAITING
+        self.state = ""
+        self.connected = False
+        self.configuration: NodeConfiguration | None = None
+        self.doing = ""
+        self.undo: list[Operation] = []
+        self.stuck = False
+        self.connections: tuple[str, ...] = ()
+        self.tells = False
+        self.changed = asyncio.Event()
+        self._emit = emit
+
+    def renew(self, process: ManagedProcess | None) -> None:
+        """Begin anew, in a new process, after the node was taken down."""
+        self.driver = None
+        self.process = process
+        self.configuration = None
+        self.undo = []
+        self.stuck = False
+        self.connections = ()
+        self.tells = False
+        self.doing = ""
+        self.connected = False
+        self.state = ""
+        self.advance(Reach.WAITING)
+
+    @property
+    def name(self) -> str:
+        """Fully qualified node name."""
+        return self.planned.full_name
+
+    def has_reached(self, condition: Condition) -> bool:
+        """Whether the condition holds; for a node that is not managed all follow its start."""
+        if self.reach is Reach.STOPPED:
+            return False
+        if not self.planned.managed:
+            return self.reach is not Reach.WAITING
+        return _ORDER.index(self.reach) >= _ORDER.index(_CONDITIONS[condition])
+
+    def advance(self, reach: Reach, standing: Standing | None = None) -> None:
+        """Note that the node came to `reach`, and tell the listeners and who waits for it."""
+        self.reach = reach
+        if standing is not None:
+            self._take(standing.state, connected=standing.connected)
+            self.learn(standing.configuration)
+        self._tell()
+
+    def learn(self, configuration: NodeConfiguration | None) -> None:
+        """Take the configuration that somebody asked for; None is nothing to take.
+
+        Of a node whose host tells, every configuration has been taken in the order of its channel
+        by now (System.on_host_event): what a reply carried may be older than what was told since.
+        """
+        if configuration is not None and not self.tells:
+            self.configuration = configuration
+
+    def report(self, state: str, *, connected: bool) -> None:
+        """Note a state that the node itself told, whoever asked for it."""
+        if (state, connected) != (self.state, self.connected):
+            self._take(state, connected=connected)
+            self._tell()
+
+    async def perform(self, operation: Operation, permit: Permit | None = None) -> Standing:
+        """Send one operation to a managed node.
+
+        Raises:
+            BringUpError: the node refused, failed or cannot be reached.
+            VerificationError: what changed since the permit's verdict does not allow it.
+        """
+        assert self.driver is not None
+        if permit is not None:
+            await permit.renewed()
+        self._emit(RequestSent(node=self.name, operation=operation))
+        return await self.driver.perform(operation, permit)
+
+    def _take(self, state: str, *, connected: bool) -> None:
+        self.state, self.connected = state, connected
+        if self.configuration is not None:
+            self.configuration = dataclasses.replace(
+                self.configuration, state=state, connected=connected
+            )
+
+    def _tell(self) -> None:
+        self._emit(
+            NodeChanged(
+                node=self.name, reach=self.reach, state=self.state, connected=self.connected
+            )
+        )
+        self.changed.set()
+        self.changed = asyncio.Event()
+
+
+class System:
+    """Every node and process of one plan that this supervisor is responsible for.
+
+    Args:
+        processes: those of the plan that this supervisor is responsible for.
+        variables: set in every process, below what the plan sets.
+        logs: the directory of the processes' log files.
+
+    Attributes:
+        logs: likewise, with what could not be written there.
+        machines: those whose nodes it brings up; None if that is all of them.
+        remote: the plan's other nodes, which another supervisor brings up.
+        touched: set whenever a node told something of itself: time to judge again.
+        liveliness: which nodes are silent.
+        present: names of the nodes that are in the graph; None before it was first looked at.
+        first: the plan as the run began with it.
+        server: the discovery server, where this supervisor runs one.
+        expected: the plan as it must be seen now; where the data layer is negotiated while the
+            system runs, it follows.
+    """
+
+    def __init__(
+        self,
+        plan: Plan,
+        *,
+        emit: Emitter,
+        logs: Path,
+        processes: Iterable[PlannedProcess],
+        variables: tuple[tuple[str, str], ...] = (),
+    ) -> None:
+        self.first = plan
+        self.plan = plan
+        self.expected = plan
+        self.server: ManagedProcess | None = None
+        self.emit = emit
+        own = tuple(processes)
+        self.logs = LogDirectory(logs, lambda text: emit(Notice(message=text)))
+        self._process = functools.partial(
+            ManagedProcess, logs=self.logs, emit=emit, variables=variables
+        )
+        self.processes = {
+            each.name: self._process(each) for each in own if each.run.kind is not RunKind.ATTACH
+        }
+        self.nodes = {
+            key: NodeRun(plan.node(key), emit) for process in own for key in process.nodes
+        }
+        for process in self.processes.values():
+            for key in process.planned.nodes:
+                self.nodes[key].process = process
+        self.remote = {
+            node.key: RemoteNode(node) for node in plan.nodes if node.key not in self.nodes
+        }
+        self.machines = frozenset(each.machine for each in own) if self.remote else None
+        self._by_name = {node.name: node for node in self.nodes.values()}
+        self.touched = asyncio.Event()
+        self.present: frozenset[str] | None = None
+        self.liveliness = Liveliness(emit, self.touched.set, self._is_there)
+
+    def _is_there(self, name: str) -> bool:
+        """Whether a node has started, and is in the graph as far as that is known."""
+        node = self._by_name.get(name)
+        if node is not None and node.reach in (Reach.WAITING, Reach.STOPPED):
+            return False
+        return self.present is None or name in self.present
+
+    def node_named(self, name: str) -> NodeRun | None:
+        """Return the node with this fully qualified name."""
+        return self._by_name.get(name)
+
+    def replan(self, plan: Plan) -> None:
+        """Take a plan whose participants are connected otherwise; running nodes do not notice."""
+        self.plan = self.expected = plan
+        for key, node in self.nodes.items():
+            node.planned = plan.node(key)
+
+    def reload(
+        self, plan: Plan, processes: Iterable[PlannedProcess], nodes: Collection[NodeRun]
+    ) -> tuple[NodeRun, ...]:
+        """Take another manifest's plan; only nodes that were taken down may differ in it.
+
+        Args:
+            plan: of which all nodes are this supervisor's.
+            processes: of that plan.
+            nodes: those that were taken down, with all of their processes.
+
+        Returns:
+            The nodes to bring up in their place.
+        """
+        self.first = self.plan = self.expected = plan
+        down = {each.planned.key: each for each in nodes}
+        stay = {key: each for key, each in self.nodes.items() if key not in down}
+        kept = {each.process.name: each.process for each in stay.values() if each.process}
+        self.nodes, self.processes = {}, {}
+        for process in processes:
+            managed = kept.get(process.name)
+            if managed is None and process.run.kind is not RunKind.ATTACH:
+                managed = self._process(process)
+            if managed is not None:
+                self.processes[process.name] = managed
+            for key in process.nodes:
+                if key in stay:
+                    self.nodes[key] = stay[key]
+                    stay[key].planned = plan.node(key)
+                    continue
+                node = self.nodes[key] = NodeRun(plan.node(key), self.emit)
+                node.process = managed
+                node.advance(Reach.WAITING)
+        self._by_name = {node.name: node for node in self.nodes.values()}
+        return tuple(each for key, each in self.nodes.items() if key not in stay)
+
+    def renew(self, nodes: Iterable[NodeRun]) -> None:
+        """Let nodes that were taken down, with all of their processes, be brought up again."""
+        processes: dict[str, ManagedProcess] = {}
+        for node in nodes:
+            old = node.process
+            if old is not None and old.name not in processes:
+                processes[old.name] = self._process(old.planned)
+            node.renew(None if old is None else processes[old.name])
+        self.processes.update(processes)
+
+    def make_process(self, planned: PlannedProcess) -> ManagedProcess:
+        """Return a process of this run that no node lives in, not yet started."""
+        return self._process(planned)
+
+    @property
+    def living(self) -> tuple[ManagedProcess, ...]:
+        """Every process that was started and has not ended, the discovery server included."""
+        every = (*self.processes.values(), *(() if self.server is None else (self.server,)))
+        return tuple(each for each in every if each.pid and each.state is not ProcessState.EXITED)
+
+    def dead(self) -> frozenset[str]:
+        """Return the names of the nodes whose process has ended.
+
+        Discovery shows them until their lease runs out, 20 s by default.
+        """
+        return frozenset(
+            node.name
+            for node in self.nodes.values()
+            if node.process is not None and node.process.state is ProcessState.EXITED
+        )
+
+    def on_host_event(self, event: HostEvent) -> None:
+        """Take a host's word on one of its nodes, in the order in which it comes.
+
+        Of a reply this is the configuration; the rest is for who asked.
+        """
+        node = self._by_name.get(event.node)
+        if node is None:
+            return
+        if event.configuration is not None:
+            node.configuration = event.configuration
+            node.tells = node.tells or event.kind == "configuration"
+        if event.kind == "reply":
+            return
+        if event.state:
+            node.report(event.state, connected=event.connected)
+        self.touched.set()
+
+    async def reached(self, node: NodeRun, condition: Condition, step: str) -> None:
+        """Wait until everything that holds `step` of `node` has come to `condition`.
+
+        The wait has no deadline of its own: the nodes waited for have theirs, and so has the
+        whole bring-up.
+        """
+        for after in node.planned.after:
+            if after.condition is not condition:
+                continue
+            other = self.nodes.get(after.node) or self.remote[after.node]
+            while not other.has_reached(condition):
+                node.doing = f"waits to {step} until {other.name} is {condition.value}"
+                await other.changed.wait()
+        node.doing = ""
+
+    def awaited(self) -> tuple[RemoteNode, ...]:
+        """Return the nodes of others that ours wait for."""
+        keys = {after.node for node in self.nodes.values() for after in node.planned.after}
+        return tuple(node for key, node in self.remote.items() if key in keys)
+
+    def dependents(self, key: str) -> tuple[NodeRun, ...]:
+        """Return the nodes that stand on `key`: those that are taken down before it."""
+        return tuple(
+            node
+            for node in self.nodes.values()
+            if any(after.node == key for after in node.planned.after)
+        )
+
+    async def refresh(self, observer: GraphObserver) -> None:
+        """Read the configuration of every reachable node and hand it to the observer.
+
+        One whose host tells of every change by itself is not asked. A node that does not answer
+        keeps its last one: that it is gone is for the graph and its process to say.
+        """
+        nodes = [
+            node
+            for node in self.nodes.values()
+            if node.driver is not None
+            and node.reach in (Reach.CONFIGURED, Reach.CONNECTED, Reach.ACTIVE)
+            and not node.stuck
+            and node.name not in self.liveliness.silent
+        ]
+        await asyncio.gather(*(self._refresh(node) for node in nodes if not node.tells))
+        for node in nodes:
+            if node.configuration is not None:
+                observer.put_configuration(node.configuration)
+
+    @staticmethod
+    async def _refresh(node: NodeRun) -> None:
+        assert node.driver is not None
+        try:
+            fresh = await asyncio.wait_for(node.driver.configuration(), _REFRESH_S)
+        except (BringUpError, asyncio.TimeoutError):
+            return
+        node.learn(fresh)

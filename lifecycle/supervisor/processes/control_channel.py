@@ -1,0 +1,226 @@
+"""The control channel to one host process, seen from the supervisor.
+
+Owns: requests and their replies, "ready"/"failed", and the place where an activate request leaves:
+it demands a permit. Protocol: lifecycle/node/host/control.py. Must not import rclpy.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+from collections.abc import Callable
+
+from lifecycle.codec import from_json, to_json
+from lifecycle.errors import BringUpError
+from lifecycle.middleware.process.busy_timer import BusySign, Overdue
+from lifecycle.node.host.control import Command, Event, HostSpec, Operation
+from lifecycle.plan.model import ParticipantConnections
+from lifecycle.supervisor.gate.gate import Permit
+
+_LONGEST_LINE = 1 << 24
+"""Bytes; a node configuration with thousands of endpoints is one line."""
+
+_CLOSE_S = 0.5
+"""For a host to read what it was sent before."""
+
+_UNASKED = frozenset({"state", "configuration"})
+"""Events by which a host tells of a node without having been asked."""
+
+
+class ChannelClosedError(BringUpError):
+    """The host closed its end: it is ending or has died."""
+
+
+class HostFailedError(BringUpError):
+    """The host cannot construct a node, and ends.
+
+    Attributes:
+        node: fully qualified name; empty if it could not host any.
+    """
+
+    def __init__(self, node: str, message: str) -> None:
+        super().__init__(message)
+        self.node = node
+
+
+class ControlChannel:
+    """Talks to one host process over a socket whose other end the host inherits.
+
+    Args:
+        spec: what it hosts.
+        on_state: told what it says of its nodes unasked, and of each reply with a configuration.
+        on_hang: called with why its executor is busy for too long, with None when it came back.
+
+    Attributes:
+        failures: what kept its nodes from being constructed, each cause once, the first one first.
+    """
+
+    def __init__(
+        self,
+        spec: HostSpec,
+        on_state: Callable[[Event], None],
+        on_hang: Callable[[Overdue | None], None] = lambda _: None,
+    ) -> None:
+        self._spec = spec
+        self._on_state = on_state
+        self._on_hang = on_hang
+        self._sign: BusySign | None = None
+        self.failures: list[HostFailedError] = []
+        self._next = 0
+        self._replies: dict[int, asyncio.Future[Event]] = {}
+        self._ready: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        # The host may end before anybody waits for "ready".
+        self._ready.add_done_callback(lambda done: done.cancelled() or done.exception())
+        self._writer: asyncio.StreamWriter | None = None
+        self._task: asyncio.Task[None] | None = None
+
+    @property
+    def silent_s(self) -> float:
+        """Its executor may be busy for so long at a time: its nodes share it."""
+        return max(node.timeouts.silent_s for node in self._spec.nodes)
+
+    async def open(self) -> socket.socket:
+        """Make the pair, send the host its spec, and return the end that the host inherits.
+
+        The caller closes the returned socket once the host was started.
+        """
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
+        ours.setblocking(False)
+        line = to_json(self._spec) + b"\n"
+        self._sign = BusySign.make(self.silent_s)
+        socket.send_fds(ours, [line[:1]], self._sign.descriptors)
+        asyncio.get_running_loop().add_reader(self._sign, self._look)
+        reader, self._writer = await asyncio.open_connection(sock=ours, limit=_LONGEST_LINE)
+        self._writer.write(line[1:])
+        self._task = asyncio.get_running_loop().create_task(self._read(reader))
+        return theirs
+
+    async def ready(self) -> None:
+        """Wait until every node of the process is constructed and its executor spins.
+
+        Raises:
+            HostFailedError: construction failed; with the host's reason.
+            ChannelClosedError: the host ended without a word.
+        """
+        await asyncio.shield(self._ready)
+
+    async def request(
+        self,
+        node: str,
+        operation: Operation,
+        permit: Permit | None = None,
+        *,
+        connection: str = "",
+        connections: ParticipantConnections = ParticipantConnections(),
+        endpoint: str = "",
+    ) -> Event:
+        """Ask one node for one operation and wait for its reply.
+
+        Args:
+            node: fully qualified name.
+            operation: what to do.
+            permit: needed for ACTIVATE, and for nothing else.
+            connection: of the node interface's operations, see Command.
+            connections: likewise.
+            endpoint: likewise.
+
+        Raises:
+            ChannelClosedError: the host ended before it replied.
+            BringUpError: an activate request without a permit that holds.
+            VerificationError: what changed since the permit's verdict does not allow it.
+        """
+        if operation is Operation.ACTIVATE:
+            if permit is None:
+                raise BringUpError(f"cannot activate {node!r} without a permit from the gate")
+            await permit.use(node)
+        if self._writer is None or self._task is None or self._task.done():
+            raise ChannelClosedError(
+                f"cannot reach {node!r}: its process closed the control channel"
+            )
+        self._next += 1
+        command = Command(
+            id=self._next,
+            node=node,
+            operation=operation,
+            connection=connection,
+            connections=connections,
+            endpoint=endpoint,
+        )
+        reply: asyncio.Future[Event] = asyncio.get_running_loop().create_future()
+        self._replies[command.id] = reply
+        self._writer.write(to_json(command) + b"\n")
+        try:
+            return await reply
+        finally:
+            self._replies.pop(command.id, None)
+
+    async def _read(self, reader: asyncio.StreamReader) -> None:
+        reason = "its process closed the control channel"
+        try:
+            while line := await reader.readline():
+                self._dispatch(from_json(line, Event))
+        except ConnectionError:
+            pass
+        except ValueError as error:
+            reason = f"its process sent what is not an event: {error}"
+        finally:
+            # A process that was killed while it was busy would be said to hang.
+            self._watch_no_more()
+            self._fail(ChannelClosedError(f"cannot reach process {self._spec.process!r}: {reason}"))
+
+    def _dispatch(self, event: Event) -> None:
+        if event.kind == "reply":
+            if event.configuration is not None:
+                # Now, in its turn: who awaits the reply goes on after what comes next.
+                self._on_state(event)
+            reply = self._replies.get(event.id)
+            if reply is not None and not reply.done():
+                reply.set_result(event)
+        elif event.kind == "ready":
+            if not self._ready.done():
+                self._ready.set_result(None)
+        elif event.kind == "failed":
+            failure = HostFailedError(event.node, event.error)
+            self.failures.append(failure)
+            if not self._ready.done():
+                self._ready.set_exception(failure)
+        elif event.kind == "beat":
+            self._on_hang(None)
+        elif event.kind in _UNASKED:
+            self._on_state(event)
+
+    def _look(self) -> None:
+        """The busy sign's timer fired."""
+        if self._sign is not None and (why := self._sign.overdue()):
+            self._on_hang(why)
+
+    def _watch_no_more(self) -> None:
+        if self._sign is not None:
+            asyncio.get_running_loop().remove_reader(self._sign)
+            self._sign.close()
+            self._sign = None
+
+    def _fail(self, error: ChannelClosedError) -> None:
+        if not self._ready.done():
+            self._ready.set_exception(error)
+        for reply in self._replies.values():
+            if not reply.done():
+                reply.set_exception(error)
+
+    async def close(self) -> None:
+        """Close our end, which makes the host shut down."""
+        self._watch_no_more()
+        if self._writer is not None:
+            writer, self._writer = self._writer, None
+            writer.close()
+            closed = asyncio.ensure_future(writer.wait_closed())
+            await asyncio.wait({closed}, timeout=_CLOSE_S)
+            writer.transport.abort()
+            # A host that was stopped, and has not read all it was sent, is ended by signals.
+            await asyncio.gather(closed, return_exceptions=True)
+        if self._task is not None:
+            self._task.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await self._task
+            self._task = None

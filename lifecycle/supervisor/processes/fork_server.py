@@ -1,0 +1,394 @@
+"""The supervisor's side of a zygote, the fork server: a `Spawner` over a socket.
+
+Owns: starting `zygote_main`, also anew when it was killed, and following its children by pidfd, so
+that an end is noticed at once. Children of a zygote that died become this process's own, which then
+learns by itself how they end and whether they are stopped. Must not import rclpy.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+
+from lifecycle.codec import from_json, to_json
+from lifecycle.errors import BringUpError
+from lifecycle.graph.waiting import set_within
+from lifecycle.supervisor.processes.fork_server_protocol import (
+    LARGEST_MESSAGE,
+    MSG_CMSG_CLOEXEC,
+    SERVES,
+    ForkRequest,
+    Report,
+)
+from lifecycle.supervisor.processes.orphans import children, descendants
+from lifecycle.supervisor.processes.spawn import SpawnRequest
+from lifecycle.supervisor.processes.states import ProcessExit
+from lifecycle.supervisor.run.events import Emitter, Notice
+
+_STATUS_WAIT_S = 1.0
+"""The zygote reaps within microseconds; after this long its report does not come any more."""
+
+_READY_S = 10.0
+"""A zygote serves after 0.2 s; a loaded machine takes longer."""
+
+_SOON_S = 2.0
+"""One that dies sooner after its start is started again only when it is needed."""
+
+_TRIES = 3
+
+_CLOSE_S = 1.0
+"""A zygote whose children have ended ends within milliseconds of its socket."""
+
+_STOPS = os.WSTOPPED | os.WCONTINUED | os.WNOHANG
+
+_MAIN = "lifecycle.supervisor.processes.fork_server_main"
+_HOST = "lifecycle.node.host.host"
+
+_FRESH_INTERPRETER = ("PYTHON", "LD_", "RMW_IMPLEMENTATION", "VIRTUAL_ENV")
+"""Variables that act while an interpreter starts; a fork of a running one would ignore them."""
+
+
+class ZygoteProcess:
+    """The operating system process of a zygote; can be started before there is an event loop.
+
+    Args:
+        preload: import rclpy and the message packages, to fork Python nodes.
+        environment: complete environment of the zygote, which its children inherit.
+    """
+
+    def __init__(
+        self, *, preload: bool, environment: Mapping[str, str], again: bool = False
+    ) -> None:
+        self._preload = preload
+        self._environment = dict(environment)
+        self.socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        argv = [sys.executable, "-m", _MAIN, str(theirs.fileno())]
+        argv += ["--preload"] * preload + ["--again"] * again
+        try:
+            self.popen = subprocess.Popen(
+                argv,
+                stdin=subprocess.DEVNULL,
+                env=self._environment,
+                pass_fds=[theirs.fileno()],
+                start_new_session=True,
+            )
+        except OSError as error:
+            self.socket.close()
+            raise BringUpError(f"cannot start the fork server: {error.strerror}") from error
+        finally:
+            theirs.close()
+
+    def again(self) -> ZygoteProcess:
+        """Start another one in the place of this one, which has died.
+
+        Raises:
+            BringUpError: it cannot be started.
+        """
+        return ZygoteProcess(preload=self._preload, environment=self._environment, again=True)
+
+    def close(self, grace_s: float = _CLOSE_S) -> None:
+        """End the zygote; it ends by itself when its socket closes and no child is left."""
+        self.socket.close()
+        try:
+            self.popen.wait(grace_s)
+        except subprocess.TimeoutExpired:
+            self.popen.kill()
+            self.popen.wait()
+
+
+class ZygoteChild:
+    """A process forked by the zygote.
+
+    Args:
+        on_stop: see SpawnRequest.
+    """
+
+    def __init__(self, pid: int, pidfd: int, on_stop: Callable[[bool], None]) -> None:
+        self.pid = pid
+        self.exited: asyncio.Future[ProcessExit] = asyncio.get_running_loop().create_future()
+        self.on_stop = on_stop
+        self._pidfd: int | None = pidfd
+        self._has_ended = False
+        self._is_ours = False
+        self._loop = asyncio.get_running_loop()
+        self._loop.add_reader(pidfd, self._ended)
+
+    def signal(self, number: int) -> None:
+        """Send a signal to the child's group; harmless once it ended."""
+        if self._pidfd is None:
+            return
+        try:
+            os.killpg(self.pid, number)
+        except ProcessLookupError:
+            # It has not reached setsid yet, or only its pidfd still stands for it.
+            with contextlib.suppress(ProcessLookupError):
+                signal.pidfd_send_signal(self._pidfd, number)
+
+    def _ended(self) -> None:
+        """The pidfd is readable: it ended. The zygote tells how, unless it is gone itself."""
+        assert self._pidfd is not None
+        self._loop.remove_reader(self._pidfd)
+        self._has_ended = True
+        if self._is_ours:
+            self.settle(None)
+        else:
+            self._loop.call_later(_STATUS_WAIT_S, self.settle, None)
+
+    def adopt(self) -> None:
+        """Take it as our own child: the zygote has died, and we are the subreaper."""
+        self._is_ours = True
+        if self._has_ended:
+            self.settle(None)
+        self.note_stops()
+
+    def note_stops(self) -> None:
+        """Tell that it was stopped or continues, where we are its parent."""
+        if not self._is_ours:
+            return
+        with contextlib.suppress(ChildProcessError):
+            while (
+                self._pidfd is not None
+                and (found := os.waitid(os.P_PIDFD, self._pidfd, _STOPS)) is not None
+            ):
+                self.on_stop(found.si_code != os.CLD_CONTINUED)
+
+    def settle(self, raw: int | None) -> None:
+        """Take the status word, or find it ourselves."""
+        if self.exited.done():
+            return
+        assert self._pidfd is not None
+        self._loop.remove_reader(self._pidfd)
+        exit_ = ProcessExit() if raw is None else ProcessExit.from_wait(raw)
+        if raw is None:
+            with contextlib.suppress(ChildProcessError):
+                found = os.waitid(os.P_PIDFD, self._pidfd, os.WEXITED | os.WNOHANG)
+                if found is not None and found.si_code == os.CLD_EXITED:
+                    exit_ = ProcessExit(status=found.si_status)
+                elif found is not None:
+                    exit_ = ProcessExit(signal=found.si_status)
+        os.close(self._pidfd)
+        self._pidfd = None
+        self.exited.set_result(exit_)
+
+
+class Zygote:
+    """A `Spawner` that asks a zygote process to fork, and starts another one if that is killed.
+
+    Args:
+        process: the first one.
+        emit: is told if one dies.
+    """
+
+    def __init__(self, process: ZygoteProcess, emit: Emitter | None = None) -> None:
+        self._emit = emit or Emitter()
+        self._pending: dict[int, tuple[asyncio.Future[ZygoteChild], SpawnRequest]] = {}
+        self._children: dict[int, ZygoteChild] = {}
+        self._next = 0
+        self._loop = asyncio.get_running_loop()
+        # Of a shell that became this process by exec: no part of the run.
+        self._foreign = children()
+        self._has_died = False
+        self._closed = False
+        self._begin(process)
+
+    @property
+    def pid(self) -> int:
+        """Process id of the zygote itself."""
+        return self._process.popen.pid
+
+    @property
+    def waited_for(self) -> tuple[int, ...]:
+        """Processes whose ends are learned here: nobody else may bury them."""
+        return (self.pid, *(each.pid for each in self._children.values()))
+
+    def family(self) -> frozenset[int]:
+        """Return the pids of all that descends from what was started, without the zygote itself."""
+        roots = {self.pid}
+        if self._has_died:
+            # What it had adopted, and what it had started, is ours now.
+            roots |= children() - self._foreign
+        return frozenset(roots.union(*map(descendants, roots)) - {self.pid})
+
+    async def ready(self) -> None:
+        """Have the zygote answer, bounded; if it has died, another one.
+
+        Raises:
+            BringUpError: it does not, or cannot be started.
+        """
+        deadline = self._loop.time() + _READY_S
+        for _ in range(_TRIES):
+            if not self._alive and not self._closed:
+                self._begin(self._process.again())
+            process, gone = self._process, self._gone
+            self._serves.clear()
+            try:
+                process.socket.send(to_json(SERVES))
+            except ConnectionError:
+                await set_within(gone, deadline - self._loop.time())
+                continue
+            except OSError as error:
+                raise BringUpError(f"cannot ask the fork server: {error.strerror}") from error
+            if not await set_within(self._serves, deadline - self._loop.time()):
+                raise BringUpError(f"the fork server does not answer within {_READY_S:g} s")
+            if self._alive and process is self._process:
+                return
+        raise BringUpError(f"the fork server {self._how}")
+
+    async def spawn(self, request: SpawnRequest) -> ZygoteChild:
+        """Fork one process.
+
+        Raises:
+            BringUpError: the zygote is gone, or the system is out of processes.
+        """
+        try:
+            if not self._alive:
+                await self.ready()
+            try:
+                return await self._forked(request)
+            except ConnectionError:  # it is dying: nothing was forked
+                await self.ready()
+                return await self._forked(request)
+        except (BringUpError, OSError) as error:
+            message = error.message if isinstance(error, BringUpError) else str(error)
+            raise BringUpError(f"cannot start process {request.name!r}: {message}") from error
+
+    async def _forked(self, request: SpawnRequest) -> ZygoteChild:
+        """Have the zygote fork; raises OSError if it cannot be asked, BringUpError otherwise."""
+        self._next += 1
+        descriptors = [request.stdout, request.stderr]
+        argv = request.argv
+        if request.control is not None:
+            descriptors.append(request.control)
+            if any(name.startswith(_FRESH_INTERPRETER) for name, _ in request.environment):
+                argv = (sys.executable, "-m", _HOST, "--control-fd", "{control}")
+        message = ForkRequest(
+            id=self._next,
+            argv=argv,
+            environment=request.environment,
+            working_directory=request.working_directory,
+            control=request.control is not None,
+        )
+        born: asyncio.Future[ZygoteChild] = self._loop.create_future()
+        self._pending[message.id] = born, request
+        try:
+            socket.send_fds(self._process.socket, [to_json(message)], descriptors)
+        except OSError:
+            del self._pending[message.id]
+            raise
+        return await born
+
+    def _begin(self, process: ZygoteProcess) -> None:
+        self._process = process
+        self._alive = True
+        self._how = ""
+        self._serves = asyncio.Event()
+        self._gone = asyncio.Event()
+        self._began_s = self._loop.time()
+        self._pidfd = os.pidfd_open(process.popen.pid)
+        process.socket.setblocking(False)
+        self._loop.add_reader(process.socket, self._reports)
+        self._loop.add_reader(self._pidfd, self._ended)
+
+    def _reports(self) -> None:
+        """Take one report; at end of file it is about to end."""
+        if self._report() is False:
+            self._loop.remove_reader(self._process.socket)
+
+    def _report(self) -> bool | None:
+        """Take one report: True; False at end of file, None if there is nothing more now."""
+        try:
+            data, descriptors, _, _ = socket.recv_fds(
+                self._process.socket, LARGEST_MESSAGE, 1, MSG_CMSG_CLOEXEC
+            )
+        except BlockingIOError:
+            return None
+        except ConnectionError:
+            return True  # it died with requests unread; what it had sent before still comes
+        if not data:
+            return False
+        report = from_json(data, Report)
+        if report.id == SERVES.id:
+            self._serves.set()
+        elif report.stopped is not None:
+            self._children[report.id].on_stop(report.stopped)
+        elif report.status is not None:
+            self._children.pop(report.id).settle(report.status)
+        else:
+            self._born(report, descriptors)
+        return True
+
+    def _born(self, report: Report, descriptors: list[int]) -> None:
+        born, request = self._pending.pop(report.id)
+        if report.error:
+            if not born.done():
+                born.set_exception(BringUpError(report.error))
+            return
+        child = ZygoteChild(report.pid, descriptors[0], request.on_stop)
+        self._children[report.id] = child
+        child.exited.add_done_callback(lambda _: self._children.pop(report.id, None))
+        if born.cancelled():
+            # Whoever asked has given up; a process that nobody knows of must not live.
+            child.signal(signal.SIGKILL)
+        else:
+            born.set_result(child)
+
+    def _ended(self) -> None:
+        """The zygote itself has ended: by now its children are ours."""
+        self._loop.remove_reader(self._pidfd)
+        os.close(self._pidfd)
+        status = self._process.popen.wait()
+        self._gone.set()
+        if self._closed:
+            return
+        while self._report():
+            pass
+        self._loop.remove_reader(self._process.socket)
+        self._process.socket.close()
+        self._alive = False
+        self._has_died = True
+        exit_ = ProcessExit(status=status) if status >= 0 else ProcessExit(signal=-status)
+        self._how = f"ended unasked ({exit_})"
+        for child in tuple(self._children.values()):
+            child.adopt()
+        for born, _ in self._pending.values():
+            if not born.done():
+                born.set_exception(BringUpError(f"the fork server {self._how}"))
+        self._pending.clear()
+        self._renew()
+
+    def _renew(self) -> None:
+        """Start another one, and say so."""
+        lost, waits = f"the fork server (pid {self.pid}) {self._how}", self._serves
+        what = "another one is started when it is needed"
+        if self._loop.time() - self._began_s > _SOON_S:
+            try:
+                self._begin(self._process.again())
+                what = f"another one (pid {self.pid}) is started"
+            except BringUpError as error:
+                what = error.message
+        waits.set()
+        self._emit(Notice(message=f"{lost}; what it started runs on, and {what}"))
+
+    def note_stops(self) -> None:
+        """Take SIGCHLD: children that a zygote left to us may have been stopped, or continue."""
+        for child in tuple(self._children.values()):
+            child.note_stops()
+
+    async def close(self) -> None:
+        """End the zygote; its children must have ended."""
+        self._closed = True
+        if not self._alive:
+            return
+        self._alive = False
+        self._how = "is ended"
+        self._loop.remove_reader(self._process.socket)
+        self._process.socket.close()
+        if not await set_within(self._gone, _CLOSE_S):
+            self._process.popen.kill()
+            await self._gone.wait()

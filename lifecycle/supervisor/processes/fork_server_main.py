@@ -1,0 +1,268 @@
+"""The zygote's own process: forks the processes of a system, and guards them.
+
+Owns: what runs in `python -m lifecycle.supervisor.processes.fork_server_main SOCKET_FD [--preload]
+[--again]`. It stays
+single-threaded and never calls rclpy.init, so that forking is safe and every child is a
+participant of its own; with `--preload` a forked host skips ~130 ms of imports. Each child leads a
+session of its own. It adopts what its children leave behind (PR_SET_CHILD_SUBREAPER), so as long as
+it lives, what descends from it is what the run started. If the supervisor vanishes the zygote ends
+what is left of its children, bounded, and of those of a zygote before it that was killed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import gc
+import os
+import selectors
+import signal
+import socket
+import sys
+import time
+import traceback
+import warnings
+from typing import NoReturn
+
+from lifecycle.codec import from_json, to_json
+from lifecycle.middleware.process.control import adopt_orphans
+from lifecycle.supervisor.processes.fork_server_protocol import (
+    LARGEST_MESSAGE,
+    MSG_CMSG_CLOEXEC,
+    SERVES,
+    ForkRequest,
+    Report,
+)
+
+GRACE_S = 4.0
+"""How long orphans get to end by themselves once the supervisor is gone."""
+
+_CHILD_SIGNAL = -1
+_ENDED = os.WEXITED | os.WNOWAIT | os.WNOHANG
+_STOPS = os.WSTOPPED | os.WCONTINUED | os.WNOHANG
+_PIPE_BYTES = 65536
+
+
+class _Zygote:
+    def __init__(self, sock: socket.socket, *, again: bool) -> None:
+        self._sock = sock
+        self._again = again
+        self._selector = selectors.DefaultSelector()
+        self._selector.register(sock, selectors.EVENT_READ, None)
+        self._children: dict[int, tuple[int, int]] = {}  # pid → (request id, pidfd)
+        # A parent is told by SIGCHLD that a child was stopped; nothing else tells of that.
+        self._signals = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
+        signal.signal(signal.SIGCHLD, _arrived)
+        signal.set_wakeup_fd(self._signals[1], warn_on_full_buffer=False)
+        self._selector.register(self._signals[0], selectors.EVENT_READ, _CHILD_SIGNAL)
+
+    def serve(self) -> None:
+        """Fork on request and report ends until the supervisor closes its side."""
+        while True:
+            for key, _ in self._selector.select():
+                if key.data == _CHILD_SIGNAL:
+                    self._note_stops()
+                    self._bury_adopted()
+                elif key.data is not None:
+                    self._reap(key.data)
+                elif not self._request():
+                    self._guard()
+                    return
+
+    def _request(self) -> bool:
+        """Serve one request; False at end of file."""
+        try:
+            data, descriptors, _, _ = socket.recv_fds(
+                self._sock, LARGEST_MESSAGE, 3, MSG_CMSG_CLOEXEC
+            )
+        except ConnectionError:
+            return False
+        if not data:
+            return False
+        request = from_json(data, ForkRequest)
+        if request == SERVES:
+            self._tell(Report(id=request.id))
+            return True
+        try:
+            with warnings.catch_warnings():
+                # Python 3.12 warns of any other thread. Those here belong to the libraries that
+                # were preloaded (numpy's among them), are idle, and hold no lock of Python's.
+                warnings.simplefilter("ignore", DeprecationWarning)
+                pid = os.fork()
+        except OSError as error:
+            pid = -1
+            self._tell(Report(id=request.id, error=str(error)))
+        if pid == 0:
+            self._become(request, descriptors)
+        for descriptor in descriptors:
+            os.close(descriptor)
+        if pid > 0:
+            self._born(request.id, pid)
+        return True
+
+    def _born(self, request: int, pid: int) -> None:
+        pidfd = os.pidfd_open(pid)
+        self._children[pid] = (request, pidfd)
+        self._selector.register(pidfd, selectors.EVENT_READ, pid)
+        self._tell(Report(id=request, pid=pid), pidfd)
+
+    def _reap(self, pid: int) -> None:
+        if pid not in self._children:
+            return  # on the way to an adopted one
+        request, pidfd = self._children.pop(pid)
+        self._selector.unregister(pidfd)
+        os.close(pidfd)
+        _, status = os.waitpid(pid, 0)
+        self._tell(Report(id=request, pid=pid, status=status))
+
+    def _note_stops(self) -> None:
+        """Tell which children were stopped or continue."""
+        with contextlib.suppress(BlockingIOError):
+            os.read(self._signals[0], _PIPE_BYTES)
+        with contextlib.suppress(ChildProcessError):
+            while (found := os.waitid(os.P_ALL, 0, _STOPS)) is not None:
+                if found.si_pid in self._children:
+                    request, _ = self._children[found.si_pid]
+                    stopped = found.si_code != os.CLD_CONTINUED
+                    self._tell(Report(id=request, pid=found.si_pid, stopped=stopped))
+
+    def _bury_adopted(self) -> None:
+        """Reap orphans that have ended, and children where one of them is in between."""
+        with contextlib.suppress(ChildProcessError):
+            while (found := os.waitid(os.P_ALL, 0, _ENDED)) is not None:
+                if found.si_pid in self._children:
+                    self._reap(found.si_pid)
+                else:
+                    os.waitpid(found.si_pid, 0)
+
+    def _tell(self, report: Report, *descriptors: int) -> None:
+        # A supervisor that is gone is noticed by the next read.
+        with contextlib.suppress(ConnectionError):
+            socket.send_fds(self._sock, [to_json(report)], descriptors)
+
+    def _guard(self) -> None:
+        """End what is left: hosts end by themselves at end of file, commands are asked to."""
+        self._signal(signal.SIGINT)
+        deadline = time.monotonic() + GRACE_S
+        self._selector.unregister(self._sock)
+        self._selector.unregister(self._signals[0])
+        while self._children and (left := deadline - time.monotonic()) > 0:
+            for key, _ in self._selector.select(left):
+                self._reap(key.data)
+        self._signal(signal.SIGKILL)
+        for pid in tuple(self._children):
+            self._reap(pid)
+        if self._again:
+            from lifecycle.rundir import RUN_VARIABLE
+            from lifecycle.supervisor.processes.orphans import end_strays
+
+            end_strays(os.environ.get(RUN_VARIABLE, ""))
+
+    def _signal(self, number: int) -> None:
+        for pid in self._children:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(pid, number)
+
+    def _become(self, request: ForkRequest, descriptors: list[int]) -> NoReturn:
+        """Turn this fork into the requested process; never returns to the zygote's code."""
+        code = 70
+        try:
+            os.setsid()
+            signal.set_wakeup_fd(-1)
+            signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+            for descriptor in self._signals:
+                os.close(descriptor)
+            self._selector.close()
+            self._sock.close()
+            for _, pidfd in self._children.values():
+                os.close(pidfd)
+            # A host takes them itself, once there is something to shut down; until then it ends
+            # at once, and without a KeyboardInterrupt in the middle of somebody's import.
+            signal.signal(signal.SIGINT, signal.SIG_DFL)
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+            _take_streams(descriptors[0], descriptors[1])
+            os.environ.update(dict(request.environment))
+            if request.working_directory:
+                os.chdir(request.working_directory)
+            control = descriptors[2] if request.control else None
+            code = _run(request.argv, control)
+        except SystemExit as error:
+            code = error.code if isinstance(error.code, int) else 1
+        except BaseException:  # noqa: BLE001 - a fork must end here, whatever happens
+            traceback.print_exc()
+        finally:
+            with contextlib.suppress(Exception):
+                sys.stdout.flush()
+                sys.stderr.flush()
+            os._exit(code)
+
+
+def _arrived(number: int, frame: object) -> None:
+    """Replace the default, which tells nobody; the wake-up descriptor ends the select."""
+
+
+def _take_streams(stdout: int, stderr: int) -> None:
+    null = os.open(os.devnull, os.O_RDONLY)
+    for descriptor, number in ((null, 0), (stdout, 1), (stderr, 2)):
+        os.dup2(descriptor, number)
+        os.close(descriptor)
+    for stream in (sys.stdout, sys.stderr):
+        stream.reconfigure(line_buffering=True)  # type: ignore[union-attr]
+
+
+def _run(argv: tuple[str, ...], control: int | None) -> int:
+    """Serve as our host, or become another program.
+
+    A host ends by itself when its control channel does. A command has none: it outlives a zygote
+    that is killed, as hosts do, and is ended by the supervisor, the next zygote or the next `up`.
+    """
+    if not argv:
+        assert control is not None
+        from lifecycle.node.host import host
+
+        _reseed()
+        return host.serve(socket.socket(fileno=control))
+    if control is not None:
+        os.set_inheritable(control, True)
+        argv = tuple(word.replace("{control}", str(control)) for word in argv)
+    for number in (signal.SIGPIPE, signal.SIGXFSZ):  # which Python ignores, and exec would hand on
+        signal.signal(number, signal.SIG_DFL)
+    try:
+        os.execvp(argv[0], argv)  # noqa: S606 - what a spawner is for
+    except OSError as error:
+        print(f"cannot run {argv[0]!r}: {error.strerror}", file=sys.stderr)
+        return 126 if isinstance(error, PermissionError) else 127
+
+
+def _reseed() -> None:
+    """Give this fork random numbers of its own; CPython reseeds only its `random` module."""
+    numpy_random = sys.modules.get("numpy.random")
+    if numpy_random is not None:
+        numpy_random.seed()
+
+
+def main() -> int:
+    """Run the zygote."""
+    parser = argparse.ArgumentParser(prog=f"python -m {__spec__.name}")
+    parser.add_argument("socket_fd", type=int)
+    parser.add_argument("--preload", action="store_true")
+    parser.add_argument("--again", action="store_true", help="another one before it was killed")
+    options = parser.parse_args()
+    # Ctrl-C is the supervisor's to handle, and its end is what ends us.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    adopt_orphans()
+    if options.preload:
+        from lifecycle.node.host import host
+
+        host.preload()
+        # Keep the shared pages shared: a child's first collection would touch them all.
+        gc.collect()
+        gc.freeze()
+    _Zygote(socket.socket(fileno=options.socket_fd), again=options.again).serve()
+    return 0
+
+
+if __name__ == "__main__":
+    main()
+    os._exit(0)

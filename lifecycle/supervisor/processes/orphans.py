@@ -1,0 +1,188 @@
+"""Ending processes that escaped: what our children left, and what a killed supervisor left.
+
+Owns: finding them without guessing, and ending them bounded. A process belongs to a run if it
+descends from the run's zygote, which adopts all that its descendants leave behind, or if its
+environment carries the run's id. Other children of this process do not: it may have become the
+supervisor by exec of a shell with background jobs. A pid alone never proves it. Must not import
+rclpy.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import signal
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Protocol
+
+import psutil
+
+from lifecycle.middleware.process.shared_memory import segments_of
+from lifecycle.rundir import OWN_CHILD, RUN_VARIABLE, RunRecord, boot_id, start_ticks
+
+GRACE_S = 3.0
+"""Between asking an orphan to end and killing it."""
+
+KILL_S = 5.0
+"""How long the kernel may take to end a killed process, before it is reported."""
+
+_TASKS = Path("/proc/self/task")
+
+_ROUNDS = 3
+"""How often what was started while others were ended is looked for."""
+
+
+class _Orphan:
+    """A process held by its pidfd, so that no signal can reach a later owner of the pid."""
+
+    def __init__(self, pid: int, pidfd: int) -> None:
+        self.pid = pid
+        self.pidfd = pidfd
+
+    def signal(self, number: int) -> None:
+        with contextlib.suppress(ProcessLookupError):
+            signal.pidfd_send_signal(self.pidfd, number)
+
+
+class Family(Protocol):
+    """What knows the processes of a run by their descent, see zygote.Zygote."""
+
+    @property
+    def pid(self) -> int:
+        """The fork server."""
+
+    def family(self) -> frozenset[int]:
+        """Return the pids of all that was started, without the fork server itself."""
+
+
+def end_strays(run_id: str, zygote: Family | None = None, grace_s: float = 0.5) -> tuple[int, ...]:
+    """End everything that still belongs to a run, but for this process and the zygote itself.
+
+    Args:
+        run_id: of the run; empty for none.
+        zygote: what this process started them by; None if only the run's id tells.
+        grace_s: seconds between SIGTERM and SIGKILL.
+
+    Returns:
+        The pids that had to be ended.
+    """
+    ended: list[int] = []
+    spared = {os.getpid()} if zygote is None else {os.getpid(), zygote.pid}
+    # Again for what they started meanwhile.
+    for _ in range(_ROUNDS):
+        strays = set(_carrying(run_id)) if run_id else set()
+        if zygote is not None:
+            strays |= zygote.family()
+        found = _end(strays - spared, grace_s)
+        if not found:
+            break
+        ended += found
+    if zygote is not None:
+        reap_adopted((zygote.pid,))
+    return tuple(sorted(ended))
+
+
+def reap_adopted(spare: Iterable[int]) -> None:
+    """Bury ended orphans that the kernel gave us (PR_SET_CHILD_SUBREAPER).
+
+    While a program of OWN_CHILD runs they wait: for the next time, or for our own end.
+    """
+    if not OWN_CHILD.acquire(blocking=False):
+        return
+    try:
+        spared = set(spare)
+        for pid in children() - spared:
+            with contextlib.suppress(ChildProcessError):
+                os.waitpid(pid, os.WNOHANG)
+    finally:
+        OWN_CHILD.release()
+
+
+def end_run(record: RunRecord) -> tuple[tuple[int, ...], frozenset[str]]:
+    """End what is left of a run whose supervisor was killed.
+
+    Returns:
+        The pids that were ended, and the shared memory files that the run was seen to own.
+    """
+    recorded = frozenset(record.segments)
+    if record.boot_id != boot_id():
+        return (), recorded
+    pids = {child.pid for child in record.children if start_ticks(child.pid) == child.start_ticks}
+    pids |= _carrying(record.run_id)
+    for pid in tuple(pids):
+        pids.update(descendants(pid))
+    pids.discard(os.getpid())
+    # What they own now may be newer than the record.
+    owned = segments_of(pids)
+    return _end(pids, GRACE_S), recorded | owned
+
+
+def children() -> frozenset[int]:
+    """Return the pids of the children of this process, adopted ones included."""
+    try:
+        found = [each.read_text(encoding="ascii") for each in _TASKS.glob("*/children")]
+    except OSError:
+        found = []  # a thread that has just ended
+    if not found:  # or a kernel without CONFIG_PROC_CHILDREN
+        return frozenset(each.pid for each in psutil.Process().children())
+    return frozenset(int(pid) for text in found for pid in text.split())
+
+
+def descendants(pid: int) -> tuple[int, ...]:
+    """Return the pids of everything that descends from a process; nothing once it has ended."""
+    try:
+        return tuple(each.pid for each in psutil.Process(pid).children(recursive=True))
+    except psutil.NoSuchProcess:
+        return ()
+
+
+def _carrying(run_id: str) -> set[int]:
+    """Pids of every process of ours whose environment carries the run's id."""
+    mark = f"{RUN_VARIABLE}={run_id}".encode()
+    found = set()
+    for entry in Path("/proc").iterdir():
+        if not entry.name.isdigit() or int(entry.name) == os.getpid():
+            continue
+        with contextlib.suppress(OSError):
+            if mark in (entry / "environ").read_bytes().split(b"\0"):
+                found.add(int(entry.name))
+    return found
+
+
+def _end(pids: Iterable[int], grace_s: float) -> tuple[int, ...]:
+    orphans = []
+    for pid in pids:
+        with contextlib.suppress(ProcessLookupError):
+            orphans.append(_Orphan(pid, os.pidfd_open(pid)))
+    try:
+        left = _living(orphans, 0.0)
+        ended = tuple(sorted(each.pid for each in left))
+        for number, wait_s in ((signal.SIGTERM, grace_s), (signal.SIGKILL, KILL_S)):
+            for each in left:
+                each.signal(number)
+                each.signal(signal.SIGCONT)  # a stopped process ends only once it goes on
+            left = _living(left, wait_s)
+        return ended
+    finally:
+        for each in orphans:
+            os.close(each.pidfd)
+
+
+def _living(orphans: list[_Orphan], wait_s: float) -> list[_Orphan]:
+    """Wait until all have ended or the time is up; return those that have not."""
+    deadline = time.monotonic() + wait_s
+    poll = select.poll()
+    left = {each.pidfd: each for each in orphans}
+    for pidfd in left:
+        poll.register(pidfd, select.POLLIN)
+    while left:
+        ready = poll.poll(max(0.0, deadline - time.monotonic()) * 1000)
+        if not ready:
+            break
+        for pidfd, _ in ready:
+            poll.unregister(pidfd)
+            del left[pidfd]
+    return list(left.values())

@@ -1,0 +1,193 @@
+"""Judging a system that runs already, started by us or by anyone.
+
+Owns: `judge_running`: looks from outside, as one more participant, until the verdict is ok or the
+time is up. Must not import rclpy.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import dataclasses
+import os
+from collections.abc import Callable
+
+from lifecycle.errors import UsageError
+from lifecycle.manifest.model import EndpointPolicy
+from lifecycle.middleware.discovery.probe_targets import peers_environment
+from lifecycle.plan.connections.contacts import reached_hosts
+from lifecycle.plan.model import Plan
+from lifecycle.rundir import run_name, runtime_root
+from lifecycle.supervisor.connections.renegotiation import Expectation, is_negotiated
+from lifecycle.supervisor.control.client import look, running
+from lifecycle.supervisor.gate.gate import closes
+from lifecycle.supervisor.gate.grace_period import Settling
+from lifecycle.supervisor.gate.verification_loop import with_findings
+from lifecycle.supervisor.nodes.observer_participant import Eyes
+from lifecycle.supervisor.run.options import onlooker_connections, own_machines
+from lifecycle.verify import verify
+from lifecycle.verify.noise import tolerating_pattern
+from lifecycle.verify.observation import NodeConfiguration, Observation
+from lifecycle.verify.rules import Heals, rule
+from lifecycle.verify.verdict import Outcome, Stage, Verdict
+
+_ASK_AGAIN_S = 0.5
+"""Nodes are asked again so long after: their matched counts change without a graph change ..."""
+
+_ASK_AT_MOST_S = 8.0
+"""... a moment after one, so whoever only looks on asks half as often each time, down to this: that
+a node hangs or somebody was reconfigured nobody tells those who stand outside."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Seen:
+    """What was seen of a running system, and how it was judged.
+
+    Attributes:
+        plan: what it was judged against: with the connections that its nodes negotiated.
+        observation: what was there.
+        verdict: of an active system.
+        rmw: name of the RMW implementation it was looked at with.
+    """
+
+    plan: Plan
+    observation: Observation
+    verdict: Verdict
+    rmw: str = ""
+
+    @property
+    def where(self) -> str:
+        """Where it was looked if nothing at all was there, else an empty text."""
+        tools = self.plan.policy.tolerated_nodes
+        names = (each.full_name for each in self.observation.nodes)
+        somebody = any(not tolerating_pattern(each, tools) for each in names)
+        return "" if somebody else where(self.plan, self.rmw)
+
+
+def judge_running(plan: Plan, *, timeout_s: float, strict: bool) -> Seen:
+    """Judge what runs against the plan, as an active system.
+
+    Args:
+        plan: what should run.
+        timeout_s: seconds, > 0, to wait for a verdict that is ok.
+        strict: wait for what is unverifiable too.
+
+    Raises:
+        MiddlewareError: no participant can be made.
+    """
+    with _looking(plan) as eyes:
+        return asyncio.run(_judge(plan, eyes, timeout_s, strict=strict))
+
+
+async def following(plan: Plan, on_look: Callable[[Seen], None]) -> None:
+    """Look at every change and hand over what was seen and its verdict, until cancelled.
+
+    What may pass by itself is given a moment to do so, see grace_period.py.
+    """
+    settling = Settling()
+    last: Verdict | None = None
+    clock = asyncio.get_running_loop().time
+    pause_s = _ASK_AGAIN_S
+    with _looking(plan) as eyes:
+        while True:
+            seen = await _see(plan, eyes)
+            now, again_s = settling.standing(last, seen.verdict, seen.plan, clock())
+            if now != last or again_s is not None:
+                pause_s = _ASK_AGAIN_S
+            last = now
+            on_look(dataclasses.replace(seen, verdict=last))
+            if await _change(eyes, pause_s):
+                pause_s = _ASK_AGAIN_S
+            else:
+                pause_s = min(pause_s * 2, _ASK_AT_MOST_S)
+
+
+def follow_running(plan: Plan, on_verdict: Callable[[Verdict], None]) -> None:
+    """Judge what runs and report each verdict that differs from the last, until interrupted."""
+    last: Verdict | None = None
+
+    def take(seen: Seen) -> None:
+        nonlocal last
+        if seen.verdict != last:
+            last = seen.verdict
+            on_verdict(last)
+
+    asyncio.run(following(plan, take))
+
+
+def where(plan: Plan, rmw: str) -> str:
+    """Say where an empty graph was looked at: what usually differs when nodes are not found."""
+    return (
+        f"no node in the graph; looked in ROS domain {plan.domain_id} with {rmw}, "
+        f"discovery range {plan.discovery_range.value}"
+    )
+
+
+def _looking(plan: Plan) -> Eyes:
+    """Open the eyes on a plan's domain; also on guests, where they are negotiated with."""
+    os.environ["ROS_DOMAIN_ID"] = str(plan.domain_id)
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = plan.discovery_range.name
+    hosts = reached_hosts(plan, own_machines(plan, ""))
+    os.environ.update(peers_environment(hosts, os.environ))
+    is_open = plan.policy.undeclared_nodes is EndpointPolicy.OPEN
+    return Eyes.open(
+        plan.domain_id,
+        onlooker_connections(plan, _heard(plan)),
+        guests=is_open and is_negotiated(plan),
+    )
+
+
+def _heard(plan: Plan) -> tuple[NodeConfiguration, ...]:
+    """Return what the supervisors of the system on this host hear of its nodes."""
+    root = runtime_root(os.environ)
+    wanted = run_name(plan, "")
+    found: list[NodeConfiguration] = []
+    for name in running(root):
+        if name == wanted or name.startswith(f"{wanted}."):
+            # One that ends just now, or is too busy to answer, knows nothing that must be known.
+            with contextlib.suppress(UsageError, TimeoutError):
+                found += look(root / name).observation.configurations
+    return tuple(found)
+
+
+async def _see(plan: Plan, eyes: Eyes) -> Seen:
+    observation = await eyes.observe(plan)
+    expected = Expectation.of(plan, observation)
+    verdict = verify(expected.plan, observation, stage=Stage.ACTIVE)
+    return Seen(
+        plan=expected.plan,
+        observation=observation,
+        verdict=with_findings(verdict, expected.findings),
+        rmw=eyes.rmw,
+    )
+
+
+async def _judge(plan: Plan, eyes: Eyes, timeout_s: float, *, strict: bool) -> Seen:
+    loop = asyncio.get_running_loop()
+    deadline = loop.time() + timeout_s
+    while True:
+        seen = await _see(plan, eyes)
+        left_s = deadline - loop.time()
+        if left_s <= 0 or not _worth_waiting(seen.verdict, strict=strict):
+            return seen
+        await _change(eyes, min(left_s, _ASK_AGAIN_S))
+
+
+def _worth_waiting(verdict: Verdict, *, strict: bool) -> bool:
+    """Whether another look may change the result: what nobody measures stays so."""
+    heals = [rule(each.rule).heals is not Heals.NEVER for each in verdict.findings]
+    if verdict.verdict is Outcome.UNVERIFIABLE and closes(verdict, strict=strict):
+        return all(heals)
+    return any(heals)
+
+
+async def _change(eyes: Eyes, timeout_s: float) -> bool:
+    """Wait for a change of the graph; False when it is time to ask the nodes again without one."""
+    try:
+        await asyncio.wait_for(eyes.wait_change(), timeout_s)
+    except asyncio.TimeoutError:
+        return False
+    return True
+
+
+__all__ = ["Seen", "follow_running", "following", "judge_running", "where"]

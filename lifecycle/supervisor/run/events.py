@@ -1,0 +1,344 @@
+"""What a supervisor tells its listeners, as typed events.
+
+Owns: the event types, their JSON names, and `Emitter`, which hands each event to every listener in
+order. Presentation lives in cli/. Must not import rclpy.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import time
+from collections.abc import Callable
+from typing import ClassVar, Union
+
+from lifecycle.codec import to_plain
+from lifecycle.node.host.control import Operation
+from lifecycle.supervisor.processes.states import ProcessState
+from lifecycle.verify.report.json_document import plain_findings
+from lifecycle.verify.verdict import Stage, Verdict
+
+
+class Reach(enum.Enum):
+    """How far one node has come; ordered, and one word per step of bring-up."""
+
+    WAITING = "waiting"
+    STARTED = "started"
+    CONFIGURED = "configured"
+    CONNECTED = "connected"
+    ACTIVE = "active"
+    STOPPED = "stopped"
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class RunStarted:
+    """A supervisor took charge of a system.
+
+    Attributes:
+        log_directory: where each process's output is kept.
+    """
+
+    kind: ClassVar[str] = "run"
+    system: str
+    domain_id: int
+    rmw: str
+    discovery_range: str
+    nodes: tuple[str, ...]
+    processes: tuple[str, ...]
+    log_directory: str
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class ProcessChanged:
+    """A process changed its state.
+
+    Attributes:
+        pid: 0 before it was spawned.
+        detail: how it ended, `exit status 1`, `killed by SIGKILL`; else empty.
+    """
+
+    kind: ClassVar[str] = "process"
+    process: str
+    state: ProcessState
+    pid: int = 0
+    detail: str = ""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class RequestSent:
+    """A request to one node is about to be sent; what the gate's promise is checked against."""
+
+    kind: ClassVar[str] = "request"
+    node: str
+    operation: Operation
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class NodeChanged:
+    """A node came a step further, or its state changed.
+
+    Attributes:
+        node: fully qualified name.
+        state: lifecycle_msgs/State label; empty for a node that is not managed.
+    """
+
+    kind: ClassVar[str] = "node"
+    node: str
+    reach: Reach
+    state: str = ""
+    connected: bool = False
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class WiringChanged:
+    """The authority made a connection or a mapping, unmade one, or failed to.
+
+    Attributes:
+        operation: CONNECT_TO, MAP_TO or DISCONNECT_FROM.
+        connection: its name; empty for the node's own participant.
+        endpoint: `publishers/video`, of a mapping.
+        urls: what a connection was made to.
+        attempt: 1 unless it was lost or could not be made before.
+        error: why it could not be made; empty if it was.
+    """
+
+    kind: ClassVar[str] = "wiring"
+    node: str
+    operation: Operation
+    connection: str = ""
+    endpoint: str = ""
+    urls: tuple[str, ...] = ()
+    attempt: int = 1
+    error: str = ""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class WiringLost:
+    """A connection or a mapping that the authority had made is no more.
+
+    Attributes:
+        connection: its name; empty for the node's own participant.
+        endpoint: `publishers/video`, of a mapping; empty for a connection.
+    """
+
+    kind: ClassVar[str] = "lost"
+    node: str
+    connection: str = ""
+    endpoint: str = ""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class NodeSilent:
+    """Nothing can be expected of a node any more, though it has not left.
+
+    Attributes:
+        cause: "stopped" by a signal, "hung" in a callback, "unserved" by an overloaded machine,
+            "lost" from the network, or "told" by its own supervisor.
+    """
+
+    kind: ClassVar[str] = "silent"
+    node: str
+    cause: str
+    message: str
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class NodeAlive:
+    """A node is not silent any more.
+
+    Attributes:
+        silent_s: for how long it was silent.
+        there: False for one that is not in the graph, or has not started: what made it silent is
+            over, and no more is known.
+    """
+
+    kind: ClassVar[str] = "alive"
+    node: str
+    silent_s: float
+    there: bool = True
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class NodeJoined:
+    """A node is in the graph that was not there when it was last looked at."""
+
+    kind: ClassVar[str] = "joined"
+    node: str
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class NodeLeft:
+    """A node is not in the graph any more; what is silent leaves it when its DDS lease is over."""
+
+    kind: ClassVar[str] = "left"
+    node: str
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class MachineConnection:
+    """The supervisor of another machine is heard, or not heard any more.
+
+    Attributes:
+        machine: its name in the manifest.
+        established: it is heard.
+        lost_s: for how long it was not; 0 the first time.
+        left: its supervisor was shut down and said so; else the connection was lost.
+    """
+
+    kind: ClassVar[str] = "connection"
+    machine: str
+    established: bool
+    lost_s: float = 0.0
+    left: bool = False
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class LogLine:
+    """One line that a process wrote.
+
+    Attributes:
+        stream: "stdout" or "stderr".
+    """
+
+    kind: ClassVar[str] = "log"
+    process: str
+    stream: str
+    line: str
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class VerdictChanged:
+    """The running system was judged and the result differs from the one before."""
+
+    kind: ClassVar[str] = "verdict"
+    stage: Stage
+    verdict: Verdict
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class GateOpened:
+    """The verdict lets the system activate.
+
+    Attributes:
+        trusted: what could not be verified and is taken on trust, in one line; empty if nothing.
+    """
+
+    kind: ClassVar[str] = "gate"
+    outcome: str
+    nodes: tuple[str, ...]
+    trusted: str = ""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class SystemReached:
+    """The whole system is connected, verified or active.
+
+    Attributes:
+        reached: "connected", "verified" or "active".
+        elapsed_s: since the supervisor started.
+    """
+
+    kind: ClassVar[str] = "system"
+    reached: str
+    elapsed_s: float
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Failure:
+    """A step that failed, or a process that ended unasked; the last verdict has it as a finding.
+
+    Attributes:
+        rule: id of the finding it becomes, `run.process-died`.
+        subject: node or process, as in that finding.
+        process: name of the process concerned; empty if there is none of ours.
+        log: the file with all that its process wrote, which came as log events, too.
+        ends_run: the run ends for it; not so under --keep-going.
+    """
+
+    kind: ClassVar[str] = "failure"
+    rule: str
+    subject: str
+    message: str
+    process: str = ""
+    log: str = ""
+    ends_run: bool = True
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Notice:
+    """Something a person should know that changes nothing: orphans swept, a step forced."""
+
+    kind: ClassVar[str] = "notice"
+    message: str
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Stopping:
+    """The system is being taken down."""
+
+    kind: ClassVar[str] = "stopping"
+    reason: str
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Stopped:
+    """Nothing of the system runs any more."""
+
+    kind: ClassVar[str] = "stopped"
+    exit_code: int
+    elapsed_s: float
+
+
+Event = Union[  # noqa: UP007 - a run-time alias on Python 3.10
+    RunStarted,
+    ProcessChanged,
+    RequestSent,
+    NodeChanged,
+    WiringChanged,
+    WiringLost,
+    NodeSilent,
+    NodeAlive,
+    NodeJoined,
+    NodeLeft,
+    MachineConnection,
+    LogLine,
+    VerdictChanged,
+    GateOpened,
+    SystemReached,
+    Failure,
+    Notice,
+    Stopping,
+    Stopped,
+]
+Listener = Callable[[Event], None]
+
+
+class Emitter:
+    """Hands every event to every listener, in the order of their registration."""
+
+    def __init__(self) -> None:
+        self._listeners: list[Listener] = []
+        self._began = time.monotonic()
+
+    @property
+    def elapsed_s(self) -> float:
+        """Seconds since this emitter, and with it the run, began."""
+        return time.monotonic() - self._began
+
+    def listen(self, listener: Listener) -> None:
+        """Add a listener; it runs in the supervisor's loop and must not block."""
+        self._listeners.append(listener)
+
+    def __call__(self, event: Event) -> None:
+        """Hand `event` to every listener."""
+        for listener in tuple(self._listeners):
+            listener(event)
+
+
+def to_record(event: Event) -> dict[str, object]:
+    """Return `event` as the JSON object that `--format json` prints."""
+    plain = to_plain(event)
+    assert isinstance(plain, dict)
+    if isinstance(event, VerdictChanged):
+        plain["verdict"]["findings"] = plain_findings(event.verdict)
+    return {"event": event.kind, **plain}

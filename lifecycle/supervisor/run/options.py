@@ -1,0 +1,191 @@
+"""What a person may ask of `up`, and what came of it.
+
+Owns: `Until`, `UpOptions`, `UpResult`, and which processes belong to this machine. Must not import
+rclpy.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import ipaddress
+import socket
+from collections.abc import Iterable, Iterator
+from typing import TYPE_CHECKING
+
+import psutil
+
+from lifecycle.errors import ExitCode, UsageError
+from lifecycle.manifest.model import Machine, Manifest
+from lifecycle.network.connection_url import ConnectionTransport, Peer, parse
+from lifecycle.plan.model import ParticipantConnections, Plan, PlannedProcess
+from lifecycle.plan.negotiation.terms import urls_of
+from lifecycle.verify.observation import NodeConfiguration
+from lifecycle.verify.verdict import Verdict
+from lifecycle.verify.view import only_shared_memory
+
+if TYPE_CHECKING:
+    from lifecycle.programming.apply import TargetOptions, Treatment
+
+
+class Until(enum.Enum):
+    """How far to bring a system up."""
+
+    CONNECTED = "connected"
+    VERIFIED = "verified"
+    ACTIVE = "active"
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class UpOptions:
+    """How to bring a system up.
+
+    Attributes:
+        stop_after_s: hold it so long, ≥ 0; None holds an active system until it is told to end,
+            and does not hold one that is only connected or verified.
+        timeout_s: for everything from the first start to the system being active, > 0.
+        strict: what cannot be verified keeps the gate closed.
+        machine: run only this machine's nodes; empty runs all whose address is local.
+        keep_going: report a dead process, but do not take the others down.
+        program: networks to program with the verified flows for as long as the system is active.
+        treatment: what their flows get beyond what the manifest says.
+    """
+
+    until: Until = Until.ACTIVE
+    stop_after_s: float | None = None
+    timeout_s: float = 30.0
+    strict: bool = False
+    machine: str = ""
+    keep_going: bool = False
+    program: tuple[TargetOptions, ...] = ()
+    treatment: Treatment | None = None
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class UpResult:
+    """How a run ended.
+
+    Attributes:
+        plan: what the verdict is of; None for the plan that the run began with.
+    """
+
+    exit_code: ExitCode
+    verdict: Verdict
+    plan: Plan | None = None
+
+
+def own_machines(plan: Plan | Manifest, machine: str) -> frozenset[str]:
+    """Return the names of the machines whose supervisor this is; empty for nodes that name none.
+
+    Args:
+        plan: the whole system, planned or as its manifest says.
+        machine: a machine of it; empty for every machine whose address is this host's.
+
+    Raises:
+        UsageError: the plan has no such machine.
+    """
+    known = {each.name: each for each in plan.machines}
+    if machine:
+        if machine not in known:
+            allowed = ", ".join(sorted(known)) or "none"
+            raise UsageError(
+                f"cannot run machine {machine!r}: the manifest declares no such machine; "
+                f"declared: {allowed}"
+            )
+        return frozenset({machine})
+    own = _own_addresses()
+    return frozenset({"", *(each.name for each in plan.machines if _is_local(each, own))})
+
+
+def local_processes(plan: Plan, machine: str) -> tuple[PlannedProcess, ...]:
+    """Return the processes that this supervisor starts or attaches to.
+
+    Args:
+        plan: the whole system.
+        machine: as for `own_machines`.
+
+    Raises:
+        UsageError: the plan has no such machine, or nothing of it is for this host.
+    """
+    wanted = own_machines(plan, machine)
+    chosen = tuple(each for each in plan.processes if each.machine in wanted)
+    if plan.processes and not chosen:
+        raise UsageError(
+            f"cannot find a node of {plan.system!r} that runs on this host",
+            hint="name its machine: lifecycle up MANIFEST --machine NAME",
+        )
+    return chosen
+
+
+def observer_connections(plan: Plan, machine: str = "") -> ParticipantConnections:
+    """Return how the participant of a supervisor, or of whoever looks on, is connected here.
+
+    Fast DDS discovers nobody by shared memory once a participant has another transport too
+    (NetworkFactory::getDefaultMetatrafficMulticastLocators). Where nodes have nothing else, neither
+    has the observer: it sees them, and their reports prove what is on their connections.
+
+    Raises:
+        UsageError: the plan has no such machine.
+    """
+    own = own_machines(plan, machine)
+    found = next((each for name, each in plan.observers if name in own), ParticipantConnections())
+    nodes = [each.connections for each in plan.nodes if each.machine in own]
+    if not any(only_shared_memory(each) for each in nodes):
+        return found
+    shared = tuple(each for each in found.urls if only_shared_memory(_connected_to(each)))
+    return dataclasses.replace(found, urls=shared or found.urls)
+
+
+def _connected_to(url: str) -> ParticipantConnections:
+    return ParticipantConnections(urls=(url,))
+
+
+def onlooker_connections(
+    plan: Plan, heard: Iterable[NodeConfiguration] = ()
+) -> ParticipantConnections:
+    """Return how whoever looks on beside the supervisor of this host is connected.
+
+    As that one is, but on ports that are free: whom it asks answers to wherever it asks from. By
+    TCP nodes dial the supervisor, and nobody dials an onlooker: it dials everybody who listens.
+
+    Args:
+        plan: of the system.
+        heard: what nodes say of themselves: one that was restarted listens elsewhere than planned.
+    """
+    connections = observer_connections(plan)
+    planned = [url for node in plan.nodes for url in urls_of(node)]
+    said = [url for each in heard for report in each.connections for url in report.urls]
+    listening = {*_tcp_listeners([*planned, *said])}
+    urls = []
+    for text in connections.urls:
+        url = parse(text)
+        if url.transport is not ConnectionTransport.UDPM:
+            url = dataclasses.replace(url, port=None, metatraffic_port=None, output_port=None)
+        if url.transport is ConnectionTransport.TCPV4 and not url.server:
+            url = dataclasses.replace(url, peers=tuple(sorted({*url.peers, *listening})))
+        urls.append(str(url))
+    return dataclasses.replace(connections, urls=tuple(urls))
+
+
+def _tcp_listeners(urls: Iterable[str]) -> Iterator[Peer]:
+    """Yield where participants with these URLs listen for TCP."""
+    for text in urls:
+        url = parse(text)
+        if url.transport is ConnectionTransport.TCPV4 and url.port and url.address:
+            yield Peer(address=url.address, port=url.port)
+
+
+def _own_addresses() -> set[str]:
+    return {
+        address.address.partition("%")[0]
+        for addresses in psutil.net_if_addrs().values()
+        for address in addresses
+        if address.family in (socket.AF_INET, socket.AF_INET6)
+    }
+
+
+def _is_local(machine: Machine, own: set[str]) -> bool:
+    if not machine.address:
+        return True
+    address = ipaddress.ip_address(machine.address)
+    return address.is_loopback or str(address) in own

@@ -1,0 +1,483 @@
+"""One run of one system, from the first process to the last: the supervisor itself.
+
+Owns: the order of the phases, what ends them, and that whatever happens everything is taken down
+and one verdict remains. Each phase is a module of its own. Must not import rclpy.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import dataclasses
+import os
+import signal
+from collections.abc import AsyncIterator, Coroutine, Iterable, Iterator
+from typing import Any
+
+from lifecycle.errors import ExitCode
+from lifecycle.rundir import RunDirectory
+from lifecycle.supervisor.connections import discovery_server
+from lifecycle.supervisor.connections.authority import authority_of
+from lifecycle.supervisor.connections.networks import Networks
+from lifecycle.supervisor.control.orders import ACTIVE, HELD, PAUSED
+from lifecycle.supervisor.control.revision import Revisions
+from lifecycle.supervisor.control.server import ControlServer, Look
+from lifecycle.supervisor.control.status import SystemStatus, system_status
+from lifecycle.supervisor.gate.activation_guard import ActivationGuard
+from lifecycle.supervisor.gate.gate import Gate, VerificationError, closes
+from lifecycle.supervisor.gate.hold import Holding
+from lifecycle.supervisor.gate.sequence import Regulator
+from lifecycle.supervisor.gate.verification_loop import Changes, Judge
+from lifecycle.supervisor.health.agreement import Agreement
+from lifecycle.supervisor.health.peer_supervisors import Neighbours
+from lifecycle.supervisor.health.process_monitor import Vigil
+from lifecycle.supervisor.nodes.appearance import Sightings
+from lifecycle.supervisor.nodes.bring_up import BringUp
+from lifecycle.supervisor.nodes.observer_participant import Eyes
+from lifecycle.supervisor.nodes.remote_nodes import Elsewhere
+from lifecycle.supervisor.nodes.stale_nodes import StaleNodes
+from lifecycle.supervisor.nodes.system import System
+from lifecycle.supervisor.processes.fork_server import Zygote
+from lifecycle.supervisor.processes.orphans import end_strays, reap_adopted
+from lifecycle.supervisor.run.events import (
+    Emitter,
+    LogLine,
+    Notice,
+    Stopped,
+    Stopping,
+    SystemReached,
+)
+from lifecycle.supervisor.run.failure import StepFailedError, with_failure
+from lifecycle.supervisor.run.options import Until, UpOptions, UpResult
+from lifecycle.supervisor.run.records import Records
+from lifecycle.supervisor.run.shutdown import TakeDown
+from lifecycle.supervisor.run.signals import ENDED_BY, Ending
+from lifecycle.supervisor.run.tasks import Worker, ended
+from lifecycle.verify.missing import missing, not_ok
+from lifecycle.verify.verdict import NOT_JUDGED, Outcome, RunEnd, Stage, Verdict
+
+_GLANCE_S = 1.0
+"""How long `--until connected` looks for a verdict to report; it gates nothing."""
+
+
+_STOPPING = "stopping"
+_KEPT = (ACTIVE, PAUSED, "pausing")
+"""Phases of a system that was verified and is what was asked for; in any other it is on its way."""
+
+
+class _Stop(Exception):  # noqa: N818 - not an error: it was asked for
+    """The run was asked to end.
+
+    Attributes:
+        reason: in words.
+        exit_code: of a run that was cut short by it.
+    """
+
+    def __init__(self, reason: str, exit_code: ExitCode) -> None:
+        super().__init__(reason)
+        self.reason = reason
+        self.exit_code = exit_code
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class _End:
+    """What a run comes to, beside its reason: nothing to add, if it is as it was asked for."""
+
+    exit_code: ExitCode = ExitCode.OK
+    why: str = ""
+    verdict: Verdict | None = None
+
+
+class Session:
+    """A supervisor of one system.
+
+    Args:
+        system: the plan and the part of it that this supervisor is responsible for.
+        options: what the person asked for.
+        directory: acquired for this run.
+        records: of this run.
+        zygote: forks the processes.
+        eyes: see the graph; made before any process.
+        networks: programmed while the system is active.
+        emit: where events go.
+        ending: knows of signals that came before.
+        worker: for what blocks.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        options: UpOptions,
+        *,
+        directory: RunDirectory,
+        records: Records,
+        zygote: Zygote,
+        eyes: Eyes,
+        networks: Networks,
+        emit: Emitter,
+        ending: Ending,
+        worker: Worker,
+    ) -> None:
+        self._worker = worker
+        self._system = system
+        self._options = options
+        self._directory = directory
+        self._zygote = zygote
+        self._eyes = eyes
+        self._networks = networks
+        self._emit = emit
+        self._ending = ending
+        self._furthest: str | None = None
+        self._held = False
+        self._ends = ""
+        self._hurry = asyncio.Event()
+        self._stop: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._changes = Changes(system, eyes)
+        self._authority = authority_of(system, emit, eyes)
+        self._neighbours = Neighbours(system, eyes)
+        self._agreement = Agreement(system, eyes, self._neighbours)
+        self._guard = ActivationGuard(system)
+        self._judge = Judge(
+            system,
+            eyes,
+            self._changes,
+            emit,
+            strict=options.strict,
+            looker=self._authority,
+            agreement=self._agreement,
+            guard=self._guard,
+        )
+        self._gate = Gate(strict=options.strict, judging=self._judge)
+        sightings = Sightings(system, eyes, self._changes)
+        self._stale = StaleNodes(system, eyes)
+        emit.listen(self._stale.on_event)
+        self._records = records
+        self._vigil = Vigil(system)
+        self._bring_up = BringUp(
+            system,
+            spawner_of=lambda _: zygote,
+            services=eyes.driver,
+            appears=sightings.appears,
+            recorded=self._records.write,
+            wirer=self._authority,
+        )
+        self._elsewhere = Elsewhere(system.plan, system.awaited(), eyes, self._changes)
+        self._regulator = Regulator(
+            system,
+            bring_up=self._bring_up,
+            judge=self._judge,
+            gate=self._gate,
+            emit=emit,
+            alive=self._vigil.during,
+            leaves=self._vigil.dead.update,
+            comes_back=self._vigil.dead.difference_update,
+            forget=eyes.drop_configuration,
+            vanishes=sightings.vanishes,
+            replanned=self._replanned,
+            program=networks.begin,
+            following=self._following,
+            spawner=zygote,
+            hurry=self._hurry,
+            timeout_s=options.timeout_s,
+        )
+        self._revisions = Revisions(system, options)
+        self._holding = Holding(
+            system,
+            judge=self._judge,
+            changes=self._changes,
+            regulator=self._regulator,
+            revisions=self._revisions,
+            vigil=self._vigil,
+            emit=emit,
+            note_segments=self._records.note_segments,
+            keep_going=options.keep_going,
+        )
+
+    def status(self) -> SystemStatus:
+        """Return what is known now."""
+        return system_status(
+            self._system,
+            self._judge.latest,
+            phase=self._regulator.phase,
+            supervisor=os.getpid(),
+            elapsed_s=self._emit.elapsed_s,
+        )
+
+    def look(self) -> Look:
+        """Return all that is known now."""
+        return Look(
+            plan=self._system.expected,
+            status=self.status(),
+            observation=self._judge.seen,
+            verdict=self._judge.latest,
+        )
+
+    def stop(self, reason: str, exit_code: ExitCode) -> None:
+        """Ask the run to end; once it ends, an interrupt asks it to hurry.
+
+        Args:
+            reason: in words.
+            exit_code: of the run, if this cuts it short.
+        """
+        if self._stop.done() or self._regulator.phase == _STOPPING:
+            if exit_code is ExitCode.INTERRUPTED:
+                self._hurry.set()
+            return
+        self._stop.set_exception(_Stop(reason, exit_code))
+
+    async def run(self) -> UpResult:
+        """Bring the system up, hold it, and take it down; never leaves anything running."""
+        server = ControlServer(
+            self._directory.socket_path,
+            self.status,
+            lambda: self.stop("lifecycle down", ExitCode.BRING_UP_FAILED),
+            look=self.look,
+            order=self._holding.ordered,
+            differences=self._revisions.differences,
+        )
+        await server.open()
+        self._neighbours.open()
+        self._agreement.open()
+        self._emit.listen(lambda event: None if isinstance(event, LogLine) else server.changed())
+        result = UpResult(exit_code=ExitCode.INTERNAL, verdict=NOT_JUDGED)
+        try:
+            with self._signals():
+                try:
+                    result = await self._until_over()
+                finally:
+                    await self._take_down()
+                if self._hurry.is_set() and result.exit_code == ExitCode.OK:
+                    result = _hurried(result)
+        finally:
+            self._stale.close()
+            await self._changes.close()
+            self._emit(Stopped(exit_code=result.exit_code, elapsed_s=self._emit.elapsed_s))
+            await server.close(result.exit_code)
+        return result
+
+    async def leave(self) -> None:
+        """Be heard no more, after `run`; Fast DDS can hang in it."""
+        self._eyes.prepare_to_leave()
+        self._agreement.close()
+        await self._neighbours.close()
+
+    async def _until_over(self) -> UpResult:
+        """Run the phases; whatever ends them becomes an exit code and a verdict."""
+        reason = stopping = "done"
+        end = _End()
+        try:
+            end = await self._unless_stopped(self._phases())
+        except _Stop as stop:
+            reason = stopping = stop.reason
+            end = self._cut_short(stop.exit_code)
+        except StepFailedError as failure:
+            for each in failure.every:
+                self._emit(each.event())
+            reason, stopping = failure.reason, "rolling back"
+            verdict = with_failure(self._judge.latest or NOT_JUDGED, failure)
+            end = _End(exit_code=failure.exit_code, verdict=verdict)
+        except VerificationError as error:
+            stopping, end = "the verdict keeps the gate closed", _End(exit_code=error.exit_code)
+            if error.again:
+                stopping = "the system changed before every node was activated"
+            elif self._regulator.phase == "activating":
+                stopping = "what became active is not what was verified"
+            reason = f"{stopping}; {not_ok(error.verdict) or error.verdict.verdict.value}"
+        self._gate.close()
+        self._regulator.phase = _STOPPING
+        self._emit(Stopping(reason=stopping))
+        self._ends = stopping
+        if end.why:
+            reason = f"{reason}, but {end.why}" if reason == "done" else f"{reason}; {end.why}"
+        run = RunEnd(
+            reason=reason,
+            reached=self._furthest,
+            exit_code=end.exit_code,
+            trusted=self._regulator.trusted,
+        )
+        verdict = dataclasses.replace(end.verdict or self._judge.latest or NOT_JUDGED, run=run)
+        return UpResult(exit_code=end.exit_code, verdict=verdict, plan=self._system.first)
+
+    def _cut_short(self, exit_code: ExitCode) -> _End:
+        """Return what a run comes to that is asked to end.
+
+        It is a success only if the system was verified, is what was asked for, and nothing bound
+        it to stay; an interrupt (Ctrl-C) never is. That other machines of the system were shut down
+        before is how a system of several hosts ends, and no failure of this one.
+
+        Args:
+            exit_code: of a run that is cut short.
+        """
+        if not self._held:
+            return _End(exit_code=exit_code, why=self._waits())
+        end = self._outcome()
+        if exit_code is ExitCode.INTERRUPTED:
+            return dataclasses.replace(end, exit_code=exit_code)
+        if end.exit_code == ExitCode.VIOLATED and self._hosts_left():
+            end = _End()
+        if end.exit_code != ExitCode.OK:
+            return end
+        if self._options.stop_after_s is not None:
+            why = f"it did not hold for the {self._options.stop_after_s:g} s of --stop-after"
+            return _End(exit_code=exit_code, why=why)
+        if self._options.until is Until.ACTIVE and self._regulator.phase not in _KEPT:
+            why = f"the system was {self._regulator.phase}, not active"
+            return _End(exit_code=exit_code, why=why)
+        return end
+
+    def _hosts_left(self) -> bool:
+        """Whether nothing is violated but that other machines of the system were shut down."""
+        latest = self._judge.latest
+        return latest is not None and self._agreement.follows_from_shut_down(latest)
+
+    def _outcome(self, meanwhile: str = "") -> _End:
+        """Return what the run of a system comes to that was held until now.
+
+        Args:
+            meanwhile: what was violated while it was held; empty if nothing was.
+        """
+        deaths = self._vigil.deaths()
+        if deaths:
+            failure = deaths[0].joined(deaths[1:])
+            verdict = with_failure(self._judge.latest or NOT_JUDGED, failure)
+            return _End(exit_code=failure.exit_code, why=failure.reason, verdict=verdict)
+        latest = self._judge.latest
+        end = _End()
+        if self._options.until is Until.CONNECTED or latest is None:
+            pass
+        elif latest.verdict is Outcome.VIOLATED:
+            end = _End(exit_code=ExitCode.VIOLATED, why=f"violated; {not_ok(latest)}")
+        elif meanwhile:
+            end = _End(exit_code=ExitCode.VIOLATED, why=f"violated meanwhile, {meanwhile}")
+        elif closes(latest, strict=self._options.strict):
+            end = _End(exit_code=ExitCode.UNVERIFIABLE, why=f"unverifiable; {not_ok(latest)}")
+        elif self._regulator.phase == HELD:
+            end = _End(exit_code=ExitCode.VIOLATED, why="held at the gate, and not active")
+        return end
+
+    def _waits(self) -> str:
+        """Say what a run still waits for that is asked to end before its system is up."""
+        latest = self._judge.latest
+        verifies = self._regulator.phase == "verifying" and latest is not None
+        return self._bring_up.unfinished() or (missing(latest) if verifies and latest else "")
+
+    async def _phases(self) -> _End:
+        loop = asyncio.get_running_loop()
+        deadline = loop.time() + self._options.timeout_s
+        async with self._following():
+            await self._vigil.during(self._bring_up.connect(self._options.timeout_s))
+        self._furthest = "connected"
+        self._emit(SystemReached(reached="connected", elapsed_s=self._emit.elapsed_s))
+        if self._options.until is Until.CONNECTED:
+            await self._vigil.during(self._judge.until_clear(Stage.CONNECTED, _GLANCE_S))
+            return await self._hold(Stage.CONNECTED)
+        permit = await self._regulator.verify(deadline - loop.time())
+        self._furthest = "verified"
+        if self._options.until is Until.VERIFIED:
+            return await self._hold(Stage.CONNECTED)
+        await self._regulator.activate(permit, deadline)
+        self._furthest = "active"
+        return await self._hold(Stage.ACTIVE)
+
+    @contextlib.asynccontextmanager
+    async def _following(self) -> AsyncIterator[None]:
+        """Keep looking at the nodes of others, and at ours that others may drive, too."""
+        followers = (
+            asyncio.ensure_future(self._elsewhere.follow()),
+            asyncio.ensure_future(self._guard.follow(self._eyes, self._changes)),
+        )
+        try:
+            yield
+        finally:
+            for each in followers:
+                if each.done():
+                    each.result()
+            await ended(*followers)
+
+    async def _hold(self, stage: Stage) -> _End:
+        """Keep the system for as long as was asked; return what the run comes to."""
+        self._held = True
+        hold_s = self._options.stop_after_s
+        if hold_s is None and self._options.until is not Until.ACTIVE:
+            hold_s = 0.0
+        return self._outcome(await self._holding.hold(stage, hold_s))
+
+    async def _unless_stopped(self, phases: Coroutine[Any, Any, _End]) -> _End:
+        running = asyncio.ensure_future(phases)
+        try:
+            waits: set[asyncio.Future[Any]] = {running, self._stop}
+            await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+            if self._stop.done():
+                self._stop.result()
+            return running.result()
+        finally:
+            await ended(running)
+
+    async def _take_down(self) -> None:
+        """End everything, also what our processes left behind."""
+        self._regulator.phase = _STOPPING
+        self._agreement.leave(self._ends)
+        self._eyes.prepare_to_leave()
+        self._holding.close(f"cannot go on: {self._system.plan.system!r} is being taken down")
+        await self._guard.close()
+        await self._bring_up.close()
+        await self._records.note_segments()
+        if self._authority is not None:
+            await self._authority.close()
+        try:
+            await TakeDown(self._system, self._emit, self._hurry).run()
+        finally:
+            # After the last message has left, and before what runs below us is ended.
+            await self._networks.close(self._hurry)
+            await discovery_server.end(self._system, self._hurry)
+        left = await self._worker.run(end_strays, self._directory.run_id, self._zygote)
+        if left:
+            self._emit(Notice(message=f"ended processes that were left behind: {_listed(left)}"))
+        self._system.logs.tell_lost()
+        if not self._stop.done():
+            self._stop.cancel()
+        elif not self._stop.cancelled():
+            self._stop.exception()
+
+    @contextlib.contextmanager
+    def _signals(self) -> Iterator[None]:
+        loop = asyncio.get_running_loop()
+        ends = self._ending.numbers
+        for number in ends:
+            loop.add_signal_handler(number, self._ended_by, number)
+        loop.add_signal_handler(signal.SIGCHLD, self._child_changed)
+        if self._ending.number is not None:
+            self._ended_by(self._ending.number)
+        try:
+            yield
+        finally:
+            for number in (*ends, signal.SIGCHLD):
+                loop.remove_signal_handler(number)
+            self._ending.resume()
+
+    def _child_changed(self) -> None:
+        self._zygote.note_stops()
+        reap_adopted(self._zygote.waited_for)
+
+    def _ended_by(self, number: int) -> None:
+        self.stop(*ENDED_BY[number])
+
+    def _replanned(self, nodes: Iterable[str]) -> None:
+        if self._authority is not None:
+            self._authority.replan(self._system.plan, frozenset(nodes))
+        self._neighbours.renew()
+        self._agreement.announce(self._system.first)
+
+
+def _hurried(result: UpResult) -> UpResult:
+    """Return what a run comes to that was interrupted while it was taken down: not cleanly."""
+    run = result.verdict.run
+    assert run is not None
+    reason = f"{run.reason}; interrupted while it was taken down"
+    run = dataclasses.replace(run, reason=reason, exit_code=ExitCode.INTERRUPTED)
+    verdict = dataclasses.replace(result.verdict, run=run)
+    return dataclasses.replace(result, exit_code=ExitCode.INTERRUPTED, verdict=verdict)
+
+
+def _listed(pids: tuple[int, ...]) -> str:
+    return ", ".join(str(pid) for pid in pids)

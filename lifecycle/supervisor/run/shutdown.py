@@ -1,0 +1,192 @@
+"""Taking a system down in reverse dependency order, bounded, whatever state it is in.
+
+Owns: what is undone on each node, and that no process of the system is left. Used at the end of a
+run and to roll back one that failed. Must not import rclpy.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Coroutine, Iterable
+from typing import Any
+
+from lifecycle.errors import BringUpError
+from lifecycle.manifest.model import RunKind
+from lifecycle.node.host.control import Operation
+from lifecycle.supervisor.connections.desired_state import Step
+from lifecycle.supervisor.nodes.driver import ACTIVE, FINALIZED, INACTIVE
+from lifecycle.supervisor.nodes.system import NodeRun, System
+from lifecycle.supervisor.processes.process import (
+    COMMAND_ESCALATION,
+    ESCALATION,
+    STARTING_ESCALATION,
+    STUCK_ESCALATION,
+    ManagedProcess,
+)
+from lifecycle.supervisor.processes.states import ProcessState
+from lifecycle.supervisor.run.events import Emitter, Notice, Reach, WiringChanged
+
+_UNDO = {
+    Operation.ACTIVATE: Operation.DEACTIVATE,
+    Operation.CONNECT: Operation.DISCONNECT,
+    Operation.CONFIGURE: Operation.CLEANUP,
+}
+
+
+class TakeDown:
+    """Takes one system down.
+
+    Args:
+        hurry: once set, nothing is asked politely any more and processes are killed at once.
+        nodes: take only these down, and the processes that hold no others; None for all.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        emit: Emitter,
+        hurry: asyncio.Event,
+        *,
+        nodes: Iterable[NodeRun] | None = None,
+    ) -> None:
+        self._system = system
+        self._emit = emit
+        self._hurry = hurry
+        self._polite: dict[str, asyncio.Event] = {key: asyncio.Event() for key in system.nodes}
+        self._nodes = system.nodes
+        if nodes is not None:
+            self._nodes = {each.planned.key: each for each in nodes}
+            for key in system.nodes.keys() - self._nodes.keys():
+                self._polite[key].set()  # nobody waits for what stays
+
+    async def run(self) -> None:
+        """Take everything down; afterwards none of the processes runs."""
+        await asyncio.gather(
+            *(self._node(key, node) for key, node in self._nodes.items()),
+            *(
+                self._process(process)
+                for process in self._system.processes.values()
+                if all(key in self._nodes for key in process.planned.nodes)
+            ),
+        )
+
+    async def _node(self, key: str, node: NodeRun) -> None:
+        """Undo what was done to one node once all that stand on it are down."""
+        try:
+            for dependent in self._system.dependents(key):
+                await self._polite[dependent.planned.key].wait()
+            await self._undo(node)
+            if not node.planned.managed and node.process is not None:
+                # All there is to undo is the process itself.
+                await self._end(node.process)
+        finally:
+            self._polite[key].set()
+
+    async def _process(self, process: ManagedProcess) -> None:
+        for key in process.planned.nodes:
+            await self._polite[key].wait()
+        await self._end(process)
+        for key in process.planned.nodes:
+            node = self._system.nodes[key]
+            if node.reach not in (Reach.WAITING, Reach.STOPPED):
+                node.advance(Reach.STOPPED)
+
+    async def _undo(self, node: NodeRun) -> None:
+        if self._system.liveliness.is_out_of_reach(node.name):
+            node.stuck = True
+        operations = [_UNDO[each] for each in reversed(node.undo)]
+        # A node that somebody else started is theirs to end.
+        if node.process is not None and node.reach is not Reach.WAITING:
+            operations.append(Operation.SHUTDOWN)
+        for operation in operations:
+            if operation is Operation.DISCONNECT:
+                await self._unwire(node)
+            if self._hurry.is_set() or node.stuck or _gone(node) or node.driver is None:
+                return
+            if _applies(operation, node):
+                # Also after one that failed: a node that refuses to clean up may still shut down.
+                await self._ask(node, operation)
+
+    async def _unwire(self, node: NodeRun) -> None:
+        """Unmake what the authority connected the node to, the last connection first."""
+        for name in reversed(node.connections):
+            if self._hurry.is_set() or node.stuck or _gone(node) or node.driver is None:
+                return
+            step = Step(node=node.name, operation=Operation.DISCONNECT_FROM, connection=name)
+            limit_s = node.planned.timeouts.cleanup_s
+            if await self._bounded(node, node.driver.wire(step), f"{step}", limit_s):
+                self._emit(WiringChanged(node=node.name, operation=step.operation, connection=name))
+        node.connections = ()
+
+    async def _ask(self, node: NodeRun, operation: Operation) -> None:
+        limits = node.planned.timeouts
+        limit_s = {
+            Operation.DEACTIVATE: limits.deactivate_s,
+            Operation.DISCONNECT: limits.cleanup_s,
+            Operation.CLEANUP: limits.cleanup_s,
+            Operation.SHUTDOWN: limits.shutdown_s,
+        }[operation]
+
+        async def perform() -> None:
+            standing = await node.perform(operation)
+            node.report(standing.state, connected=standing.connected)
+
+        await self._bounded(node, perform(), f"{operation.value} {node.name!r}", limit_s)
+
+    async def _bounded(
+        self, node: NodeRun, doing: Coroutine[Any, Any, object], what: str, limit_s: float
+    ) -> bool:
+        """Await one request within its limit; whether it was carried out."""
+        request = asyncio.ensure_future(doing)
+        hurry = asyncio.ensure_future(self._hurry.wait())
+        try:
+            await asyncio.wait(
+                {request, hurry}, timeout=limit_s, return_when=asyncio.FIRST_COMPLETED
+            )
+            if not request.done():
+                node.stuck = True
+                if not self._hurry.is_set():
+                    self._emit(
+                        Notice(
+                            message=f"cannot {what} within {limit_s:g} s; its process is ended "
+                            "all the same"
+                        )
+                    )
+                return False
+            request.result()
+        except BringUpError as error:
+            if not _gone(node):
+                self._emit(Notice(message=error.message))
+            return False
+        else:
+            return True
+        finally:
+            for each in (request, hurry):
+                each.cancel()
+            await asyncio.gather(request, hurry, return_exceptions=True)
+
+    async def _end(self, process: ManagedProcess) -> None:
+        escalation = ESCALATION
+        if process.state is ProcessState.STARTING:
+            escalation = STARTING_ESCALATION
+        elif process.planned.run.kind is RunKind.COMMAND:
+            escalation = COMMAND_ESCALATION
+        elif any(self._system.nodes[key].stuck for key in process.planned.nodes):
+            escalation = STUCK_ESCALATION
+        needed = await process.end(escalation, self._hurry)
+        if needed and not self._hurry.is_set():
+            self._emit(Notice(message=f"process {process.name!r} had to be ended with {needed}"))
+
+
+def _applies(operation: Operation, node: NodeRun) -> bool:
+    """Whether there is something to undo in the state that the node is in; it may have failed."""
+    return {
+        Operation.DEACTIVATE: node.state == ACTIVE,
+        Operation.DISCONNECT: node.state == INACTIVE and node.connected,
+        Operation.CLEANUP: node.state == INACTIVE,
+        Operation.SHUTDOWN: node.state != FINALIZED,
+    }[operation]
+
+
+def _gone(node: NodeRun) -> bool:
+    return node.process is not None and node.process.state is ProcessState.EXITED

@@ -1,0 +1,392 @@
+"""`up`: everything around a session that must be there before it and be gone after it.
+
+Owns: the run directory and what a killed supervisor left in it, the environment of the run, the
+zygote, the supervisor's own participant and the sweep of shared memory. Must not import rclpy.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import dataclasses
+import os
+import traceback
+from collections.abc import Awaitable, Callable, Collection, Iterable, Iterator, Mapping
+
+from lifecycle.errors import ExitCode, LifecycleError
+from lifecycle.manifest.model import Authority, DataLayerSource, EndpointPolicy, RunKind
+from lifecycle.middleware.discovery.probe_targets import discovery_peers, peers_environment
+from lifecycle.middleware.fastdds.profiles import discovery_environment
+from lifecycle.middleware.process.control import adopt_orphans, check_threads, exit_after
+from lifecycle.middleware.process.shared_memory import check_room, sweep
+from lifecycle.plan import moved_observer
+from lifecycle.plan.connections.contacts import reached_hosts
+from lifecycle.plan.model import Plan
+from lifecycle.rundir import (
+    RUN_VARIABLE,
+    RunDirectory,
+    RunRecord,
+    new_run_id,
+    run_name,
+    runtime_root,
+)
+from lifecycle.supervisor.connections import discovery_server
+from lifecycle.supervisor.connections.networks import open_networks, token_variables
+from lifecycle.supervisor.control.status import SystemStatus
+from lifecycle.supervisor.nodes.observer_participant import Eyes
+from lifecycle.supervisor.nodes.system import System
+from lifecycle.supervisor.processes.fork_server import Zygote, ZygoteProcess
+from lifecycle.supervisor.processes.logs import check_log_root, log_directory
+from lifecycle.supervisor.processes.orphans import end_run
+from lifecycle.supervisor.run.events import Emitter, Event, Listener, Notice, RunStarted
+from lifecycle.supervisor.run.failure import StepFailedError, never_connected, with_failure
+from lifecycle.supervisor.run.options import (
+    UpOptions,
+    UpResult,
+    local_processes,
+    observer_connections,
+    own_machines,
+)
+from lifecycle.supervisor.run.records import Records, noting
+from lifecycle.supervisor.run.session import Session
+from lifecycle.supervisor.run.signals import Ending
+from lifecycle.supervisor.run.tasks import Worker
+from lifecycle.verify.verdict import NOT_JUDGED
+
+LEAVE_S = 10.0
+"""A participant leaves within 0.2 s, over connections that nobody answers within 4 s.
+
+Where it is made, Fast DDS may wait for ever for threads that it cannot have."""
+
+
+THREADS = 24
+"""A supervisor has up to 16, most of them its participant's."""
+
+OBSERVER_TRIES = 4
+
+
+Conclude = Callable[[UpResult], ExitCode]
+
+
+class Forerunner:
+    """A zygote that is started before the manifest is read, to import while we do.
+
+    Args:
+        preload: see ZygoteProcess.
+        without: variables of our environment that nothing it starts shall have.
+
+    Attributes:
+        run_id: of the run that it is for.
+    """
+
+    def __init__(self, *, preload: bool = True, without: Collection[str] = ()) -> None:
+        self.run_id = new_run_id()
+        environment = {name: text for name, text in os.environ.items() if name not in without}
+        self.process = ZygoteProcess(
+            preload=preload, environment={**environment, RUN_VARIABLE: self.run_id}
+        )
+
+    def close(self) -> None:
+        """End it; harmless if a run has ended it already."""
+        self.process.close()
+
+
+def up(
+    plan: Plan,
+    options: UpOptions,
+    listeners: Iterable[Listener] = (),
+    *,
+    forerunner: Forerunner | None = None,
+    ending: Ending | None = None,
+    on_start: Callable[[Callable[[], SystemStatus]], None] | None = None,
+    conclude: Conclude | None = None,
+) -> UpResult:
+    """Bring a system up, hold it, take it down. Blocks; call it from the main thread.
+
+    It changes this process for good: orphans of its children become its own children, and the
+    variables that place the system in the graph are set in its environment.
+
+    Args:
+        plan: what to bring up.
+        options: how.
+        listeners: told every event, in this thread. One that raises is told nothing more; the run
+            goes on to its end, and then what it raised is raised.
+        forerunner: used and ended.
+        ending: has been told of signals since before this call; entered by the caller.
+        on_start: given the way to ask for the status, once there is a system.
+        conclude: given how the run ended, once nothing of the system runs any more; returns the
+            exit code. What it does not write may be lost: leaving the graph comes after it, and
+            where Fast DDS hangs in that, this process ends with that exit code after `LEAVE_S`.
+
+    Raises:
+        AlreadyRunningError: another supervisor has this system in this domain.
+        UsageError: the plan has nothing for this host, the run directory or the options of a
+            network to program cannot be used.
+        MiddlewareError: no participant can be made in the plan's domain.
+        Ended: a signal asked for it before there was a session; nothing is left.
+    """
+    if ending is None:
+        with Ending() as ours:
+            return up(
+                plan,
+                options,
+                listeners,
+                forerunner=forerunner,
+                ending=ours,
+                on_start=on_start,
+                conclude=conclude,
+            )
+    guarded = tuple(_Guarded(each) for each in listeners)
+    with ending.noted():
+        result = _up(
+            plan,
+            options,
+            guarded,
+            forerunner=forerunner,
+            ending=ending,
+            on_start=on_start,
+            conclude=conclude,
+        )
+    for each in guarded:
+        if each.error is not None:
+            raise each.error
+    return result
+
+
+class _Guarded:
+    """A listener whose exception ends no more than itself, see `up`."""
+
+    def __init__(self, listener: Listener) -> None:
+        self._listener = listener
+        self.error: Exception | None = None
+
+    def __call__(self, event: Event) -> None:
+        if self.error is None:
+            try:
+                self._listener(event)
+            except Exception as error:  # noqa: BLE001 - it is not ours, and raised in the end
+                traceback.print_exc()
+                self.error = error
+
+
+def _up(
+    plan: Plan,
+    options: UpOptions,
+    listeners: Iterable[Listener],
+    *,
+    forerunner: Forerunner | None,
+    ending: Ending,
+    on_start: Callable[[Callable[[], SystemStatus]], None] | None,
+    conclude: Conclude | None,
+) -> UpResult:
+    """Do what `up` says, where a signal is only noted."""
+    processes = local_processes(plan, options.machine)
+    emit = Emitter()
+    for listener in listeners:
+        emit.listen(listener)
+    python = any(each.run.kind is RunKind.PYTHON for each in processes)
+    forerunner = forerunner or Forerunner(preload=python, without=token_variables(options.program))
+    try:
+        directory = RunDirectory.acquire(
+            runtime_root(os.environ),
+            run_name(plan, options.machine),
+            forerunner.run_id,
+            domain_id=plan.domain_id,
+        )
+    except LifecycleError:
+        forerunner.close()
+        raise
+    records: Records | None = None
+    try:
+        if directory.previous is not None:
+            _clean_up_after(directory.previous, emit)
+        # Servers may be asked to remove what dead runs left: that must not outlast a signal.
+        with ending.raised() if options.program else contextlib.nullcontext():
+            networks = open_networks(plan, options, directory, emit, environment=os.environ)
+        check_log_root(os.environ)
+        _enter_graph(plan, options, directory)
+
+        async def run(leaving: contextlib.AsyncExitStack) -> UpResult:
+            nonlocal records
+            logs = log_directory(os.environ, plan.system)
+            system = System(
+                plan,
+                emit=emit,
+                logs=logs,
+                processes=processes,
+                variables=_graph_variables(os.environ),
+            )
+            zygote = Zygote(forerunner.process, emit)
+            worker = leaving.enter_context(contextlib.closing(Worker("lifecycle")))
+            records = leaving.enter_context(noting(directory, system, zygote, worker, emit))
+            try:
+                # Before any participant: who asks a server that is not there waits to ask again.
+                with ending.raised():
+                    await discovery_server.begin(system, zygote, ours=_serves(plan, options))
+                eyes = _eyes(plan, options, emit)
+                leaving.callback(eyes.destroy)
+                await records.note_segments()
+                emit(_started(system, eyes, str(logs)))
+                session = Session(
+                    system,
+                    options,
+                    directory=directory,
+                    records=records,
+                    zygote=zygote,
+                    eyes=eyes,
+                    networks=networks,
+                    emit=emit,
+                    ending=ending,
+                    worker=worker,
+                )
+                leaving.push_async_callback(session.leave)
+                if on_start is not None:
+                    on_start(session.status)
+                return await session.run()
+            except StepFailedError as failure:
+                emit(failure.event())
+                verdict = never_connected(
+                    with_failure(NOT_JUDGED, failure), failure.reason, failure.exit_code
+                )
+                return UpResult(exit_code=failure.exit_code, verdict=verdict)
+            finally:
+                await discovery_server.end(system, asyncio.Event())
+                await zygote.close()
+                _sweep(records, emit)
+
+        return asyncio.run(_leaving_last(run, conclude))
+    finally:
+        forerunner.close()
+        _sweep(records)
+        directory.release()
+
+
+async def _leaving_last(
+    run: Callable[[contextlib.AsyncExitStack], Awaitable[UpResult]], conclude: Conclude | None
+) -> UpResult:
+    """Run, and leave the graph once nothing of the system runs any more, bounded.
+
+    Fast DDS can hang there with the GIL held: then the process ends with the code all the same, and
+    the next `up` cleans up what it could not.
+    """
+    exit_code = ExitCode.INTERNAL
+    leaving = contextlib.AsyncExitStack()
+    try:
+        result = await run(leaving)
+        if conclude is not None:
+            result = dataclasses.replace(result, exit_code=conclude(result))
+        exit_code = result.exit_code
+        return result
+    finally:
+        with _ends_within(LEAVE_S, exit_code):
+            await leaving.aclose()
+
+
+def _sweep(records: Records | None, emit: Emitter | None = None) -> None:
+    """Remove the shared memory that processes of the run have left."""
+    swept = sweep(records.segments) if records else ()
+    if swept and emit:
+        emit(Notice(message=f"removed shared memory left in /dev/shm: {', '.join(swept)}"))
+
+
+@contextlib.contextmanager
+def _ends_within(seconds: float, code: int) -> Iterator[None]:
+    """End this process with `code` if what is done inside takes longer: Fast DDS can hang."""
+    live_on = exit_after(seconds, code)
+    try:
+        yield
+    finally:
+        live_on()
+
+
+def _serves(plan: Plan, options: UpOptions) -> bool:
+    server = plan.server
+    return server is not None and server.machine in own_machines(plan, options.machine)
+
+
+def _eyes(plan: Plan, options: UpOptions, emit: Emitter) -> Eyes:
+    """Make the supervisor's participant; on another port if a discovery server is not reached.
+
+    Fast DDS may never use the first connection to it (middleware/discovery/dead_connections.py).
+    """
+    layer = plan.data_layer
+    dynamic = layer.source is DataLayerSource.DYNAMIC
+    wires = layer.authority is Authority.SUPERVISOR
+    planned = connections = observer_connections(plan, options.machine)
+    for number in range(OBSERVER_TRIES):
+        with _ends_within(options.timeout_s + LEAVE_S, ExitCode.BRING_UP_FAILED):
+            eyes = Eyes.open(
+                plan.domain_id,
+                connections,
+                guests=wires and dynamic and plan.policy.undeclared_nodes is EndpointPolicy.OPEN,
+                events=wires and (dynamic or layer.events),
+            )
+        if number + 1 == OBSERVER_TRIES or eyes.reaches_servers():
+            break
+        eyes.prepare_to_leave()
+        eyes.destroy()
+        connections = moved_observer(plan, planned, number)
+        emit(
+            Notice(
+                message="the supervisor's own participant is made again on a fresh port: the "
+                "discovery server did not take its connection; "
+                f"try {number + 1} of {OBSERVER_TRIES - 1}"
+            )
+        )
+    return eyes
+
+
+def _started(system: System, eyes: Eyes, logs: str) -> RunStarted:
+    return RunStarted(
+        system=system.plan.system,
+        domain_id=system.plan.domain_id,
+        rmw=eyes.rmw,
+        discovery_range=system.plan.discovery_range.value,
+        nodes=tuple(each.name for each in system.nodes.values()),
+        processes=tuple(system.processes),
+        log_directory=logs,
+    )
+
+
+_GRAPH_VARIABLES = (
+    "ROS_DOMAIN_ID",
+    "ROS_AUTOMATIC_DISCOVERY_RANGE",
+    "ROS_STATIC_PEERS",
+    "FASTRTPS_DEFAULT_PROFILES_FILE",
+)
+
+
+def _enter_graph(plan: Plan, options: UpOptions, directory: RunDirectory) -> None:
+    """Place this process where the plan's nodes will be, and have participants found quickly.
+
+    Raises:
+        MiddlewareError: it cannot have the threads of a participant. Fast DDS would end the process
+            then, or wait for ever.
+    """
+    adopt_orphans()
+    check_threads(THREADS)
+    check_room()
+    os.environ["ROS_DOMAIN_ID"] = str(plan.domain_id)
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = plan.discovery_range.name
+    hosts = reached_hosts(plan, own_machines(plan, options.machine))
+    os.environ.update(peers_environment(hosts, os.environ))
+    peers = discovery_peers(plan.domain_id, hosts, os.environ)
+    os.environ.update(discovery_environment(directory.path, peers=peers))
+
+
+def _graph_variables(environment: Mapping[str, str]) -> tuple[tuple[str, str], ...]:
+    """What a zygote that was started before `_enter_graph` has to hand on."""
+    return tuple((name, environment[name]) for name in _GRAPH_VARIABLES if name in environment)
+
+
+def _clean_up_after(record: RunRecord, emit: Emitter) -> None:
+    """Sweep what a supervisor left that had no chance to do it itself."""
+    ended, segments = end_run(record)
+    swept = sweep(segments)
+    if ended or swept:
+        emit(
+            Notice(
+                message=f"cleaned up after supervisor {record.supervisor.pid}, which was killed: "
+                f"{len(ended)} processes, {len(swept)} files in /dev/shm"
+            )
+        )
