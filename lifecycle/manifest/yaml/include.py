@@ -147,7 +147,7 @@ def _moved_topic(link: Link, old: dict[str, Node], new: dict[str, Node]) -> str:
 
 
 def _topic(node: Node, name: str) -> str:
-    """Return the topic of an endpoint; empty if a name is not legal, which `semantics` reports."""
+    """Return the topic of an endpoint; empty if a name is not legal, which `checks` report."""
     try:
         return resolve(name, node_name=node.name, namespace=node.namespace, remap=node.remap)
     except LifecycleError:
