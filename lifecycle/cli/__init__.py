@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import signal
 import sys
 import traceback
 
@@ -90,7 +91,12 @@ def program() -> int:
     verb = sys.argv[1:2]
     if verb == ["run"]:  # whose streams are the user's node's
         return main()
-    return own_streams(waits=verb != ["up"]).settled(main())
+    code = own_streams(waits=verb != ["up"]).settled(main())
+    if verb == ["up"]:
+        # The interpreter takes a moment to end, and what was said of the run stands.
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, signal.SIG_IGN)
+    return code
 
 
 def main(arguments: list[str] | None = None) -> int:
