@@ -20,7 +20,7 @@ from lifecycle.graph.events import GraphEvents
 from lifecycle.graph.transport import Remove
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.middleware.rcl.graph_queries import endpoints_of_node
-from lifecycle.middleware.rcl.stale_node_filter import Census
+from lifecycle.middleware.rcl.stale_node_filter import StaleNodeFilter
 from lifecycle.verify.noise import fold_actions, is_noise_node, known_node, without_noise
 from lifecycle.verify.observation import (
     EndpointReport,
@@ -67,7 +67,7 @@ class Discovery:
         self, node: Node, events: GraphEvents, asker: Asker, reread: Callable[[str], None]
     ) -> None:
         self._node = node
-        self._census = Census(node)
+        self._stale_node_filter = StaleNodeFilter(node)
         self._events = events
         self._asker = asker
         self._reread = reread
@@ -87,7 +87,7 @@ class Discovery:
         self._due = None
         if self._closed:
             return
-        everybody = tuple(self._census.count())
+        everybody = tuple(self._stale_node_filter.count())
         names = frozenset(filter(_counts, everybody))
         hidden = sorted(each for each in everybody if each.rpartition("/")[2].startswith("_"))
         reporting = {each.node for each in self._events.members() if each.incarnation}

@@ -67,11 +67,11 @@ def may_be_same(a: str, b: str, *, same_machine: bool | None) -> bool:
         return a == b
     if one.is_multicast or other.is_multicast:
         return one == other
-    elsewhere = same_machine is False
+    remote_nodes = same_machine is False
     if one.is_unspecified or other.is_unspecified:
-        return not elsewhere
+        return not remote_nodes
     local = one.is_loopback or one.is_link_local
-    return _equal(one, other) and not (local and elsewhere)
+    return _equal(one, other) and not (local and remote_nodes)
 
 
 def _equal(one: IpAddress, other: IpAddress) -> bool:

@@ -75,7 +75,7 @@ def restarted(plan: Plan, keys: Collection[str], *, first: Plan, heard: Heard = 
     processes = {node.process for node in first.nodes if node.key in keys}
     own = {place for place in original if not place[1] and place[0] in processes}
     new = {
-        place: dataclasses.replace(each, url=_elsewhere(first, original, place, current[place]))
+        place: dataclasses.replace(each, url=_remote_nodes(first, original, place, current[place]))
         for place, each in original.items()
         if (place in own or place[0] in keys) and each.moves
     }
@@ -178,7 +178,7 @@ def _with_port(urls: Collection[str]) -> Iterator[ConnectionUrl]:
             yield url
 
 
-def _elsewhere(
+def _remote_nodes(
     first: Plan, original: Mapping[_Place, _Listener], place: _Place, now: _Listener
 ) -> ConnectionUrl:
     """Return the participant's URL on the next port of its own.
@@ -186,14 +186,14 @@ def _elsewhere(
     Every participant of a host has one port of each round, whoever restarts it: supervisors that
     share a host need not ask each other.
     """
-    neighbours = [each for each in original if each[0] and original[each].host == now.host]
+    peer_supervisors = [each for each in original if each[0] and original[each].host == now.host]
     taken = {host: set(ports) for host, ports in terms_of(first).taken}
     pool = PortPool(first.discovery.first_port + RESTART_PORTS_FROM, taken)
-    mine = neighbours.index(place)
-    port = pool.take(now.host, len(neighbours))[mine]
+    mine = peer_supervisors.index(place)
+    port = pool.take(now.host, len(peer_supervisors))[mine]
     if now.url.port != original[place].url.port:
         while port <= (now.url.port or 0):
-            port = pool.take(now.host, len(neighbours))[mine]
+            port = pool.take(now.host, len(peer_supervisors))[mine]
     return dataclasses.replace(now.url, port=port)
 
 

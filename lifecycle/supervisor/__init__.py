@@ -2,7 +2,7 @@
 
 Owns: everything between a plan and a running system. Public: `up` and what it takes and tells,
 `status` and `down` of a running one, `judge_running` for a system that somebody else runs. Names
-load on first use: the zygote, which is of this room, must start without the rest of it.
+load on first use: the fork server, which is of this room, must start without the rest of it.
 """
 
 from __future__ import annotations

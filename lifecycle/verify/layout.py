@@ -76,12 +76,12 @@ def lay_out(
     left_over: list[ObservedEndpoint] = []
     for node in plan.nodes:
         configuration = configurations.get(node.full_name)
-        elsewhere = machines is not None and node.machine not in machines
+        remote_nodes = machines is not None and node.machine not in machines
         matched, rest = _match_node(
             node,
             configuration,
             places.get(node.full_name, {}),
-            beyond=elsewhere and only_shared_memory(node.connections),
+            beyond=remote_nodes and only_shared_memory(node.connections),
         )
         by_node[node.full_name] = tuple(matched)
         # A second node of the same name has the same endpoints again; that is one finding.

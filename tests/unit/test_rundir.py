@@ -103,11 +103,11 @@ def test_a_run_directory_that_lists_what_is_programmed_stays(tmp_path: Path) -> 
 def test_a_link_in_the_place_of_a_run_directory_is_refused_and_not_followed(
     tmp_path: Path, place: str
 ) -> None:
-    elsewhere = tmp_path / "elsewhere"
-    elsewhere.mkdir(mode=0o700)
+    remote_nodes = tmp_path / "elsewhere"
+    remote_nodes.mkdir(mode=0o700)
     link = tmp_path / place
     link.parent.mkdir(mode=0o700, exist_ok=True)
-    link.symlink_to(elsewhere)
+    link.symlink_to(remote_nodes)
     with pytest.raises(UsageError) as caught:
         RunDirectory.acquire(tmp_path / "lifecycle", "robot@30", "abc")
     assert str(caught.value) == (
@@ -115,7 +115,7 @@ def test_a_link_in_the_place_of_a_run_directory_is_refused_and_not_followed(
         "of this user that others cannot write; remove it, or set XDG_RUNTIME_DIR to such a "
         "directory"
     )
-    assert list(elsewhere.iterdir()) == []
+    assert list(remote_nodes.iterdir()) == []
 
 
 @pytest.mark.parametrize("place", ["lifecycle", "lifecycle/robot@30"])

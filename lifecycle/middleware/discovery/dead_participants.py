@@ -93,7 +93,7 @@ def remove_participants(
     It is sent to whom an observer with these URLs could meet by UDP, and to the UDP sockets of some
     processes, whose participants may be connected by ports that only they know. Nothing is said to
     those who are reached over shared memory or TCP alone: for them the lease has to run out. Our
-    own observer does not count what is dead (`Census.ignore`).
+    own observer does not count what is dead (`StaleNodeFilter.ignore`).
 
     Args:
         prefixes: GUID prefixes, 24 hex digits each.

@@ -25,7 +25,7 @@ from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.rcl.graph_guard import GraphGuard
 from lifecycle.middleware.rcl.graph_queries import endpoints_of, endpoints_of_node, topic_endpoints
 from lifecycle.middleware.rcl.hidden_node import quiet_node
-from lifecycle.middleware.rcl.stale_node_filter import Census
+from lifecycle.middleware.rcl.stale_node_filter import StaleNodeFilter
 from lifecycle.middleware.rcl.type_hash import with_service_hashes
 from lifecycle.network.connection_url import ConnectionTransport
 from lifecycle.plan.model import ParticipantConnections
@@ -98,7 +98,7 @@ class GraphObserver:
         )
         self._name = self.node.get_fully_qualified_name()
         self.urls = settings.urls
-        self._census = Census(self.node)
+        self._stale_node_filter = StaleNodeFilter(self.node)
         self._lock = threading.Lock()
         self._callbacks: tuple[Callable[[], None], ...] = ()
         self._destroyed = False
@@ -146,7 +146,7 @@ class GraphObserver:
         if self._guard.failure is not None:
             raise self._guard.failure
         self._known = frozenset()
-        counts = self._census.count()
+        counts = self._stale_node_filter.count()
         ourselves = {} if counts[self._name] > 1 else {self._name}
         endpoints = [
             each for each in self._topic_endpoints(declared, names) if each.node not in ourselves
@@ -235,7 +235,7 @@ class GraphObserver:
         """
         if self._destroyed:
             return frozenset()
-        homes = self._census.homes()
+        homes = self._stale_node_filter.homes()
         own = next(iter(homes.get(self.node.get_fully_qualified_name(), ())), "")
         claimed = {*reported, *(prefix for name in nodes for prefix in homes.get(name, ()))}
         processes = {
@@ -243,7 +243,7 @@ class GraphObserver:
         }
         processes.discard(own[:PROCESS_DIGITS])
         return frozenset(
-            each for each in self._census.shown() if each[:PROCESS_DIGITS] in processes
+            each for each in self._stale_node_filter.shown() if each[:PROCESS_DIGITS] in processes
         )
 
     def remove_participants(self, prefixes: Iterable[str], pids: Iterable[int]) -> None:
@@ -256,7 +256,7 @@ class GraphObserver:
             prefixes: GUID prefixes, 24 hex digits each.
             pids: of processes on this host that run; they are reached wherever they listen.
         """
-        self._census.ignore(prefixes := tuple(prefixes))
+        self._stale_node_filter.ignore(prefixes := tuple(prefixes))
         self._changed()
         remove_participants(prefixes, self.domain_id, self.urls, os.environ, (os.getpid(), *pids))
 
@@ -287,7 +287,7 @@ class GraphObserver:
         self, declared: Collection[str], names: DeclaredNames
     ) -> Iterator[ObservedEndpoint]:
         for kind, topic, info in topic_endpoints(self.node):
-            if self._census.ignores(info.gid):
+            if self._stale_node_filter.ignores(info.gid):
                 continue
             if info.node:
                 self._known |= {info.gid[:_PREFIX_DIGITS]}
@@ -334,7 +334,7 @@ class GraphObserver:
                     node = known_node(info.node)
                     if node not in untold or (kind, info.gid[:_PREFIX_DIGITS]) in shown:
                         continue
-                    if self._census.ignores(info.gid):
+                    if self._stale_node_filter.ignores(info.gid):
                         continue
                     shown.add((kind, info.gid[:_PREFIX_DIGITS]))
                     type_ = _service_type(info.type)

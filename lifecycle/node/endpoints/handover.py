@@ -53,13 +53,13 @@ class Handover:
         self._peers_before = peers_before
         self._after = after
         self._finish = finish
-        self._settling = False
+        self._grace_period = False
         self._call_off = after(PATIENCE_S, self.end)
 
     def peers_changed(self, peers: int) -> None:
         """The new placement has so many peers now."""
-        if peers >= self._peers_before and not self._settling and not self.done.done():
-            self._settling = True
+        if peers >= self._peers_before and not self._grace_period and not self.done.done():
+            self._grace_period = True
             self._call_off()
             self._call_off = self._after(SETTLE_S, self.end)
 

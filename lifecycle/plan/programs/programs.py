@@ -132,8 +132,8 @@ class _Looking:
         found = self._class(node)
         if isinstance(found, NotThereError):
             # A module that is not here may be there; one that is here lacks the class there, too.
-            elsewhere = not is_ours and found.message.startswith("cannot find module")
-            self._missing(node, "run.python", subject, found, is_ours=not elsewhere)
+            remote_nodes = not is_ours and found.message.startswith("cannot find module")
+            self._missing(node, "run.python", subject, found, is_ours=not remote_nodes)
         elif isinstance(found, UnknownError):
             self.unresolved.append(Unresolved(at=at, subject=subject, reason=found.message))
         elif found.is_node is False:

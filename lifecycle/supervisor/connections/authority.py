@@ -54,7 +54,7 @@ CALM_S = 10.0
 
 
 class Reaching(Protocol):
-    """How nodes that are not ours are reached, see eyes.Eyes."""
+    """How nodes that are not ours are reached, see eyes.ObserverParticipant."""
 
     def hand(self, node: str) -> Hand:
         """Return the hand on any node that has a node interface, by full name."""

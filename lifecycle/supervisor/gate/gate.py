@@ -59,7 +59,7 @@ def closes(verdict: Verdict, *, strict: bool) -> bool:
 
 
 class Judging(Protocol):
-    """What a permit asks about the verdict that it came from, see judge.Judge."""
+    """What a permit asks about the verdict that it came from, see judge.VerificationLoop."""
 
     def is_current(self, verdict: Verdict) -> bool:
         """Whether nothing changed since the look that `verdict` came from."""

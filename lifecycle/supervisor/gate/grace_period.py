@@ -1,7 +1,7 @@
 """What is wrong for a passing moment only, because the facts of one change arrive one by one.
 
-Owns: `Settling`: which findings may pass by themselves while a system is watched, and for how long
-a verdict that is worse by these alone is not told. The gate knows no such patience. Pure.
+Owns: `GracePeriod`: which findings may pass by themselves while a system is watched, and for how
+long a verdict that is worse by these alone is not told. The gate knows no such patience. Pure.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _Key = tuple[str, str, str, EndpointKind | None]
 _Place = tuple[object, ...]
 
 
-class Settling:
+class GracePeriod:
     """Knows since when something that may pass is wrong.
 
     Two kinds of findings may: an endpoint whose node is not known (yet), and whatever concerns an

@@ -24,10 +24,10 @@ from lifecycle.supervisor.control.orders import (
 )
 from lifecycle.supervisor.control.revision import Revisions
 from lifecycle.supervisor.gate.gate import VerificationError
-from lifecycle.supervisor.gate.sequence import Regulator
-from lifecycle.supervisor.gate.verification_loop import Changes, Judge
+from lifecycle.supervisor.gate.sequence import GateSequence
+from lifecycle.supervisor.gate.verification_loop import Changes, VerificationLoop
 from lifecycle.supervisor.gate.watch import Watch
-from lifecycle.supervisor.health.process_monitor import Vigil
+from lifecycle.supervisor.health.process_monitor import ProcessMonitor
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.run.events import Emitter, Notice
 from lifecycle.supervisor.run.failure import StepFailedError
@@ -54,11 +54,11 @@ class Holding:
         self,
         system: System,
         *,
-        judge: Judge,
+        judge: VerificationLoop,
         changes: Changes,
-        regulator: Regulator,
+        gate_sequence: GateSequence,
         revisions: Revisions,
-        vigil: Vigil,
+        process_monitor: ProcessMonitor,
         emit: Emitter,
         note_segments: Callable[[], Awaitable[None]],
         keep_going: bool,
@@ -66,9 +66,9 @@ class Holding:
         self._system = system
         self._judge = judge
         self._changes = changes
-        self._regulator = regulator
+        self._gate_sequence = gate_sequence
         self._revisions = revisions
-        self._vigil = vigil
+        self._process_monitor = process_monitor
         self._emit = emit
         self._note_segments = note_segments
         self._keep_going = keep_going
@@ -101,7 +101,7 @@ class Holding:
             if pending is None:
                 return self._violated
             await self._carry_out(pending)
-            stage = self._regulator.stage
+            stage = self._gate_sequence.stage
 
     async def ordered(self, order: Order) -> Done:
         """Take an order from outside, if it fits what the system is doing; return its outcome."""
@@ -112,7 +112,7 @@ class Holding:
         return await self._mailbox.place(order)
 
     def _check(self, order: Order) -> None:
-        check_order(order, self._system, self._regulator.phase)
+        check_order(order, self._system, self._gate_sequence.phase)
         self._revisions.check(order)
 
     def close(self, reason: str) -> None:
@@ -130,13 +130,13 @@ class Holding:
                     self._emit(Notice(message=f"takes the changed manifest: {line}"))
             else:
                 pending.order = dataclasses.replace(pending.order, plan=None, reload=False)
-            await self._regulator.carry_out(pending.order)
+            await self._gate_sequence.carry_out(pending.order)
             await self._note_segments()
         except (UsageError, NotBegunError) as error:
             pending.finish(Done(exit_code=error.exit_code, error=str(error)))
         except (VerificationError, StepFailedError) as error:
             pending.finish(Done(exit_code=error.exit_code, error=str(error)))
-            held = self._regulator.phase in (PAUSED, HELD)
+            held = self._gate_sequence.phase in (PAUSED, HELD)
             if not held or not isinstance(error, VerificationError):
                 raise
             self._emit(Notice(message=str(error)))
@@ -149,7 +149,7 @@ class Holding:
         """Wait for an order; None once the time is over."""
         loop = asyncio.get_running_loop()
         while True:
-            death = asyncio.ensure_future(self._vigil.next_death())
+            death = asyncio.ensure_future(self._process_monitor.next_death())
             order = asyncio.ensure_future(self._mailbox.next())
             try:
                 left = None if deadline is None else max(0.0, deadline - loop.time())

@@ -26,7 +26,7 @@ from lifecycle.supervisor.control.orders import (
 )
 from lifecycle.supervisor.gate.first_contact import TRIES, UNCHANGED_S, undiscovered
 from lifecycle.supervisor.gate.gate import Gate, Permit, VerificationError, behind_s, closes
-from lifecycle.supervisor.gate.verification_loop import Judge
+from lifecycle.supervisor.gate.verification_loop import VerificationLoop
 from lifecycle.supervisor.nodes.bring_up import BringUp
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.processes.spawn import Spawner
@@ -43,7 +43,7 @@ Alive = Callable[[Coroutine[Any, Any, object]], Coroutine[Any, Any, None]]
 """Runs a step; the unexpected end of any process ends it."""
 
 
-class Regulator:
+class GateSequence:
     """Carries out orders on one system.
 
     Args:
@@ -69,7 +69,7 @@ class Regulator:
         system: System,
         *,
         bring_up: BringUp,
-        judge: Judge,
+        judge: VerificationLoop,
         gate: Gate,
         emit: Emitter,
         alive: Alive,

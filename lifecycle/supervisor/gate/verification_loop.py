@@ -17,7 +17,7 @@ from lifecycle.plan.model import Plan
 from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.gate.activation_guard import ActivationGuard
 from lifecycle.supervisor.gate.gate import closes
-from lifecycle.supervisor.gate.grace_period import Settling
+from lifecycle.supervisor.gate.grace_period import GracePeriod
 from lifecycle.supervisor.health.agreement import Agreement
 from lifecycle.supervisor.health.liveliness import Presence
 from lifecycle.supervisor.nodes.system import GraphObserver, System
@@ -121,7 +121,7 @@ class Looker(Protocol):
         """Return what the observation alone does not tell."""
 
 
-class Judge:
+class VerificationLoop:
     """Judges one system.
 
     Attributes:
@@ -156,7 +156,7 @@ class Judge:
         self._mark: tuple[int, int] | None = None
         self.seen = Observation()
         self._presence = Presence(emit)
-        self._settling = Settling()
+        self._grace_period = GracePeriod()
         self.ahead: frozenset[str] = frozenset()
 
     async def once(self, stage: Stage) -> Verdict:
@@ -194,7 +194,9 @@ class Judge:
         """
         found = await self._look(stage)
         now_s = asyncio.get_running_loop().time()
-        verdict, again_s = self._settling.standing(self.latest, found, self._system.expected, now_s)
+        verdict, again_s = self._grace_period.standing(
+            self.latest, found, self._system.expected, now_s
+        )
         self._stands(stage, verdict)
         return verdict, again_s
 

@@ -57,14 +57,14 @@ class Notices(Protocol):
 
 
 class Air(Protocol):
-    """What carries notices, see eyes.Eyes."""
+    """What carries notices, see eyes.ObserverParticipant."""
 
     def plan_notices(self, on_notice: Callable[[str], None]) -> Notices:
         """Take part in the exchange of plans; the callback comes from any thread."""
 
 
 class Connected(Protocol):
-    """Who knows which supervisors are connected, see neighbours.Neighbours."""
+    """Who knows which supervisors are connected, see neighbours.PeerSupervisors."""
 
     @property
     def machines(self) -> frozenset[str]:

@@ -47,7 +47,7 @@ class Voice(Protocol):
 
 
 class Air(Protocol):
-    """What carries voices, see eyes.Eyes."""
+    """What carries voices, see eyes.ObserverParticipant."""
 
     def machine_voice(self, system: str, machine: str) -> Voice:
         """Be heard as the supervisor of a machine."""
@@ -84,7 +84,7 @@ class Listener:
 
 
 @dataclasses.dataclass(slots=True)
-class _Neighbour:
+class _PeerSupervisor:
     """One who should be heard.
 
     Attributes:
@@ -100,7 +100,7 @@ class _Neighbour:
     lost_at_s: float | None = None
 
 
-class Neighbours:
+class PeerSupervisors:
     """Hears whom a system depends on; `open` it in a loop and `close` it."""
 
     def __init__(self, system: System, air: Air) -> None:
@@ -108,13 +108,13 @@ class Neighbours:
         self._air = air
         self._loop = asyncio.get_running_loop()
         self._closed = False
-        self._known: list[_Neighbour] = []
-        self._machines: list[_Neighbour] = []
+        self._known: list[_PeerSupervisor] = []
+        self._machines: list[_PeerSupervisor] = []
         self._ears: list[Ear] = []
         self._attached: tuple[str, ...] = ()
         self._voices: list[Voice] = []
         self._said: Mapping[str, str] = {}
-        self._missing: dict[str, _Neighbour] = {}
+        self._missing: dict[str, _PeerSupervisor] = {}
         self._calling: asyncio.Task[None] | None = None
         self._tasks: set[asyncio.Task[None]] = set()
 
@@ -127,12 +127,12 @@ class Neighbours:
         for machine, nodes in remote.items():
             if machine:
                 what = f"the supervisor of machine {machine!r}"
-                self._machines.append(_Neighbour(what, machine, tuple(nodes)))
+                self._machines.append(_PeerSupervisor(what, machine, tuple(nodes)))
                 listener = self._listener(self._machines[-1])
                 self._ears.append(self._air.machine_ear(plan.system, machine, listener))
         self._attached = self._attached_nodes()
         for name in self._attached:
-            listener = self._listener(_Neighbour(repr(name), "", (name,)))
+            listener = self._listener(_PeerSupervisor(repr(name), "", (name,)))
             self._ears.append(self._air.node_ear(name, listener))
         if remote:
             own = dict.fromkeys(node.planned.machine for node in self._system.nodes.values())
@@ -178,7 +178,7 @@ class Neighbours:
         self._ears.clear()
         self._voices.clear()
 
-    def _listener(self, neighbour: _Neighbour) -> Listener:
+    def _listener(self, neighbour: _PeerSupervisor) -> Listener:
         self._known.append(neighbour)
 
         def soon(do: Callable[..., None]) -> Callable[..., None]:
@@ -195,7 +195,7 @@ class Neighbours:
 
         return Listener(heard=soon(self._heard), left=soon(self._left), told=soon(self._told))
 
-    def _heard(self, neighbour: _Neighbour, heard: bool) -> None:
+    def _heard(self, neighbour: _PeerSupervisor, heard: bool) -> None:
         if self._closed or heard is neighbour.heard:
             return
         neighbour.heard = heard
@@ -204,7 +204,7 @@ class Neighbours:
         else:
             self._lost(neighbour)
 
-    def _lost(self, neighbour: _Neighbour) -> None:
+    def _lost(self, neighbour: _PeerSupervisor) -> None:
         neighbour.lost_at_s = self._loop.time()
         if neighbour.machine:
             self._system.emit(MachineConnection(machine=neighbour.machine, established=False))
@@ -216,7 +216,7 @@ class Neighbours:
         if self._calling is None:
             self._calling = asyncio.ensure_future(self._call())
 
-    def _found(self, neighbour: _Neighbour) -> None:
+    def _found(self, neighbour: _PeerSupervisor) -> None:
         lost_s = 0.0
         if neighbour.lost_at_s is not None:
             lost_s = self._loop.time() - neighbour.lost_at_s
@@ -231,7 +231,7 @@ class Neighbours:
             )
         self._system.liveliness.came_back(neighbour.nodes, Cause.LOST)
 
-    def _left(self, neighbour: _Neighbour) -> None:
+    def _left(self, neighbour: _PeerSupervisor) -> None:
         """It left properly, or DDS forgot it after it was lost."""
         if self._closed or not neighbour.heard:
             return
@@ -242,7 +242,7 @@ class Neighbours:
             )
         self._system.liveliness.came_back(neighbour.nodes, Cause.TOLD)
 
-    def _told(self, neighbour: _Neighbour, silent: Mapping[str, str]) -> None:
+    def _told(self, neighbour: _PeerSupervisor, silent: Mapping[str, str]) -> None:
         if self._closed:
             return
         for name in neighbour.nodes:

@@ -1,6 +1,6 @@
 """Doing something while every process of the system lives.
 
-Owns: `Vigil`: what runs in it is ended by the first process that ends unasked.
+Owns: `ProcessMonitor`: what runs in it is ended by the first process that ends unasked.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _SPEAK_S = 0.7 + ALSO_S
 """A step notices its node's death itself within this, and knows what the node was doing."""
 
 
-class Vigil:
+class ProcessMonitor:
     """Watch over the processes of one system.
 
     Attributes:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import asyncio
 
 from lifecycle.supervisor.gate.verification_loop import Changes
-from lifecycle.supervisor.nodes.observer_participant import Eyes
+from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 from lifecycle.supervisor.nodes.system import System
 
 _LEASE_S = 21.0
@@ -18,9 +18,11 @@ _LEASE_S = 21.0
 class Sightings:
     """Who is in the graph of one system, as an event to wait for."""
 
-    def __init__(self, system: System, eyes: Eyes, changes: Changes) -> None:
+    def __init__(
+        self, system: System, observer_participant: ObserverParticipant, changes: Changes
+    ) -> None:
         self._system = system
-        self._eyes = eyes
+        self._observer_participant = observer_participant
         self._changes = changes
 
     async def appears(self, name: str) -> None:
@@ -42,5 +44,5 @@ class Sightings:
             await self._changes.beyond(count, left_s)
 
     async def _is_there(self, name: str) -> bool:
-        observation = await self._eyes.observe(self._system.plan)
+        observation = await self._observer_participant.observe(self._system.plan)
         return any(each.full_name == name for each in observation.nodes)

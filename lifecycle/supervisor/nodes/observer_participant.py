@@ -30,7 +30,7 @@ _BURST_S = 0.05
 """Shorter than an observer's own: bring-up is a race, and a look costs a few milliseconds."""
 
 
-class Eyes:
+class ObserverParticipant:
     """What a supervisor sees and reaches of one domain. `destroy` it, or use it in a `with`."""
 
     def __init__(self, observer: Observer, clients: NodeClients, graph: GraphObserver) -> None:
@@ -47,7 +47,7 @@ class Eyes:
         *,
         guests: bool = False,
         events: bool = False,
-    ) -> Eyes:
+    ) -> ObserverParticipant:
         """Make the participant; before any process, so that each is discovered at once.
 
         Args:
@@ -65,10 +65,10 @@ class Eyes:
         graph = GraphObserver(domain_id, connections)
         clients = NodeClients(graph)
         observer = Observer(graph, clients, quiet_s=_QUIET_S, burst_s=_BURST_S, guests=guests)
-        eyes = cls(observer, clients, graph)
+        observer_participant = cls(observer, clients, graph)
         if events:
-            eyes._listen()
-        return eyes
+            observer_participant._listen()
+        return observer_participant
 
     @property
     def rmw(self) -> str:
@@ -197,7 +197,7 @@ class Eyes:
             self._transport.close()
         self._observer.destroy()
 
-    def __enter__(self) -> Eyes:  # noqa: PYI034 - typing.Self is not in Python 3.10
+    def __enter__(self) -> ObserverParticipant:  # noqa: PYI034 - typing.Self is not in Python 3.10
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -1,8 +1,8 @@
 """Nodes of the plan that another supervisor brings up, on another machine.
 
 Owns: `RemoteNode`, how far such a node has come as far as the graph and its own report tell, and
-`Elsewhere`, which keeps that up to date. Nothing here is driven: each supervisor activates its own.
-Must not import rclpy.
+`RemoteNodes`, which keeps that up to date. Nothing here is driven: each supervisor activates its
+own. Must not import rclpy.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class RemoteNode:
             self.changed = asyncio.Event()
 
 
-class Elsewhere:
+class RemoteNodes:
     """Looks at remote nodes while anybody may wait for them."""
 
     def __init__(

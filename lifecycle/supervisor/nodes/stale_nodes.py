@@ -26,7 +26,7 @@ _PREFIX_DIGITS = 24
 
 
 class Graph(Protocol):
-    """Where participants are seen and removed, see eyes.Eyes."""
+    """Where participants are seen and removed, see eyes.ObserverParticipant."""
 
     def participants_of(
         self, pid: int, *, nodes: Iterable[str], reported: Iterable[str]

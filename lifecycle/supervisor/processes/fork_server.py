@@ -1,8 +1,8 @@
-"""The supervisor's side of a zygote, the fork server: a `Spawner` over a socket.
+"""The supervisor's side of a fork server: a `Spawner` over a socket.
 
-Owns: starting `zygote_main`, also anew when it was killed, and following its children by pidfd, so
-that an end is noticed at once. Children of a zygote that died become this process's own, which then
-learns by itself how they end and whether they are stopped. Must not import rclpy.
+Owns: starting `fork_server_main`, also anew when it was killed, and following its children by
+pidfd, so that an end is noticed at once. Children of a fork server that died become this process's
+own, which then learns by itself how they end and whether they are stopped. Must not import rclpy.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ from lifecycle.supervisor.processes.states import ProcessExit
 from lifecycle.supervisor.run.events import Emitter, Notice
 
 _STATUS_WAIT_S = 1.0
-"""The zygote reaps within microseconds; after this long its report does not come any more."""
+"""The fork server reaps within microseconds; after this long its report does not come any more."""
 
 _READY_S = 10.0
-"""A zygote serves after 0.2 s; a loaded machine takes longer."""
+"""A fork server serves after 0.2 s; a loaded machine takes longer."""
 
 _SOON_S = 2.0
 """One that dies sooner after its start is started again only when it is needed."""
@@ -43,7 +43,7 @@ _SOON_S = 2.0
 _TRIES = 3
 
 _CLOSE_S = 1.0
-"""A zygote whose children have ended ends within milliseconds of its socket."""
+"""A fork server whose children have ended ends within milliseconds of its socket."""
 
 _STOPS = os.WSTOPPED | os.WCONTINUED | os.WNOHANG
 
@@ -54,12 +54,12 @@ _FRESH_INTERPRETER = ("PYTHON", "LD_", "RMW_IMPLEMENTATION", "VIRTUAL_ENV")
 """Variables that act while an interpreter starts; a fork of a running one would ignore them."""
 
 
-class ZygoteProcess:
-    """The operating system process of a zygote; can be started before there is an event loop.
+class ForkServerProcess:
+    """The operating system process of a fork server; can be started before there is an event loop.
 
     Args:
         preload: import rclpy and the message packages, to fork Python nodes.
-        environment: complete environment of the zygote, which its children inherit.
+        environment: complete environment of the fork server, which its children inherit.
     """
 
     def __init__(
@@ -84,16 +84,16 @@ class ZygoteProcess:
         finally:
             theirs.close()
 
-    def again(self) -> ZygoteProcess:
+    def again(self) -> ForkServerProcess:
         """Start another one in the place of this one, which has died.
 
         Raises:
             BringUpError: it cannot be started.
         """
-        return ZygoteProcess(preload=self._preload, environment=self._environment, again=True)
+        return ForkServerProcess(preload=self._preload, environment=self._environment, again=True)
 
     def close(self, grace_s: float = _CLOSE_S) -> None:
-        """End the zygote; it ends by itself when its socket closes and no child is left."""
+        """End the fork server; it ends by itself when its socket closes and no child is left."""
         self.socket.close()
         try:
             self.popen.wait(grace_s)
@@ -102,8 +102,8 @@ class ZygoteProcess:
             self.popen.wait()
 
 
-class ZygoteChild:
-    """A process forked by the zygote.
+class ForkServerChild:
+    """A process forked by the fork server.
 
     Args:
         on_stop: see SpawnRequest.
@@ -131,7 +131,7 @@ class ZygoteChild:
                 signal.pidfd_send_signal(self._pidfd, number)
 
     def _ended(self) -> None:
-        """The pidfd is readable: it ended. The zygote tells how, unless it is gone itself."""
+        """The pidfd is readable: it ended. The fork server tells how, unless it is gone itself."""
         assert self._pidfd is not None
         self._loop.remove_reader(self._pidfd)
         self._has_ended = True
@@ -141,7 +141,7 @@ class ZygoteChild:
             self._loop.call_later(_STATUS_WAIT_S, self.settle, None)
 
     def adopt(self) -> None:
-        """Take it as our own child: the zygote has died, and we are the subreaper."""
+        """Take it as our own child: the fork server has died, and we are the subreaper."""
         self._is_ours = True
         if self._has_ended:
             self.settle(None)
@@ -177,18 +177,18 @@ class ZygoteChild:
         self.exited.set_result(exit_)
 
 
-class Zygote:
-    """A `Spawner` that asks a zygote process to fork, and starts another one if that is killed.
+class ForkServer:
+    """A `Spawner` that asks a process to fork, and starts another one if that is killed.
 
     Args:
         process: the first one.
         emit: is told if one dies.
     """
 
-    def __init__(self, process: ZygoteProcess, emit: Emitter | None = None) -> None:
+    def __init__(self, process: ForkServerProcess, emit: Emitter | None = None) -> None:
         self._emit = emit or Emitter()
-        self._pending: dict[int, tuple[asyncio.Future[ZygoteChild], SpawnRequest]] = {}
-        self._children: dict[int, ZygoteChild] = {}
+        self._pending: dict[int, tuple[asyncio.Future[ForkServerChild], SpawnRequest]] = {}
+        self._children: dict[int, ForkServerChild] = {}
         self._next = 0
         self._loop = asyncio.get_running_loop()
         # Of a shell that became this process by exec: no part of the run.
@@ -199,7 +199,7 @@ class Zygote:
 
     @property
     def pid(self) -> int:
-        """Process id of the zygote itself."""
+        """Process id of the fork server itself."""
         return self._process.popen.pid
 
     @property
@@ -208,7 +208,7 @@ class Zygote:
         return (self.pid, *(each.pid for each in self._children.values()))
 
     def family(self) -> frozenset[int]:
-        """Return the pids of all that descends from what was started, without the zygote itself."""
+        """Return the pids of all that descends from what was started, but for the fork server."""
         roots = {self.pid}
         if self._has_died:
             # What it had adopted, and what it had started, is ours now.
@@ -216,7 +216,7 @@ class Zygote:
         return frozenset(roots.union(*map(descendants, roots)) - {self.pid})
 
     async def ready(self) -> None:
-        """Have the zygote answer, bounded; if it has died, another one.
+        """Have the fork server answer, bounded; if it has died, another one.
 
         Raises:
             BringUpError: it does not, or cannot be started.
@@ -240,11 +240,11 @@ class Zygote:
                 return
         raise BringUpError(f"the fork server {self._how}")
 
-    async def spawn(self, request: SpawnRequest) -> ZygoteChild:
+    async def spawn(self, request: SpawnRequest) -> ForkServerChild:
         """Fork one process.
 
         Raises:
-            BringUpError: the zygote is gone, or the system is out of processes.
+            BringUpError: the fork server is gone, or the system is out of processes.
         """
         try:
             if not self._alive:
@@ -258,8 +258,8 @@ class Zygote:
             message = error.message if isinstance(error, BringUpError) else str(error)
             raise BringUpError(f"cannot start process {request.name!r}: {message}") from error
 
-    async def _forked(self, request: SpawnRequest) -> ZygoteChild:
-        """Have the zygote fork; raises OSError if it cannot be asked, BringUpError otherwise."""
+    async def _forked(self, request: SpawnRequest) -> ForkServerChild:
+        """Have it fork; raises OSError if it cannot be asked, BringUpError otherwise."""
         self._next += 1
         descriptors = [request.stdout, request.stderr]
         argv = request.argv
@@ -274,7 +274,7 @@ class Zygote:
             working_directory=request.working_directory,
             control=request.control is not None,
         )
-        born: asyncio.Future[ZygoteChild] = self._loop.create_future()
+        born: asyncio.Future[ForkServerChild] = self._loop.create_future()
         self._pending[message.id] = born, request
         try:
             socket.send_fds(self._process.socket, [to_json(message)], descriptors)
@@ -283,7 +283,7 @@ class Zygote:
             raise
         return await born
 
-    def _begin(self, process: ZygoteProcess) -> None:
+    def _begin(self, process: ForkServerProcess) -> None:
         self._process = process
         self._alive = True
         self._how = ""
@@ -329,7 +329,7 @@ class Zygote:
             if not born.done():
                 born.set_exception(BringUpError(report.error))
             return
-        child = ZygoteChild(report.pid, descriptors[0], request.on_stop)
+        child = ForkServerChild(report.pid, descriptors[0], request.on_stop)
         self._children[report.id] = child
         child.exited.add_done_callback(lambda _: self._children.pop(report.id, None))
         if born.cancelled():
@@ -339,7 +339,7 @@ class Zygote:
             born.set_result(child)
 
     def _ended(self) -> None:
-        """The zygote itself has ended: by now its children are ours."""
+        """The fork server itself has ended: by now its children are ours."""
         self._loop.remove_reader(self._pidfd)
         os.close(self._pidfd)
         status = self._process.popen.wait()
@@ -376,12 +376,12 @@ class Zygote:
         self._emit(Notice(message=f"{lost}; what it started runs on, and {what}"))
 
     def note_stops(self) -> None:
-        """Take SIGCHLD: children that a zygote left to us may have been stopped, or continue."""
+        """Take SIGCHLD: children that were left to us may have been stopped, or continue."""
         for child in tuple(self._children.values()):
             child.note_stops()
 
     async def close(self) -> None:
-        """End the zygote; its children must have ended."""
+        """End the fork server; its children must have ended."""
         self._closed = True
         if not self._alive:
             return

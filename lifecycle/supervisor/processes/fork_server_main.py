@@ -1,12 +1,12 @@
-"""The zygote's own process: forks the processes of a system, and guards them.
+"""The fork server's own process: forks the processes of a system, and guards them.
 
 Owns: what runs in `python -m lifecycle.supervisor.processes.fork_server_main SOCKET_FD [--preload]
 [--again]`. It stays
 single-threaded and never calls rclpy.init, so that forking is safe and every child is a
 participant of its own; with `--preload` a forked host skips ~130 ms of imports. Each child leads a
 session of its own. It adopts what its children leave behind (PR_SET_CHILD_SUBREAPER), so as long as
-it lives, what descends from it is what the run started. If the supervisor vanishes the zygote ends
-what is left of its children, bounded, and of those of a zygote before it that was killed.
+it lives, what descends from it is what the run started. If the supervisor vanishes it ends what is
+left of its children, bounded, and of those of a fork server before it that was killed.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _STOPS = os.WSTOPPED | os.WCONTINUED | os.WNOHANG
 _PIPE_BYTES = 65536
 
 
-class _Zygote:
+class _ForkServer:
     def __init__(self, sock: socket.socket, *, again: bool) -> None:
         self._sock = sock
         self._again = again
@@ -164,7 +164,7 @@ class _Zygote:
                 os.killpg(pid, number)
 
     def _become(self, request: ForkRequest, descriptors: list[int]) -> NoReturn:
-        """Turn this fork into the requested process; never returns to the zygote's code."""
+        """Turn this fork into the requested process; never returns to the fork server's code."""
         code = 70
         try:
             os.setsid()
@@ -213,8 +213,9 @@ def _take_streams(stdout: int, stderr: int) -> None:
 def _run(argv: tuple[str, ...], control: int | None) -> int:
     """Serve as our host, or become another program.
 
-    A host ends by itself when its control channel does. A command has none: it outlives a zygote
-    that is killed, as hosts do, and is ended by the supervisor, the next zygote or the next `up`.
+    A host ends by itself when its control channel does. A command has none: it outlives a fork
+    server that is killed, as hosts do, and is ended by the supervisor, the next fork server or the
+    next `up`.
     """
     if not argv:
         assert control is not None
@@ -242,7 +243,7 @@ def _reseed() -> None:
 
 
 def main() -> int:
-    """Run the zygote."""
+    """Run the fork server."""
     parser = argparse.ArgumentParser(prog=f"python -m {__spec__.name}")
     parser.add_argument("socket_fd", type=int)
     parser.add_argument("--preload", action="store_true")
@@ -259,7 +260,7 @@ def main() -> int:
         # Keep the shared pages shared: a child's first collection would touch them all.
         gc.collect()
         gc.freeze()
-    _Zygote(socket.socket(fileno=options.socket_fd), again=options.again).serve()
+    _ForkServer(socket.socket(fileno=options.socket_fd), again=options.again).serve()
     return 0
 
 

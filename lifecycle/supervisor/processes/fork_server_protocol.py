@@ -1,7 +1,7 @@
-"""What a supervisor and its zygote say to each other.
+"""What a supervisor and its fork server say to each other.
 
 Owns: the messages, each one datagram of JSON on an AF_UNIX SOCK_SEQPACKET pair, with descriptors
-beside it (SCM_RIGHTS, unix(7)). Imports nothing of this room: the zygote must start fast.
+beside it (SCM_RIGHTS, unix(7)). Imports nothing of this room: the fork server must start fast.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ MSG_CMSG_CLOEXEC = 0x40000000
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class ForkRequest:
-    """Supervisor → zygote, with descriptors stdout, stderr and, if `control`, the channel.
+    """Supervisor → fork server, with descriptors stdout, stderr and, if `control`, the channel.
 
     Attributes:
-        id: ≥ 1; 0 only asks whether the zygote serves, which answers with the same id.
+        id: ≥ 1; 0 only asks whether the fork server serves, which answers with the same id.
     """
 
     id: int
@@ -36,7 +36,7 @@ SERVES = ForkRequest(id=0, argv=(), environment=(), working_directory="", contro
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Report:
-    """Zygote → supervisor: a child was forked (with its pidfd), stopped, continued or ended.
+    """Fork server → supervisor: a child was forked (with its pidfd), stopped, continued or ended.
 
     Attributes:
         id: of the ForkRequest.

@@ -1,7 +1,7 @@
 """Ending processes that escaped: what our children left, and what a killed supervisor left.
 
 Owns: finding them without guessing, and ending them bounded. A process belongs to a run if it
-descends from the run's zygote, which adopts all that its descendants leave behind, or if its
+descends from the run's fork server, which adopts all that its descendants leave behind, or if its
 environment carries the run's id. Other children of this process do not: it may have become the
 supervisor by exec of a shell with background jobs. A pid alone never proves it. Must not import
 rclpy.
@@ -48,7 +48,7 @@ class _Orphan:
 
 
 class Family(Protocol):
-    """What knows the processes of a run by their descent, see zygote.Zygote."""
+    """What knows the processes of a run by their descent, see fork_server.ForkServer."""
 
     @property
     def pid(self) -> int:
@@ -58,30 +58,32 @@ class Family(Protocol):
         """Return the pids of all that was started, without the fork server itself."""
 
 
-def end_strays(run_id: str, zygote: Family | None = None, grace_s: float = 0.5) -> tuple[int, ...]:
-    """End everything that still belongs to a run, but for this process and the zygote itself.
+def end_strays(
+    run_id: str, fork_server: Family | None = None, grace_s: float = 0.5
+) -> tuple[int, ...]:
+    """End everything that still belongs to a run, but for this process and the fork server itself.
 
     Args:
         run_id: of the run; empty for none.
-        zygote: what this process started them by; None if only the run's id tells.
+        fork_server: what this process started them by; None if only the run's id tells.
         grace_s: seconds between SIGTERM and SIGKILL.
 
     Returns:
         The pids that had to be ended.
     """
     ended: list[int] = []
-    spared = {os.getpid()} if zygote is None else {os.getpid(), zygote.pid}
+    spared = {os.getpid()} if fork_server is None else {os.getpid(), fork_server.pid}
     # Again for what they started meanwhile.
     for _ in range(_ROUNDS):
         strays = set(_carrying(run_id)) if run_id else set()
-        if zygote is not None:
-            strays |= zygote.family()
+        if fork_server is not None:
+            strays |= fork_server.family()
         found = _end(strays - spared, grace_s)
         if not found:
             break
         ended += found
-    if zygote is not None:
-        reap_adopted((zygote.pid,))
+    if fork_server is not None:
+        reap_adopted((fork_server.pid,))
     return tuple(sorted(ended))
 
 

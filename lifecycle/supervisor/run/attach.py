@@ -21,9 +21,9 @@ from lifecycle.rundir import run_name, runtime_root
 from lifecycle.supervisor.connections.renegotiation import Expectation, is_negotiated
 from lifecycle.supervisor.control.client import look, running
 from lifecycle.supervisor.gate.gate import closes
-from lifecycle.supervisor.gate.grace_period import Settling
+from lifecycle.supervisor.gate.grace_period import GracePeriod
 from lifecycle.supervisor.gate.verification_loop import with_findings
-from lifecycle.supervisor.nodes.observer_participant import Eyes
+from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 from lifecycle.supervisor.run.options import onlooker_connections, own_machines
 from lifecycle.verify import verify
 from lifecycle.verify.noise import tolerating_pattern
@@ -75,8 +75,8 @@ def judge_running(plan: Plan, *, timeout_s: float, strict: bool) -> Seen:
     Raises:
         MiddlewareError: no participant can be made.
     """
-    with _looking(plan) as eyes:
-        return asyncio.run(_judge(plan, eyes, timeout_s, strict=strict))
+    with _looking(plan) as observer_participant:
+        return asyncio.run(_judge(plan, observer_participant, timeout_s, strict=strict))
 
 
 async def following(plan: Plan, on_look: Callable[[Seen], None]) -> None:
@@ -84,19 +84,19 @@ async def following(plan: Plan, on_look: Callable[[Seen], None]) -> None:
 
     What may pass by itself is given a moment to do so, see grace_period.py.
     """
-    settling = Settling()
+    grace_period = GracePeriod()
     last: Verdict | None = None
     clock = asyncio.get_running_loop().time
     pause_s = _ASK_AGAIN_S
-    with _looking(plan) as eyes:
+    with _looking(plan) as observer_participant:
         while True:
-            seen = await _see(plan, eyes)
-            now, again_s = settling.standing(last, seen.verdict, seen.plan, clock())
+            seen = await _see(plan, observer_participant)
+            now, again_s = grace_period.standing(last, seen.verdict, seen.plan, clock())
             if now != last or again_s is not None:
                 pause_s = _ASK_AGAIN_S
             last = now
             on_look(dataclasses.replace(seen, verdict=last))
-            if await _change(eyes, pause_s):
+            if await _change(observer_participant, pause_s):
                 pause_s = _ASK_AGAIN_S
             else:
                 pause_s = min(pause_s * 2, _ASK_AT_MOST_S)
@@ -123,14 +123,14 @@ def where(plan: Plan, rmw: str) -> str:
     )
 
 
-def _looking(plan: Plan) -> Eyes:
+def _looking(plan: Plan) -> ObserverParticipant:
     """Open the eyes on a plan's domain; also on guests, where they are negotiated with."""
     os.environ["ROS_DOMAIN_ID"] = str(plan.domain_id)
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = plan.discovery_range.name
     hosts = reached_hosts(plan, own_machines(plan, ""))
     os.environ.update(peers_environment(hosts, os.environ))
     is_open = plan.policy.undeclared_nodes is EndpointPolicy.OPEN
-    return Eyes.open(
+    return ObserverParticipant.open(
         plan.domain_id,
         onlooker_connections(plan, _heard(plan)),
         guests=is_open and is_negotiated(plan),
@@ -150,27 +150,29 @@ def _heard(plan: Plan) -> tuple[NodeConfiguration, ...]:
     return tuple(found)
 
 
-async def _see(plan: Plan, eyes: Eyes) -> Seen:
-    observation = await eyes.observe(plan)
+async def _see(plan: Plan, observer_participant: ObserverParticipant) -> Seen:
+    observation = await observer_participant.observe(plan)
     expected = Expectation.of(plan, observation)
     verdict = verify(expected.plan, observation, stage=Stage.ACTIVE)
     return Seen(
         plan=expected.plan,
         observation=observation,
         verdict=with_findings(verdict, expected.findings),
-        rmw=eyes.rmw,
+        rmw=observer_participant.rmw,
     )
 
 
-async def _judge(plan: Plan, eyes: Eyes, timeout_s: float, *, strict: bool) -> Seen:
+async def _judge(
+    plan: Plan, observer_participant: ObserverParticipant, timeout_s: float, *, strict: bool
+) -> Seen:
     loop = asyncio.get_running_loop()
     deadline = loop.time() + timeout_s
     while True:
-        seen = await _see(plan, eyes)
+        seen = await _see(plan, observer_participant)
         left_s = deadline - loop.time()
         if left_s <= 0 or not _worth_waiting(seen.verdict, strict=strict):
             return seen
-        await _change(eyes, min(left_s, _ASK_AGAIN_S))
+        await _change(observer_participant, min(left_s, _ASK_AGAIN_S))
 
 
 def _worth_waiting(verdict: Verdict, *, strict: bool) -> bool:
@@ -181,10 +183,10 @@ def _worth_waiting(verdict: Verdict, *, strict: bool) -> bool:
     return any(heals)
 
 
-async def _change(eyes: Eyes, timeout_s: float) -> bool:
+async def _change(observer_participant: ObserverParticipant, timeout_s: float) -> bool:
     """Wait for a change of the graph; False when it is time to ask the nodes again without one."""
     try:
-        await asyncio.wait_for(eyes.wait_change(), timeout_s)
+        await asyncio.wait_for(observer_participant.wait_change(), timeout_s)
     except asyncio.TimeoutError:
         return False
     return True

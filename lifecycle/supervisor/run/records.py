@@ -33,7 +33,7 @@ class Records:
         self,
         directory: RunDirectory,
         system: System,
-        zygote: Family,
+        fork_server: Family,
         worker: Worker,
         emit: Emitter,
     ) -> None:
@@ -43,7 +43,7 @@ class Records:
         self._said = False
         self._directory = directory
         self._system = system
-        self._zygote = zygote
+        self._fork_server = fork_server
         self.segments: frozenset[str] = frozenset()
 
     def write(self) -> None:
@@ -75,7 +75,7 @@ class Records:
             self._again.cancel()
 
     def _write(self) -> None:
-        pids = {"zygote": self._zygote.pid}
+        pids = {"zygote": self._fork_server.pid}
         pids.update({each.name: each.pid for each in self._system.living})
         self._directory.record(
             tuple(
@@ -95,7 +95,7 @@ class Records:
 
     def _owned(self) -> frozenset[str]:
         """Return what is owned now, also by what our processes started: `ros2 run` does."""
-        return segments_of((os.getpid(), self._zygote.pid, *self._zygote.family()))
+        return segments_of((os.getpid(), self._fork_server.pid, *self._fork_server.family()))
 
     async def note_each(self, created: asyncio.Event) -> None:
         """Note the shared memory of our processes each time that the event is set, for ever."""
@@ -107,13 +107,13 @@ class Records:
 
 @contextlib.contextmanager
 def noting(
-    directory: RunDirectory, system: System, zygote: Family, worker: Worker, emit: Emitter
+    directory: RunDirectory, system: System, fork_server: Family, worker: Worker, emit: Emitter
 ) -> Iterator[Records]:
     """Keep records that note shared memory once it is made: its owner may be killed at any time.
 
     Where the kernel does not announce it, it is noted when `note_segments` is called.
     """
-    records = Records(directory, system, zygote, worker, emit)
+    records = Records(directory, system, fork_server, worker, emit)
     records.write()
     try:
         creations = Creations()

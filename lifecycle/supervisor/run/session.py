@@ -26,18 +26,18 @@ from lifecycle.supervisor.control.status import SystemStatus, system_status
 from lifecycle.supervisor.gate.activation_guard import ActivationGuard
 from lifecycle.supervisor.gate.gate import Gate, VerificationError, closes
 from lifecycle.supervisor.gate.hold import Holding
-from lifecycle.supervisor.gate.sequence import Regulator
-from lifecycle.supervisor.gate.verification_loop import Changes, Judge
+from lifecycle.supervisor.gate.sequence import GateSequence
+from lifecycle.supervisor.gate.verification_loop import Changes, VerificationLoop
 from lifecycle.supervisor.health.agreement import Agreement
-from lifecycle.supervisor.health.peer_supervisors import Neighbours
-from lifecycle.supervisor.health.process_monitor import Vigil
+from lifecycle.supervisor.health.peer_supervisors import PeerSupervisors
+from lifecycle.supervisor.health.process_monitor import ProcessMonitor
 from lifecycle.supervisor.nodes.appearance import Sightings
 from lifecycle.supervisor.nodes.bring_up import BringUp
-from lifecycle.supervisor.nodes.observer_participant import Eyes
-from lifecycle.supervisor.nodes.remote_nodes import Elsewhere
+from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
+from lifecycle.supervisor.nodes.remote_nodes import RemoteNodes
 from lifecycle.supervisor.nodes.stale_nodes import StaleNodes
 from lifecycle.supervisor.nodes.system import System
-from lifecycle.supervisor.processes.fork_server import Zygote
+from lifecycle.supervisor.processes.fork_server import ForkServer
 from lifecycle.supervisor.processes.orphans import end_strays, reap_adopted
 from lifecycle.supervisor.run.events import (
     Emitter,
@@ -96,7 +96,7 @@ class Session:
         options: what the person asked for.
         directory: acquired for this run.
         records: of this run.
-        zygote: forks the processes.
+        fork_server: forks the processes.
         eyes: see the graph; made before any process.
         networks: programmed while the system is active.
         emit: where events go.
@@ -111,8 +111,8 @@ class Session:
         *,
         directory: RunDirectory,
         records: Records,
-        zygote: Zygote,
-        eyes: Eyes,
+        fork_server: ForkServer,
+        observer_participant: ObserverParticipant,
         networks: Networks,
         emit: Emitter,
         ending: Ending,
@@ -122,8 +122,8 @@ class Session:
         self._system = system
         self._options = options
         self._directory = directory
-        self._zygote = zygote
-        self._eyes = eyes
+        self._fork_server = fork_server
+        self._observer_participant = observer_participant
         self._networks = networks
         self._emit = emit
         self._ending = ending
@@ -132,14 +132,14 @@ class Session:
         self._ends = ""
         self._hurry = asyncio.Event()
         self._stop: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._changes = Changes(system, eyes)
-        self._authority = authority_of(system, emit, eyes)
-        self._neighbours = Neighbours(system, eyes)
-        self._agreement = Agreement(system, eyes, self._neighbours)
+        self._changes = Changes(system, observer_participant)
+        self._authority = authority_of(system, emit, observer_participant)
+        self._peer_supervisors = PeerSupervisors(system, observer_participant)
+        self._agreement = Agreement(system, observer_participant, self._peer_supervisors)
         self._guard = ActivationGuard(system)
-        self._judge = Judge(
+        self._judge = VerificationLoop(
             system,
-            eyes,
+            observer_participant,
             self._changes,
             emit,
             strict=options.strict,
@@ -148,35 +148,37 @@ class Session:
             guard=self._guard,
         )
         self._gate = Gate(strict=options.strict, judging=self._judge)
-        sightings = Sightings(system, eyes, self._changes)
-        self._stale = StaleNodes(system, eyes)
+        sightings = Sightings(system, observer_participant, self._changes)
+        self._stale = StaleNodes(system, observer_participant)
         emit.listen(self._stale.on_event)
         self._records = records
-        self._vigil = Vigil(system)
+        self._process_monitor = ProcessMonitor(system)
         self._bring_up = BringUp(
             system,
-            spawner_of=lambda _: zygote,
-            services=eyes.driver,
+            spawner_of=lambda _: fork_server,
+            services=observer_participant.driver,
             appears=sightings.appears,
             recorded=self._records.write,
             wirer=self._authority,
         )
-        self._elsewhere = Elsewhere(system.plan, system.awaited(), eyes, self._changes)
-        self._regulator = Regulator(
+        self._remote_nodes = RemoteNodes(
+            system.plan, system.awaited(), observer_participant, self._changes
+        )
+        self._gate_sequence = GateSequence(
             system,
             bring_up=self._bring_up,
             judge=self._judge,
             gate=self._gate,
             emit=emit,
-            alive=self._vigil.during,
-            leaves=self._vigil.dead.update,
-            comes_back=self._vigil.dead.difference_update,
-            forget=eyes.drop_configuration,
+            alive=self._process_monitor.during,
+            leaves=self._process_monitor.dead.update,
+            comes_back=self._process_monitor.dead.difference_update,
+            forget=observer_participant.drop_configuration,
             vanishes=sightings.vanishes,
             replanned=self._replanned,
             program=networks.begin,
             following=self._following,
-            spawner=zygote,
+            spawner=fork_server,
             hurry=self._hurry,
             timeout_s=options.timeout_s,
         )
@@ -185,9 +187,9 @@ class Session:
             system,
             judge=self._judge,
             changes=self._changes,
-            regulator=self._regulator,
+            gate_sequence=self._gate_sequence,
             revisions=self._revisions,
-            vigil=self._vigil,
+            process_monitor=self._process_monitor,
             emit=emit,
             note_segments=self._records.note_segments,
             keep_going=options.keep_going,
@@ -198,7 +200,7 @@ class Session:
         return system_status(
             self._system,
             self._judge.latest,
-            phase=self._regulator.phase,
+            phase=self._gate_sequence.phase,
             supervisor=os.getpid(),
             elapsed_s=self._emit.elapsed_s,
         )
@@ -219,7 +221,7 @@ class Session:
             reason: in words.
             exit_code: of the run, if this cuts it short.
         """
-        if self._stop.done() or self._regulator.phase == _STOPPING:
+        if self._stop.done() or self._gate_sequence.phase == _STOPPING:
             if exit_code is ExitCode.INTERRUPTED:
                 self._hurry.set()
             return
@@ -236,7 +238,7 @@ class Session:
             differences=self._revisions.differences,
         )
         await server.open()
-        self._neighbours.open()
+        self._peer_supervisors.open()
         self._agreement.open()
         self._emit.listen(lambda event: None if isinstance(event, LogLine) else server.changed())
         result = UpResult(exit_code=ExitCode.INTERNAL, verdict=NOT_JUDGED)
@@ -257,9 +259,9 @@ class Session:
 
     async def leave(self) -> None:
         """Be heard no more, after `run`; Fast DDS can hang in it."""
-        self._eyes.prepare_to_leave()
+        self._observer_participant.prepare_to_leave()
         self._agreement.close()
-        await self._neighbours.close()
+        await self._peer_supervisors.close()
 
     async def _until_over(self) -> UpResult:
         """Run the phases; whatever ends them becomes an exit code and a verdict."""
@@ -280,11 +282,11 @@ class Session:
             stopping, end = "the verdict keeps the gate closed", _End(exit_code=error.exit_code)
             if error.again:
                 stopping = "the system changed before every node was activated"
-            elif self._regulator.phase == "activating":
+            elif self._gate_sequence.phase == "activating":
                 stopping = "what became active is not what was verified"
             reason = f"{stopping}; {not_ok(error.verdict) or error.verdict.verdict.value}"
         self._gate.close()
-        self._regulator.phase = _STOPPING
+        self._gate_sequence.phase = _STOPPING
         self._emit(Stopping(reason=stopping))
         self._ends = stopping
         if end.why:
@@ -293,7 +295,7 @@ class Session:
             reason=reason,
             reached=self._furthest,
             exit_code=end.exit_code,
-            trusted=self._regulator.trusted,
+            trusted=self._gate_sequence.trusted,
         )
         verdict = dataclasses.replace(end.verdict or self._judge.latest or NOT_JUDGED, run=run)
         return UpResult(exit_code=end.exit_code, verdict=verdict, plan=self._system.first)
@@ -320,8 +322,8 @@ class Session:
         if self._options.stop_after_s is not None:
             why = f"it did not hold for the {self._options.stop_after_s:g} s of --stop-after"
             return _End(exit_code=exit_code, why=why)
-        if self._options.until is Until.ACTIVE and self._regulator.phase not in _KEPT:
-            why = f"the system was {self._regulator.phase}, not active"
+        if self._options.until is Until.ACTIVE and self._gate_sequence.phase not in _KEPT:
+            why = f"the system was {self._gate_sequence.phase}, not active"
             return _End(exit_code=exit_code, why=why)
         return end
 
@@ -336,7 +338,7 @@ class Session:
         Args:
             meanwhile: what was violated while it was held; empty if nothing was.
         """
-        deaths = self._vigil.deaths()
+        deaths = self._process_monitor.deaths()
         if deaths:
             failure = deaths[0].joined(deaths[1:])
             verdict = with_failure(self._judge.latest or NOT_JUDGED, failure)
@@ -351,31 +353,31 @@ class Session:
             end = _End(exit_code=ExitCode.VIOLATED, why=f"violated meanwhile, {meanwhile}")
         elif closes(latest, strict=self._options.strict):
             end = _End(exit_code=ExitCode.UNVERIFIABLE, why=f"unverifiable; {not_ok(latest)}")
-        elif self._regulator.phase == HELD:
+        elif self._gate_sequence.phase == HELD:
             end = _End(exit_code=ExitCode.VIOLATED, why="held at the gate, and not active")
         return end
 
     def _waits(self) -> str:
         """Say what a run still waits for that is asked to end before its system is up."""
         latest = self._judge.latest
-        verifies = self._regulator.phase == "verifying" and latest is not None
+        verifies = self._gate_sequence.phase == "verifying" and latest is not None
         return self._bring_up.unfinished() or (missing(latest) if verifies and latest else "")
 
     async def _phases(self) -> _End:
         loop = asyncio.get_running_loop()
         deadline = loop.time() + self._options.timeout_s
         async with self._following():
-            await self._vigil.during(self._bring_up.connect(self._options.timeout_s))
+            await self._process_monitor.during(self._bring_up.connect(self._options.timeout_s))
         self._furthest = "connected"
         self._emit(SystemReached(reached="connected", elapsed_s=self._emit.elapsed_s))
         if self._options.until is Until.CONNECTED:
-            await self._vigil.during(self._judge.until_clear(Stage.CONNECTED, _GLANCE_S))
+            await self._process_monitor.during(self._judge.until_clear(Stage.CONNECTED, _GLANCE_S))
             return await self._hold(Stage.CONNECTED)
-        permit = await self._regulator.verify(deadline - loop.time())
+        permit = await self._gate_sequence.verify(deadline - loop.time())
         self._furthest = "verified"
         if self._options.until is Until.VERIFIED:
             return await self._hold(Stage.CONNECTED)
-        await self._regulator.activate(permit, deadline)
+        await self._gate_sequence.activate(permit, deadline)
         self._furthest = "active"
         return await self._hold(Stage.ACTIVE)
 
@@ -383,8 +385,8 @@ class Session:
     async def _following(self) -> AsyncIterator[None]:
         """Keep looking at the nodes of others, and at ours that others may drive, too."""
         followers = (
-            asyncio.ensure_future(self._elsewhere.follow()),
-            asyncio.ensure_future(self._guard.follow(self._eyes, self._changes)),
+            asyncio.ensure_future(self._remote_nodes.follow()),
+            asyncio.ensure_future(self._guard.follow(self._observer_participant, self._changes)),
         )
         try:
             yield
@@ -415,9 +417,9 @@ class Session:
 
     async def _take_down(self) -> None:
         """End everything, also what our processes left behind."""
-        self._regulator.phase = _STOPPING
+        self._gate_sequence.phase = _STOPPING
         self._agreement.leave(self._ends)
-        self._eyes.prepare_to_leave()
+        self._observer_participant.prepare_to_leave()
         self._holding.close(f"cannot go on: {self._system.plan.system!r} is being taken down")
         await self._guard.close()
         await self._bring_up.close()
@@ -430,7 +432,7 @@ class Session:
             # After the last message has left, and before what runs below us is ended.
             await self._networks.close(self._hurry)
             await discovery_server.end(self._system, self._hurry)
-        left = await self._worker.run(end_strays, self._directory.run_id, self._zygote)
+        left = await self._worker.run(end_strays, self._directory.run_id, self._fork_server)
         if left:
             self._emit(Notice(message=f"ended processes that were left behind: {_listed(left)}"))
         self._system.logs.tell_lost()
@@ -456,8 +458,8 @@ class Session:
             self._ending.resume()
 
     def _child_changed(self) -> None:
-        self._zygote.note_stops()
-        reap_adopted(self._zygote.waited_for)
+        self._fork_server.note_stops()
+        reap_adopted(self._fork_server.waited_for)
 
     def _ended_by(self, number: int) -> None:
         self.stop(*ENDED_BY[number])
@@ -465,7 +467,7 @@ class Session:
     def _replanned(self, nodes: Iterable[str]) -> None:
         if self._authority is not None:
             self._authority.replan(self._system.plan, frozenset(nodes))
-        self._neighbours.renew()
+        self._peer_supervisors.renew()
         self._agreement.announce(self._system.first)
 
 

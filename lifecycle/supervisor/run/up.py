@@ -1,7 +1,7 @@
 """`up`: everything around a session that must be there before it and be gone after it.
 
 Owns: the run directory and what a killed supervisor left in it, the environment of the run, the
-zygote, the supervisor's own participant and the sweep of shared memory. Must not import rclpy.
+fork server, the supervisor's own participant and the sweep of shared memory. Must not import rclpy.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from lifecycle.rundir import (
 from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.connections.networks import open_networks, token_variables
 from lifecycle.supervisor.control.status import SystemStatus
-from lifecycle.supervisor.nodes.observer_participant import Eyes
+from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 from lifecycle.supervisor.nodes.system import System
-from lifecycle.supervisor.processes.fork_server import Zygote, ZygoteProcess
+from lifecycle.supervisor.processes.fork_server import ForkServer, ForkServerProcess
 from lifecycle.supervisor.processes.logs import check_log_root, log_directory
 from lifecycle.supervisor.processes.orphans import end_run
 from lifecycle.supervisor.run.events import Emitter, Event, Listener, Notice, RunStarted
@@ -69,10 +69,10 @@ Conclude = Callable[[UpResult], ExitCode]
 
 
 class Forerunner:
-    """A zygote that is started before the manifest is read, to import while we do.
+    """A fork server that is started before the manifest is read, to import while we do.
 
     Args:
-        preload: see ZygoteProcess.
+        preload: see ForkServerProcess.
         without: variables of our environment that nothing it starts shall have.
 
     Attributes:
@@ -82,7 +82,7 @@ class Forerunner:
     def __init__(self, *, preload: bool = True, without: Collection[str] = ()) -> None:
         self.run_id = new_run_id()
         environment = {name: text for name, text in os.environ.items() if name not in without}
-        self.process = ZygoteProcess(
+        self.process = ForkServerProcess(
             preload=preload, environment={**environment, RUN_VARIABLE: self.run_id}
         )
 
@@ -216,24 +216,24 @@ def _up(
                 processes=processes,
                 variables=_graph_variables(os.environ),
             )
-            zygote = Zygote(forerunner.process, emit)
+            fork_server = ForkServer(forerunner.process, emit)
             worker = leaving.enter_context(contextlib.closing(Worker("lifecycle")))
-            records = leaving.enter_context(noting(directory, system, zygote, worker, emit))
+            records = leaving.enter_context(noting(directory, system, fork_server, worker, emit))
             try:
                 # Before any participant: who asks a server that is not there waits to ask again.
                 with ending.raised():
-                    await discovery_server.begin(system, zygote, ours=_serves(plan, options))
-                eyes = _eyes(plan, options, emit)
-                leaving.callback(eyes.destroy)
+                    await discovery_server.begin(system, fork_server, ours=_serves(plan, options))
+                observer_participant = _observer_participant(plan, options, emit)
+                leaving.callback(observer_participant.destroy)
                 await records.note_segments()
-                emit(_started(system, eyes, str(logs)))
+                emit(_started(system, observer_participant, str(logs)))
                 session = Session(
                     system,
                     options,
                     directory=directory,
                     records=records,
-                    zygote=zygote,
-                    eyes=eyes,
+                    fork_server=fork_server,
+                    observer_participant=observer_participant,
                     networks=networks,
                     emit=emit,
                     ending=ending,
@@ -251,7 +251,7 @@ def _up(
                 return UpResult(exit_code=failure.exit_code, verdict=verdict)
             finally:
                 await discovery_server.end(system, asyncio.Event())
-                await zygote.close()
+                await fork_server.close()
                 _sweep(records, emit)
 
         return asyncio.run(_leaving_last(run, conclude))
@@ -304,7 +304,7 @@ def _serves(plan: Plan, options: UpOptions) -> bool:
     return server is not None and server.machine in own_machines(plan, options.machine)
 
 
-def _eyes(plan: Plan, options: UpOptions, emit: Emitter) -> Eyes:
+def _observer_participant(plan: Plan, options: UpOptions, emit: Emitter) -> ObserverParticipant:
     """Make the supervisor's participant; on another port if a discovery server is not reached.
 
     Fast DDS may never use the first connection to it (middleware/discovery/dead_connections.py).
@@ -315,16 +315,16 @@ def _eyes(plan: Plan, options: UpOptions, emit: Emitter) -> Eyes:
     planned = connections = observer_connections(plan, options.machine)
     for number in range(OBSERVER_TRIES):
         with _ends_within(options.timeout_s + LEAVE_S, ExitCode.BRING_UP_FAILED):
-            eyes = Eyes.open(
+            observer_participant = ObserverParticipant.open(
                 plan.domain_id,
                 connections,
                 guests=wires and dynamic and plan.policy.undeclared_nodes is EndpointPolicy.OPEN,
                 events=wires and (dynamic or layer.events),
             )
-        if number + 1 == OBSERVER_TRIES or eyes.reaches_servers():
+        if number + 1 == OBSERVER_TRIES or observer_participant.reaches_servers():
             break
-        eyes.prepare_to_leave()
-        eyes.destroy()
+        observer_participant.prepare_to_leave()
+        observer_participant.destroy()
         connections = moved_observer(plan, planned, number)
         emit(
             Notice(
@@ -333,14 +333,14 @@ def _eyes(plan: Plan, options: UpOptions, emit: Emitter) -> Eyes:
                 f"try {number + 1} of {OBSERVER_TRIES - 1}"
             )
         )
-    return eyes
+    return observer_participant
 
 
-def _started(system: System, eyes: Eyes, logs: str) -> RunStarted:
+def _started(system: System, observer_participant: ObserverParticipant, logs: str) -> RunStarted:
     return RunStarted(
         system=system.plan.system,
         domain_id=system.plan.domain_id,
-        rmw=eyes.rmw,
+        rmw=observer_participant.rmw,
         discovery_range=system.plan.discovery_range.value,
         nodes=tuple(each.name for each in system.nodes.values()),
         processes=tuple(system.processes),
@@ -375,7 +375,7 @@ def _enter_graph(plan: Plan, options: UpOptions, directory: RunDirectory) -> Non
 
 
 def _graph_variables(environment: Mapping[str, str]) -> tuple[tuple[str, str], ...]:
-    """What a zygote that was started before `_enter_graph` has to hand on."""
+    """What a fork server that was started before `_enter_graph` has to hand on."""
     return tuple((name, environment[name]) for name in _GRAPH_VARIABLES if name in environment)
 
 

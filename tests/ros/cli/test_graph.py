@@ -83,16 +83,16 @@ def test_without_a_supervisor_what_runs_is_looked_at_from_outside(
     assert empty.stderr == (
         f"no node in the graph; looked in ROS domain {fresh_domain}, discovery range localhost\n"
     )
-    elsewhere = tmp_path / "elsewhere"
-    elsewhere.mkdir()
+    remote_nodes = tmp_path / "elsewhere"
+    remote_nodes.mkdir()
     with up(manifest, runtime=tmp_path) as run:
         run.until("system", reached="active")
-        seen = picture(str(manifest), *ENOUGH, runtime=elsewhere)
+        seen = picture(str(manifest), *ENOUGH, runtime=remote_nodes)
         assert (seen["phase"], seen["verdict"]) == ("", "ok")
         assert states(seen) == {"/listener": ACTIVE, "/talker": ACTIVE}
 
-        other = pair(elsewhere, fresh_domain, edit={"nodes/third": _THIRD})
-        seen = picture(str(other), "--timeout", "0", runtime=elsewhere)
+        other = pair(remote_nodes, fresh_domain, edit={"nodes/third": _THIRD})
+        seen = picture(str(other), "--timeout", "0", runtime=remote_nodes)
         assert states(seen)["/third"] == ("missing", "not there")
 
 
@@ -161,12 +161,12 @@ def test_a_watched_page_is_replaced_when_nodes_come(
     wait_until: Callable[..., None],
 ) -> None:
     manifest, page = pair(tmp_path, fresh_domain), tmp_path / "graph.html"
-    elsewhere = tmp_path / "elsewhere"
-    elsewhere.mkdir()
+    remote_nodes = tmp_path / "elsewhere"
+    remote_nodes.mkdir()
     watching(str(manifest), "--format", "html", "--output", str(page))
     wait_until(page.is_file, timeout_s=BOUND_S)
     assert "∅ not there: missing" in page.read_text()
-    with up(manifest, runtime=elsewhere) as run:
+    with up(manifest, runtime=remote_nodes) as run:
         run.until("system", reached="active")
         pids = {str(run.pid_of(key)) for key in ("listener", "talker")}
         shown = re.compile(r"● active · pid (\d+)")

@@ -56,8 +56,8 @@ def test_another_system_concerns_us_only_if_it_plans_a_node_of_ours() -> None:
 
 
 def test_a_system_of_our_name_on_machines_of_its_own_does_not_concern_us() -> None:
-    elsewhere = said(plan("robot", "lidar", "screen"), machine="attic")
-    assert not concerns(plan(), OURS, elsewhere)
+    remote_nodes = said(plan("robot", "lidar", "screen"), machine="attic")
+    assert not concerns(plan(), OURS, remote_nodes)
 
 
 def test_a_notice_is_replaced_by_what_comes_in_its_place() -> None:

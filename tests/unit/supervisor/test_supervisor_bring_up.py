@@ -12,8 +12,8 @@ from lifecycle.errors import BringUpError
 from lifecycle.manifest.model import Condition, RunKind, Timeouts
 from lifecycle.node.host.control import Operation
 from lifecycle.supervisor.gate.gate import Gate, Permit, VerificationError
-from lifecycle.supervisor.gate.verification_loop import Changes, Judge
-from lifecycle.supervisor.health.process_monitor import Vigil
+from lifecycle.supervisor.gate.verification_loop import Changes, VerificationLoop
+from lifecycle.supervisor.health.process_monitor import ProcessMonitor
 from lifecycle.supervisor.nodes.bring_up import ALSO_S
 from lifecycle.supervisor.processes.states import ProcessExit, ProcessState
 from lifecycle.supervisor.run.events import Notice, ProcessChanged, Reach, RequestSent
@@ -162,7 +162,7 @@ class _Judging:
         self.graph = FakeGraph()
         self.changes = Changes(world.system, self.graph)
         self.looks = 0
-        self._judge = Judge(
+        self._judge = VerificationLoop(
             world.system, self.graph, self.changes, world.emit, strict=False, verify_=self._verify
         )
 
@@ -449,9 +449,9 @@ def test_a_process_is_blamed_once_for_each_node_that_it_cannot_host_and_for_no_o
         error = "ModuleNotFoundError: No module named 'camera_driver'"
         world.spawner.unhosted["all"] = {"/b": error, "/c": "cannot import 'm:C': no module 'm'"}
         world.spawner.takes_s["d start"] = 60.0
-        vigil = Vigil(world.system)
+        process_monitor = ProcessMonitor(world.system)
         with pytest.raises(StepFailedError) as caught:
-            await vigil.during(world.bring_up.connect(LIMIT_S))
+            await process_monitor.during(world.bring_up.connect(LIMIT_S))
         assert _failed(caught) == [
             ("run.start-failed", "/b", f"cannot start '/b': {error}"),
             ("run.start-failed", "/c", "cannot import 'm:C': no module 'm'"),
@@ -478,7 +478,7 @@ def test_every_process_that_died_by_then_is_named(tmp_path: Path) -> None:
 
         dying = asyncio.ensure_future(die())
         with pytest.raises(StepFailedError) as caught:
-            await Vigil(world.system).during(world.bring_up.connect(LIMIT_S))
+            await ProcessMonitor(world.system).during(world.bring_up.connect(LIMIT_S))
         await dying
         assert [(each.rule, each.subject) for each in caught.value.every] == [
             ("run.process-died", "/a"),

@@ -10,7 +10,7 @@ import pytest
 
 from lifecycle.manifest.model import Condition
 from lifecycle.plan.model import Plan
-from lifecycle.supervisor.nodes.remote_nodes import Elsewhere, RemoteNode
+from lifecycle.supervisor.nodes.remote_nodes import RemoteNode, RemoteNodes
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.run.tasks import ended
 from lifecycle.verify.observation import Identity, NodeConfiguration, Observation, ObservedNode
@@ -106,7 +106,7 @@ def test_a_step_that_a_remote_node_holds_goes_on_once_that_is_seen(tmp_path: Pat
         await asyncio.sleep(0)
         doing = node.doing
         graph = _Graph(Observation(), _seen("inactive", connected=False), _seen("active"))
-        await Elsewhere(plan, system.awaited(), graph, graph).follow()
+        await RemoteNodes(plan, system.awaited(), graph, graph).follow()
         await asyncio.wait_for(waiting, 1.0)
         assert node.doing == ""
         assert system.machines == frozenset({""})

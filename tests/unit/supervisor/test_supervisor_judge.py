@@ -16,7 +16,7 @@ from lifecycle.plan.model import Plan
 from lifecycle.supervisor.gate.grace_period import PASSING_S
 from lifecycle.supervisor.gate.verification_loop import (
     Changes,
-    Judge,
+    VerificationLoop,
     with_findings,
     without,
     without_nodes,
@@ -78,7 +78,7 @@ class _Bench:
         self.looks: list[float] = []
         self.judged: list[dict[str, object]] = []
         self.changes = Changes(self.world.system, self.graph)
-        self.judge = Judge(
+        self.judge = VerificationLoop(
             self.world.system,
             self.graph,
             self.changes,

@@ -21,10 +21,10 @@ from lifecycle.node.host.control import Event as HostEvent
 from lifecycle.plan.model import Plan, PlannedProcess
 from lifecycle.supervisor.gate.verification_loop import without_nodes
 from lifecycle.supervisor.health.liveliness import Cause, Liveliness, Presence
-from lifecycle.supervisor.health.peer_supervisors import CALL_EACH_S, Listener, Neighbours
+from lifecycle.supervisor.health.peer_supervisors import CALL_EACH_S, Listener, PeerSupervisors
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.control_channel import ChannelClosedError, ControlChannel
-from lifecycle.supervisor.processes.fork_server import Zygote, ZygoteProcess
+from lifecycle.supervisor.processes.fork_server import ForkServer, ForkServerProcess
 from lifecycle.supervisor.processes.logs import LogDirectory
 from lifecycle.supervisor.processes.process import ManagedProcess
 from lifecycle.supervisor.run.events import (
@@ -98,7 +98,7 @@ def test_a_node_is_not_called_alive_that_has_not_started_or_is_not_in_the_graph(
             "/viewer: not silent any more after 2.0 s, but not there yet",
             "/lamp: alive again after 2.0 s",
         ]
-        await desk.neighbours.close()
+        await desk.peer_supervisors.close()
 
     run(test())
 
@@ -241,8 +241,8 @@ class Desk:
         own = [each for each in plan.processes if each.name == "camera"]
         self.system = System(plan, emit=emit, logs=directory, processes=own)
         self.air = FakeAir()
-        self.neighbours = Neighbours(self.system, self.air)
-        self.neighbours.open()
+        self.peer_supervisors = PeerSupervisors(self.system, self.air)
+        self.peer_supervisors.open()
 
     @property
     def desk(self) -> Listener:
@@ -282,7 +282,7 @@ def test_with_a_machine_its_nodes_are_lost_and_found(tmp_path: Path) -> None:
         ]
         states = [each.established for each in desk.events if isinstance(each, MachineConnection)]
         assert states == [True, False, True]
-        await desk.neighbours.close()
+        await desk.peer_supervisors.close()
 
     run(test())
 
@@ -293,7 +293,7 @@ def test_a_machine_that_was_never_heard_is_not_lost(tmp_path: Path) -> None:
         desk.desk.heard(False)
         await settle()
         assert desk.told() == []
-        await desk.neighbours.close()
+        await desk.peer_supervisors.close()
 
     run(test())
 
@@ -305,7 +305,7 @@ def test_a_supervisor_that_leaves_properly_loses_no_node(tmp_path: Path) -> None
         desk.desk.left()
         await settle()
         assert desk.told() == [("connection", "desk"), ("connection", "desk")]
-        await desk.neighbours.close()
+        await desk.peer_supervisors.close()
 
     run(test())
 
@@ -318,7 +318,7 @@ def test_that_dds_forgets_a_lost_machine_changes_nothing(tmp_path: Path) -> None
         desk.desk.left()
         await settle()
         assert set(desk.system.liveliness.silent) == {"/viewer", "/lamp"}
-        await desk.neighbours.close()
+        await desk.peer_supervisors.close()
 
     run(test())
 
@@ -335,7 +335,7 @@ def test_calls_go_out_while_somebody_is_missing_and_only_then(tmp_path: Path) ->
         desk.desk.heard(True)
         await asyncio.sleep(10 * CALL_EACH_S)
         assert len(desk.air.calls) == 4
-        await desk.neighbours.close()
+        await desk.peer_supervisors.close()
 
     run(test())
 
@@ -349,7 +349,7 @@ def test_what_another_supervisor_says_of_its_nodes_is_taken_over(tmp_path: Path)
         desk.desk.told({})
         await settle()
         assert desk.told() == [("silent", "/viewer"), ("alive", "/viewer")]
-        await desk.neighbours.close()
+        await desk.peer_supervisors.close()
 
     run(test())
 
@@ -362,7 +362,7 @@ def test_our_own_silent_nodes_are_told_again_and_again_until_it_is_over(tmp_path
         desk.system.liveliness.came_back(["/camera"], Cause.HUNG)
         await asyncio.sleep(1)
         assert desk.air.voices["robot/robot"].told == [{"/camera": "it hangs"}] * 3 + [{}] * 3
-        await desk.neighbours.close()
+        await desk.peer_supervisors.close()
 
     run(test())
 
@@ -374,7 +374,7 @@ def test_who_is_lost_to_us_is_not_told_to_others(tmp_path: Path) -> None:
         desk.desk.heard(False)
         await asyncio.sleep(1)
         assert desk.air.voices["robot/robot"].told == []
-        await desk.neighbours.close()
+        await desk.peer_supervisors.close()
 
     run(test())
 
@@ -384,10 +384,10 @@ def test_a_system_of_one_machine_neither_speaks_nor_listens(tmp_path: Path) -> N
         plan = plan_of(planned_node("camera"))
         system = System(plan, emit=Emitter(), logs=tmp_path, processes=plan.processes)
         air = FakeAir()
-        neighbours = Neighbours(system, air)
-        neighbours.open()
+        peer_supervisors = PeerSupervisors(system, air)
+        peer_supervisors.open()
         assert (air.ears, air.voices) == ({}, {})
-        await neighbours.close()
+        await peer_supervisors.close()
 
     run(test())
 
@@ -410,13 +410,13 @@ def test_a_reloaded_plan_has_its_own_attached_nodes_followed_and_no_others(tmp_p
         plan = attached("lidar", "radar")
         system = System(plan, emit=Emitter(), logs=tmp_path, processes=plan.processes)
         air = FakeAir()
-        neighbours = Neighbours(system, air)
-        neighbours.open()
+        peer_supervisors = PeerSupervisors(system, air)
+        peer_supervisors.open()
         assert set(air.ears) == {"/lidar", "/radar"}
         old = dict(air.ears)
         for each in old.values():
             each.listener.heard(True)
-        neighbours.renew()
+        peer_supervisors.renew()
         assert air.destroyed == 0  # the same nodes: nobody is heard anew
         old["/lidar"].listener.heard(False)
         await settle()
@@ -427,7 +427,7 @@ def test_a_reloaded_plan_has_its_own_attached_nodes_followed_and_no_others(tmp_p
         plan = attached("radar", "sonar")
         system.reload(plan, plan.processes, tuple(system.nodes.values()))
         air.ears.clear()
-        neighbours.renew()
+        peer_supervisors.renew()
         assert air.destroyed == 2
         assert set(air.ears) == {"/radar", "/sonar"}
         # Who is not planned any more is neither missed nor called, whatever was on the way.
@@ -441,7 +441,7 @@ def test_a_reloaded_plan_has_its_own_attached_nodes_followed_and_no_others(tmp_p
         air.ears["/sonar"].listener.heard(False)
         await settle()
         assert set(system.liveliness.silent) == {"/sonar"}
-        await neighbours.close()
+        await peer_supervisors.close()
 
     run(test())
 
@@ -455,8 +455,8 @@ def test_a_loss_has_us_and_our_hosts_prepare_and_after_it_tell_our_names_anew(
         world = World(plan, tmp_path)
         world.system.remote = dict(Desk(tmp_path).system.remote)
         air = FakeAir()
-        neighbours = Neighbours(world.system, air)
-        neighbours.open()
+        peer_supervisors = PeerSupervisors(world.system, air)
+        peer_supervisors.open()
         await world.bring_up.connect(30)
         listener = air.ears["robot/desk"].listener
         listener.heard(True)
@@ -474,7 +474,7 @@ def test_a_loss_has_us_and_our_hosts_prepare_and_after_it_tell_our_names_anew(
         operations = (Operation.SEND_AGAIN_SOON, Operation.TELL_NAMES)
         asked = [each for each in operations if f"/camera {each.value}" in world.log]
         assert [each.value for each in asked] == done
-        await neighbours.close()
+        await peer_supervisors.close()
         for process in world.system.processes.values():
             await process.end(((9, 5.0),), asyncio.Event())
 
@@ -569,7 +569,7 @@ def test_closing_a_channel_closes_its_busy_sign(tmp_path: Path) -> None:
 def test_a_fork_server_tells_that_a_process_was_stopped_and_continues(tmp_path: Path) -> None:
     async def test() -> None:
         told: asyncio.Queue[bool] = asyncio.Queue()
-        zygote = Zygote(ZygoteProcess(preload=False, environment=os.environ))
+        fork_server = ForkServer(ForkServerProcess(preload=False, environment=os.environ))
         argv = ("sleep", "60")
         planned = PlannedProcess(
             name="it",
@@ -580,13 +580,13 @@ def test_a_fork_server_tells_that_a_process_was_stopped_and_continues(tmp_path: 
         )
         process = ManagedProcess(planned, logs=LogDirectory(tmp_path, print), emit=Emitter())
         process.on_stop = told.put_nowait
-        await process.spawn(zygote, None)
+        await process.spawn(fork_server, None)
         for number, expected in ((signal.SIGSTOP, True), (signal.SIGCONT, False)) * 2:
             os.kill(process.pid, number)
             assert await asyncio.wait_for(told.get(), 10) is expected
         assert not process.ended.done()
         await process.end(((signal.SIGKILL, 10.0),), asyncio.Event())
-        await zygote.close()
+        await fork_server.close()
         assert told.empty()
 
     asyncio.run(test())

@@ -1,4 +1,4 @@
-"""Real processes without ROS: the zygote, process states, output, and orphans."""
+"""Real processes without ROS: the fork server, process states, output, and orphans."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from lifecycle.plan.model import PlannedProcess
 from lifecycle.rundir import RUN_VARIABLE, ChildRecord, RunRecord, boot_id, start_ticks
 from lifecycle.supervisor.processes import logs
 from lifecycle.supervisor.processes.control_channel import ControlChannel
-from lifecycle.supervisor.processes.fork_server import Zygote, ZygoteProcess
+from lifecycle.supervisor.processes.fork_server import ForkServer, ForkServerProcess
 from lifecycle.supervisor.processes.logs import (
     LONGEST_LINE,
     LineReader,
@@ -48,10 +48,10 @@ def _run(test: Coroutine[Any, Any, None]) -> None:
 
 
 class _Bench:
-    """A zygote and processes of it."""
+    """A fork server and processes of it."""
 
-    def __init__(self, tmp_path: Path, zygote: Zygote) -> None:
-        self.zygote = zygote
+    def __init__(self, tmp_path: Path, fork_server: ForkServer) -> None:
+        self.fork_server = fork_server
         self.lines: list[str] = []
         self.spoke = asyncio.Event()
         self.emit = Emitter()
@@ -68,7 +68,7 @@ class _Bench:
     async def close(self) -> None:
         for process in self._processes:
             await process.end(COMMAND_ESCALATION, asyncio.Event())
-        await self.zygote.close()
+        await self.fork_server.close()
 
     async def start(self, *argv: str, environment: tuple[tuple[str, str], ...] = ()) -> Any:
         process = ManagedProcess(
@@ -84,14 +84,14 @@ class _Bench:
             emit=self.emit,
         )
         self._processes.append(process)
-        await process.spawn(self.zygote, None)
+        await process.spawn(self.fork_server, None)
         return process
 
 
 @contextlib.asynccontextmanager
 async def _bench(tmp_path: Path) -> Any:
-    zygote = Zygote(ZygoteProcess(preload=False, environment=os.environ))
-    bench = _Bench(tmp_path, zygote)
+    fork_server = ForkServer(ForkServerProcess(preload=False, environment=os.environ))
+    bench = _Bench(tmp_path, fork_server)
     try:
         yield bench
     finally:
@@ -161,42 +161,44 @@ def test_a_process_that_ignores_sigint_and_sigterm_is_killed_with_its_group(
     _run(test())
 
 
-def test_a_zygote_that_was_killed_is_replaced_and_what_it_started_runs_on(tmp_path: Path) -> None:
+def test_a_fork_server_that_was_killed_is_replaced_and_what_it_started_runs_on(
+    tmp_path: Path,
+) -> None:
     async def test() -> None:
         environment = {**os.environ, RUN_VARIABLE: uuid.uuid4().hex}
-        process = ZygoteProcess(preload=False, environment=environment)
-        zygote = Zygote(process)
-        bench = _Bench(tmp_path, zygote)
+        process = ForkServerProcess(preload=False, environment=environment)
+        fork_server = ForkServer(process)
+        bench = _Bench(tmp_path, fork_server)
         first = await bench.start("sleep", "60")
         process.popen.kill()
-        await zygote.ready()
+        await fork_server.ready()
         second = await bench.start("sleep", "60")
-        assert zygote.pid != process.popen.pid
+        assert fork_server.pid != process.popen.pid
         assert not first.ended.done()
         os.kill(first.pid, signal.SIGKILL)
         await first.ended
 
         third = await bench.start("sleep", "60")
-        os.kill(zygote.pid, signal.SIGKILL)
-        await zygote.ready()
-        # Another zygote guards what those before it started, should the supervisor vanish.
-        zygote._process.socket.shutdown(2)
+        os.kill(fork_server.pid, signal.SIGKILL)
+        await fork_server.ready()
+        # Another fork server guards what those before it started, should the supervisor vanish.
+        fork_server._process.socket.shutdown(2)
         await asyncio.gather(second.ended, third.ended)
         await bench.close()
 
     _run(test())
 
 
-def test_without_any_zygote_nothing_can_be_started(
+def test_without_any_fork_server_nothing_can_be_started(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def test() -> None:
-        process = ZygoteProcess(preload=False, environment=os.environ)
-        zygote = Zygote(process)
+        process = ForkServerProcess(preload=False, environment=os.environ)
+        fork_server = ForkServer(process)
         process.popen.kill()
         process.popen.wait()
         monkeypatch.setattr(sys, "executable", "/no/such/python")
-        bench = _Bench(tmp_path, zygote)
+        bench = _Bench(tmp_path, fork_server)
         expected = (
             "cannot start process 'it': cannot start the fork server: No such file or directory"
         )
@@ -208,11 +210,11 @@ def test_without_any_zygote_nothing_can_be_started(
     _run(test())
 
 
-def test_when_the_supervisor_vanishes_the_zygote_ends_what_it_forked(tmp_path: Path) -> None:
+def test_when_the_supervisor_vanishes_the_fork_server_ends_what_it_forked(tmp_path: Path) -> None:
     async def test() -> None:
-        process = ZygoteProcess(preload=False, environment=os.environ)
-        zygote = Zygote(process)
-        bench = _Bench(tmp_path, zygote)
+        process = ForkServerProcess(preload=False, environment=os.environ)
+        fork_server = ForkServer(process)
+        bench = _Bench(tmp_path, fork_server)
         child = await bench.start("sleep", "60")
         process.socket.shutdown(2)
         assert await asyncio.get_running_loop().run_in_executor(None, process.popen.wait) == 0

@@ -246,11 +246,11 @@ def test_a_flow_is_as_unique_as_it_is_on_the_declared_address_of_its_machine(add
             Machine(name="n", address="10.0.0.2", at=at(2)),
         ),
     )
-    here, elsewhere = nfe("udp"), nfe("udp", address="10.9.9.9")
+    here, remote_nodes = nfe("udp"), nfe("udp", address="10.9.9.9")
     flow, *_ = flows_after(
         both(
-            change_report(PUB, "/a", nfes=(here, elsewhere)),
-            change_report(PUB, "/b", nfes=(elsewhere,)),
+            change_report(PUB, "/a", nfes=(here, remote_nodes)),
+            change_report(PUB, "/b", nfes=(remote_nodes,)),
         ),
         plan,
     )

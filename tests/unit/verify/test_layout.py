@@ -463,8 +463,8 @@ def test_parts_of_an_action_that_is_declared_or_seen_are_not_left_over() -> None
     assert view_after(both(part, drop_endpoint(ACTION_SERVER, "/robot/dock"))).undeclared == ()
     other = add_endpoint(PUB, "/robot/camera", "/lift/_action/feedback", gid="99")
     assert [each.name for each in view_after(other).undeclared] == ["/lift/_action/feedback"]
-    elsewhere = add_endpoint(PUB, "/viewer", "/robot/dock/_action/feedback", gid="99")
-    assert [each.node for each in view_after(elsewhere).undeclared] == ["/viewer"]
+    remote_nodes = add_endpoint(PUB, "/viewer", "/robot/dock/_action/feedback", gid="99")
+    assert [each.node for each in view_after(remote_nodes).undeclared] == ["/viewer"]
     lift = add_endpoint(ACTION_SERVER, "/robot/camera", "/lift", type="a/action/B")
     assert [each.name for each in view_after(both(other, lift)).undeclared] == ["/lift"]
 

@@ -230,7 +230,7 @@ def _loopback(
     if not local or any(not is_loopback(each.address) for each in url.peers):
         return
     for kind, name in connection.map:
-        for key in _elsewhere(system, node, kind, name):
+        for key in _remote_nodes(system, node, kind, name):
             message = (
                 f"cannot reach {key!r}, which {name!r} of {node.key!r} is for, by {local[0]!r}: "
                 "a loopback address never leaves its host, and they are on different machines"
@@ -239,7 +239,7 @@ def _loopback(
             return
 
 
-def _elsewhere(system: System, node: Node, kind: EndpointKind, name: str) -> Iterator[str]:
+def _remote_nodes(system: System, node: Node, kind: EndpointKind, name: str) -> Iterator[str]:
     """Yield nodes of other hosts that have the other end of a topic."""
     other = {
         EndpointKind.PUBLISHER: EndpointKind.SUBSCRIPTION,
