@@ -67,7 +67,7 @@ def target_plan(
         UsageError: no such run, or arguments for a system that is named.
         ManifestError: the manifest cannot be loaded.
     """
-    from lifecycle.rundir import run_name, runtime_root
+    from lifecycle.run_directory import run_name, runtime_root
     from lifecycle.supervisor.control.client import find_run
 
     root = runtime_root(environment)

@@ -24,7 +24,7 @@ def command(target: str | None, assignments: tuple[str, ...], machine: str, form
     """
     from lifecycle.cli.target import target_run
     from lifecycle.codec import to_json
-    from lifecycle.rundir import runtime_root
+    from lifecycle.run_directory import runtime_root
     from lifecycle.supervisor.control.client import running, status
     from lifecycle.verify.verdict import Outcome
 

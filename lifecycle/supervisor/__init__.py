@@ -11,7 +11,6 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from lifecycle.rundir import AlreadyRunningError, run_name, runtime_root
     from lifecycle.supervisor.control.client import down, find_run, running, status
     from lifecycle.supervisor.control.status import NodeStatus, SystemStatus
     from lifecycle.supervisor.run.attach import follow_running, judge_running
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
     from lifecycle.supervisor.run.up import Forerunner, up
 
 __all__ = [
-    "AlreadyRunningError",
     "Emitter",
     "Event",
     "Forerunner",
@@ -36,16 +34,13 @@ __all__ = [
     "find_run",
     "follow_running",
     "judge_running",
-    "run_name",
     "running",
-    "runtime_root",
     "status",
     "to_record",
     "up",
 ]
 
 _HOME = {
-    "AlreadyRunningError": ".rundir",
     "Emitter": "run.events",
     "Event": "run.events",
     "Forerunner": "run.up",
@@ -60,9 +55,7 @@ _HOME = {
     "find_run": "control.client",
     "follow_running": "run.attach",
     "judge_running": "run.attach",
-    "run_name": ".rundir",
     "running": "control.client",
-    "runtime_root": ".rundir",
     "status": "control.client",
     "to_record": "run.events",
     "up": "run.up",
@@ -73,4 +66,4 @@ def __getattr__(name: str) -> object:
     """Import the module that defines `name` (PEP 562)."""
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f".{_HOME[name]}", __name__), name)
+    return getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)

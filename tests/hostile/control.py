@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from lifecycle.codec import to_json, to_plain
 from lifecycle.manifest import load
 from lifecycle.plan import build_plan
-from lifecycle.rundir import connect
+from lifecycle.run_directory import connect
 from lifecycle.supervisor.control.server import Ask, Question, ask
 from tests.hostile.attack import (
     Attack,

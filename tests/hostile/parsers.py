@@ -35,7 +35,7 @@ from lifecycle.programming.apply.nft import root_qdiscs
 from lifecycle.programming.apply.settings import load_settings
 from lifecycle.programming.apply.tool import HostTool, Output
 from lifecycle.programming.rules.nftables import parse_managed_comment
-from lifecycle.rundir import read_record
+from lifecycle.run_directory import read_record
 from lifecycle.supervisor.control.server import Answer, Question
 from lifecycle.verify import Stage
 from lifecycle.verify.observation import ConfigurationError, decode_configuration

@@ -15,7 +15,7 @@ PURE_ROOMS = (
     "plan",
     "verify",
     "export",
-    "rundir",
+    "run_directory",
     "programming.rules",
     "codec",
     "errors",

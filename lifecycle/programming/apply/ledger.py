@@ -21,7 +21,7 @@ from pathlib import Path
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import LifecycleError, UsageError
 from lifecycle.programming.apply.errors import ProgrammingError
-from lifecycle.rundir import (
+from lifecycle.run_directory import (
     LEDGER_LOCK_NAME,
     LEDGER_NAME,
     ChildRecord,

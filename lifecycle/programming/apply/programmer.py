@@ -28,7 +28,7 @@ from lifecycle.programming.apply.errors import PartlyError
 from lifecycle.programming.apply.ledger import Ledger, has_ledger, owner_is_dead
 from lifecycle.programming.apply.targets import TargetOptions, Targets
 from lifecycle.programming.rules.rules import FlowRule, LeftOut, RuleSet, SourceAddress, flow_rules
-from lifecycle.rundir import is_held, run_name, runtime_root
+from lifecycle.run_directory import is_held, run_name, runtime_root
 from lifecycle.verify.verdict import FlowReport, Outcome
 
 _DISCARD_PORT = 9
@@ -309,7 +309,7 @@ def sweep_orphans(root: Path, *, own: str = "", within_s: float | None = None) -
     """Remove what the dead runs of this user left in networks.
 
     Args:
-        root: directory of all run directories, see rundir.runtime_root.
+        root: directory of all run directories, see run_directory.runtime_root.
         own: name of the caller's own run, whose directory it holds itself.
         within_s: for all that servers are asked; None for the patience with each request.
     """

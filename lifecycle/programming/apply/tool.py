@@ -20,7 +20,7 @@ from lifecycle.programming.apply.errors import (
     PrivilegeError,
     ProgrammingError,
 )
-from lifecycle.rundir import OWN_CHILD
+from lifecycle.run_directory import OWN_CHILD
 
 _TIMEOUT_S = 10.0
 """They talk to the kernel only; a busy machine needs tenths of a second."""

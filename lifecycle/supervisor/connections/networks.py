@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 from lifecycle.errors import LifecycleError
 from lifecycle.graph.waiting import set_within
 from lifecycle.plan.model import Plan
-from lifecycle.rundir import LEDGER_NAME, RunDirectory
+from lifecycle.run_directory import LEDGER_NAME, RunDirectory
 from lifecycle.supervisor.run.events import Emitter, Event, Notice, VerdictChanged
 from lifecycle.supervisor.run.failure import NOT_PROGRAMMED, StepFailedError
 from lifecycle.supervisor.run.options import UpOptions
@@ -86,13 +86,11 @@ class Keeper:
     Args:
         programmer: see Programs.
         tell: takes what was done and what failed, as text for people; called from the loop.
-        worker: the thread; None makes one.
+        worker: the thread.
     """
 
-    def __init__(
-        self, programmer: Programs, tell: Callable[[str], None], worker: Worker | None = None
-    ) -> None:
-        self._worker = worker or Worker("networks")
+    def __init__(self, programmer: Programs, tell: Callable[[str], None], worker: Worker) -> None:
+        self._worker = worker
         self._programmer = programmer
         self._tell = tell
         self._flows: tuple[FlowReport, ...] | None = None

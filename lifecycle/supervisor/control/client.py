@@ -11,7 +11,7 @@ from pathlib import Path
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.middleware.process.shared_memory import sweep
 from lifecycle.plan.model import Plan
-from lifecycle.rundir import RunDirectory, is_held, new_run_id, read_record
+from lifecycle.run_directory import RunDirectory, is_held, new_run_id, read_record
 from lifecycle.supervisor.connections.networks import remove_programmed
 from lifecycle.supervisor.control.server import Answer, Ask, Look, Question, ask, strange
 from lifecycle.supervisor.control.status import SystemStatus
@@ -32,7 +32,7 @@ def find_run(root: Path, word: str) -> Path:
     """Return the directory of the run that `word` means.
 
     Args:
-        root: see rundir.runtime_root.
+        root: see run_directory.runtime_root.
         word: a run's name, `teleop@7`, or its system, `teleop`, where only one such run is there.
 
     Raises:

@@ -17,7 +17,7 @@ from pathlib import Path
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import UsageError
 from lifecycle.plan.model import Plan
-from lifecycle.rundir import connect, short_path
+from lifecycle.run_directory import connect, short_path
 from lifecycle.supervisor.control.orders import Done, Order, OrderKind
 from lifecycle.supervisor.control.status import SystemStatus
 from lifecycle.verify.observation import Observation

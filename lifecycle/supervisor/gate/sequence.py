@@ -334,20 +334,19 @@ class GateSequence:
             # What is active was verified before; what is not stays inactive until asked again.
             self.phase = before
             raise
-        waiting = self._inactive()
         try:
             await self.activate(permit, deadline)
         except VerificationError as error:
             if error.again:
                 if self.phase == "activating":
-                    await self._withdraw(permit, waiting)
+                    await self._withdraw(permit)
                 self.phase = before
             raise
 
-    async def _withdraw(self, permit: Permit, waiting: Iterable[NodeRun]) -> None:
+    async def _withdraw(self, permit: Permit) -> None:
         """Deactivate again what was activated since the gate opened: the rest may not follow."""
-        begun = tuple(each for each in waiting if each.name in permit.sent)
-        for each in waiting:
+        begun = tuple(each for each in self._system.nodes.values() if each.name in permit.sent)
+        for each in self._inactive():
             if each not in begun:
                 each.undo = [one for one in each.undo if one is not Operation.ACTIVATE]
         if begun:

@@ -153,7 +153,7 @@ class _ForkServer:
         for pid in tuple(self._children):
             self._reap(pid)
         if self._again:
-            from lifecycle.rundir import RUN_VARIABLE
+            from lifecycle.run_directory import RUN_VARIABLE
             from lifecycle.supervisor.processes.orphans import end_strays
 
             end_strays(os.environ.get(RUN_VARIABLE, ""))

@@ -21,7 +21,7 @@ from typing import Protocol
 import psutil
 
 from lifecycle.middleware.process.shared_memory import segments_of
-from lifecycle.rundir import OWN_CHILD, RUN_VARIABLE, RunRecord, boot_id, start_ticks
+from lifecycle.run_directory import OWN_CHILD, RUN_VARIABLE, RunRecord, boot_id, start_ticks
 
 GRACE_S = 3.0
 """Between asking an orphan to end and killing it."""

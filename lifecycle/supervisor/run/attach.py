@@ -17,7 +17,7 @@ from lifecycle.manifest.model import EndpointPolicy
 from lifecycle.middleware.discovery.probe_targets import peers_environment
 from lifecycle.plan.connections.contacts import reached_hosts
 from lifecycle.plan.model import Plan
-from lifecycle.rundir import run_name, runtime_root
+from lifecycle.run_directory import run_name, runtime_root
 from lifecycle.supervisor.connections.renegotiation import Expectation, is_negotiated
 from lifecycle.supervisor.control.client import look, running
 from lifecycle.supervisor.gate.gate import closes

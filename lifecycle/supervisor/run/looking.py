@@ -12,7 +12,7 @@ from pathlib import Path
 
 from lifecycle.export.picture import Picture, Supervised, build_picture
 from lifecycle.plan.model import Plan
-from lifecycle.rundir import is_held, run_name, runtime_root
+from lifecycle.run_directory import is_held, run_name, runtime_root
 from lifecycle.supervisor.control.client import look
 from lifecycle.supervisor.control.server import Look, follow
 from lifecycle.supervisor.control.status import SystemStatus

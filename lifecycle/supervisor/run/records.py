@@ -12,7 +12,7 @@ import os
 from collections.abc import Iterator
 
 from lifecycle.middleware.process.shared_memory import Creations, segments_of
-from lifecycle.rundir import ChildRecord, RunDirectory, start_ticks
+from lifecycle.run_directory import ChildRecord, RunDirectory, start_ticks
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.orphans import Family
 from lifecycle.supervisor.run.events import Emitter, Notice

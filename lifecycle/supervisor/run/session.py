@@ -15,7 +15,7 @@ from collections.abc import AsyncIterator, Coroutine, Iterable, Iterator
 from typing import Any
 
 from lifecycle.errors import ExitCode
-from lifecycle.rundir import RunDirectory
+from lifecycle.run_directory import RunDirectory
 from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.connections.authority import authority_of
 from lifecycle.supervisor.connections.networks import Networks

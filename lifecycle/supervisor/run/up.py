@@ -22,7 +22,7 @@ from lifecycle.middleware.process.shared_memory import check_room, sweep
 from lifecycle.plan import moved_observer
 from lifecycle.plan.connections.contacts import reached_hosts
 from lifecycle.plan.model import Plan
-from lifecycle.rundir import (
+from lifecycle.run_directory import (
     RUN_VARIABLE,
     RunDirectory,
     RunRecord,

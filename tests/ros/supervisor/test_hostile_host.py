@@ -17,7 +17,7 @@ from std_msgs.msg import String
 
 from lifecycle.errors import ExitCode
 from lifecycle.middleware import segments_of
-from lifecycle.rundir import RUN_VARIABLE
+from lifecycle.run_directory import RUN_VARIABLE
 from tests.ros.supervisor.running import ROOT, Up, command, environment, marked, pair
 
 OPEN = {"policy/undeclared_nodes": "open"}

@@ -23,7 +23,7 @@ from typing import IO, Any
 import pytest
 
 from lifecycle.errors import ExitCode
-from lifecycle.rundir import short_path
+from lifecycle.run_directory import short_path
 from lifecycle.supervisor.control.server import Ask, Question, ask
 from tests.ros.supervisor.running import (
     BOUND_S,

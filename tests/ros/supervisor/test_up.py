@@ -480,9 +480,9 @@ _HANGS_IN_FAST_DDS = """
 import threading
 import lifecycle.supervisor.run.up as run
 from lifecycle.cli import program
-from lifecycle.supervisor.nodes.observer_participant import Eyes
+from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 run.LEAVE_S = 1.0
-Eyes.destroy = lambda self: threading.Event().wait()
+ObserverParticipant.destroy = lambda self: threading.Event().wait()
 raise SystemExit(program())
 """
 

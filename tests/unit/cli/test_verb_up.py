@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -65,3 +67,19 @@ def test_a_wrong_option_leaves_no_report_of_an_earlier_run(tmp_path: Path) -> No
     result = CliRunner().invoke(verb_up.command, words)
     assert result.exit_code == ExitCode.USAGE
     assert report.read_text() == ""
+
+
+@pytest.mark.parametrize(("verb", "is_ignored"), [("up", True), ("check", False)])
+def test_a_signal_after_the_end_of_a_run_does_not_change_its_exit_code(
+    verb: str, is_ignored: bool
+) -> None:
+    program = (
+        "import signal, sys\n"
+        "from lifecycle.cli import program\n"
+        f"sys.argv = ['lifecycle', {verb!r}, '--help']\n"
+        "program()\n"
+        "numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)\n"
+        "ignored = {signal.getsignal(each) is signal.SIG_IGN for each in numbers}\n"
+        f"sys.exit(ignored != {{{is_ignored}}})\n"
+    )
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0

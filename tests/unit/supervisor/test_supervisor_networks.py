@@ -19,7 +19,7 @@ from lifecycle.programming.apply import (
     PrivilegeError,
     TargetOptions,
 )
-from lifecycle.rundir import OWN_CHILD, RunDirectory, new_run_id
+from lifecycle.run_directory import OWN_CHILD, RunDirectory, new_run_id
 from lifecycle.supervisor.connections.networks import Networks, open_networks, remove_programmed
 from lifecycle.supervisor.control.client import down
 from lifecycle.supervisor.processes.orphans import reap_adopted
@@ -193,7 +193,7 @@ class Applied:
 
     def apply(self, *, owned: bool = False) -> Path:
         from lifecycle.programming.apply import open_programmer
-        from lifecycle.rundir import run_name
+        from lifecycle.run_directory import run_name
 
         programmer = open_programmer(
             plan(), [self.options], environment=self.environment, owned=owned

@@ -22,7 +22,7 @@ from lifecycle.manifest.model import Run, RunKind
 from lifecycle.node.host.control import HostSpec
 from lifecycle.plan import build_plan
 from lifecycle.plan.model import PlannedProcess
-from lifecycle.rundir import RUN_VARIABLE, ChildRecord, RunRecord, boot_id, start_ticks
+from lifecycle.run_directory import RUN_VARIABLE, ChildRecord, RunRecord, boot_id, start_ticks
 from lifecycle.supervisor.processes import logs
 from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.supervisor.processes.fork_server import ForkServer, ForkServerProcess

@@ -32,6 +32,7 @@ from lifecycle.programming.apply.targets import TargetOptions, Targets
 from lifecycle.programming.rules.rules import flow_rules
 from lifecycle.supervisor.connections import networks as keeper_module
 from lifecycle.supervisor.connections.networks import Keeper
+from lifecycle.supervisor.run.tasks import Worker
 from lifecycle.verify.verdict import FlowReport, Outcome
 from tests.unit.programming.apply.fakes import FakeTarget
 from tests.unit.programming.apply.samples import (
@@ -319,7 +320,7 @@ class FakePrograms:
 
 
 async def _kept(programs: FakePrograms, told: list[str]) -> None:
-    keeper = Keeper(programs, told.append)
+    keeper = Keeper(programs, told.append, Worker("networks"))
     keeper.take([report("/one")])
     await asyncio.wait_for(programs.done.wait(), 5)
     await keeper.close()
@@ -358,7 +359,7 @@ def test_a_keeper_tells_a_failure_and_tries_again(monkeypatch: pytest.MonkeyPatc
 def test_a_keeper_that_never_had_flows_still_removes_what_is_listed() -> None:
     async def run() -> FakePrograms:
         programs = FakePrograms()
-        await Keeper(programs, print).close()
+        await Keeper(programs, print, Worker("networks")).close()
         return programs
 
     assert asyncio.run(run()).seen == [("closed",)]

@@ -14,7 +14,7 @@ import pytest
 
 from lifecycle.cli import main
 from lifecycle.errors import ExitCode, UsageError
-from lifecycle.rundir import (
+from lifecycle.run_directory import (
     LEDGER_NAME,
     AlreadyRunningError,
     ChildRecord,
