@@ -13,7 +13,7 @@ from lifecycle.printable import lines
 
 if TYPE_CHECKING:
     from lifecycle.manifest import Loaded, Manifest
-    from lifecycle.plan.programs.programs import Resolution
+    from lifecycle.plan.programs import Resolution
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -100,7 +100,7 @@ def resolve(manifest: Manifest, machine: str = "") -> Resolution:
     Raises:
         UsageError: the manifest declares no such machine.
     """
-    from lifecycle.plan.programs.programs import resolve_programs
+    from lifecycle.plan.programs import resolve_programs
     from lifecycle.supervisor.run.options import own_machines
 
     own = own_machines(manifest, machine)

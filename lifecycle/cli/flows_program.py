@@ -203,7 +203,7 @@ def treatment_of(*, mapping: str, flow_labels: bool) -> Treatment:
     Raises:
         UsageError: no such mapping, or its file cannot be used.
     """
-    from lifecycle.network.five_qi_dscp import dscp_mapping, parse_mapping
+    from lifecycle.network.five_qi import dscp_mapping, parse_mapping
     from lifecycle.programming.apply import Treatment
 
     if not mapping:

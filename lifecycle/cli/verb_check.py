@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import os
+import re
+import xml.etree.ElementTree as ET
 from pathlib import Path
+from urllib.parse import quote
 
 import click
 
-from lifecycle.cli.check_report import CheckReport, write_check
 from lifecycle.cli.common import format_option, manifest_arguments, parse_assignments, resolve
 from lifecycle.cli.report import (
     report_format,
@@ -15,12 +19,196 @@ from lifecycle.cli.report import (
     write_report,
     written_or_said,
 )
+from lifecycle.codec import to_json
 from lifecycle.errors import ExitCode, LifecycleError
 from lifecycle.manifest import Diagnostic, Manifest, ManifestError, Severity, load
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.plan import check_plan, effective_domain
-from lifecycle.plan.programs.programs import Resolution
+from lifecycle.plan.programs import Resolution, Unresolved
 from lifecycle.printable import json_text, lines
+
+_NOT_XML = re.compile(r"[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+
+TESTS = {
+    "document": ("yaml.", "manifest.", "nodl."),
+    "system": ("check.",),
+    "plan": ("plan.",),
+    "programs": ("program.",),
+}
+"""Test → beginnings of the rules that it stands for; any other rule is of the system."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class CheckReport:
+    """What `check --format json` prints (schema: schemas/check.v1.schema.json).
+
+    Attributes:
+        ok: the exit code is 0.
+        system: empty where the manifest could not be loaded.
+        nodes: number of nodes; likewise endpoints and links. 0 where it could not be loaded.
+        diagnostics: by position.
+        unresolved: what nodes run and could not be looked for here.
+    """
+
+    manifest: str
+    ok: bool
+    system: str
+    nodes: int
+    endpoints: int
+    links: int
+    diagnostics: tuple[Diagnostic, ...]
+    unresolved: tuple[Unresolved, ...] = ()
+
+    def exit_code(self, *, strict: bool) -> ExitCode:
+        """Return what `check` exits with."""
+        if self.ok:
+            return ExitCode.OK
+        errors = any(each.severity is Severity.ERROR for each in self.diagnostics)
+        alone = strict and not errors and not self.diagnostics
+        return ExitCode.UNVERIFIABLE if alone else ExitCode.MANIFEST_INVALID
+
+
+def write_check(report: CheckReport, format_: str, *, strict: bool) -> str:
+    """Return a report as "text", "json", "sarif" or "junit".
+
+    Args:
+        report: what was found.
+        format_: see above.
+        strict: warnings and what could not be resolved count as failures.
+    """
+    if format_ == "json":
+        return to_json(report).decode()
+    if format_ == "sarif":
+        return _sarif(report)
+    if format_ == "junit":
+        return _junit(report, strict=strict)
+    lines = [*map(str, report.diagnostics), *map(str, report.unresolved), summary(report)]
+    return "\n".join(lines)
+
+
+def summary(report: CheckReport) -> str:
+    """Return one line, `teleop: 6 nodes, 14 endpoints, 3 links: ok`."""
+    severities = [each.severity for each in report.diagnostics]
+    errors, warnings = severities.count(Severity.ERROR), severities.count(Severity.WARNING)
+    found = [_count(errors, "error")] * bool(errors) + [_count(warnings, "warning")] * bool(
+        warnings
+    )
+    found += [f"{len(report.unresolved)} not resolved"] * bool(report.unresolved)
+    outcome = "ok" if report.ok else "not ok"
+    verdict = f"{outcome} ({', '.join(found)})" if found else outcome
+    if not report.system:
+        return f"{report.manifest}: {verdict}"
+    counts = (
+        _count(report.nodes, "node"),
+        _count(report.endpoints, "endpoint"),
+        _count(report.links, "link"),
+    )
+    return f"{report.system}: {', '.join(counts)}: {verdict}"
+
+
+def _count(number: int, word: str) -> str:
+    return f"{number} {word}{'' if number == 1 else 's'}"
+
+
+def _junit(report: CheckReport, *, strict: bool) -> str:
+    suites = ET.Element("testsuites")
+    suite = ET.SubElement(suites, "testsuite", name=_legal(f"lifecycle check {report.manifest}"))
+    failures = 0
+    for name in TESTS:
+        case = ET.SubElement(suite, "testcase", classname="check", name=name)
+        found = [each for each in report.diagnostics if _test(each.rule) == name]
+        bad = [each for each in found if strict or each.severity is Severity.ERROR]
+        notes = list(map(str, report.unresolved)) if name == "programs" else []
+        said = [str(each) for each in found if each not in bad]
+        if bad or (strict and notes):
+            failures += 1
+            failed = [*map(str, bad), *(notes if strict else ())]
+            failure = ET.SubElement(case, "failure", message=_legal(failed[0]))
+            failure.text = _legal("\n".join(failed))
+        if said or notes:
+            out = ET.SubElement(case, "system-out")
+            out.text = _legal("\n".join([*said, *notes]))
+    for each in (suites, suite):
+        each.set("tests", str(len(TESTS)))
+        each.set("failures", str(failures))
+        each.set("skipped", "0")
+    ET.indent(suites)
+    return '<?xml version="1.0" encoding="utf-8"?>\n' + ET.tostring(suites, encoding="unicode")
+
+
+def _test(rule: str) -> str:
+    return next((name for name, begin in TESTS.items() if rule.startswith(begin)), "system")
+
+
+def _sarif(report: CheckReport) -> str:
+    rules = sorted({each.rule for each in report.diagnostics} | {_UNRESOLVED})
+    results = [
+        _result(
+            each.rule,
+            rules,
+            each.severity.value,
+            f"{each.message}; {each.hint}" if each.hint else each.message,
+            each,
+        )
+        for each in report.diagnostics
+    ] + [
+        _result(
+            _UNRESOLVED,
+            rules,
+            "note",
+            f"could not resolve {each.subject}: {each.reason}",
+            each,
+        )
+        for each in report.unresolved
+    ]
+    log = {
+        "$schema": "https://json.schemastore.org/sarif-2.1.0.json",
+        "version": "2.1.0",
+        "runs": [
+            {
+                "tool": {
+                    "driver": {"name": "lifecycle", "rules": [{"id": each} for each in rules]}
+                },
+                "columnKind": "unicodeCodePoints",
+                "results": results,
+                "properties": {"ok": report.ok, "summary": summary(report)},
+                "invocations": [{"executionSuccessful": report.ok}],
+            }
+        ],
+    }
+    return json.dumps(log, ensure_ascii=False, indent=2)
+
+
+_UNRESOLVED = "program.unresolved"
+
+
+def _result(
+    rule: str, rules: list[str], level: str, text: str, found: Diagnostic | Unresolved
+) -> dict[str, object]:
+    at = found.at
+    return {
+        "ruleId": rule,
+        "ruleIndex": rules.index(rule),
+        "level": level,
+        "message": {"text": text},
+        "locations": [
+            {
+                "physicalLocation": {
+                    "artifactLocation": {"uri": quote(at.file)},
+                    "region": {"startLine": at.line, "startColumn": at.column},
+                },
+                **(
+                    {"logicalLocations": [{"fullyQualifiedName": at.path, "kind": "resource"}]}
+                    if at.path
+                    else {}
+                ),
+            }
+        ],
+    }
+
+
+def _legal(text: str) -> str:
+    return _NOT_XML.sub("\ufffd", text)
 
 
 @click.command()

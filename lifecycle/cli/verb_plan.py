@@ -10,7 +10,7 @@ from lifecycle import codec
 from lifecycle.cli.common import format_option, load_manifest, manifest_arguments
 from lifecycle.errors import ExitCode
 from lifecycle.plan import Plan, build_plan
-from lifecycle.plan.render.text import render_text
+from lifecycle.plan.render import render_text
 
 
 @click.command("plan")

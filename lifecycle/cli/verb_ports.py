@@ -15,15 +15,17 @@ from lifecycle.cli.common import format_option, load_manifest
 from lifecycle.codec import to_json
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest.model import Discovery
-from lifecycle.network.budget import count, describe_domains, overflows
 from lifecycle.network.ports import (
     Capacity,
     EphemeralRange,
     ParticipantPorts,
     Platform,
     PortUse,
+    count,
+    describe_domains,
     ephemeral_range,
     max_participants,
+    overflows,
     overlaps,
     participant_ports,
     read_ephemeral_range,
@@ -31,7 +33,7 @@ from lifecycle.network.ports import (
     unique_flow_ports,
 )
 from lifecycle.plan.build import build_plan, effective_domain
-from lifecycle.plan.connections.demand import demand
+from lifecycle.plan.connections.hosts import demand
 from lifecycle.plan.model import Plan
 
 THIS = "this"

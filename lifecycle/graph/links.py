@@ -12,7 +12,7 @@ import dataclasses
 from lifecycle.graph.event import NodeLiveliness
 from lifecycle.graph.view import NodeView
 from lifecycle.manifest.qos import Certainty, incompatibilities
-from lifecycle.network.flow import FlowTuple, flow_tuples
+from lifecycle.network.nfe import FlowTuple, flow_tuples
 from lifecycle.verify.observation import EndpointReport, Identity
 from lifecycle.verify.transport import NETWORK, NONE, carrier
 from lifecycle.verify.verdict import Outcome

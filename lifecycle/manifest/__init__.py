@@ -2,10 +2,14 @@
 
 `load` reads a manifest with its includes and raises `ManifestError` with every finding at once.
 What leaves this room are the types of `model`, `qos` and `diagnostics`; nothing outside knows YAML.
+YAML and JSON Schema are imported when `load` is asked for.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, Severity
-from lifecycle.manifest.load import Loaded, load
 from lifecycle.manifest.model import (
     After,
     Authority,
@@ -42,6 +46,9 @@ from lifecycle.manifest.qos import (
     QosProfile,
     Reliability,
 )
+
+if TYPE_CHECKING:
+    from lifecycle.manifest.loading import Loaded, load
 
 __all__ = [
     "PRESETS",
@@ -83,3 +90,12 @@ __all__ = [
     "UniqueHow",
     "load",
 ]
+
+
+def __getattr__(name: str) -> object:
+    """Import the reader when it is asked for (PEP 562)."""
+    if name not in {"Loaded", "load"}:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from lifecycle.manifest import loading
+
+    return getattr(loading, name)

@@ -1,55 +1,70 @@
-"""A manifest file → a checked system.
+"""A manifest file → a checked system: the door of this room.
 
-Owns: the run of source → arguments → schema → build for a manifest and everything it includes,
-then of the semantic checks, with every finding gathered on the way. Touches the file system; needs
-no ROS.
+Owns: reading, validation, includes, arguments and checks in their order, and what is left of a
+document without what is wrong in it, so that all findings come at once.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import os
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
-from lifecycle.manifest import salvage
 from lifecycle.manifest.builders.cursor import Cursor
 from lifecycle.manifest.builders.system import Fragment, build_fragment
 from lifecycle.manifest.checks import check, check_sound
+from lifecycle.manifest.checks.system import SEPARABLE, Partial
 from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, Severity
-from lifecycle.manifest.model import Manifest
-from lifecycle.manifest.schema.validation import validate
+from lifecycle.manifest.model import Manifest, Node
+from lifecycle.manifest.schema import MANIFEST, nearest, read_schema, validate
 from lifecycle.manifest.yaml import include
 from lifecycle.manifest.yaml.arguments import substitute
-from lifecycle.manifest.yaml.document import Document, error, warning
+from lifecycle.manifest.yaml.document import Document, Place, Value, error, warning
 from lifecycle.manifest.yaml.source import is_outside, read_document
 
-SUFFIX = ".lifecycle.yaml"
-"""What a manifest's name ends in; plain `.yaml` belongs to ROS launch files."""
+_NONE: Mapping[str, str] = MappingProxyType({})
 
 
-def load_manifest(
-    path: Path, arguments: Mapping[str, str], environment: Mapping[str, str]
-) -> tuple[Manifest, tuple[Diagnostic, ...]]:
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Loaded:
+    """A manifest without errors.
+
+    Attributes:
+        warnings: what may be wrong with it, by position.
+    """
+
+    manifest: Manifest
+    warnings: tuple[Diagnostic, ...]
+
+
+def load(
+    path: str | os.PathLike[str],
+    arguments: Mapping[str, str] = _NONE,
+    *,
+    environment: Mapping[str, str] | None = None,
+) -> Loaded:
     """Read and check a manifest, with everything it includes.
 
     Args:
         path: the file.
         arguments: values by argument name.
-        environment: what `$(env NAME)` sees.
-
-    Returns:
-        The manifest and its warnings.
+        environment: what `$(env NAME)` and the search for packages see; this process's environment
+            if None.
 
     Raises:
         ManifestError: with every error and warning, sorted by position.
     """
-    loading = _Loading(environment)
-    origin = include.Origin.of(path)
+    variables = os.environ if environment is None else environment
+    loading = _Loading(variables)
+    origin = include.Origin.of(Path(path))
     result = loading.read(origin, arguments, ())
     found = loading.found
 
     def every() -> tuple[Diagnostic, ...]:
-        quoted = _without_outside_text(found, str(path), environment)
+        quoted = _without_outside_text(found, os.fspath(path), variables)
         return _sorted(quoted, loading.files)
 
     if result is None:
@@ -70,13 +85,128 @@ def load_manifest(
         positions=fragment.positions,
     )
     if wrong := [each for each in found if each.severity is Severity.ERROR]:
-        part = salvage.partial(manifest, wrong, lost=fragment.lost, machines=loading.machines)
-        found += check_sound(part, environment=environment)
+        part = partial(manifest, wrong, lost=fragment.lost, machines=loading.machines)
+        found += check_sound(part, environment=variables)
         raise ManifestError(every())
-    found += check(manifest, environment=environment)
+    found += check(manifest, environment=variables)
     if any(each.severity is Severity.ERROR for each in found):
         raise ManifestError(every())
-    return manifest, every()
+    return Loaded(manifest=manifest, warnings=every())
+
+
+_SEGMENTS = re.compile(r"[^.\[]+")
+"""Finds `nodes`, `camera`, `interface` in `nodes.camera.interface[0]`."""
+
+
+def sound(document: Document, unsound: Sequence[Place]) -> Document:
+    """Return a document without the parts, nodes, machines and sections that hold unsound values.
+
+    Links stay in their list, so that the others keep their numbers; see `links`.
+    """
+    broken = links(unsound)
+    cut = {_cut(place) for place in unsound if place and place[:2] not in broken}
+    return dataclasses.replace(document, root=_without(document.root, cut))
+
+
+def links(unsound: Iterable[Place]) -> frozenset[Place]:
+    """Return the places of the links that hold unsound values."""
+    return frozenset(place[:2] for place in unsound if place[:1] == ("links",) and len(place) > 1)
+
+
+def lost(document: Document, rest: Document) -> frozenset[str] | None:
+    """Return the keys of nodes that are left out of `rest`; None if they are not known."""
+    every, kept = entries(document, "nodes"), entries(rest, "nodes")
+    if every is None or kept is None:
+        return every
+    return every - kept
+
+
+def entries(document: Document, section: str) -> frozenset[str] | None:
+    """Return the keys in a section, none where it is missing; None if it is no mapping."""
+    value = document.find((section,))
+    if value is None:
+        return frozenset()
+    return frozenset(value.data) if isinstance(value.data, Mapping) else None
+
+
+def partial(
+    manifest: Manifest,
+    wrong: Iterable[Diagnostic],
+    *,
+    lost: frozenset[str] | None,
+    machines: frozenset[str] | None,
+) -> Partial:
+    """Return what is left of a manifest without the nodes whose name or endpoints are not sound.
+
+    Args:
+        manifest: what could be built.
+        wrong: every error so far.
+        lost: keys of nodes that could not be built; None if there may be any.
+        machines: names of all that are declared; None if not all are known.
+    """
+    flaws: dict[tuple[str, str], set[str]] = {}
+    sections: set[str] = set()
+    for each in wrong:
+        section, *inside = _SEGMENTS.findall(each.at.path)[:3] or [""]
+        if section == "nodes" and inside:
+            flaws.setdefault((each.at.file, inside[0]), set()).add(_part(inside[1:]))
+        else:
+            sections.add(section)
+    flawed = {node.key: frozenset(flaws.get(_place(node), ())) for node in manifest.nodes}
+    nodes = tuple(each for each in manifest.nodes if "" not in flawed[each.key])
+    if lost is not None:
+        lost |= {each.key for each in manifest.nodes} - {each.key for each in nodes}
+    if machines is not None:
+        machines |= {each.name for each in manifest.machines}
+    return Partial(
+        manifest=dataclasses.replace(manifest, nodes=nodes),
+        flawed=flawed,
+        sections=frozenset(sections),
+        lost=lost,
+        machines=machines,
+    )
+
+
+def _place(node: Node) -> tuple[str, str]:
+    """The file and the key by which findings name a node; an include may have given it a prefix."""
+    return node.at.file, _SEGMENTS.findall(node.at.path)[1]
+
+
+def _part(inside: Iterable[str | int]) -> str:
+    """Return the separable part of a node that a place in it belongs to; empty for the whole node.
+
+    A key that is none is the one that it was most probably meant to be.
+    """
+    key = str(next(iter(inside), ""))
+    keys = read_schema(MANIFEST)["$defs"]["node"]["properties"]
+    meant = key if key in keys else nearest(key, keys)
+    return meant if meant in SEPARABLE else ""
+
+
+def _cut(place: Place) -> Place:
+    """Return the place of what is left out with an unsound value."""
+    if place[0] == "nodes" and len(place) > 1:
+        part = _part(place[2:])
+        return (*place[:2], part) if part else place[:2]
+    return place[: 2 if place[0] == "machines" else 1]
+
+
+def _without(value: Value, cut: Iterable[Place]) -> Value:
+    if not isinstance(value.data, Mapping):
+        return value
+    below: dict[str | int, list[Place]] = {}
+    for first, *rest in cut:
+        below.setdefault(first, []).append(tuple(rest))
+    kept = {
+        key: _without(each, below.get(key, ()))
+        for key, each in value.data.items()
+        if () not in below.get(key, ())
+    }
+    return dataclasses.replace(value, data=kept)
+
+
+SUFFIX = ".lifecycle.yaml"
+"""What a manifest's name ends in; plain `.yaml` belongs to ROS launch files."""
 
 
 class _Loading:
@@ -124,17 +254,17 @@ class _Loading:
         violations = validate(document, ignore=substituted.broken)
         self.found += [each for _, each in violations]
         unsound = [*substituted.broken, *(place for place, _ in violations)]
-        root = Cursor.root(salvage.sound(document, unsound))
+        root = Cursor.root(sound(document, unsound))
         fragment = dataclasses.replace(
             build_fragment(
                 root,
                 base=origin.path.parent,
                 environment=self._environment,
-                unsound=salvage.links(unsound),
+                unsound=links(unsound),
             ),
-            lost=salvage.lost(document, root.document),
+            lost=lost(document, root.document),
         )
-        names = salvage.entries(document, "machines")
+        names = entries(document, "machines")
         self.machines = None if names is None or self.machines is None else self.machines | names
         self.found += fragment.diagnostics
         self._check_outermost(root, fragment)

@@ -5,38 +5,33 @@ Pure: imports nothing of the package but `lifecycle.codec`, no ROS, opens no soc
 
 from __future__ import annotations
 
-from lifecycle.network.budget import (
-    overflows,
-)
 from lifecycle.network.dscp import (
     CodePoint,
+    MappedPriority,
+    TransportPriorityMapping,
     code_points,
     describe,
     dscp_name,
     dscp_of_tos,
+    map_priority,
     parse_dscp,
     tos,
 )
 from lifecycle.network.five_qi import (
+    DscpMapping,
     FiveQi,
     Proposal,
     check_class,
-    five_qi_of,
-    five_qis,
-    propose,
-)
-from lifecycle.network.five_qi_dscp import (
-    DscpMapping,
     dscp_mapping,
     dscp_mappings,
+    five_qi_of,
+    five_qis,
     parse_mapping,
-)
-from lifecycle.network.flow import (
-    FlowTuple,
-    flow_tuples,
+    propose,
 )
 from lifecycle.network.nfe import (
     FlowIdentifier,
+    FlowTuple,
     FlowUniqueness,
     InternetProtocol,
     LocatedNfe,
@@ -44,6 +39,7 @@ from lifecycle.network.nfe import (
     TransportProtocol,
     UniqueRequirement,
     dissimilar,
+    flow_tuples,
     is_ip,
     is_unique,
     is_unique_endpoint,
@@ -58,6 +54,7 @@ from lifecycle.network.ports import (
     Platform,
     max_participants,
     max_unique_subscriptions,
+    overflows,
     overlaps,
     owner_of,
     participant_ports,
@@ -71,11 +68,6 @@ from lifecycle.network.rmw_capabilities import (
     capabilities,
     dscp_feasibility,
     feasibility,
-)
-from lifecycle.network.transport_priority import (
-    MappedPriority,
-    TransportPriorityMapping,
-    map_priority,
 )
 
 __all__ = [

@@ -3,10 +3,10 @@
 from lifecycle.plan.build import build_plan, check_plan, effective_domain, with_files_of_now
 from lifecycle.plan.comparison import Change, changes, differences, plan_checksum
 from lifecycle.plan.connections.wiring import with_graph
-from lifecycle.plan.errors import PlanError
 from lifecycle.plan.model import (
     ParticipantConnections,
     Plan,
+    PlanError,
     PlannedEndpoint,
     PlannedFile,
     PlannedFlow,
@@ -25,8 +25,7 @@ from lifecycle.plan.negotiation.data_layer import (
     Terms,
 )
 from lifecycle.plan.negotiation.negotiate import negotiate
-from lifecycle.plan.negotiation.parties import party_of_node, wishes_of
-from lifecycle.plan.negotiation.terms import hosts_of, terms_of
+from lifecycle.plan.negotiation.parties import hosts_of, party_of_node, terms_of, wishes_of
 from lifecycle.plan.participants import ParticipantCost, owner_of, participants_cost
 from lifecycle.plan.restart import is_restarted_url, moved_observer, moving_nodes, restarted
 

@@ -10,38 +10,255 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from lifecycle.errors import UsageError
 from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position
-from lifecycle.manifest.flows.flow_needs import FlowNeeds, ParticipantGroup, ResolvedNeed
+from lifecycle.manifest.flows import FlowNeeds, ParticipantGroup, ResolvedNeed
+from lifecycle.manifest.installed_types import installed_hash, search_prefixes
 from lifecycle.manifest.model import (
     Discovery,
     DiscoveryMode,
     DiscoveryRange,
     Endpoint,
+    EndpointKind,
     FlowTransport,
+    Link,
     Manifest,
     Node,
     RunKind,
+    UniqueHow,
 )
 from lifecycle.manifest.names import resolve
-from lifecycle.manifest.types.ament_index import search_prefixes
-from lifecycle.manifest.types.type_hash import installed_hash
 from lifecycle.manifest.yaml.document import error
 from lifecycle.manifest.yaml.source import read_bytes
 from lifecycle.network.ports import MAX_DOMAIN_ID, domain_of
 from lifecycle.network.rmw_capabilities import DEFAULT_RMW
-from lifecycle.plan.connections.declared_connections import place_declared
-from lifecycle.plan.connections.wiring import Wired, variables_of, wire
-from lifecycle.plan.errors import PlanError
-from lifecycle.plan.flows import planned_flows
-from lifecycle.plan.levels import dependency_levels
-from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedFile, PlannedNode
+from lifecycle.plan.command import command_line
+from lifecycle.plan.connections.wiring import Wired, place_declared, variables_of, wire
+from lifecycle.plan.model import (
+    Plan,
+    PlanError,
+    PlannedEndpoint,
+    PlannedFile,
+    PlannedFlow,
+    PlannedNode,
+    PlannedProcess,
+)
 from lifecycle.plan.parameters import ParameterFiles
 from lifecycle.plan.participants import place_flows
-from lifecycle.plan.processes import planned_processes, process_name
+
+
+def dependency_levels(nodes: Sequence[Node]) -> tuple[tuple[str, ...], ...]:
+    """Layer nodes so that each stands one level below the last node it waits for.
+
+    Nodes of one level keep the manifest's order and do not wait for each other.
+
+    Raises:
+        PlanError: a node waits for itself along some path, or for a node that does not exist.
+    """
+    by_key = {node.key: node for node in nodes}
+    depth: dict[str, int] = {}
+    for node in nodes:
+        _settle(node, by_key, depth)
+    if not nodes:
+        return ()
+    levels: list[list[str]] = [[] for _ in range(max(depth.values()) + 1)]
+    for node in nodes:
+        levels[depth[node.key]].append(node.key)
+    return tuple(tuple(level) for level in levels)
+
+
+def _settle(root: Node, by_key: dict[str, Node], depth: dict[str, int]) -> None:
+    """Find the level of `root` and of all it waits for; iterative, so depth has no limit."""
+    path: list[str] = [root.key]
+    while path:
+        node = by_key[path[-1]]
+        open_dependency = ""
+        for after in node.after:
+            if after.node not in by_key:
+                raise PlanError(
+                    f"cannot wait for node {after.node!r}: the manifest declares no such node",
+                    at=after.at,
+                )
+            if after.node in path:
+                cycle = " → ".join([*path[path.index(after.node) :], after.node])
+                raise PlanError(
+                    f"cannot order the nodes: they wait for each other, {cycle}", at=after.at
+                )
+            if after.node not in depth:
+                open_dependency = after.node
+                break
+        if open_dependency:
+            path.append(open_dependency)
+            continue
+        depth[node.key] = 1 + max((depth[after.node] for after in node.after), default=-1)
+        path.pop()
+
+
+ANY = "*"
+"""A link's `from` or `to` that stands for every node."""
+
+_STRENGTH = {UniqueHow.NOT: 0, UniqueHow.WEAKLY: 1, UniqueHow.STRONGLY: 2}
+
+
+def planned_flows(nodes: Sequence[PlannedNode], links: Sequence[Link]) -> tuple[PlannedFlow, ...]:
+    """Pair every publisher with every subscription of its topic, nodes and endpoints in order.
+
+    Several links on one pair add up: the strongest uniqueness and the shortest delay hold. A link
+    that names two nodes is kept even if they declare no such endpoints, so that it can be judged.
+    """
+    hearers: dict[str, list[str]] = {}
+    for node in nodes:
+        for topic in _topics(node, EndpointKind.SUBSCRIPTION):
+            hearers.setdefault(topic, []).append(node.key)
+    pairs: dict[tuple[str, str, str], None] = {}
+    for publisher in nodes:
+        for topic in _topics(publisher, EndpointKind.PUBLISHER):
+            for subscription in hearers.get(topic, ()):
+                pairs[topic, publisher.key, subscription] = None
+    for link in links:
+        if ANY not in (link.from_node, link.to_node):
+            pairs.setdefault((link.topic, link.from_node, link.to_node), None)
+    return tuple(_flow(pair, links) for pair in pairs)
+
+
+def _topics(node: PlannedNode, kind: EndpointKind) -> Iterable[str]:
+    """Resolved names of one kind, each once, in order."""
+    return dict.fromkeys(each.resolved for each in node.endpoints if each.kind is kind)
+
+
+def _flow(pair: tuple[str, str, str], links: Sequence[Link]) -> PlannedFlow:
+    topic, publisher, subscription = pair
+    named = [
+        link
+        for link in links
+        if link.topic == topic
+        and link.from_node in (publisher, ANY)
+        and link.to_node in (subscription, ANY)
+    ]
+    told = [link.transport for link in named if link.transport is not FlowTransport.ANY]
+    delays = [link.max_delay_ms for link in named if link.max_delay_ms is not None]
+    return PlannedFlow(
+        topic=topic,
+        publisher=publisher,
+        subscription=subscription,
+        unique=max(
+            (link.unique for link in named), key=_STRENGTH.__getitem__, default=UniqueHow.NOT
+        ),
+        max_delay_ms=min(delays, default=None),
+        linked=bool(named),
+        transport=next(iter(told), FlowTransport.ANY),
+        quantities=tuple(each for link in named for each in link.quantities),
+    )
+
+
+def process_name(node: Node) -> str:
+    """Return the name of the node's process: as declared, else the node's key."""
+    return node.process or node.key
+
+
+def planned_processes(
+    nodes: Sequence[Node],
+    *,
+    domain_id: int,
+    discovery_range: DiscoveryRange,
+    environment: Mapping[str, str],
+    shared_memory: bool = False,
+) -> tuple[PlannedProcess, ...]:
+    """Group nodes by process, in the order in which the manifest first names each process.
+
+    Args:
+        nodes: in manifest order.
+        domain_id: 0–232.
+        discovery_range: given to every process in ROS_AUTOMATIC_DISCOVERY_RANGE, but to commands
+            that have shared memory alone: rmw_fastrtps_cpp 8.4 would have them look for peers at
+            127.0.0.1 only, where nobody is, and shared memory stays on this host anyway.
+        shared_memory: own participants have nothing else.
+        environment: where AMENT_PREFIX_PATH is looked up.
+
+    Raises:
+        PlanError: nodes of one process disagree about machine, kind, folder or a variable; two
+            executables want one process; an executable cannot be found.
+    """
+    groups: dict[str, list[Node]] = {}
+    for node in nodes:
+        groups.setdefault(process_name(node), []).append(node)
+
+    def graph_variables(kind: RunKind) -> tuple[tuple[str, str], ...]:
+        near = discovery_range is DiscoveryRange.LOCALHOST and shared_memory
+        reach = (
+            DiscoveryRange.SYSTEM_DEFAULT if near and kind is RunKind.COMMAND else discovery_range
+        )
+        return (("ROS_DOMAIN_ID", str(domain_id)), ("ROS_AUTOMATIC_DISCOVERY_RANGE", reach.name))
+
+    return tuple(
+        _process(name, group, graph_variables(group[0].run.kind), environment)
+        for name, group in groups.items()
+    )
+
+
+def _process(
+    name: str,
+    nodes: Sequence[Node],
+    graph_variables: tuple[tuple[str, str], ...],
+    environment: Mapping[str, str],
+) -> PlannedProcess:
+    first = nodes[0]
+    for node in nodes[1:]:
+        _must_agree(name, first, node)
+    is_command = first.run.kind is RunKind.COMMAND
+    return PlannedProcess(
+        name=name,
+        machine=first.machine,
+        run=first.run,
+        nodes=tuple(node.key for node in nodes),
+        argv=command_line(first, environment) if is_command else (),
+        environment=_variables(name, nodes, graph_variables),
+    )
+
+
+def _must_agree(process: str, first: Node, node: Node) -> None:
+    """Raise PlanError unless `node` can live in the process of `first`."""
+    where = f"cannot put nodes {first.key!r} and {node.key!r} into one process {process!r}"
+    if node.machine != first.machine:
+        raise PlanError(
+            f"{where}: they stand on machines {first.machine!r} and {node.machine!r}", at=node.at
+        )
+    if node.run.kind is not first.run.kind:
+        raise PlanError(
+            f"{where}: one is run by {first.run.kind.value}, the other by {node.run.kind.value}",
+            at=node.at,
+        )
+    if node.run.kind is RunKind.COMMAND:
+        raise PlanError(
+            f"{where}: a command is a process of its own; only python nodes share one", at=node.at
+        )
+    if node.run.working_directory != first.run.working_directory:
+        raise PlanError(
+            f"{where}: they want working directories {first.run.working_directory!r}"
+            f" and {node.run.working_directory!r}",
+            at=node.at,
+        )
+
+
+def _variables(
+    process: str, nodes: Sequence[Node], graph_variables: tuple[tuple[str, str], ...]
+) -> tuple[tuple[str, str], ...]:
+    """Merge the nodes' variables over those that place the process in the graph."""
+    merged: dict[str, tuple[str, str]] = {}
+    for node in nodes:
+        for name, value in node.run.environment:
+            known, owner = merged.setdefault(name, (value, node.key))
+            if known != value:
+                raise PlanError(
+                    f"cannot set {name} of process {process!r} to {value!r} for node {node.key!r}:"
+                    f" node {owner!r} sets it to {known!r}",
+                    at=node.at,
+                )
+    own = {name: value for name, (value, _) in merged.items()}
+    return tuple({**dict(graph_variables), **own}.items())
 
 
 def build_plan(manifest: Manifest, *, environment: Mapping[str, str] | None = None) -> Plan:
@@ -50,7 +267,7 @@ def build_plan(manifest: Manifest, *, environment: Mapping[str, str] | None = No
     The same manifest and environment always give the same plan.
 
     Args:
-        manifest: valid, as `lifecycle.manifest.load` returns it.
+        manifest: valid, as `lifecycle.manifest.loading` returns it.
         environment: variables to read ROS_DOMAIN_ID, ROS_AUTOMATIC_DISCOVERY_RANGE,
             RMW_IMPLEMENTATION and AMENT_PREFIX_PATH from; None takes this process's own.
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import Node, ParameterValue, Run
-from lifecycle.plan.errors import PlanError
+from lifecycle.plan.model import PlanError
 
 
 def command_line(node: Node, environment: Mapping[str, str]) -> tuple[str, ...]:

@@ -23,7 +23,7 @@ from lifecycle.manifest.model import Node, ParameterDeclaration, ParameterValue
 from lifecycle.plan.model import ExpectedParameter
 
 if TYPE_CHECKING:
-    from lifecycle.manifest.checks.parameters.parameter_sections import Section
+    from lifecycle.manifest.checks.parameters import Section
 
 GIVEN = "parameters"
 COMMAND = "command"
@@ -104,8 +104,7 @@ class ParameterFiles:
         return found
 
     def _file(self, path: str) -> _File:
-        from lifecycle.manifest.checks.parameters.parameter_files import shown_path
-        from lifecycle.manifest.checks.parameters.parameter_sections import read_sections
+        from lifecycle.manifest.checks.parameters import read_sections, shown_path
 
         if path not in self._files:
             shown = shown_path(path, self._manifest)
@@ -115,7 +114,7 @@ class ParameterFiles:
 
 
 def _declared(declaration: ParameterDeclaration, given: _Given | None) -> ExpectedParameter:
-    from lifecycle.manifest.checks.parameters.parameter_types import misfit
+    from lifecycle.manifest.checks.parameters import misfit
 
     type_ = declaration.type
     if given is None and declaration.default is not None:
@@ -135,7 +134,7 @@ def _declared(declaration: ParameterDeclaration, given: _Given | None) -> Expect
 
 
 def _undeclared(name: str, given: _Given) -> ExpectedParameter | None:
-    from lifecycle.manifest.checks.parameters.parameter_types import type_of
+    from lifecycle.manifest.checks.parameters import type_of
 
     if given.value is None:
         return None
@@ -174,7 +173,7 @@ def _command_line(node: Node) -> Iterator[tuple[str, str, str]]:
 
 def _scalar(text: str) -> ParameterValue | None:
     """Return what rcl makes of a value on a command line; None of anything but a plain scalar."""
-    from lifecycle.manifest.checks.parameters.parameter_types import read_scalar
+    from lifecycle.manifest.checks.parameters import read_scalar
 
     if len(text) > 1 and text[0] == text[-1] in "'\"" and not {text[0], "\\"} & set(text[1:-1]):
         return read_scalar(text[1:-1], quoted=True)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
-from lifecycle.manifest.flows.flow_needs import ParticipantGroup
+from lifecycle.manifest.flows import ParticipantGroup
 from lifecycle.network.dscp import describe
 from lifecycle.plan.model import PlannedEndpoint, PlannedParticipant
 

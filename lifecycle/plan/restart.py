@@ -18,9 +18,8 @@ from types import MappingProxyType
 from lifecycle.network.connection_url import ConnectionTransport, ConnectionUrl, Peer, parse
 from lifecycle.plan.connections.contacts import contacts_of
 from lifecycle.plan.connections.hosts import PortPool
-from lifecycle.plan.errors import PlanError
-from lifecycle.plan.model import ParticipantConnections, Plan, PlannedNode
-from lifecycle.plan.negotiation.terms import hosts_of, terms_of
+from lifecycle.plan.model import ParticipantConnections, Plan, PlanError, PlannedNode
+from lifecycle.plan.negotiation.parties import hosts_of, terms_of
 
 RESTART_PORTS_FROM = 2000
 """How far above `first_port` the ports of restarted participants begin: out of the way of ports

@@ -14,8 +14,8 @@ import dataclasses
 import re
 from collections.abc import Collection, Iterable, Mapping
 
+from lifecycle.manifest.installed_types import join
 from lifecycle.manifest.model import TOLERATED_NODES, EndpointKind
-from lifecycle.manifest.types.type_hash import join
 from lifecycle.plan.model import Plan
 from lifecycle.verify.observation import ObservedEndpoint
 

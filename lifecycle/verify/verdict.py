@@ -10,8 +10,7 @@ import enum
 from collections.abc import Iterable
 
 from lifecycle.manifest.model import EndpointKind, UniqueHow
-from lifecycle.network.flow import FlowTuple, flow_tuples
-from lifecycle.network.nfe import NetworkFlowEndpoint, UniqueRequirement
+from lifecycle.network.nfe import FlowTuple, NetworkFlowEndpoint, UniqueRequirement, flow_tuples
 
 
 class Outcome(enum.Enum):

@@ -22,13 +22,13 @@ from lifecycle.graph.messages import GraphMessageError, Joined, encode
 from lifecycle.graph.messages import decode as decode_message
 from lifecycle.manifest import ManifestError, load
 from lifecycle.manifest.diagnostics import Position
-from lifecycle.manifest.nodl.document import read_interface
-from lifecycle.manifest.types.idl import IdlError, parse_struct
-from lifecycle.manifest.types.type_hash import _hashes
+from lifecycle.manifest.installed_types import _hashes
+from lifecycle.manifest.message_size import IdlError, parse_struct
+from lifecycle.manifest.nodl import read_interface
 from lifecycle.node.host.control import Event
-from lifecycle.plan.notice import PlanNoticeError, announced_plan, notice_of
-from lifecycle.plan.notice import decode as decode_notice
-from lifecycle.plan.notice import encode as encode_notice
+from lifecycle.plan.comparison import PlanNoticeError, announced_plan, notice_of
+from lifecycle.plan.comparison import decode as decode_notice
+from lifecycle.plan.comparison import encode as encode_notice
 from lifecycle.programming.apply.errors import ProgrammingError
 from lifecycle.programming.apply.ledger import Ledger
 from lifecycle.programming.apply.nft import root_qdiscs

@@ -18,16 +18,17 @@ from rclpy.impl.implementation_singleton import rclpy_implementation as rcl
 from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 from rclpy.validate_full_topic_name import validate_full_topic_name
 
-from lifecycle.manifest.checks.parameters.parameter_sections import read_sections
-from lifecycle.manifest.checks.parameters.parameter_types import type_of
+from lifecycle.manifest.checks.parameters import read_sections, type_of
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.names import (
     NameNotLegalError,
+    RemapRuleError,
     expand,
     full_name_problem,
     name_problem,
     namespace_problem,
     node_name_problem,
+    parse_rule,
     resolve,
 )
 from lifecycle.manifest.qos import (
@@ -41,7 +42,6 @@ from lifecycle.manifest.qos import (
     Reliability,
     incompatibilities,
 )
-from lifecycle.manifest.remapping import RemapRuleError, parse_rule
 
 pytestmark = pytest.mark.ros
 

@@ -9,10 +9,9 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Mapping
 
-from lifecycle.export.picture.basis import Basis
-from lifecycle.export.picture.flows import pictured_flows
-from lifecycle.export.picture.lines import pictured_lines
+from lifecycle.export.picture.lines import pictured_flows, pictured_lines, pictured_participants
 from lifecycle.export.picture.model import (
+    Basis,
     NodeState,
     Picture,
     PicturedFinding,
@@ -21,7 +20,6 @@ from lifecycle.export.picture.model import (
     PicturedProcess,
     Presence,
 )
-from lifecycle.export.picture.participants import pictured_participants
 from lifecycle.manifest.model import RunKind
 from lifecycle.plan.model import Plan
 from lifecycle.verify.layout import lay_out

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from lifecycle.export.picture.graph import Edge, edges, framed, node_words
-from lifecycle.export.picture.look import LINES, STATES
-from lifecycle.export.picture.model import LineKind, Picture, PicturedNode, Presence
+from lifecycle.export.picture.model import LINES, STATES, LineKind, Picture, PicturedNode, Presence
 from lifecycle.printable import one_line
 
 _STYLES = {

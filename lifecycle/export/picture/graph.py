@@ -9,9 +9,9 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterator
 
-from lifecycle.export.picture.look import STATES, numbers, remark
-from lifecycle.export.picture.matrix import wrapped
+from lifecycle.export.picture.lines import OWN
 from lifecycle.export.picture.model import (
+    STATES,
     LineKind,
     Picture,
     PicturedArrow,
@@ -19,9 +19,10 @@ from lifecycle.export.picture.model import (
     PicturedLine,
     PicturedNode,
     Presence,
+    numbers,
+    remark,
 )
-from lifecycle.export.picture.participants import OWN
-from lifecycle.export.picture.views import edge_label, is_unique
+from lifecycle.export.picture.views import edge_label, is_unique, wrapped
 from lifecycle.verify.verdict import Outcome
 
 _LABEL_CHARACTERS = 60

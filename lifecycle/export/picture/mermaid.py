@@ -7,8 +7,7 @@ import re
 from collections.abc import Iterator
 
 from lifecycle.export.picture.graph import Edge, edges, framed, node_words
-from lifecycle.export.picture.look import DASHES, LINES, STATES
-from lifecycle.export.picture.model import LineKind, Picture, PicturedNode
+from lifecycle.export.picture.model import DASHES, LINES, STATES, LineKind, Picture, PicturedNode
 
 
 def picture_to_mermaid(picture: Picture) -> str:

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import dataclasses
 import enum
+from collections.abc import Callable, Mapping
 
-from lifecycle.verify.verdict import Outcome
+from lifecycle.verify.verdict import Finding, FlowReport, Outcome, Verdict
+from lifecycle.verify.view import View
 
 
 class LineKind(enum.Enum):
@@ -248,3 +250,112 @@ class Picture:
             for process in machine.processes
             for node in process.nodes
         )
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Look:
+    """How one state looks; `ink` is readable on `fill`."""
+
+    symbol: str
+    fill: str
+    ink: str = "#1b2733"
+
+
+STATES = {
+    NodeState.ACTIVE: Look(symbol="●", fill="#009e73", ink="#ffffff"),
+    NodeState.CONNECTED: Look(symbol="◉", fill="#0072b2", ink="#ffffff"),
+    NodeState.INACTIVE: Look(symbol="◐", fill="#56b4e9"),
+    NodeState.UNCONFIGURED: Look(symbol="○", fill="#f0e442"),
+    NodeState.FINALIZED: Look(symbol="■", fill="#8c8c8c", ink="#ffffff"),
+    NodeState.CHANGING: Look(symbol="◌", fill="#f7f3b0"),
+    NodeState.PLAIN: Look(symbol="◆", fill="#cfe8e0"),
+    NodeState.UNKNOWN: Look(symbol="?", fill="#e3e8ee"),
+    NodeState.SILENT: Look(symbol="◇", fill="#e69f00"),
+    NodeState.DEAD: Look(symbol="✖", fill="#1b2733", ink="#ffffff"),
+    NodeState.ABSENT: Look(symbol="∅", fill="#ffffff", ink="#b3261e"),
+    NodeState.MANAGED: Look(symbol="▣", fill="#dbe6f3"),
+}
+
+LINES = {
+    Presence.PRESENT: "#3f6ea8",
+    Presence.MISSING: "#b3261e",
+    Presence.UNDECLARED: "#c75b00",
+    Presence.PLANNED: "#4d5a66",
+}
+"""Colour of what is drawn as a line or a frame."""
+
+DASHES = {
+    Presence.PRESENT: "",
+    Presence.MISSING: "7 5",
+    Presence.UNDECLARED: "2 4",
+    Presence.PLANNED: "",
+}
+"""SVG's stroke-dasharray: missing is dashed, undeclared is dotted."""
+
+PRESENCE_WORDS = {
+    Presence.PRESENT: "declared, and there",
+    Presence.MISSING: "declared, but missing",
+    Presence.UNDECLARED: "there, but not declared",
+    Presence.PLANNED: "declared",
+}
+
+OUTCOMES = {
+    Outcome.OK: Look(symbol="✓", fill="#009e73", ink="#ffffff"),
+    Outcome.VIOLATED: Look(symbol="✗", fill="#b3261e", ink="#ffffff"),
+    Outcome.UNVERIFIABLE: Look(symbol="?", fill="#e69f00"),
+}
+
+
+def remark(presence: Presence) -> tuple[str, ...]:
+    """What is said of something beside its name: nothing if it is as declared."""
+    return () if presence.as_declared else (PRESENCE_WORDS[presence],)
+
+
+def numbers(findings: tuple[int, ...]) -> str:
+    """Spell what points to findings: `⚠1 ⚠4`; empty without any."""
+    return " ".join(f"⚠{number}" for number in findings)
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Basis:
+    """The two sides of a picture.
+
+    Attributes:
+        view: plan and observation; the observation is empty where nobody looked.
+        verdict: on the two; None where nobody looked, which makes it the picture of a plan.
+        reports: the verdict's, by topic, publisher and subscription.
+    """
+
+    view: View
+    verdict: Verdict | None
+    reports: Mapping[tuple[str, str, str], FlowReport]
+
+    @classmethod
+    def of(cls, view: View, verdict: Verdict | None) -> Basis:
+        """Return the basis of the picture of a view."""
+        flows = verdict.flows if verdict else ()
+        reports = {(each.topic, each.publisher, each.subscription): each for each in flows}
+        return cls(view=view, verdict=verdict, reports=reports)
+
+    @property
+    def absent(self) -> Presence:
+        """What everything declared is that is not in the observation."""
+        return Presence.PLANNED if self.verdict is None else Presence.MISSING
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """All findings; elements call them by their place here, from 1."""
+        return () if self.verdict is None else self.verdict.findings
+
+    def numbers(self, concerns: Callable[[Finding], bool]) -> tuple[int, ...]:
+        """Return the numbers of the findings that concern something."""
+        return tuple(n for n, each in enumerate(self.findings, start=1) if concerns(each))
+
+    def outcome(self, name: str, source: str, target: str) -> Outcome | None:
+        """What the verdict is on two ends that belong together; None in the picture of a plan."""
+        if self.verdict is None:
+            return None
+        report = self.reports.get((name, source, target))
+        subject = f"{name}: {source} → {target}"
+        found = [each.outcome for each in self.findings if each.subject == subject]
+        return Outcome.worst([*found, *([report.outcome] if report else [])])

@@ -5,8 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from xml.sax.saxutils import escape, quoteattr
 
-from lifecycle.export.picture.look import DASHES, LINES, OUTCOMES, PRESENCE_WORDS, STATES
-from lifecycle.export.picture.matrix import (
+from lifecycle.export.picture.model import (
+    DASHES,
+    LINES,
+    OUTCOMES,
+    PRESENCE_WORDS,
+    STATES,
+    NodeState,
+    Picture,
+    Presence,
+)
+from lifecycle.export.picture.views import (
     LINE,
     MARGIN,
     QUIET_EM,
@@ -14,11 +23,11 @@ from lifecycle.export.picture.matrix import (
     PlacedColumn,
     PlacedRow,
     Stroke,
+    computational,
+    data_layer,
     place,
     text_width,
 )
-from lifecycle.export.picture.model import NodeState, Picture, Presence
-from lifecycle.export.picture.views import computational, data_layer
 from lifecycle.printable import one_line
 from lifecycle.verify.verdict import Outcome
 

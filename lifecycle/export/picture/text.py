@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
-from lifecycle.export.picture.look import OUTCOMES, STATES, numbers, remark
 from lifecycle.export.picture.model import (
+    OUTCOMES,
+    STATES,
     Picture,
     PicturedArrow,
     PicturedFlow,
     PicturedLine,
     PicturedNode,
     Presence,
+    numbers,
+    remark,
 )
 from lifecycle.export.picture.views import edge_label, end_words
 from lifecycle.printable import one_line

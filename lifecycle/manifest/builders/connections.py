@@ -23,7 +23,7 @@ from lifecycle.manifest.model import (
     Interface,
 )
 from lifecycle.manifest.yaml.document import error
-from lifecycle.manifest.yaml.scalars import quote
+from lifecycle.manifest.yaml.yaml_parser import quote
 from lifecycle.network.connection_url import ConnectionUrl, ConnectionUrlError, parse
 
 _KINDS = {kind.value: kind for kind in EndpointKind}

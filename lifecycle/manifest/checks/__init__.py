@@ -1,32 +1,162 @@
 """Everything a manifest's parts say about each other: the checks that need the whole system.
 
-Owns: `check`, which runs every topic's checks and collects what they find; one file per topic, each
-a generator of diagnostics with rule ids `check.*`. Those that hold of a part are run by `partial`.
-Needs no ROS: types come from the ament index.
+Owns: `CHECKS`, the one registry. Each check is a generator of diagnostics with rule ids `check.*`
+and says what it needs: of a manifest in which something is wrong already, those checks run that
+what is wrong cannot put right, on the nodes that are sound for them. Needs no ROS: types come from
+the ament index.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 
-from lifecycle.manifest.checks import matching, names, order, placement, remaps, types
+from lifecycle.manifest.checks.connection_urls import check_urls
 from lifecycle.manifest.checks.connections import (
-    connection_urls,
-    connections,
-    declared_connections,
-    discovery,
+    check_connections,
+    check_counterparts,
+    check_mapped_endpoints,
 )
-from lifecycle.manifest.checks.flows import flow_transport, flows, identifiers, links, middleware
-from lifecycle.manifest.checks.parameters import parameter_files, parameters
-from lifecycle.manifest.checks.partial import Partial, check_sound
-from lifecycle.manifest.checks.system import System
+from lifecycle.manifest.checks.discovery import check_discovery
+from lifecycle.manifest.checks.flow_transport import check_middleware, check_transport
+from lifecycle.manifest.checks.flows import (
+    check_flow_endpoints,
+    check_flows,
+    check_identifiers,
+    check_link_uniqueness,
+    check_links,
+)
+from lifecycle.manifest.checks.matching import check_qos, check_types
+from lifecycle.manifest.checks.names import check_names, check_remaps
+from lifecycle.manifest.checks.nodes import (
+    check_machines,
+    check_order,
+    check_ports,
+    check_processes,
+)
+from lifecycle.manifest.checks.parameters import check_parameter_files, check_parameters
+from lifecycle.manifest.checks.system import Partial, System
 from lifecycle.manifest.diagnostics import Diagnostic
-from lifecycle.manifest.flows.flow_needs import FlowNeeds
+from lifecycle.manifest.flows import FlowNeeds
+from lifecycle.manifest.installed_types import search_prefixes
 from lifecycle.manifest.model import Manifest
-from lifecycle.manifest.types.ament_index import search_prefixes
 
-__all__ = ["Partial", "check", "check_sound"]
+__all__ = ["CHECKS", "Check", "Scope", "check", "check_sound"]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Scope:
+    """What a check may read.
+
+    Attributes:
+        system: the manifest, or the part of it that is sound for the check.
+        machines: names of all machines that are declared.
+        environment: of the process that will run the system.
+    """
+
+    system: System
+    machines: tuple[str, ...]
+    environment: Mapping[str, str]
+
+    @functools.cached_property
+    def prefixes(self) -> tuple[Path, ...]:
+        """Where packages are installed, in the order in which they are searched."""
+        return search_prefixes(self.environment)
+
+    @functools.cached_property
+    def needs(self) -> FlowNeeds:
+        """What the endpoints of the system ask of their flows."""
+        return FlowNeeds(self.system.manifest, self.prefixes)
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Check:
+    """One check, and what must be sound so that its findings hold.
+
+    Attributes:
+        run: yields what it finds.
+        parts: keys of a node without which the node is left out (see `SEPARABLE`).
+        sections: sections of the document that must be sound.
+        machines: the names of all declared machines must be known.
+        whole: it holds only of a manifest in which nothing is wrong.
+        whole_rules: these of its rules do: what they are about may be among what is left out.
+    """
+
+    run: Callable[[Scope], Iterator[Diagnostic]]
+    parts: tuple[str, ...] = ()
+    sections: frozenset[str] = frozenset()
+    machines: bool = False
+    whole: bool = False
+    whole_rules: frozenset[str] = frozenset()
+
+    def holds_of(self, part: Partial) -> bool:
+        """Whether what it needs of a document is sound in this part of it."""
+        known = part.machines is not None or not self.machines
+        return not self.whole and known and part.sound(*self.sections)
+
+
+_REACH = frozenset({"discovery", "machines", "data_layer"})
+_FLOWS = frozenset({"network", "links", "machines"})
+_WIRED = ("connections", "flows", "run")
+
+CHECKS = (
+    Check(run=lambda scope: check_names(scope.system)),
+    Check(run=lambda scope: check_remaps(scope.system)),
+    Check(run=lambda scope: check_types(scope.system, scope.prefixes)),
+    Check(run=lambda scope: check_qos(scope.system)),
+    Check(run=lambda scope: check_counterparts(scope.system), whole=True),
+    Check(run=lambda scope: check_order(scope.system), parts=("after",)),
+    Check(run=lambda scope: check_parameters(scope.system), parts=("run",)),
+    Check(
+        run=lambda scope: check_parameter_files(scope.system),
+        parts=("parameters", "parameter_files", "run"),
+        whole_rules=frozenset({"check.parameter-file-unmatched"}),
+    ),
+    Check(run=lambda scope: check_machines(scope.system, scope.machines), machines=True),
+    Check(run=lambda scope: check_processes(scope.system), parts=("run",)),
+    Check(
+        run=lambda scope: check_ports(scope.system, scope.needs, scope.environment),
+        whole=True,
+    ),
+    Check(
+        run=lambda scope: check_discovery(scope.system, scope.environment),
+        parts=("run",),
+        sections=_REACH,
+    ),
+    Check(run=lambda scope: check_mapped_endpoints(scope.system)),
+    Check(
+        run=lambda scope: check_connections(scope.system, scope.needs),
+        parts=_WIRED,
+        sections=_REACH | _FLOWS,
+    ),
+    Check(
+        run=lambda scope: check_urls(scope.system),
+        parts=("connections",),
+        sections=_REACH,
+        whole_rules=frozenset({"check.connection-peer"}),
+    ),
+    Check(run=lambda scope: check_flow_endpoints(scope.system)),
+    Check(run=lambda scope: check_flows(scope.system, scope.needs), parts=_WIRED, sections=_FLOWS),
+    Check(
+        run=lambda scope: check_transport(scope.system, scope.needs, scope.environment),
+        whole=True,
+    ),
+    Check(run=lambda scope: check_identifiers(scope.system, scope.needs), whole=True),
+    Check(
+        run=lambda scope: check_middleware(scope.system, scope.needs, scope.environment),
+        parts=_WIRED,
+        sections=_FLOWS,
+    ),
+    Check(run=lambda scope: check_links(scope.system)),
+    Check(
+        run=lambda scope: check_link_uniqueness(scope.system, scope.needs),
+        parts=("flows",),
+        sections=frozenset({"network"}),
+    ),
+)
 
 
 def check(
@@ -42,32 +172,43 @@ def check(
     Returns:
         Every error and warning, in the order of their places in each document.
     """
-    variables = os.environ if environment is None else environment
-    system = System.of(manifest)
-    prefixes = search_prefixes(variables)
-    needs = FlowNeeds(manifest, prefixes)
-    found = [
-        *names.check(system),
-        *remaps.check(system),
-        *types.check(system, prefixes),
-        *matching.check(system),
-        *connections.check(system),
-        *order.check(system),
-        *parameters.check(system),
-        *parameter_files.check(system),
-        *placement.check(system, needs, variables),
-        *discovery.check(system, variables),
-        *declared_connections.endpoints(system),
-        *declared_connections.check(system, needs),
-        *connection_urls.check(system),
-        *flows.endpoints(system),
-        *flows.check(system, needs),
-        *flow_transport.check(system, needs, variables),
-        *identifiers.check(system, needs),
-        *middleware.check(system, needs, variables),
-        *links.check(system, needs),
-    ]
+    scope = Scope(
+        system=System.of(manifest),
+        machines=tuple(each.name for each in manifest.machines),
+        environment=os.environ if environment is None else environment,
+    )
+    found = [finding for each in CHECKS for finding in each.run(scope)]
     files = {each.at.file: None for each in found}
     rank = {file: index for index, file in enumerate((manifest.path, *files))}
     found.sort(key=lambda each: (rank[each.at.file], each.at.line, each.at.column))
     return tuple(dict.fromkeys(found))
+
+
+def check_sound(
+    part: Partial, *, environment: Mapping[str, str] | None = None
+) -> tuple[Diagnostic, ...]:
+    """Check what is left of a manifest without what is wrong already.
+
+    Args:
+        part: as `load` has built it.
+        environment: as for `check`.
+    """
+    variables = os.environ if environment is None else environment
+    scopes: dict[tuple[str, ...], Scope] = {}
+
+    def scope(parts: tuple[str, ...]) -> Scope:
+        if parts not in scopes:
+            scopes[parts] = Scope(
+                system=part.system(*parts),
+                machines=tuple(sorted(part.machines or ())),
+                environment=variables,
+            )
+        return scopes[parts]
+
+    return tuple(
+        finding
+        for each in CHECKS
+        if each.holds_of(part)
+        for finding in each.run(scope(each.parts))
+        if finding.rule not in each.whole_rules
+    )

@@ -7,16 +7,34 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from lifecycle.manifest.checks.system import Resolved, System, full_name, spell
-from lifecycle.manifest.diagnostics import Diagnostic
-from lifecycle.manifest.model import EndpointKind, Node
-from lifecycle.manifest.names import expand, name_problem, namespace_problem, node_name_problem
+from lifecycle.errors import LifecycleError
+from lifecycle.manifest.checks.system import (
+    Resolved,
+    System,
+    full_name,
+    read_rule,
+    spell,
+    usable_rules,
+)
+from lifecycle.manifest.diagnostics import Diagnostic, Position
+from lifecycle.manifest.model import EndpointKind, EndpointPolicy, Node
+from lifecycle.manifest.names import (
+    RemapKind,
+    RemapRule,
+    expand,
+    hidden_names,
+    name_problem,
+    namespace_problem,
+    node_name_problem,
+    parse_rule,
+)
+from lifecycle.manifest.schema import did_you_mean
 from lifecycle.manifest.yaml.document import error, warning
 
 _ANSWERING = (EndpointKind.SERVICE_SERVER, EndpointKind.ACTION_SERVER)
 
 
-def check(system: System) -> Iterator[Diagnostic]:
+def check_names(system: System) -> Iterator[Diagnostic]:
     """Yield findings about the names of nodes and endpoints."""
     for node in system.manifest.nodes:
         yield from _illegal_node(node)
@@ -85,3 +103,135 @@ def _duplicate_endpoints(group: tuple[Resolved, ...]) -> Iterator[Diagnostic]:
 def _remapped(each: Resolved) -> bool:
     """Whether a rule gave it its name; then the rule is what `remaps` reports."""
     return expand(each.endpoint.name, each.node.name, each.node.namespace) != each.name
+
+
+_ACTIONS = (EndpointKind.ACTION_SERVER, EndpointKind.ACTION_CLIENT)
+
+
+def check_remaps(system: System) -> Iterator[Diagnostic]:
+    """Yield findings about remap rules."""
+    resolved: dict[str, list[Resolved]] = {}
+    for each in system.endpoints:
+        resolved.setdefault(each.node.key, []).append(each)
+    for node in system.manifest.nodes:
+        rules: list[tuple[str, RemapRule]] = []
+        for match, replacement in node.remap:
+            rule = read_rule(match, replacement)
+            if isinstance(rule, LifecycleError):
+                yield error("check.remap-rule", _place(node, match), rule.message, rule.hint)
+            else:
+                rules.append((match, rule))
+        yield from _unused(node, rules)
+        yield from _collisions(node, resolved.get(node.key, []))
+
+
+def _place(node: Node, match: str) -> Position:
+    return node.where(f"remap.{match}")
+
+
+def _unused(node: Node, rules: list[tuple[str, RemapRule]]) -> Iterator[Diagnostic]:
+    names = _graph_names(node)
+    used = {id(_applied(node, rules, name, kind)) for name, kind in names if name}
+    for match, rule in rules:
+        at = _place(node, match)
+        if rule.kind in (RemapKind.NODE_NAME, RemapKind.NAMESPACE):
+            key = "name" if rule.kind is RemapKind.NODE_NAME else "namespace"
+            message = f"cannot remap {match!r} here: the manifest says who the node is"
+            yield error("check.remap-identity", at, message, f"write '{key}: {rule.replacement}'")
+        elif rule.node not in ("", node.name):
+            message = (
+                f"cannot apply the rule {match!r}: it is for node {rule.node!r}, "
+                f"this one is {node.name!r}"
+            )
+            yield warning("check.remap-unused", at, message, "remove the prefix, or the rule")
+        elif id(rule) not in used:
+            yield from _never_matches(node, match, rule, names)
+
+
+def _applied(
+    node: Node, rules: list[tuple[str, RemapRule]], name: str, kind: RemapKind
+) -> RemapRule | None:
+    """Return the first rule for a fully qualified name, the one that rcl applies."""
+    for _, rule in rules:
+        if rule.applies_to(kind, node.name) and _expanded(node, rule.match) == name:
+            return rule
+    return None
+
+
+def _graph_names(node: Node) -> list[tuple[str, RemapKind]]:
+    """Return the names, before remapping, that rcl looks for a rule for."""
+    names = []
+    for endpoint in node.interface.endpoints:
+        expanded = _expanded(node, endpoint.name)
+        if endpoint.kind in _ACTIONS:
+            names += [(name, _remap_kind(hidden)) for name, hidden in hidden_names(expanded)]
+        else:
+            names.append((expanded, _remap_kind(endpoint.kind)))
+    return names
+
+
+def _expanded(node: Node, name: str) -> str:
+    """Return the fully qualified name; empty for one that is not legal, which `names` reports."""
+    try:
+        return expand(name, node.name, node.namespace)
+    except LifecycleError:
+        return ""
+
+
+def _remap_kind(kind: EndpointKind) -> RemapKind:
+    return RemapKind.TOPIC if kind.is_topic else RemapKind.SERVICE
+
+
+def _never_matches(
+    node: Node,
+    match: str,
+    rule: RemapRule,
+    names: list[tuple[str, RemapKind]],
+) -> Iterator[Diagnostic]:
+    at = _place(node, match)
+    wanted = _expanded(node, rule.match)
+    actions = [each.name for each in node.interface.endpoints if each.kind in _ACTIONS]
+    if not wanted:
+        return
+    if any(_expanded(node, name) == wanted for name in actions):
+        yield error(
+            "check.remap-action",
+            at,
+            f"cannot remap the action {wanted!r}: rcl remaps its hidden topics and services only",
+            f"remap {match}/_action/send_goal, …/cancel_goal, …/get_result, …/feedback and "
+            "…/status, or declare the action by its final name",
+        )
+    elif any(name == wanted and kind & rule.kind for name, kind in names):
+        message = f"cannot apply the rule {match!r}: an earlier rule for {wanted!r} always wins"
+        yield warning("check.remap-shadowed", at, message, "remove one of the two")
+    elif node.endpoints is EndpointPolicy.DECLARED:
+        known = [name for name, kind in names if kind & rule.kind]
+        message = f"cannot apply the rule {match!r}: no endpoint of the node is named {wanted!r}"
+        yield warning("check.remap-unused", at, message, did_you_mean(wanted, known))
+
+
+def _collisions(node: Node, resolved: list[Resolved]) -> Iterator[Diagnostic]:
+    """Refuse a rule that gives an endpoint the name of another one of its kind and node."""
+    first: dict[tuple[EndpointKind, str], Resolved] = {}
+    for each in resolved:
+        other = first.setdefault((each.endpoint.kind, each.name), each)
+        before = [expand(one.endpoint.name, node.name, node.namespace) for one in (other, each)]
+        if other is each or before == [each.name, each.name]:
+            continue
+        moved, stays = (each, other) if before[1] != each.name else (other, each)
+        message = (
+            f"cannot remap {each.endpoint.kind.noun} {moved.endpoint.name!r} onto {each.name!r}: "
+            f"{stays.endpoint.name!r} of the same node has that name ({spell(stays.at)})"
+        )
+        yield error("check.remap-collision", _rule_place(moved), message, "remap only one of them")
+
+
+def _rule_place(moved: Resolved) -> Position:
+    """Return the place of the rule that renamed an endpoint; the endpoint's if it is not plain."""
+    node = moved.node
+    expanded = expand(moved.endpoint.name, node.name, node.namespace)
+    for match, replacement in usable_rules(node):
+        rule = parse_rule(match, replacement)
+        if rule.match and _expanded(node, rule.match) == expanded:
+            return _place(node, match)
+    return moved.at

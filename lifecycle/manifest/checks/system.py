@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Mapping
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import Endpoint, EndpointKind, EndpointPolicy, Manifest, Node
-from lifecycle.manifest.names import full_node_name, resolve
-from lifecycle.manifest.remapping import RemapRule, parse_rule
+from lifecycle.manifest.names import RemapRule, full_node_name, parse_rule, resolve
+from lifecycle.network.rmw_capabilities import DEFAULT_RMW
+
+_RMW_VARIABLE = "RMW_IMPLEMENTATION"
 
 
 def spell(at: Position) -> str:
@@ -161,3 +164,101 @@ def read_rule(match: str, replacement: str) -> RemapRule | LifecycleError:
 def full_name(node: Node) -> str:
     """Return the node's fully qualified name."""
     return full_node_name(node.name, node.namespace)
+
+
+_EVERY_NODE = (
+    (EndpointKind.SERVICE_SERVER, "describe_parameters"),
+    (EndpointKind.SERVICE_SERVER, "get_parameter_types"),
+    (EndpointKind.SERVICE_SERVER, "get_parameters"),
+    (EndpointKind.SERVICE_SERVER, "get_type_description"),
+    (EndpointKind.SERVICE_SERVER, "list_parameters"),
+    (EndpointKind.SERVICE_SERVER, "set_parameters"),
+    (EndpointKind.SERVICE_SERVER, "set_parameters_atomically"),
+)
+_MANAGED_NODE = (
+    (EndpointKind.PUBLISHER, "transition_event"),
+    (EndpointKind.SERVICE_SERVER, "change_state"),
+    (EndpointKind.SERVICE_SERVER, "get_available_states"),
+    (EndpointKind.SERVICE_SERVER, "get_available_transitions"),
+    (EndpointKind.SERVICE_SERVER, "get_state"),
+    (EndpointKind.SERVICE_SERVER, "get_transition_graph"),
+)
+_OWN_NODE = tuple(
+    (EndpointKind.SERVICE_SERVER, name)
+    for name in ("alias", "connect_to", "disconnect", "get_configuration", "map_to", "remap")
+)
+
+_OF_THE_GRAPH = (
+    (EndpointKind.PUBLISHER, "/parameter_events"),
+    (EndpointKind.PUBLISHER, "/rosout"),
+    # What tools and simulators take part in, outside of any one system.
+    (EndpointKind.PUBLISHER, "/clock"),
+    # The graph interface's transport.
+    (EndpointKind.PUBLISHER, "/lifecycle/graph"),
+    (EndpointKind.SUBSCRIPTION, "/lifecycle/graph"),
+    (EndpointKind.SUBSCRIPTION, "/diagnostics"),
+    (EndpointKind.SUBSCRIPTION, "/parameter_events"),
+    (EndpointKind.SUBSCRIPTION, "/rosout"),
+)
+
+
+def implicit_names(system: System) -> frozenset[tuple[EndpointKind, str]]:
+    """Return kind and fully qualified name of every endpoint that exists undeclared."""
+    names = set(_OF_THE_GRAPH)
+    for node in system.manifest.nodes:
+        own = (*_EVERY_NODE, *(_MANAGED_NODE if node.managed else ()), *_OWN_NODE)
+        names.update((kind, f"{full_name(node)}/{name}") for kind, name in own)
+    return frozenset(names)
+
+
+SEPARABLE = frozenset(
+    {
+        "after",
+        "connections",
+        "flows",
+        "log_level",
+        "parameter_files",
+        "parameters",
+        "run",
+        "timeouts",
+    }
+)
+"""Keys of a node that can be wrong while its name and its endpoints are what they are."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Partial:
+    """What is left of a manifest.
+
+    Attributes:
+        manifest: with the nodes whose name and endpoints are sound, and the links that are.
+        flawed: by node key, which of its SEPARABLE parts are not sound; those may be left out.
+        sections: sections of the document that are not sound as a whole.
+        lost: as `System.lost`.
+        machines: names of all that are declared; None if not all are known.
+    """
+
+    manifest: Manifest
+    flawed: Mapping[str, frozenset[str]]
+    sections: frozenset[str]
+    lost: frozenset[str] | None
+    machines: frozenset[str] | None
+
+    def system(self, *needed: str) -> System:
+        """Return the nodes of which the `needed` parts are sound."""
+        nodes = self.manifest.nodes
+        kept = tuple(each for each in nodes if not self.flawed.get(each.key, set()) & {*needed})
+        lost = self.lost
+        if lost is not None:
+            lost |= {each.key for each in nodes} - {each.key for each in kept}
+        return System.of(dataclasses.replace(self.manifest, nodes=kept), lost=lost)
+
+    def sound(self, *sections: str) -> bool:
+        """Whether nothing is wrong in these sections."""
+        return not self.sections & {*sections}
+
+
+def rmw_of(node: Node, environment: Mapping[str, str]) -> str:
+    """Return the RMW identifier that a node will run with."""
+    own = dict(node.run.environment).get(_RMW_VARIABLE, "")
+    return own or environment.get(_RMW_VARIABLE, "") or DEFAULT_RMW

@@ -15,10 +15,9 @@ from collections.abc import Mapping
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.builders.cursor import Cursor
 from lifecycle.manifest.diagnostics import Diagnostic
-from lifecycle.manifest.schema.message_text import did_you_mean
-from lifecycle.manifest.yaml import scalars
+from lifecycle.manifest.schema import did_you_mean
 from lifecycle.manifest.yaml.document import Document, Place, Scalar, Value, error
-from lifecycle.manifest.yaml.yaml_parser import MAX_FINDINGS
+from lifecycle.manifest.yaml.yaml_parser import MAX_FINDINGS, quote, resolve
 
 MAX_TEXT = 1 << 20
 """Characters that the substitutions of one document may produce."""
@@ -103,7 +102,7 @@ class _Substitution:
                 known = (
                     f"declared: {', '.join(declared)}" if declared else "the manifest declares none"
                 )
-                message = f"cannot set the argument {scalars.quote(name)}; {known}"
+                message = f"cannot set the argument {quote(name)}; {known}"
                 at = self._document.key_at(("arguments",))
                 if self._include:
                     owner = self._include
@@ -117,7 +116,7 @@ class _Substitution:
             if value is None:
                 continue
             if not _encodable(value):
-                message = f"cannot set {name} to {scalars.quote(value)}: it is not UTF-8"
+                message = f"cannot set {name} to {quote(value)}: it is not UTF-8"
                 self._report("manifest.substitution", place, message)
                 continue
             self.values[name] = value
@@ -154,7 +153,7 @@ class _Substitution:
             self._report(
                 "manifest.argument-choice",
                 place,
-                f"cannot set {name} to {scalars.quote(value)}; allowed: {', '.join(allowed)}",
+                f"cannot set {name} to {quote(value)}; allowed: {', '.join(allowed)}",
                 did_you_mean(value, allowed),
             )
 
@@ -183,12 +182,12 @@ class _Substitution:
             data: Scalar = text
             # An empty string stays one, instead of becoming null.
             if whole and not whole[1] and not value.quoted and text:
-                data = scalars.resolve(text)
+                data = resolve(text)
         except LifecycleError as problem:
             if problem.message:
                 self._report("manifest.substitution", place, problem.message, problem.hint)
         except ValueError as problem:
-            self._report("yaml.number", place, f"cannot use {scalars.quote(text)}: {problem}")
+            self._report("yaml.number", place, f"cannot use {quote(text)}: {problem}")
         else:
             return dataclasses.replace(value, data=data, text=text)
         self.broken.append(place)
@@ -196,7 +195,7 @@ class _Substitution:
 
     def _spend(self, text: str) -> None:
         if not _encodable(text):
-            raise LifecycleError(f"cannot use {scalars.quote(text)}: it is not UTF-8")
+            raise LifecycleError(f"cannot use {quote(text)}: it is not UTF-8")
         exhausted = self._room < 0
         self._room -= len(text)
         if self._room < 0:
@@ -220,10 +219,10 @@ class _Substitution:
                 return self._argument(name, place)
             if kind == "arg":
                 raise LifecycleError(
-                    f"cannot give a default in {scalars.quote(match[0])}",
+                    f"cannot give a default in {quote(match[0])}",
                     hint=f"declare it: arguments: {{{name}: {{default: …}}}}",
                 )
-        raise LifecycleError(f"cannot substitute {scalars.quote(match[0])}", hint=_ALLOWED)
+        raise LifecycleError(f"cannot substitute {quote(match[0])}", hint=_ALLOWED)
 
     def _variable(self, name: str, default: str | None) -> str:
         found = self._environment.get(name, default)

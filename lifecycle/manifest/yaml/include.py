@@ -13,14 +13,14 @@ from pathlib import Path
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.builders.cursor import Cursor
-from lifecycle.manifest.builders.interface import Findings
+from lifecycle.manifest.builders.node import Findings
 from lifecycle.manifest.builders.system import Fragment
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import EndpointKind, Link, Machine, Node
 from lifecycle.manifest.names import resolve
-from lifecycle.manifest.schema.message_text import did_you_mean
+from lifecycle.manifest.schema import did_you_mean
 from lifecycle.manifest.yaml.document import error
-from lifecycle.manifest.yaml.scalars import quote
+from lifecycle.manifest.yaml.yaml_parser import quote
 
 MAX_DEPTH = 16
 """Manifests that include each other in a row."""

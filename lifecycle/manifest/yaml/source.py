@@ -16,8 +16,7 @@ from pathlib import Path
 
 from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position
 from lifecycle.manifest.yaml.document import Document, error
-from lifecycle.manifest.yaml.scalars import quote
-from lifecycle.manifest.yaml.yaml_parser import compose
+from lifecycle.manifest.yaml.yaml_parser import compose, quote
 
 MAX_BYTES = 1 << 20
 """Size limit of one file, 1 MiB."""

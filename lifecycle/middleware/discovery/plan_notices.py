@@ -2,7 +2,7 @@
 
 Owns: `PlanNotices`. The name of the topic holds no system: who was started with another manifest
 must be noticed too. The last notice of each is kept for those who come later. What it says is text
-here, see lifecycle.plan.notice.
+here, see lifecycle.plan.comparison.
 """
 
 from __future__ import annotations

@@ -10,8 +10,8 @@ import dataclasses
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
+from lifecycle.manifest.installed_types import join
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.manifest.types.type_hash import join
 from lifecycle.middleware.rcl.graph_queries import EndpointInfo, endpoints_of
 from lifecycle.verify.observation import ObservedEndpoint
 

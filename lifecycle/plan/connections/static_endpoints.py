@@ -14,11 +14,11 @@ from lifecycle.manifest.model import EndpointKind, RunKind
 from lifecycle.manifest.qos import Durability, Reliability
 from lifecycle.network.connection_url import ConnectionTransport
 from lifecycle.plan.connections.contacts import contacts_of, fixed_url
-from lifecycle.plan.connections.declared_connections import participant_name
+from lifecycle.plan.connections.control import participant_name
 from lifecycle.plan.connections.hosts import Hosts, PortPool
-from lifecycle.plan.errors import PlanError
 from lifecycle.plan.model import (
     ParticipantConnections,
+    PlanError,
     PlannedEndpoint,
     PlannedNode,
     PlannedParticipant,

@@ -7,10 +7,12 @@ observers are connected, endpoints are negotiated for, observers learn to see th
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from lifecycle.manifest.diagnostics import Diagnostic, Position
+from lifecycle.manifest.flows import ParticipantGroup
 from lifecycle.manifest.model import (
+    ConnectionDeclaration,
     DataLayerSource,
     Discovery,
     DiscoveryMode,
@@ -19,23 +21,138 @@ from lifecycle.manifest.model import (
     Manifest,
 )
 from lifecycle.manifest.yaml.document import error
-from lifecycle.plan.connections.control import connect_control, is_fixed
-from lifecycle.plan.connections.feasible import infeasible
+from lifecycle.network.dscp import describe
+from lifecycle.network.nfe import UniqueRequirement
+from lifecycle.plan.connections.control import (
+    connect_control,
+    connect_observers,
+    is_fixed,
+    participant_name,
+    with_tcp,
+)
 from lifecycle.plan.connections.hosts import Hosts, PortPool
-from lifecycle.plan.connections.observers import connect_observers, with_tcp
 from lifecycle.plan.connections.static_endpoints import place_static
-from lifecycle.plan.errors import PlanError
 from lifecycle.plan.model import (
     ParticipantConnections,
     Plan,
+    PlanError,
+    PlannedEndpoint,
     PlannedFlow,
     PlannedNode,
+    PlannedParticipant,
     PlannedServer,
 )
-from lifecycle.plan.negotiation.data_layer import DataLayerGraph
+from lifecycle.plan.negotiation.data_layer import DataLayerGraph, Party
+from lifecycle.plan.negotiation.media import carried
 from lifecycle.plan.negotiation.negotiate import negotiate
-from lifecycle.plan.negotiation.parties import party_of_node, place_negotiated, wishes_of
-from lifecycle.plan.negotiation.terms import make_terms, written_ports
+from lifecycle.plan.negotiation.parties import (
+    endpoint_of,
+    make_terms,
+    party_of_node,
+    place_negotiated,
+    wishes_of,
+    written_ports,
+)
+
+_SERVERS = {
+    EndpointKind.SERVICE_CLIENT: EndpointKind.SERVICE_SERVER,
+    EndpointKind.ACTION_CLIENT: EndpointKind.ACTION_SERVER,
+}
+_WORDS = {EndpointKind.SERVICE_CLIENT: "service", EndpointKind.ACTION_CLIENT: "action"}
+_NO_UDP = frozenset(("shm", "tcpv4"))
+
+_End = tuple[PlannedNode, PlannedEndpoint]
+
+
+def infeasible(
+    nodes: Sequence[PlannedNode], parties: Mapping[str, Party], *, negotiated: bool
+) -> tuple[Diagnostic, ...]:
+    """Return what participants are asked for and cannot do.
+
+    Args:
+        nodes: with all connections that are planned.
+        parties: the nodes as negotiation sees them, by key.
+        negotiated: topics are where they will be; else only those on declared connections are.
+    """
+    carriers = _Carriers(parties)
+    found = [*_services(nodes, parties, carriers)]
+    for node in nodes:
+        for each in node.endpoints:
+            if negotiated or _on_connection(node, each):
+                found += _without_udp(node, each, carriers(node, each))
+    return tuple(found)
+
+
+class _Carriers:
+    """Knows by which transports an endpoint can be reached; nothing where nobody knows."""
+
+    def __init__(self, parties: Mapping[str, Party]) -> None:
+        self._parties = parties
+
+    def __call__(self, node: PlannedNode, each: PlannedEndpoint) -> tuple[str, ...]:
+        return endpoint_of(node, each).by or self._parties[node.key].own
+
+
+_By = Callable[[PlannedNode, PlannedEndpoint], tuple[str, ...]]
+
+
+def _on_connection(node: PlannedNode, each: PlannedEndpoint) -> bool:
+    return any(one.name == each.participant and one.connection for one in node.participants)
+
+
+def _at(node: PlannedNode, each: PlannedEndpoint) -> Position:
+    return each.at or node.at
+
+
+def _services(
+    nodes: Sequence[PlannedNode], parties: Mapping[str, Party], carriers: _By
+) -> Iterator[Diagnostic]:
+    servers: dict[tuple[EndpointKind, str], list[_End]] = {}
+    for node in nodes:
+        for each in node.endpoints:
+            servers.setdefault((each.kind, each.resolved), []).append((node, each))
+    for node in nodes:
+        for each in node.endpoints:
+            wanted = _SERVERS.get(each.kind)
+            if wanted is None:
+                continue
+            for other, server in servers.get((wanted, each.resolved), ()):
+                mine, theirs = carriers(node, each), carriers(other, server)
+                near = parties[node.key].host == parties[other.key].host
+                if not mine or not theirs or carried(mine, theirs, same_host=near):
+                    continue
+                message = (
+                    f"cannot call {_WORDS[each.kind]} {each.resolved!r} of {other.key!r} from "
+                    f"{node.key!r}: the client's participant has {', '.join(mine)}, the server's "
+                    f"{', '.join(theirs)}, and they are on {'one host' if near else 'two hosts'}"
+                )
+                hint = "map both ends onto connections that have a transport in common"
+                yield error("plan.service-apart", _at(node, each), message, hint)
+
+
+def _without_udp(
+    node: PlannedNode, each: PlannedEndpoint, by: tuple[str, ...]
+) -> Iterator[Diagnostic]:
+    if not by or not {*by} <= _NO_UDP:
+        return
+    has = ", ".join(by)
+    if each.dscp is not None and each.enforce_dscp:
+        message = (
+            f"cannot mark {each.kind.noun} {each.name!r} of {node.key!r} {describe(each.dscp)}: "
+            f"its participant has {has}, and only UDP sockets can be marked"
+        )
+        hint = "use 'transport: udpv4', or remove the mark"
+        yield error("plan.mark-without-udp", _at(node, each), message, hint)
+    if (
+        each.kind is EndpointKind.SUBSCRIPTION
+        and each.unique is UniqueRequirement.STRICTLY_REQUIRED
+    ):
+        message = (
+            f"cannot give subscription {each.name!r} of {node.key!r} a port of its own: its "
+            f"participant has {has}, and only UDP has one port for each subscription"
+        )
+        hint = "use 'transport: udpv4', or remove 'unique'"
+        yield error("plan.unique-without-udp", _at(node, each), message, hint)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -245,3 +362,63 @@ def _with_medium(flow: PlannedFlow, graph: DataLayerGraph) -> PlannedFlow:
     media = dict.fromkeys(each.medium for each in found)
     reasons = dict.fromkeys(each.reason for each in found)
     return dataclasses.replace(flow, medium=" and ".join(media), medium_reason=", ".join(reasons))
+
+
+def place_declared(
+    node_name: str,
+    endpoints: Sequence[PlannedEndpoint],
+    declared: Sequence[ConnectionDeclaration],
+    groups: Sequence[ParticipantGroup],
+) -> tuple[
+    tuple[PlannedEndpoint, ...], tuple[PlannedParticipant, ...], tuple[ParticipantGroup, ...]
+]:
+    """Place endpoints on declared connections.
+
+    Args:
+        node_name: the node's base name.
+        endpoints: all of the node's endpoints.
+        declared: its connections.
+        groups: endpoints that must share, or not share, a participant.
+
+    Returns:
+        The endpoints with `participant` filled in where a connection carries them, a participant
+        for each connection, and the groups without the endpoints that are placed now.
+    """
+    places = {
+        entry: participant_name(node_name, connection.name)
+        for connection in declared
+        for entry in connection.map
+    }
+    placed = tuple(
+        dataclasses.replace(each, participant=places.get((each.kind, each.name), each.participant))
+        for each in endpoints
+    )
+    left = tuple(
+        dataclasses.replace(group, names=remaining)
+        for group in groups
+        if (remaining := tuple(name for name in group.names if (group.kind, name) not in places))
+    )
+    return placed, tuple(_participant(node_name, each, groups) for each in declared), left
+
+
+def _participant(
+    node_name: str, connection: ConnectionDeclaration, groups: Sequence[ParticipantGroup]
+) -> PlannedParticipant:
+    needs = [
+        group
+        for group in groups
+        if {*connection.map} & {(group.kind, name) for name in group.names}
+    ]
+    marks = [url.dscp for url in connection.urls] + [group.dscp for group in needs]
+    sizes = [group.max_datagram_bytes for group in needs]
+    count = len(connection.map)
+    return PlannedParticipant(
+        name=participant_name(node_name, connection.name),
+        dscp=next((each for each in marks if each is not None), None),
+        reason=f"connection {connection.name} for {count} endpoint{'' if count == 1 else 's'}",
+        max_datagram_bytes=min((each for each in sizes if each is not None), default=None),
+        non_blocking_send=any(group.non_blocking_send for group in needs),
+        connection=connection.name,
+        connections=ParticipantConnections(urls=tuple(str(url) for url in connection.urls)),
+        declared=True,
+    )

@@ -20,7 +20,7 @@ import psutil
 
 from lifecycle.errors import LifecycleError
 from lifecycle.network.address import canonical, is_loopback
-from lifecycle.network.five_qi_dscp import DscpMapping
+from lifecycle.network.five_qi import DscpMapping
 from lifecycle.plan.model import Plan, PlannedNode
 from lifecycle.programming.apply.changes import Changes, Target
 from lifecycle.programming.apply.deadline import Deadline

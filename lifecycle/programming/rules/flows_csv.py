@@ -10,7 +10,7 @@ import io
 from collections.abc import Iterable, Iterator
 
 from lifecycle.network.dscp import dscp_name, tos
-from lifecycle.network.flow import FlowTuple
+from lifecycle.network.nfe import FlowTuple
 from lifecycle.verify.verdict import FlowReport
 
 COLUMNS = (

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Mapping
 from types import MappingProxyType
 from typing import TypeVar
 
-from lifecycle.network.five_qi_dscp import DscpMapping
+from lifecycle.network.five_qi import DscpMapping
 from lifecycle.plan.model import Plan
 from lifecycle.programming.rules.camara import CamaraSettings, render_camara
 from lifecycle.programming.rules.fastdds_pro import render_fastdds_pro

@@ -16,9 +16,8 @@ from lifecycle.codec import to_json
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.network.address import canonical, is_loopback, is_multicast, is_wildcard, socket_text
 from lifecycle.network.dscp import describe, parse_dscp
-from lifecycle.network.five_qi_dscp import DscpMapping
-from lifecycle.network.flow import FlowTuple
-from lifecycle.network.nfe import InternetProtocol, TransportProtocol, is_ip
+from lifecycle.network.five_qi import DscpMapping
+from lifecycle.network.nfe import FlowTuple, InternetProtocol, TransportProtocol, is_ip
 from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedNode
 from lifecycle.programming.rules.packet_filter import (
     PROTOCOL_NUMBERS,

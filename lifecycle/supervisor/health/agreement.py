@@ -17,17 +17,18 @@ from typing import Protocol
 
 from lifecycle.manifest.model import DiscoveryRange, RunKind
 from lifecycle.node.reporting.machine_id import machine_id
-from lifecycle.plan.comparison import differences, plan_checksum
-from lifecycle.plan.model import Plan
-from lifecycle.plan.notice import (
+from lifecycle.plan.comparison import (
     PlanNotice,
     PlanNoticeError,
     announced_plan,
     concerns,
     decode,
+    differences,
     encode,
     notice_of,
+    plan_checksum,
 )
+from lifecycle.plan.model import Plan
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.verify.observation import Observation
 from lifecycle.verify.rules import nodes, rule, run

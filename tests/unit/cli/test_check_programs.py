@@ -12,7 +12,7 @@ import jsonschema
 import pytest
 
 from lifecycle.cli import main
-from lifecycle.manifest.schema.validation import read_schema
+from lifecycle.manifest.schema import read_schema
 
 MANIFEST = """manifest_version: 1
 system: talk

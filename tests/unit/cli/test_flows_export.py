@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from lifecycle.cli import verb_flows, verb_up
-from lifecycle.cli.flows_export import NAMES, Export
+from lifecycle.cli.verb_flows import NAMES, Export
 from lifecycle.errors import UsageError
 from lifecycle.programming.rules import EXPORTS
 from tests.unit.programming.apply.samples import nef_settings, settings_file

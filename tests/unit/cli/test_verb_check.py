@@ -11,8 +11,8 @@ import jsonschema
 import pytest
 
 from lifecycle.cli import main, verb_check
-from lifecycle.manifest.schema.validation import read_schema
-from lifecycle.plan.programs.programs import Resolution
+from lifecycle.manifest.schema import read_schema
+from lifecycle.plan.programs import Resolution
 
 ROOT = Path(__file__).parents[3]
 CORPUS = ROOT / "tests" / "corpus"

@@ -32,10 +32,8 @@ from lifecycle.export.picture import (
     planned_picture,
 )
 from lifecycle.export.picture import model as picture_model
-from lifecycle.export.picture.look import LINES, OUTCOMES, STATES
-from lifecycle.export.picture.matrix import place
-from lifecycle.export.picture.model import LineKind
-from lifecycle.export.picture.views import computational, data_layer
+from lifecycle.export.picture.model import LINES, OUTCOMES, STATES, LineKind
+from lifecycle.export.picture.views import computational, data_layer, place
 from lifecycle.plan import build_plan
 from lifecycle.verify import Outcome, Stage, verify
 from lifecycle.verify.observation import Observation, ObservedEndpoint, ObservedNode

@@ -23,9 +23,8 @@ from lifecycle.export.picture import (
     picture_to_text,
     planned_picture,
 )
-from lifecycle.export.picture.matrix import LINE, place, text_width
 from lifecycle.export.picture.model import LineKind
-from lifecycle.export.picture.views import computational, data_layer
+from lifecycle.export.picture.views import LINE, computational, data_layer, place, text_width
 from lifecycle.manifest import load
 from lifecycle.manifest.model import Condition, Endpoint, EndpointKind, UniqueHow
 from lifecycle.plan import Plan, build_plan

@@ -9,7 +9,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lifecycle.export.yaml_text import Noted, comment, scalar, to_yaml
+from lifecycle.export.manifest_yaml import Noted, comment, scalar, to_yaml
 from lifecycle.manifest.yaml.source import parse
 
 TEXTS = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=20)

@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from lifecycle.manifest import load
-from lifecycle.manifest.flows.dscp_resolution import identifiers, marking_of
-from lifecycle.manifest.flows.flow_needs import FlowNeeds, ParticipantGroup
+from lifecycle.manifest.flows import FlowNeeds, ParticipantGroup, identifiers, marking_of
 from lifecycle.manifest.model import (
     EndpointKind,
     FlowIdentification,
@@ -20,11 +19,9 @@ from lifecycle.manifest.model import (
     Run,
     RunKind,
 )
-from lifecycle.network.dscp import code_points
-from lifecycle.network.five_qi import five_qi_of
-from lifecycle.network.five_qi_dscp import dscp_mapping
+from lifecycle.network.dscp import TransportPriorityMapping, code_points
+from lifecycle.network.five_qi import dscp_mapping, five_qi_of
 from lifecycle.network.nfe import UniqueRequirement
-from lifecycle.network.transport_priority import TransportPriorityMapping
 from tests.unit.plan.samples import at, link, manifest, need, node, publisher, subscription
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION

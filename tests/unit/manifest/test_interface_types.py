@@ -8,8 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.manifest.types.ament_index import find_resource, list_resources, search_prefixes
-from lifecycle.manifest.types.interface_types import TypeLookup, TypeStatus, look_up
+from lifecycle.manifest.installed_types import (
+    TypeLookup,
+    TypeStatus,
+    find_resource,
+    list_resources,
+    look_up,
+    search_prefixes,
+)
 
 INDEX = Path("share", "ament_index", "resource_index")
 
@@ -78,8 +84,8 @@ def test_resources_are_listed_without_hidden_files(prefix: Path) -> None:
 
 def test_looking_a_type_up_imports_no_message_package() -> None:
     code = (
-        "import sys; from lifecycle.manifest.types.ament_index import search_prefixes\n"
-        "from lifecycle.manifest.types.interface_types import look_up\n"
+        "import sys; from lifecycle.manifest.installed_types import search_prefixes\n"
+        "from lifecycle.manifest.installed_types import look_up\n"
         "look_up('sensor_msgs/msg/Image', search_prefixes())\n"
         "sys.exit(bool({'rclpy', 'sensor_msgs', 'ament_index_python'} & set(sys.modules)))"
     )

@@ -10,9 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lifecycle.manifest.types.ament_index import search_prefixes
-from lifecycle.manifest.types.idl import Field, IdlError, parse_struct
-from lifecycle.manifest.types.message_size import bounded_size
+from lifecycle.manifest.installed_types import search_prefixes
+from lifecycle.manifest.message_size import Field, IdlError, bounded_size, parse_struct
 
 INSTALLED = search_prefixes({})
 
@@ -160,7 +159,7 @@ def test_scalars_take_what_a_c_compiler_gives_them(words: list[str]) -> None:
 
 
 def layout(words: list[str]) -> int:
-    from lifecycle.manifest.types import message_size
+    from lifecycle.manifest import message_size
 
     found = message_size._Layout()
     for word in words:

@@ -9,6 +9,9 @@ from hypothesis import strategies as st
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.names import (
     NameNotLegalError,
+    RemapKind,
+    RemapRule,
+    RemapRuleError,
     expand,
     full_name_problem,
     full_node_name,
@@ -16,9 +19,9 @@ from lifecycle.manifest.names import (
     name_problem,
     namespace_problem,
     node_name_problem,
+    parse_rule,
     resolve,
 )
-from lifecycle.manifest.remapping import RemapKind, RemapRule, RemapRuleError, parse_rule
 
 PUBLISHER, SERVER = EndpointKind.PUBLISHER, EndpointKind.SERVICE_SERVER
 ACTION = EndpointKind.ACTION_SERVER

@@ -8,7 +8,7 @@ import pytest
 
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import Endpoint, EndpointKind, Interface, ParameterDeclaration
-from lifecycle.manifest.nodl.document import MAX_DOCUMENTS, read_interface
+from lifecycle.manifest.nodl import MAX_DOCUMENTS, read_interface
 from lifecycle.manifest.qos import (
     POLICIES,
     PRESETS,

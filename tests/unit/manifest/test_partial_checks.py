@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from lifecycle.manifest import ManifestError, Severity, load
-from lifecycle.manifest.checks.partial import SEPARABLE
+from lifecycle.manifest.checks.system import SEPARABLE
 from tests.unit.manifest.test_corpus import pairs
 
 REPOSITORY = Path(__file__).parents[3]

@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from lifecycle.manifest import ManifestError, load
-from lifecycle.manifest.schema.validation import read_schema
+from lifecycle.manifest.schema import read_schema
 from lifecycle.manifest.yaml.yaml_parser import compose
 
 SLOW = settings(

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lifecycle.manifest.yaml.scalars import INT64_MAX, INT64_MIN, resolve
+from lifecycle.manifest.yaml.yaml_parser import INT64_MAX, INT64_MIN, resolve
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,7 @@ from lifecycle.manifest import (
     Reliability,
     UniqueHow,
 )
-from lifecycle.manifest.schema.validation import MANIFEST, read_schema, validate
+from lifecycle.manifest.schema import MANIFEST, read_schema, validate
 from lifecycle.manifest.yaml.source import parse
 from lifecycle.network.dscp import code_points
 from lifecycle.network.nfe import UniqueRequirement

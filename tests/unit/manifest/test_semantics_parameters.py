@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import pytest
 
-from lifecycle.manifest.checks.parameters.parameter_sections import Section
-from lifecycle.manifest.checks.parameters.parameter_types import (
+from lifecycle.manifest.checks.parameters import (
+    Section,
     misfit,
     read_scalar,
     suggestion,

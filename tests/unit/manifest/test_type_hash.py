@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.manifest.types.ament_index import search_prefixes
-from lifecycle.manifest.types.type_hash import installed_hash, join
+from lifecycle.manifest.installed_types import installed_hash, join, search_prefixes
 
 INSTALLED = search_prefixes({})
 STRING = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"

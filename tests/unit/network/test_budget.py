@@ -6,8 +6,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lifecycle.network.budget import describe_domains, overflows
-from lifecycle.network.ports import EphemeralRange, Platform, max_participants
+from lifecycle.network.ports import (
+    EphemeralRange,
+    Platform,
+    describe_domains,
+    max_participants,
+    overflows,
+)
 
 HINT = (
     "use another domain, run fewer processes, or give fewer publishers a flow of their own "

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from lifecycle.network.five_qi import five_qis
-from lifecycle.network.five_qi_dscp import dscp_mapping, dscp_mappings, parse_mapping
+from lifecycle.network.five_qi import dscp_mapping, dscp_mappings, five_qis, parse_mapping
 
 
 def test_every_shipped_mapping_says_where_it_comes_from_and_how_complete_it_is() -> None:

@@ -5,8 +5,13 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lifecycle.network.flow import FlowTuple, flow_tuples
-from lifecycle.network.nfe import InternetProtocol, NetworkFlowEndpoint, TransportProtocol
+from lifecycle.network.nfe import (
+    FlowTuple,
+    InternetProtocol,
+    NetworkFlowEndpoint,
+    TransportProtocol,
+    flow_tuples,
+)
 
 IPV4, IPV6 = InternetProtocol.IPV4, InternetProtocol.IPV6
 UDP, TCP = TransportProtocol.UDP, TransportProtocol.TCP

@@ -6,7 +6,7 @@ import dataclasses
 
 import pytest
 
-from lifecycle.network.five_qi_dscp import DscpMapping, dscp_mappings
+from lifecycle.network.five_qi import DscpMapping, dscp_mappings
 from lifecycle.network.tables import read_table
 
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lifecycle.network.transport_priority import TransportPriorityMapping, map_priority
+from lifecycle.network.dscp import TransportPriorityMapping, map_priority
 
 MAPPINGS = st.builds(
     lambda mask, ends: TransportPriorityMapping(mask=mask, low=min(ends), high=max(ends)),

@@ -22,8 +22,8 @@ from lifecycle.manifest.model import (
 from lifecycle.network.connection_url import parse
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan import PlanError, build_plan, check_plan
-from lifecycle.plan.connections.demand import demand
-from lifecycle.plan.render.text import render_text
+from lifecycle.plan.connections.hosts import demand
+from lifecycle.plan.render import render_text
 from tests.unit.plan.samples import (
     at,
     endpoint,

@@ -9,10 +9,8 @@ import zlib
 import pytest
 
 from lifecycle.manifest.model import Machine
-from lifecycle.plan import notice as notices
-from lifecycle.plan.comparison import plan_checksum
-from lifecycle.plan.model import Plan
-from lifecycle.plan.notice import (
+from lifecycle.plan import comparison as notices
+from lifecycle.plan.comparison import (
     PlanNotice,
     PlanNoticeError,
     announced_plan,
@@ -20,7 +18,9 @@ from lifecycle.plan.notice import (
     decode,
     encode,
     notice_of,
+    plan_checksum,
 )
+from lifecycle.plan.model import Plan
 from tests.unit.supervisor.fakes import HERE, plan_of, planned_node
 
 

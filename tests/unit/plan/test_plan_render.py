@@ -23,9 +23,8 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.manifest.qos import PRESETS, History, Liveliness, QosProfile
 from lifecycle.plan import build_plan
-from lifecycle.plan.connections.demand import demand
-from lifecycle.plan.render.table import table
-from lifecycle.plan.render.text import render_text, spell_qos
+from lifecycle.plan.connections.hosts import demand
+from lifecycle.plan.render import render_text, spell_qos, table
 from tests.unit.plan.samples import at, need, node, planned, publisher, subscription, teleop
 
 TELEOP = """\

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from lifecycle.manifest.model import EndpointKind, Run, RunKind
-from lifecycle.plan.programs.programs import Resolution, resolve_programs
+from lifecycle.plan.programs import Resolution, resolve_programs
 from tests.unit.plan.samples import endpoint, manifest, node, publisher, subscription
 
 TALKER = """

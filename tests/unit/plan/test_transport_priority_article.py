@@ -10,9 +10,9 @@ import pytest
 from lifecycle.manifest import load
 from lifecycle.manifest.checks import check
 from lifecycle.manifest.model import EndpointKind, Machine, Manifest, Network
-from lifecycle.network.transport_priority import TransportPriorityMapping
+from lifecycle.network.dscp import TransportPriorityMapping
 from lifecycle.plan import PlanError, build_plan
-from lifecycle.plan.render.text import render_text
+from lifecycle.plan.render import render_text
 from lifecycle.verify import Outcome, Stage, verify
 from tests.unit.plan.samples import at, manifest, need, node, publisher
 from tests.unit.verify.edits import change_report

@@ -27,7 +27,7 @@ from lifecycle.network.nfe import (
     UniqueRequirement,
 )
 from lifecycle.plan import PlanError, build_plan
-from lifecycle.plan.render.text import render_text
+from lifecycle.plan.render import render_text
 from lifecycle.verify import Outcome, Stage, verify
 from tests.unit.plan.samples import at, link, manifest, need, node, publisher, subscription
 from tests.unit.verify.edits import change_report

@@ -12,9 +12,8 @@ import pytest
 
 from lifecycle.manifest.model import DiscoveryRange, Machine, RunKind
 from lifecycle.node.reporting.machine_id import machine_id
-from lifecycle.plan.comparison import plan_checksum
+from lifecycle.plan.comparison import decode, encode, notice_of, plan_checksum
 from lifecycle.plan.model import Plan
-from lifecycle.plan.notice import decode, encode, notice_of
 from lifecycle.supervisor.gate.verification_loop import with_findings
 from lifecycle.supervisor.health.agreement import ANNOUNCED_S, Agreement
 from lifecycle.supervisor.nodes.system import System

@@ -10,10 +10,9 @@ import json
 import pytest
 from rich.console import Console
 
-from lifecycle.cli.flow_table import render_flows
-from lifecycle.cli.live import Live
-from lifecycle.cli.status_text import status_text
-from lifecycle.cli.up_output import JsonLines, PlainLines
+from lifecycle.cli.up_output import JsonLines, Live, PlainLines
+from lifecycle.cli.verb_flows import render_flows
+from lifecycle.cli.verb_status import status_text
 from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import UniqueHow
 from lifecycle.network.nfe import (

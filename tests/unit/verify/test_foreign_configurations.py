@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from lifecycle import codec
 from lifecycle.graph.messages import GraphMessageError
 from lifecycle.graph.messages import decode as decode_message
-from lifecycle.plan.notice import PlanNoticeError, announced_plan
-from lifecycle.plan.notice import decode as decode_notice
+from lifecycle.plan.comparison import PlanNoticeError, announced_plan
+from lifecycle.plan.comparison import decode as decode_notice
 from lifecycle.verify import Stage, render_text, to_json, to_junit, to_sarif, verify
 from lifecycle.verify.observation import (
     LONGEST_CONFIGURATION,

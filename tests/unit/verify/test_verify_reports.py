@@ -14,8 +14,8 @@ import pytest
 
 from lifecycle import codec
 from lifecycle.manifest.model import EndpointKind, UniqueHow
-from lifecycle.network.flow import FlowTuple
 from lifecycle.network.nfe import (
+    FlowTuple,
     InternetProtocol,
     NetworkFlowEndpoint,
     TransportProtocol,

@@ -7,7 +7,7 @@ import re
 
 import pytest
 
-from lifecycle.network.five_qi_dscp import dscp_mapping
+from lifecycle.network.five_qi import dscp_mapping
 from lifecycle.network.nfe import TransportProtocol
 from lifecycle.plan import PlannedNode
 from lifecycle.programming.rules.rules import FlowRule, asks, flow_rules, named, rules_digest

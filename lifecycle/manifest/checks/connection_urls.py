@@ -1,0 +1,293 @@
+"""Checks of the addresses and ports that connection URLs fix.
+
+Owns: check.connection-ports, check.connection-address, check.connection-peer,
+check.connection-urls. Pure.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import ipaddress
+from collections.abc import Iterator
+
+from lifecycle.manifest.checks.system import System, spell
+from lifecycle.manifest.diagnostics import Diagnostic, Position
+from lifecycle.manifest.model import (
+    ConnectionDeclaration,
+    DiscoveryMode,
+    EndpointKind,
+    FlowTransport,
+    Node,
+)
+from lifecycle.manifest.yaml.document import error, warning
+from lifecycle.network.address import is_loopback, may_be_same
+from lifecycle.network.connection_url import ConnectionTransport, ConnectionUrl, Peer
+from lifecycle.network.ports import DG, MAX_DOMAIN_ID, domain_base, owner_of
+
+_WORDS = {
+    "port": "port",
+    "metatraffic_port": "metatraffic port",
+    "output_port": "output port",
+}
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class _Use:
+    """One port that a URL opens."""
+
+    host: str
+    tcp: bool
+    group: bool
+    address: str
+    port: int
+    what: str
+    at: Position
+
+
+def check_urls(system: System) -> Iterator[Diagnostic]:
+    """Yield findings about the URLs of every declared connection."""
+    uses: list[_Use] = []
+    contacts: set[tuple[str, int]] = set()
+    for node, connection, url, at in _urls(system):
+        uses += _uses(system, node, connection, url, at)
+        contacts |= _contacts(system, node, url)
+        yield from _own_address(system, node, url, at)
+    yield from _collisions(uses)
+    yield from _well_known(system, uses)
+    for node, connection, url, at in _urls(system):
+        yield from _peers(system, url, at, contacts)
+        yield from _loopback(system, node, connection, url, at)
+    for node in system.manifest.nodes:
+        for connection in node.connections:
+            yield from _together(node, connection)
+
+
+def _urls(
+    system: System,
+) -> Iterator[tuple[Node, ConnectionDeclaration, ConnectionUrl, Position]]:
+    for node in system.manifest.nodes:
+        for connection in node.connections:
+            for index, url in enumerate(connection.urls):
+                yield (
+                    node,
+                    connection,
+                    url,
+                    node.where(f"connections.{connection.name}.urls.{index}"),
+                )
+
+
+def _host(system: System, node: Node) -> str:
+    found = (each.address for each in system.manifest.machines if each.name == node.machine)
+    return next(found, "")
+
+
+def _uses(
+    system: System,
+    node: Node,
+    connection: ConnectionDeclaration,
+    url: ConnectionUrl,
+    at: Position,
+) -> Iterator[_Use]:
+    for attribute, word in _WORDS.items():
+        port = getattr(url, attribute)
+        if port is None:
+            continue
+        group = url.transport is ConnectionTransport.UDPM
+        yield _Use(
+            host=_host(system, node),
+            tcp=url.transport is ConnectionTransport.TCPV4,
+            group=group and attribute == "port",
+            address="" if group or attribute == "output_port" else url.address,
+            port=port,
+            what=f"{word} of connection {connection.name!r} of {node.key!r}",
+            at=at,
+        )
+
+
+def _contacts(system: System, node: Node, url: ConnectionUrl) -> set[tuple[str, int]]:
+    """Return where a connection's discovery is reached, by every address of its host."""
+    tcp = url.transport is ConnectionTransport.TCPV4
+    port = url.port if tcp else url.metatraffic_port
+    if port is None:
+        return set()
+    own = "" if url.transport is ConnectionTransport.UDPM else url.address
+    addresses = (
+        {own}
+        if own and not ipaddress.ip_address(own).is_unspecified
+        else {
+            _host(system, node),
+            "127.0.0.1",
+            "::1",
+            *url.interfaces,
+        }
+    )
+    return {(address, port) for address in addresses}
+
+
+def _own_address(
+    system: System, node: Node, url: ConnectionUrl, at: Position
+) -> Iterator[Diagnostic]:
+    host = _host(system, node)
+    if not host or not url.address or url.transport is ConnectionTransport.UDPM:
+        return
+    own = ipaddress.ip_address(url.address)
+    if own.is_loopback or own.is_unspecified or own == ipaddress.ip_address(host):
+        return
+    if own.version != ipaddress.ip_address(host).version:
+        return  # a host has addresses of both kinds, and a machine is declared with one
+    message = (
+        f"cannot listen on {url.address!r} for {node.key!r}: its machine {node.machine!r} has the "
+        f"address {host}"
+    )
+    hint = "leave the address out to listen on every interface"
+    yield error("check.connection-address", at, message, hint)
+
+
+def _collisions(uses: list[_Use]) -> Iterator[Diagnostic]:
+    seen: dict[tuple[str, bool, int], list[_Use]] = {}
+    for use in uses:
+        for other in seen.setdefault((use.host, use.tcp, use.port), []):
+            if use.group and other.group:
+                continue
+            one, two = use.address or "0.0.0.0", other.address or "0.0.0.0"  # noqa: S104 - a name
+            if may_be_same(one, two, same_machine=True):
+                protocol = "TCP" if use.tcp else "UDP"
+                message = (
+                    f"cannot give {protocol} port {use.port} to the {use.what}: it is the "
+                    f"{other.what} ({spell(other.at)})"
+                )
+                yield error("check.connection-ports", use.at, message, "choose another port")
+                break
+        seen[use.host, use.tcp, use.port].append(use)
+
+
+def _well_known(system: System, uses: list[_Use]) -> Iterator[Diagnostic]:
+    """Judge ports that participants of the system's own domain take by themselves."""
+    discovery = system.manifest.discovery
+    domain = discovery.domain_id or 0
+    if (
+        discovery.mode is not DiscoveryMode.DYNAMIC
+        or discovery.transport in (FlowTransport.SHM, FlowTransport.TCPV4)
+        or not 0 <= domain <= MAX_DOMAIN_ID
+    ):
+        return
+    for use in uses:
+        owner = None if use.tcp else owner_of(use.port)
+        if owner is None or owner.domain_id != domain:
+            continue
+        whose = (
+            "every participant"
+            if owner.participant_id is None
+            else f"participant {owner.participant_id}"
+        )
+        message = (
+            f"cannot give UDP port {use.port} to the {use.what}: in domain {domain} it is the "
+            f"{owner.role.replace('_', ' ')} port of {whose}"
+        )
+        base = domain_base(domain)
+        hint = f"choose a port outside of {base}–{min(base + DG - 1, 65535)}"
+        yield error("check.connection-ports", use.at, message, hint)
+
+
+def _peers(
+    system: System, url: ConnectionUrl, at: Position, contacts: set[tuple[str, int]]
+) -> Iterator[Diagnostic]:
+    """Warn of peers whom nobody of the system is."""
+    discovery = system.manifest.discovery
+    planned = discovery.mode is not DiscoveryMode.DYNAMIC and (
+        discovery.transport is not FlowTransport.SHM
+    )
+    domain = domain_base(min(max(discovery.domain_id or 0, 0), MAX_DOMAIN_ID))
+    for peer in url.peers:
+        if peer.port is None or planned or domain <= peer.port < domain + DG:
+            continue
+        if (peer.address, peer.port) in contacts:
+            continue
+        near = sorted(port for address, port in contacts if address == peer.address)
+        spelled = ", ".join(str(Peer(address=peer.address, port=each)) for each in near)
+        message = f"cannot find a participant of this system at {str(peer)!r}"
+        hint = (
+            f"planned there: {spelled}"
+            if near
+            else "no connection listens at that address: 'metatraffic_port' is what peers name"
+        )
+        yield warning("check.connection-peer", at, message, hint)
+
+
+def _loopback(
+    system: System,
+    node: Node,
+    connection: ConnectionDeclaration,
+    url: ConnectionUrl,
+    at: Position,
+) -> Iterator[Diagnostic]:
+    """Judge loopback addresses where what is carried has an end elsewhere."""
+    if url.transport is ConnectionTransport.UDPM:
+        return
+    local = [str(each) for each in url.peers if is_loopback(each.address)]
+    if is_loopback(url.address):
+        local.insert(0, url.address)
+    if not local or any(not is_loopback(each.address) for each in url.peers):
+        return
+    for kind, name in connection.map:
+        for key in _remote_nodes(system, node, kind, name):
+            message = (
+                f"cannot reach {key!r}, which {name!r} of {node.key!r} is for, by {local[0]!r}: "
+                "a loopback address never leaves its host, and they are on different machines"
+            )
+            yield error("check.connection-address", at, message, "use the machines' addresses")
+            return
+
+
+def _remote_nodes(system: System, node: Node, kind: EndpointKind, name: str) -> Iterator[str]:
+    """Yield nodes of other hosts that have the other end of a topic."""
+    other = {
+        EndpointKind.PUBLISHER: EndpointKind.SUBSCRIPTION,
+        EndpointKind.SUBSCRIPTION: EndpointKind.PUBLISHER,
+    }.get(kind)
+    mine = [
+        each.name
+        for each in system.endpoints
+        if each.node.key == node.key and (each.endpoint.kind, each.endpoint.name) == (kind, name)
+    ]
+    if other is None or not mine:
+        return
+    for each in system.named(other, mine[0]):
+        if _host(system, each.node) != _host(system, node):
+            yield each.node.key
+
+
+def _together(node: Node, connection: ConnectionDeclaration) -> Iterator[Diagnostic]:
+    """Judge URLs that one participant cannot have together (Fast DDS 2.14)."""
+    at = node.where(f"connections.{connection.name}")
+    udp = [
+        url
+        for url in connection.urls
+        if url.transport in (ConnectionTransport.UDPV4, ConnectionTransport.UDPV6)
+    ]
+    fixed = [url for url in udp if url.port]
+    shm = [url for url in connection.urls if url.transport is ConnectionTransport.SHM]
+    rule, name = "check.connection-urls", connection.name
+    if shm and fixed:
+        message = (
+            f"cannot use 'shm://' beside {str(fixed[0])!r} in {name!r}: beside fixed ports Fast "
+            "DDS does not listen to shared memory"
+        )
+        yield error(rule, at, message, "leave shm:// or the port out")
+    served = [url for url in connection.urls if url.server]
+    looking = [url for url in connection.urls if url.peers]
+    if served and looking:
+        message = (
+            f"cannot look for peers by {str(looking[0])!r} in {name!r} as a client of a discovery "
+            "server: a client finds nobody else"
+        )
+        yield error(rule, at, message, "leave peer= or server= out")
+    tcp = [
+        url for url in connection.urls if url.transport is ConnectionTransport.TCPV4 and url.port
+    ]
+    if len(tcp) > 1:
+        message = (
+            f"cannot listen on {str(tcp[0])!r} and {str(tcp[1])!r} in {name!r}: one participant "
+            "has one TCP port"
+        )
+        yield error(rule, at, message, "make two connections of it")

@@ -1,0 +1,300 @@
+"""Checks of who talks to whom: ends that have no other end.
+
+Owns: check.unpublished, check.unheard, check.no-server. How severe they are is the manifest's
+policy. Pure.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+
+from lifecycle.manifest.checks.system import Resolved, System, full_name, implicit_names, spell
+from lifecycle.manifest.diagnostics import Diagnostic, Position, Severity
+from lifecycle.manifest.flows import FlowNeeds, ResolvedNeed
+from lifecycle.manifest.model import (
+    Authority,
+    ConnectionDeclaration,
+    DiscoveryMode,
+    EndpointKind,
+    EndpointPolicy,
+    FlowTransport,
+    Node,
+    RunKind,
+)
+from lifecycle.manifest.schema import did_you_mean
+from lifecycle.manifest.yaml.document import error, warning
+from lifecycle.network.connection_url import ConnectionTransport
+from lifecycle.network.dscp import describe
+
+_OTHER_END = {
+    EndpointKind.SUBSCRIPTION: EndpointKind.PUBLISHER,
+    EndpointKind.PUBLISHER: EndpointKind.SUBSCRIPTION,
+    EndpointKind.SERVICE_CLIENT: EndpointKind.SERVICE_SERVER,
+    EndpointKind.ACTION_CLIENT: EndpointKind.ACTION_SERVER,
+}
+"""Kinds that make no sense alone. A server that nobody calls is an offer."""
+
+_RULES = {
+    EndpointKind.SUBSCRIPTION: "check.unpublished",
+    EndpointKind.PUBLISHER: "check.unheard",
+    EndpointKind.SERVICE_CLIENT: "check.no-server",
+    EndpointKind.ACTION_CLIENT: "check.no-server",
+}
+
+
+def check_counterparts(system: System) -> Iterator[Diagnostic]:
+    """Yield findings about endpoints that nothing in the manifest connects to."""
+    implicit = implicit_names(system)
+    for each in system.endpoints:
+        kind = each.endpoint.kind
+        other = _OTHER_END.get(kind)
+        if other is None or system.named(other, each.name) or (other, each.name) in implicit:
+            continue
+        severity = _severity(system, kind)
+        if severity is not None:
+            yield _alone(system, each, other, severity)
+
+
+def _severity(system: System, kind: EndpointKind) -> Severity | None:
+    policy = system.manifest.policy
+    severity = policy.unheard if kind is EndpointKind.PUBLISHER else policy.unpublished
+    if severity is Severity.ERROR and system.is_open:
+        return Severity.WARNING  # the other end may be one that the manifest does not declare
+    return severity
+
+
+def _alone(system: System, each: Resolved, other: EndpointKind, severity: Severity) -> Diagnostic:
+    kind, policy = each.endpoint.kind, "unpublished"
+    if kind is EndpointKind.PUBLISHER:
+        message = f"cannot be heard on {each.name!r}: no node of this system subscribes to it"
+        policy = "unheard"
+    elif kind is EndpointKind.SUBSCRIPTION:
+        message = f"cannot receive anything on {each.name!r}: no node of this system publishes it"
+    else:
+        message = f"cannot call {each.name!r}: no node of this system is its {other.noun}"
+    hint = did_you_mean(each.name, system.names(other)) or (
+        f"'policy: {{{policy}: ignore}}' accepts it"
+    )
+    return Diagnostic(rule=_RULES[kind], severity=severity, at=each.at, message=message, hint=hint)
+
+
+_FLOW_NAME = re.compile(r"flow_[0-9]+\Z")
+_UDP = (ConnectionTransport.UDPV4, ConnectionTransport.UDPV6, ConnectionTransport.UDPM)
+_CARRIERS = {
+    FlowTransport.NETWORK: (*_UDP, ConnectionTransport.TCPV4),
+    FlowTransport.SHM: (ConnectionTransport.SHM,),
+    FlowTransport.UDPV4: (ConnectionTransport.UDPV4,),
+    FlowTransport.UDPV6: (ConnectionTransport.UDPV6,),
+    FlowTransport.MULTICAST: (ConnectionTransport.UDPM,),
+    FlowTransport.TCPV4: (ConnectionTransport.TCPV4,),
+}
+
+
+def check_connections(system: System, needs: FlowNeeds) -> Iterator[Diagnostic]:
+    """Yield findings about every declared connection, but for `check_mapped_endpoints`."""
+    hidden: dict[str, tuple[Node, ConnectionDeclaration]] = {}
+    for node in system.manifest.nodes:
+        if node.connections:
+            yield from _foreign(system, node)
+        for each in node.connections:
+            yield from _name(system, node, each, hidden)
+            yield from _flows(node, each, needs)
+
+
+def check_mapped_endpoints(system: System) -> Iterator[Diagnostic]:
+    """Yield findings about what connections carry, whatever their URLs are."""
+    for node in system.manifest.nodes:
+        yield from _endpoints(node)
+
+
+def _foreign(system: System, node: Node) -> Iterator[Diagnostic]:
+    if node.run.kind is RunKind.PYTHON:
+        return
+    at = node.where(f"connections.{node.connections[0].name}")
+    supervised = system.manifest.data_layer.authority is Authority.SUPERVISOR
+    if supervised and node.managed:
+        return  # its ~/connect_to service is called, if it has one
+    message = f"cannot connect {node.key!r}: its participants are its own code's to make"
+    hint = "write it as 'run: {python: module:Class}'" + (
+        ""
+        if supervised
+        else ", or use 'data_layer: {authority: supervisor}' if it has ~/connect_to"
+    )
+    yield error("check.connection-foreign", at, message, hint)
+
+
+def _endpoints(node: Node) -> Iterator[Diagnostic]:
+    """Judge what the connections of a node carry."""
+    declared = {(each.kind, each.name) for each in node.interface.endpoints}
+    first: dict[tuple[EndpointKind, str], tuple[str, Position]] = {}
+    for connection in node.connections:
+        counts: dict[EndpointKind, int] = {}
+        for kind, name in connection.map:
+            index = counts.get(kind, 0)
+            counts[kind] = index + 1
+            place = f"connections.{connection.name}.map"
+            at = node.where(f"{place}.{kind.value}.{index}")
+            if at is node.at:
+                at = node.where(place)
+            if (kind, name) not in declared:
+                known = [each for other, each in declared if other is kind]
+                message = (
+                    f"cannot map {kind.noun} {name!r} onto {connection.name!r}: {node.key!r} "
+                    "declares no such endpoint"
+                )
+                hint = did_you_mean(name, known)
+                if not hint:
+                    hint = f"declared: {', '.join(sorted(known)) or 'none'}"
+                opened = node.endpoints is EndpointPolicy.OPEN
+                yield (warning if opened else error)("check.connection-endpoint", at, message, hint)
+                continue
+            other, there = first.setdefault((kind, name), (connection.name, at))
+            if there is not at:
+                message = (
+                    f"cannot map {kind.noun} {name!r} onto {connection.name!r}: it is mapped "
+                    f"onto {other!r} ({spell(there)})"
+                )
+                hint = "one connection may have several URLs: put them together"
+                yield error("check.connection-endpoint", at, message, hint)
+
+
+def _name(
+    system: System,
+    node: Node,
+    connection: ConnectionDeclaration,
+    hidden: dict[str, tuple[Node, ConnectionDeclaration]],
+) -> Iterator[Diagnostic]:
+    reserved = ""
+    if _FLOW_NAME.match(connection.name):
+        reserved = "it names a participant that tells a flow apart"
+    mode = system.manifest.discovery.mode
+    if connection.name == "data" and mode is DiscoveryMode.STATIC_ENDPOINTS:
+        reserved = "in discovery mode static_endpoints it carries every topic"
+    if reserved:
+        message = f"cannot name a connection {connection.name!r}: {reserved}"
+        yield error("check.connection-name", connection.at, message, "choose another name")
+    namespace, _, base = full_name(node).rpartition("/")
+    name = f"{namespace}/_{base}_{connection.name}"
+    owner, other = hidden.setdefault(name, (node, connection))
+    if other is not connection:
+        message = (
+            f"cannot name a connection of {node.key!r} {connection.name!r}: its hidden node "
+            f"{name!r} would have the name of that of {other.name!r} of {owner.key!r} "
+            f"({spell(other.at)})"
+        )
+        yield error("check.connection-name", connection.at, message, "choose another name")
+
+
+def _flows(node: Node, connection: ConnectionDeclaration, needs: FlowNeeds) -> Iterator[Diagnostic]:
+    """Judge needs of flows against the connection that carries them."""
+    transports = {url.transport for url in connection.urls}
+    found = [
+        (kind, each)
+        for kind, name in connection.map
+        if (each := needs.of(node.key, kind, name)) is not None
+    ]
+    for kind, each in found:
+        yield from _carrier(connection, kind, each, transports)
+    publisher = EndpointKind.PUBLISHER
+    publishers = [name for kind, name in connection.map if kind is publisher]
+    for kind, each in found:
+        if kind is publisher:
+            yield from _apart(node, connection, each, publishers, needs)
+        elif each.dscp is not None:
+            sharing = [(name, needs.of(node.key, publisher, name)) for name in publishers]
+            sharing += [
+                (one.need.name, one)
+                for other, one in found
+                if other is kind and one.dscp is not None and one is not each
+            ]
+            yield from _marked_apart(connection, each, sharing)
+
+
+def _what(kind: EndpointKind, each: ResolvedNeed) -> str:
+    return f"{kind.noun} {each.need.name!r}"
+
+
+def _carrier(
+    connection: ConnectionDeclaration,
+    kind: EndpointKind,
+    each: ResolvedNeed,
+    transports: set[ConnectionTransport],
+) -> Iterator[Diagnostic]:
+    if not transports:
+        return
+    rule, what = "check.connection-flow", _what(kind, each)
+    spelled = ", ".join(sorted(each.value for each in transports))
+    wanted = _CARRIERS.get(each.need.transport, ())
+    if wanted and not transports & {*wanted}:
+        message = (
+            f"cannot carry {what} by {each.need.transport.value}: connection "
+            f"{connection.name!r} has {spelled}"
+        )
+        hint = "add a URL of that transport to it, or remove 'transport'"
+        yield error(rule, each.need.at, message, hint)
+    if each.need.lossy is False and transports == {ConnectionTransport.UDPM}:
+        message = (
+            f"cannot carry {what}, whose data are declared not lossy, by multicast alone, as "
+            f"connection {connection.name!r} does"
+        )
+        hint = "add 'tcpv4://' or 'udpv4://' to it, or remove 'lossy: false'"
+        yield error(rule, each.need.at, message, hint)
+    if kind is EndpointKind.SUBSCRIPTION and each.unique and not transports & {*_UDP}:
+        message = (
+            f"cannot give {what} a port of its own on connection {connection.name!r}: it has "
+            f"{spelled}, and only UDP has one port for each subscription"
+        )
+        yield error(rule, each.need.at, message, "add a UDP URL to it, or remove 'unique'")
+
+
+def _apart(
+    node: Node,
+    connection: ConnectionDeclaration,
+    each: ResolvedNeed,
+    publishers: list[str],
+    needs: FlowNeeds,
+) -> Iterator[Diagnostic]:
+    """Judge whether a publisher may share the connection with those that it is shared with."""
+    rule, name = "check.connection-flow", each.need.name
+    others = [other for other in publishers if other != name]
+    if each.unique and others:
+        message = (
+            f"cannot give publisher {name!r} a flow of its own on connection "
+            f"{connection.name!r}: it also carries {', '.join(map(repr, others))}, from the same "
+            "sockets"
+        )
+        yield error(rule, each.need.at, message, "give it a connection of its own")
+    if each.dscp is not None:
+        sharing = [(name, needs.of(node.key, each.need.kind, name)) for name in others]
+        yield from _marked_apart(connection, each, sharing)
+
+
+def _marked_apart(
+    connection: ConnectionDeclaration,
+    each: ResolvedNeed,
+    sharing: Sequence[tuple[str, ResolvedNeed | None]],
+) -> Iterator[Diagnostic]:
+    """Judge whether the sockets of the connection may carry the mark of one endpoint.
+
+    `sharing` has the name and need of those that send from them too.
+    """
+    assert each.dscp is not None
+    rule, noun, name = "check.connection-flow", each.need.kind.noun, each.need.name
+    marks = {url.dscp for url in connection.urls if url.dscp is not None}
+    for mark in sorted(marks - {each.dscp}):
+        message = (
+            f"cannot mark {noun} {name!r} {describe(each.dscp)}: a URL of connection "
+            f"{connection.name!r} says {describe(mark)}"
+        )
+        yield error(rule, each.need.at, message, "say it once")
+    for other, resolved in sharing:
+        theirs = resolved.dscp if resolved else None
+        if theirs == each.dscp:
+            continue
+        has = describe(theirs) if theirs is not None else "no DSCP"
+        message = (
+            f"cannot mark {noun} {name!r} {describe(each.dscp)} on connection "
+            f"{connection.name!r}: {other!r} shares its sockets and has {has}"
+        )
+        yield error(rule, each.need.at, message, "give it a connection of its own")

@@ -1,0 +1,399 @@
+"""Checks of what endpoints ask of their network flows, one by one.
+
+Owns: check.flow-unknown-endpoint, check.flow-dscp, check.transport-priority, check.flow-five-qi,
+check.five-qi-class, check.flow-impossible, check.flow-foreign. Pure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from lifecycle.manifest.checks.system import Resolved, System, spell
+from lifecycle.manifest.diagnostics import Diagnostic
+from lifecycle.manifest.flows import OWN_FLOW, FlowNeeds, ResolvedNeed
+from lifecycle.manifest.model import (
+    EndpointKind,
+    FlowIdentification,
+    FlowNeed,
+    Link,
+    Node,
+    RunKind,
+    UniqueHow,
+)
+from lifecycle.manifest.names import full_name_problem
+from lifecycle.manifest.qos import Reliability
+from lifecycle.manifest.schema import did_you_mean
+from lifecycle.manifest.yaml.document import error, warning
+from lifecycle.network.dscp import MAX_DSCP, describe
+from lifecycle.network.five_qi import five_qi_of
+from lifecycle.network.nfe import UniqueRequirement
+
+ASKS_UNIQUE = (*OWN_FLOW, UniqueRequirement.SYSTEM_DEFAULT)
+"""Requirements that may make an endpoint's NFE unique."""
+
+_FIVE_QI = range(1, 255)  # one octet, 0 and 255 reserved (TS 24.501 §9.11.4.12)
+_KEPT_BY_CLASS = ("max_delay_ms", "loss")
+"""What a class promises whatever the rate; the others depend on what an operator configures."""
+
+
+def check_flow_endpoints(system: System) -> Iterator[Diagnostic]:
+    """Yield findings about flow needs of endpoints that are not declared."""
+    for node in system.manifest.nodes:
+        for need in node.flows:
+            yield from _endpoint(node, need)
+
+
+def check_flows(system: System, needs: FlowNeeds) -> Iterator[Diagnostic]:
+    """Yield findings about flow needs, but for `check_flow_endpoints`."""
+    for node in system.manifest.nodes:
+        for each in needs.of_node(node):
+            yield from _marking(node, each)
+            yield from _class(each)
+            if node.run.kind is not RunKind.PYTHON:
+                yield from _foreign(node, each)
+
+
+def _endpoint(node: Node, need: FlowNeed) -> Iterator[Diagnostic]:
+    noun = need.kind.noun
+    declared = [each.name for each in node.interface.endpoints if each.kind is need.kind]
+    if need.name in declared:
+        return
+    other = next(
+        (
+            each.kind
+            for each in node.interface.endpoints
+            if each.name == need.name and each.kind is not need.kind
+        ),
+        None,
+    )
+    hint = did_you_mean(need.name, declared)
+    if other in (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION):
+        hint = f"it is a {other.noun}: move it to 'flows.{other.value}'"
+    elif other is not None:
+        hint = f"it is a {other.noun}; only publishers and subscriptions have flow needs"
+    message = f"cannot ask a flow of {noun} {need.name!r}: {node.key!r} declares no such {noun}"
+    yield error("check.flow-unknown-endpoint", need.at, message, hint)
+
+
+def _marking(node: Node, each: ResolvedNeed) -> Iterator[Diagnostic]:
+    need = each.need
+    given = [
+        word
+        for word, value in (("a DSCP", need.dscp), ("a priority", need.transport_priority))
+        if value is not None
+    ]
+    if given and need.kind is EndpointKind.SUBSCRIPTION and _is_best_effort(node, need):
+        message = (
+            f"cannot mark anything that subscription {need.name!r} sends with {given[0]}: it is "
+            f"BEST_EFFORT and acknowledges nothing"
+        )
+        hint = "make it RELIABLE, or mark the publishers of the topic"
+        yield warning("check.flow-dscp", need.at, message, hint)
+    if len(given) > 1:
+        message = (
+            f"cannot give {need.kind.noun} {need.name!r} both dscp and transport_priority: each is "
+            f"the whole mark"
+        )
+        yield error("check.flow-dscp", need.at, message, f"keep one; {_both(need)}")
+        return
+    if need.dscp is not None and not 0 <= need.dscp <= MAX_DSCP:
+        message = f"cannot use DSCP {need.dscp}; allowed: 0 to {MAX_DSCP}"
+        yield error("check.flow-dscp", need.at, message)
+    message, hint = each.marking.problem
+    if message and need.transport_priority is not None:
+        yield error("check.flow-dscp", need.at, message, hint)
+    for note in each.marking.notes:
+        rule = "check.five-qi-class" if need.transport_priority is None else ""
+        message, _, hint = note.partition("; ")
+        yield warning(rule or "check.transport-priority", need.at, message, hint)
+
+
+def _is_best_effort(node: Node, need: FlowNeed) -> bool:
+    """Whether a reader sends no ACKNACK: a BEST_EFFORT one never does (DDSI-RTPS §8.4.11)."""
+    qos = next(
+        (
+            each.qos
+            for each in node.interface.endpoints
+            if (each.kind, each.name) == (need.kind, need.name)
+        ),
+        None,
+    )
+    return qos is not None and qos.reliability is Reliability.BEST_EFFORT
+
+
+def _both(need: FlowNeed) -> str:
+    dscp, priority = need.dscp or 0, need.transport_priority or 0
+    spelled = describe(dscp) if 0 <= dscp <= MAX_DSCP else f"DSCP {dscp}"
+    return f"the one is {spelled}, the other goes through a mapping from {priority:#x}"
+
+
+def _class(each: ResolvedNeed) -> Iterator[Diagnostic]:
+    need, class_ = each.need, each.flow_class
+    if need.five_qi is not None and need.five_qi not in _FIVE_QI:
+        message = f"cannot use five_qi {need.five_qi}; allowed: {_FIVE_QI[0]} to {_FIVE_QI[-1]}"
+        yield error("check.flow-five-qi", need.at, message)
+        return
+    message, hint = class_.problem
+    if message:
+        yield error("check.flow-five-qi", need.at, message, hint)
+        return
+    for issue in class_.issues:
+        make = error if issue.field in _KEPT_BY_CLASS else warning
+        hint = "choose another class, or write 'five_qi: auto'"
+        yield make("check.five-qi-class", need.at, issue.message, hint)
+    if need.five_qi is None or class_.five_qi is None:
+        return
+    try:
+        known = five_qi_of(class_.five_qi)
+    except ValueError:
+        message = (
+            f"cannot check what {need.name!r} declares against 5QI {need.five_qi}: 128 to 254 are "
+            f"an operator's own"
+        )
+        if each.max_delay_ms is not None or need.loss is not None:
+            yield warning("check.five-qi-class", need.at, message, "ask that operator")
+        return
+    if known.flagged:
+        message = f"cannot be sure of {', '.join(known.flagged)} of {known}: {known.note}"
+        yield warning(
+            "check.five-qi-class", need.at, message, "choose another, or ask the operator"
+        )
+
+
+def _foreign(node: Node, each: ResolvedNeed) -> Iterator[Diagnostic]:
+    """Judge needs of a node that others start: it keeps the one participant that it makes."""
+    need = each.need
+    what = f"{need.kind.noun} {need.name!r} of {node.key!r}"
+    hint = "write it as 'run: {python: module:Class}'"
+    if need.unique is UniqueRequirement.STRICTLY_REQUIRED and need.kind is EndpointKind.PUBLISHER:
+        message = (
+            f"cannot make {what} strictly unique: no RMW does that for a publisher, and only a "
+            f"node with 'run: python' can be given a participant of its own"
+        )
+        yield error("check.flow-impossible", need.at, message, hint)
+    elif each.unique:
+        message = f"cannot make {what} unique from outside: its own code must ask for it"
+        yield warning("check.flow-foreign", need.at, message, hint)
+    if each.dscp is not None:
+        message = f"cannot mark {what} with a DSCP: only a node with 'run: python' can be marked"
+        yield warning("check.flow-foreign", need.at, message, hint)
+    if need.non_blocking_send:
+        message = f"cannot make {what} send without waiting: its participant is not ours"
+        yield warning("check.flow-foreign", need.at, message, hint)
+
+
+_DSCP_VALUES = MAX_DSCP + 1
+_ASK = "ask for 'unique: strictly_required', or give each a DSCP of its own"
+_OWN = "give it another DSCP, or none: then it gets one that nobody has"
+
+
+def check_identifiers(system: System, needs: FlowNeeds) -> Iterator[Diagnostic]:
+    """Yield findings about publishers that their DSCP tells apart.
+
+    All nodes are counted. The article counts subscriptions too; here they are told apart by their
+    ports, and a DSCP that one acknowledges with must only not be an identifier of another's.
+    """
+    if system.manifest.network.flow_identification is FlowIdentification.DSCP:
+        yield from _repurposed(system, needs)
+    else:
+        yield from _relied_on(system, needs)
+
+
+def _publishers(system: System, needs: FlowNeeds) -> Iterator[tuple[Resolved, ResolvedNeed]]:
+    for each in system.endpoints:
+        need = needs.of(each.node.key, each.endpoint.kind, each.endpoint.name)
+        if need is not None and each.endpoint.kind is EndpointKind.PUBLISHER:
+            yield each, need
+
+
+def _subscriptions(system: System, needs: FlowNeeds) -> Iterator[tuple[Resolved, ResolvedNeed]]:
+    for each in system.endpoints:
+        need = needs.of(each.node.key, each.endpoint.kind, each.endpoint.name)
+        if need is not None and each.endpoint.kind is EndpointKind.SUBSCRIPTION:
+            yield each, need
+
+
+def _repurposed(system: System, needs: FlowNeeds) -> Iterator[Diagnostic]:
+    publishers = list(_publishers(system, needs))
+    relying = {id(need) for _, need in _relying(system, needs)}
+    asking = [each for each in publishers if each[1].unique or id(each[1]) in relying]
+    others = [
+        *(each for each in publishers if not (each[1].unique or id(each[1]) in relying)),
+        *_subscriptions(system, needs),
+    ]
+    for _, need in asking:
+        message, hint = need.marking.problem
+        if message and need.need.transport_priority is None:
+            yield error("check.dscp-exhausted", need.need.at, message, hint)
+    holders: dict[int, Resolved] = {}
+    for each, need in asking:
+        if need.dscp is not None:
+            holders.setdefault(need.dscp, each)
+    for each, need in (*asking, *others):
+        other = None if need.dscp is None else holders.get(need.dscp)
+        if need.dscp is not None and other is not None and other is not each:
+            message = (
+                f"cannot give {each.endpoint.kind.noun} {each.name!r} of {each.node.key!r} "
+                f"{describe(need.dscp)}: it identifies {other.name!r} of {other.node.key!r} "
+                f"({spell(other.at)})"
+            )
+            yield error("check.dscp-not-unique", need.need.at, message, _OWN)
+    at = system.manifest.network.at
+    if asking and at is not None:
+        message = (
+            f"cannot be sure that the network takes {len(asking)} of {_DSCP_VALUES} DSCP values "
+            f"for identifiers: routers read them as classes, and may reset or erase them"
+        )
+        hint = (
+            "tell those who run the network and configure each router on the way, or use "
+            "'flow_identification: participant'"
+        )
+        yield warning("check.dscp-repurposed", at, message, hint)
+
+
+def _relied_on(system: System, needs: FlowNeeds) -> Iterator[Diagnostic]:
+    """Judge publishers that only their DSCP tells apart although nobody said so.
+
+    A link may demand a unique flow of a publisher that asks for none but is marked: then its DSCP
+    is re-purposed as the identifier, and of those there are 64, all else in the NFE being equal.
+    """
+    holders: dict[int, Resolved] = {}
+    relying = list(_relying(system, needs))
+    for number, (each, need) in enumerate(relying, start=1):
+        assert need.dscp is not None
+        other = holders.setdefault(need.dscp, each)
+        if number > _DSCP_VALUES:
+            message = (
+                f"cannot tell publisher {each.name!r} of {each.node.key!r} apart by its DSCP: it "
+                f"is number {number} of {len(relying)} that have nothing else, and a DSCP has "
+                f"{_DSCP_VALUES} values"
+            )
+            yield error("check.dscp-exhausted", need.need.at, message, _ASK)
+        elif other is not each:
+            message = (
+                f"cannot tell publisher {each.name!r} of {each.node.key!r} apart by "
+                f"{describe(need.dscp)}: {other.name!r} of {other.node.key!r} has the same "
+                f"({spell(other.at)})"
+            )
+            yield error("check.dscp-not-unique", need.need.at, message, _ASK)
+
+
+def _relying(system: System, needs: FlowNeeds) -> Iterator[tuple[Resolved, ResolvedNeed]]:
+    demanded = {
+        (link.from_node, link.topic)
+        for link in system.manifest.links
+        if link.unique is not UniqueHow.NOT
+    }
+    for each, need in _publishers(system, needs):
+        if need.dscp is None or need.need.unique in ASKS_UNIQUE:
+            continue
+        if (each.node.key, each.name) in demanded and 0 <= need.dscp <= MAX_DSCP:
+            yield each, need
+
+
+_VERBS = {EndpointKind.PUBLISHER: "publish", EndpointKind.SUBSCRIPTION: "subscribe to"}
+
+
+def check_links(system: System) -> Iterator[Diagnostic]:
+    """Yield findings about the topic and the ends of every link."""
+    for link in system.manifest.links:
+        if problem := full_name_problem(link.topic):
+            message = f"cannot use {link.topic!r} as the topic of a link: {problem}"
+            hint = did_you_mean(link.topic, system.names(EndpointKind.PUBLISHER))
+            yield error("check.link-topic", link.at, message, hint)
+            continue
+        ends = [
+            *_end(system, link, link.from_node, EndpointKind.PUBLISHER),
+            *_end(system, link, link.to_node, EndpointKind.SUBSCRIPTION),
+        ]
+        yield from (each for each in ends if isinstance(each, Diagnostic))
+
+
+def check_link_uniqueness(system: System, needs: FlowNeeds) -> Iterator[Diagnostic]:
+    """Yield findings about links that demand of flows what their ends do not ask for."""
+    for link in system.manifest.links:
+        if full_name_problem(link.topic) or not {link.from_node, link.to_node} <= {*system.nodes}:
+            continue
+        ends = [
+            *_end(system, link, link.from_node, EndpointKind.PUBLISHER),
+            *_end(system, link, link.to_node, EndpointKind.SUBSCRIPTION),
+        ]
+        resolved = [each for each in ends if isinstance(each, Resolved)]
+        if len(resolved) == len(ends):
+            yield from _uniqueness(link, resolved, needs)
+
+
+def _end(
+    system: System, link: Link, key: str, kind: EndpointKind
+) -> Iterator[Resolved | Diagnostic]:
+    """Yield the endpoints at one end of a link, or why there are none."""
+    if not system.may_exist(key):
+        message = f"cannot link node {key!r}: there is no such node"
+        hint = did_you_mean(key, system.known)
+        yield error("check.link-unknown-node", link.at, message, hint)
+        return
+    if key not in system.nodes:
+        return  # what is wrong in it comes first
+    found = [each for each in system.named(kind, link.topic) if each.node.key == key]
+    if found:
+        yield from found
+        return
+    topics = [
+        each.name
+        for each in system.endpoints
+        if each.endpoint.kind is kind and each.node.key == key
+    ]
+    message = f"cannot link {link.topic!r}: node {key!r} does not {_VERBS[kind]} it"
+    others = sorted({each.node.key for each in system.named(kind, link.topic)})
+    hint = did_you_mean(link.topic, topics)
+    if not hint and others:
+        hint = f"node {', '.join(repr(each) for each in others)} does"
+    yield error("check.link-topic", link.at, message, hint)
+
+
+def _uniqueness(link: Link, ends: list[Resolved], needs: FlowNeeds) -> Iterator[Diagnostic]:
+    """Compare what the link demands with what its ends ask for.
+
+    *Unique Network Flows*: a flow is strongly unique if both NFEs are unique, weakly if one is.
+    """
+    silent = [each for each in ends if not _asks(each, needs)]
+    if link.unique is UniqueHow.STRONGLY:
+        for each in silent:
+            message = f"{_flow(link)}: {_end_name(each)} does not ask to be unique"
+            yield error("check.link-not-unique", link.at, message, _remedy(each))
+    # A DSCP of its own makes an NFE unique as well; `flows` judges whether it is its own. That of
+    # a subscription is of its acknowledgements and tells no data apart.
+    marked = any(
+        _dscp(each, needs) is not None
+        for each in ends
+        if each.endpoint.kind is EndpointKind.PUBLISHER
+    )
+    if link.unique is UniqueHow.WEAKLY and len(silent) == len(ends) and not marked:
+        names = " nor ".join(_end_name(each) for each in ends)
+        message = f"{_flow(link)}: neither {names} asks to be unique"
+        yield error("check.link-not-unique", link.at, message, _remedy(ends[-1]))
+
+
+def _flow(link: Link) -> str:
+    return f"cannot make the flow of {link.topic!r} {link.unique.value} unique"
+
+
+def _end_name(each: Resolved) -> str:
+    return f"{each.endpoint.kind.noun} {each.endpoint.name!r} of {each.node.key!r}"
+
+
+def _remedy(each: Resolved) -> str:
+    return (
+        f"add '{each.endpoint.name}: {{unique: strictly_required}}' to "
+        f"nodes.{each.node.key}.flows.{each.endpoint.kind.value}"
+    )
+
+
+def _asks(each: Resolved, needs: FlowNeeds) -> bool:
+    resolved = needs.of(each.node.key, each.endpoint.kind, each.endpoint.name)
+    return resolved is not None and resolved.need.unique in ASKS_UNIQUE
+
+
+def _dscp(each: Resolved, needs: FlowNeeds) -> int | None:
+    resolved = needs.of(each.node.key, each.endpoint.kind, each.endpoint.name)
+    return None if resolved is None else resolved.dscp

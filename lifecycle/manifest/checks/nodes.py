@@ -1,0 +1,223 @@
+"""Checks of where and in which order nodes run: machines, processes, ports, and `after`.
+
+Owns: check.unknown-machine, check.process-machine, check.process-run, check.process-environment,
+check.process-name, check.domain, check.ports, check.after-unknown, check.after-self,
+check.after-cycle, check.after-unmanaged. Port arithmetic is `lifecycle.network`'s. Pure.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Collection, Iterator, Mapping
+
+from lifecycle.manifest.checks.system import System, spell
+from lifecycle.manifest.diagnostics import Diagnostic, Position
+from lifecycle.manifest.flows import FlowNeeds
+from lifecycle.manifest.model import After, Condition, EndpointKind, Machine, Node, RunKind
+from lifecycle.manifest.schema import did_you_mean
+from lifecycle.manifest.yaml.document import error, warning
+from lifecycle.network.ports import (
+    MAX_DOMAIN_ID,
+    EphemeralRange,
+    Platform,
+    describe_domains,
+    domain_of,
+    max_participants,
+    overflows,
+    safe_domains,
+)
+
+_NO_EPHEMERAL = EphemeralRange(first=1, last=1)
+"""Asks for the limits that hold whatever an operating system does with its ports."""
+
+_SUPERVISOR = 1
+"""The observer of the supervisor that each host has."""
+
+
+def check_machines(system: System, declared: Collection[str]) -> Iterator[Diagnostic]:
+    """Yield findings about nodes on machines that are not `declared`."""
+    for node in system.manifest.nodes:
+        if node.machine not in declared:
+            message = (
+                f"cannot run {node.key!r} on machine {node.machine!r}: there is no such machine"
+            )
+            hint = did_you_mean(node.machine, declared) or "declare it under 'machines:'"
+            yield error("check.unknown-machine", node.where("machine"), message, hint)
+
+
+def check_processes(system: System) -> Iterator[Diagnostic]:
+    """Yield findings about processes that nodes share."""
+    first: dict[str, Node] = {}
+    for node in system.manifest.nodes:
+        if not node.process:
+            continue
+        at = node.where("process")
+        if node.run.kind is not RunKind.PYTHON:
+            message = f"cannot run {node.key!r} in process {node.process!r}: only 'run: python' can"
+            yield error("check.process-run", at, message, "remove 'process:'")
+            continue
+        namesake = system.nodes.get(node.process)
+        if namesake is not None and namesake.process != node.process:
+            message = (
+                f"cannot name a process {node.process!r}: node {namesake.key!r} runs in a process "
+                f"of that name ({spell(namesake.at)})"
+            )
+            yield error("check.process-name", at, message, "choose another name")
+        other = first.setdefault(node.process, node)
+        if other is not node:
+            yield from _apart(node, other, at)
+
+
+def _apart(node: Node, other: Node, at: Position) -> Iterator[Diagnostic]:
+    """Judge two nodes that share a process."""
+    together = f"cannot share process {node.process!r} with {other.key!r} ({spell(other.at)})"
+    if node.machine != other.machine:
+        message = (
+            f"{together}: it runs on machine {other.machine!r}, {node.key!r} on {node.machine!r}"
+        )
+        yield error("check.process-machine", at, message, "put both on one machine")
+    different = [
+        name
+        for name, one, two in (
+            ("environment", dict(node.run.environment), dict(other.run.environment)),
+            ("working_directory", node.run.working_directory, other.run.working_directory),
+        )
+        if one != two
+    ]
+    for name in different:
+        message = f"{together}: a process has one {name}, these nodes ask for two"
+        yield error("check.process-environment", at, message, f"give both the same 'run.{name}'")
+
+
+def check_ports(
+    system: System, needs: FlowNeeds, environment: Mapping[str, str]
+) -> Iterator[Diagnostic]:
+    """Yield findings about the domain, and about room for the ports of all participants.
+
+    `environment` is asked for ROS_DOMAIN_ID, which holds where the manifest names no domain.
+    """
+    discovery = system.manifest.discovery
+    domain = discovery.domain_id
+    if domain is None:
+        # One that is no domain is nobody's fault but the environment's, and refused where it is.
+        domain = domain_of(environment.get("ROS_DOMAIN_ID", "")) or 0
+    start = Position(file=system.manifest.path, line=1, column=1, path="discovery.domain_id")
+    at = discovery.at or start
+    if not 0 <= domain <= MAX_DOMAIN_ID:
+        message = f"cannot use domain id {domain}; allowed: 0 to {MAX_DOMAIN_ID}"
+        yield error("check.domain", at, message, "Fast DDS ends every process beyond it")
+        return
+    if max_participants(domain, Platform.LINUX).participants == 0:
+        domains = describe_domains(safe_domains(Platform.LINUX))
+        message = (
+            f"cannot be sure of the ports of domain {domain}: Linux gives them to other sockets, "
+            f"by default"
+        )
+        yield warning("check.domain", at, message, f"use domain {domains}")
+    for host in _hosts(system):
+        yield from _crowded(system, needs, host, domain, discovery.at or host[0].at)
+
+
+def _hosts(system: System) -> list[list[Machine]]:
+    """Group machines that are one host: of one address, or of none, which stands for this host."""
+    hosts: dict[str, list[Machine]] = {}
+    for machine in system.manifest.machines:
+        hosts.setdefault(machine.address, []).append(machine)
+    return list(hosts.values())
+
+
+def _crowded(
+    system: System, needs: FlowNeeds, host: list[Machine], domain: int, at: Position
+) -> Iterator[Diagnostic]:
+    names = {machine.name: None for machine in host}
+    nodes = [node for node in system.manifest.nodes if node.machine in names]
+    used = dict.fromkeys(node.machine for node in nodes)
+    over = functools.partial(
+        overflows,
+        domain,
+        participants=_SUPERVISOR + _participants(nodes, needs),
+        unique_subscriptions=sum(
+            each.unique and each.need.kind is EndpointKind.SUBSCRIPTION
+            for node in nodes
+            for each in needs.of_node(node)
+        ),
+        host=f"machine{'s' * (len(used) > 1)} {', '.join(map(repr, used))}",
+    )
+    refused = over(ephemeral=_NO_EPHEMERAL)
+    for each in refused:
+        message, _, hint = each.partition("; ")
+        yield error("check.ports", at, message, hint)
+    # Where no participant at all is safe, check.domain has said so.
+    if not refused and max_participants(domain, Platform.LINUX).participants:
+        for each in over(ephemeral=Platform.LINUX):
+            message, _, hint = each.partition("; ")
+            yield warning("check.ports", at, message, hint)
+
+
+def _participants(nodes: list[Node], needs: FlowNeeds) -> int:
+    """Count DDS participants as the planner makes them.
+
+    One for each process and each choice of transports in it, and one more for each group of
+    publishers that need their own.
+    """
+    shared = {(node.process or f"\0{node.key}", needs.node_transports(node)) for node in nodes}
+    extra = sum(len(needs.groups(node)) for node in nodes if node.run.kind is RunKind.PYTHON)
+    return len(shared) + extra
+
+
+def check_order(system: System) -> Iterator[Diagnostic]:
+    """Yield findings about the order in which nodes come up."""
+    for node in system.manifest.nodes:
+        for after in node.after:
+            if not system.may_exist(after.node):
+                message = f"cannot wait for node {after.node!r}: there is no such node"
+                hint = did_you_mean(after.node, system.known)
+                yield error("check.after-unknown", after.at, message, hint)
+            elif after.node not in system.nodes:
+                continue  # what is wrong in it comes first
+            elif after.node == node.key:
+                message = f"cannot make {node.key!r} wait for itself"
+                yield error("check.after-self", after.at, message, "remove it")
+            else:
+                yield from _unmanaged(node, after, system.nodes[after.node])
+    yield from cycles(system)
+
+
+def _unmanaged(node: Node, after: After, other: Node) -> Iterator[Diagnostic]:
+    """Judge conditions of nodes that have nothing but a start (see `Condition`)."""
+    key, condition = after.node, after.condition
+    if not node.managed and condition is Condition.ACTIVE:
+        message = (
+            f"cannot hold the start of {node.key!r} until {key!r} is active: {node.key!r} is not "
+            f"managed, and nothing is activated before every node runs"
+        )
+        yield error("check.after-unmanaged", after.at, message, f"write '{key}: connected'")
+    elif not other.managed and condition is not Condition.STARTED:
+        message = (
+            f"cannot wait until {key!r} is {condition.value}: it is not managed and only starts"
+        )
+        yield warning("check.after-unmanaged", after.at, message, f"write '{key}: started'")
+
+
+def cycles(system: System) -> Iterator[Diagnostic]:
+    """Report each circle once, at the edge that closes it; iterative, so depth has no limit."""
+    edges = {
+        key: [each for each in node.after if each.node in system.nodes and each.node != key]
+        for key, node in system.nodes.items()
+    }
+    done: set[str] = set()
+    for root in system.nodes:
+        path: dict[str, Iterator[After]] = {} if root in done else {root: iter(edges[root])}
+        while path:
+            key, pending = next(reversed(path.items()))
+            after = next(pending, None)
+            if after is None:
+                del path[key]
+                done.add(key)
+            elif after.node in path:
+                keys = list(path)
+                circle = [*keys[keys.index(after.node) :], after.node]
+                message = f"cannot order nodes that wait for each other: {' → '.join(circle)}"
+                yield error("check.after-cycle", after.at, message, "remove one of these 'after'")
+            elif after.node not in done:
+                path[after.node] = iter(edges[after.node])

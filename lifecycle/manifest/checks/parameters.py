@@ -1,0 +1,400 @@
+"""Checks of parameters given in the manifest against those that the interface declares.
+
+Owns: check.parameter-undeclared, check.parameter-type, check.parameter-unused. An interface that
+declares no parameters says nothing about them, so nothing is checked then. Pure.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import os
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from lifecycle.manifest.checks.system import System, full_name
+from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, Severity
+from lifecycle.manifest.model import Node, ParameterValue, RunKind
+from lifecycle.manifest.nodl import nearest_file
+from lifecycle.manifest.schema import did_you_mean
+from lifecycle.manifest.yaml.document import Document, Place, Value, error, warning
+from lifecycle.manifest.yaml.source import is_outside, read_document
+from lifecycle.manifest.yaml.yaml_parser import INT64_MAX, INT64_MIN, quote
+
+_SCALARS = {bool: "bool", int: "int", float: "double", str: "string"}
+_IMPLICIT = ("use_sim_time", "start_type_description_service")
+
+
+def _spellings(word: str) -> tuple[str, str, str]:
+    return word, word.capitalize(), word.upper()
+
+
+# rcl_yaml_param_parser's get_value(): YAML 1.1 booleans, strtoll with base 0, then strtod.
+_TRUE = frozenset(("Y", "y", *_spellings("yes"), *_spellings("true"), *_spellings("on")))
+_FALSE = frozenset(("N", "n", *_spellings("no"), *_spellings("false"), *_spellings("off")))
+_INTEGER = re.compile(r"\s*([-+]?)(0[xX][0-9a-fA-F]+|0[0-7]*|[1-9][0-9]*)\Z", re.ASCII)
+_DOUBLE = re.compile(
+    r"\s*[-+]?(\.?(inf|nan)|infinity|([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?)\Z",
+    re.ASCII | re.IGNORECASE,
+)
+_LONGEST_INTEGER = 80
+
+
+def is_implicit(name: str) -> bool:
+    """Tell whether ROS declares this parameter itself, in every node or for every topic."""
+    return name in _IMPLICIT or name.startswith("qos_overrides.")
+
+
+def type_of(value: ParameterValue) -> str:
+    """Return a value's type, `int`, `string_array`; `array` for an empty array, which fits all."""
+    if isinstance(value, tuple):
+        return f"{_SCALARS[type(value[0])]}_array" if value else "array"
+    return _SCALARS[type(value)]
+
+
+def misfit(value: ParameterValue, declared: str) -> str:
+    """Return how a value fails its declared type, to follow "cannot set … to "; empty if it fits.
+
+    ROS converts nothing: an integer for a double ends the node when it declares the parameter.
+    """
+    given = type_of(value)
+    bytes_given = declared == "byte_array" and given == "int_array"
+    if given == declared or (given == "array" and declared.endswith("_array")):
+        return ""
+    if bytes_given and isinstance(value, tuple):
+        if all(isinstance(each, int) and 0 <= each <= 0xFF for each in value):
+            return ""
+        return f"{_show(value)}: a byte_array holds 0 to 255"
+    article = "an" if given[0] in "ai" else "a"
+    return f"{_show(value)}: it is {article} {given}, declared is {declared}"
+
+
+def suggestion(value: ParameterValue, declared: str) -> str:
+    """Return how to write the value so that it fits; empty where that cannot be told."""
+    if declared == "double" and isinstance(value, int) and not isinstance(value, bool):
+        return f"write {float(value)}"
+    if declared == "string" and not isinstance(value, (str, tuple)):
+        return "put it in quotes"
+    if declared == "double_array" and type_of(value) == "int_array" and isinstance(value, tuple):
+        return f"write [{', '.join(str(float(each)) for each in value)}]"
+    if declared.endswith("_array") and not isinstance(value, tuple):
+        return f"write [{_show(value)}]"
+    return ""
+
+
+def read_scalar(text: str, *, quoted: bool) -> bool | int | float | str:
+    """Return what rcl makes of a scalar in a parameter file.
+
+    Args:
+        text: as written, without quotes.
+        quoted: it stood in quotes.
+    """
+    if quoted:
+        return text
+    if text in _TRUE or text in _FALSE:
+        return text in _TRUE
+    if (match := _INTEGER.match(text)) and len(text) <= _LONGEST_INTEGER:
+        digits = match[2]
+        octal = digits.startswith("0") and digits[1:2] not in ("", "x", "X")
+        number = int(f"{match[1]}{digits}", 8 if octal else 0)
+        if INT64_MIN <= number <= INT64_MAX:
+            return number
+    if _DOUBLE.match(text):
+        return float(text.strip().replace(".inf", "inf").replace(".nan", "nan").lower())
+    return text
+
+
+def _show(value: ParameterValue) -> str:
+    if isinstance(value, tuple):
+        return f"[{', '.join(quote(each) for each in value[:4])}{', …' if len(value) > 4 else ''}]"
+    return quote(value)
+
+
+def check_parameters(system: System) -> Iterator[Diagnostic]:
+    """Yield findings about the parameters of every node."""
+    for node in system.manifest.nodes:
+        yield from _given(node)
+        yield from _no_effect(node)
+
+
+def _given(node: Node) -> Iterator[Diagnostic]:
+    declared = {each.name: each for each in node.interface.parameters}
+    for name, value in node.parameters:
+        at = node.where(f"parameters.{name}")
+        declaration = declared.get(name)
+        if declaration is not None:
+            if problem := misfit(value, declaration.type):
+                message = f"cannot set parameter {name!r} to {problem}"
+                yield error(
+                    "check.parameter-type", at, message, suggestion(value, declaration.type)
+                )
+        elif declared and not is_implicit(name):
+            message = f"cannot set parameter {name!r}: the interface declares no such parameter"
+            hint = did_you_mean(name, declared) or "declare it under 'interface.parameters'"
+            yield error("check.parameter-undeclared", at, message, hint)
+
+
+def _no_effect(node: Node) -> Iterator[Diagnostic]:
+    """Warn of what a node that somebody else starts will never be given, only judged by."""
+    if node.run.kind is not RunKind.ATTACH:
+        return
+    places = [(f"parameters.{name}", "parameters") for name, _ in node.parameters[:1]]
+    places += [
+        (f"parameter_files.{i}", "parameter files") for i in range(len(node.parameter_files))
+    ]
+    for place, what in places[:1]:
+        message = f"cannot give {what} to {node.key!r}, which is attached: they are only verified"
+        hint = "give them where it is started"
+        yield warning("check.parameter-unused", node.where(place), message, hint)
+
+
+PARAMETERS_KEY = "ros__parameters"
+
+_LAYOUT = f"write 'NODE: {{{PARAMETERS_KEY}: {{NAME: VALUE}}}}'"
+
+
+@functools.cache
+def _pattern(name: str) -> re.Pattern[str] | None:
+    # parameter_map_from() of rclcpp and rclpy: every "/*" becomes "(/\w+)", so "/**" "(/\w+)*".
+    try:
+        return re.compile(name.replace("/*", r"(/\w+)"), re.ASCII)
+    except re.error:
+        return None
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Section:
+    """What a file sets for the nodes that one name or pattern stands for.
+
+    Attributes:
+        pattern: `/robot/camera`, `/**`, `/robot/*`; always with a leading slash.
+        parameters: (name, value, position) in the file's order.
+    """
+
+    pattern: str
+    parameters: tuple[tuple[str, ParameterValue, Position], ...]
+    at: Position
+
+    @property
+    def is_wildcard(self) -> bool:
+        """Whether it may stand for several nodes."""
+        return "*" in self.pattern
+
+    def matches(self, node: str) -> bool:
+        """Tell whether a node with this fully qualified name takes the section's values."""
+        pattern = _pattern(self.pattern)
+        return pattern is not None and pattern.fullmatch(node) is not None
+
+
+def read_sections(path: str, *, shown: str) -> tuple[tuple[Section, ...], tuple[Diagnostic, ...]]:
+    """Read a parameter file.
+
+    Args:
+        path: the file, which exists.
+        shown: how messages name it.
+
+    Returns:
+        Sections in the file's order, and what is wrong with the file.
+    """
+    flaws: list[Diagnostic] = []
+    try:
+        document = read_document(path, shown=shown, found=flaws)
+    except ManifestError as problem:
+        return (), tuple(_reworded(each) for each in problem.diagnostics)
+    # Infinite doubles, and integers that are too long and become doubles, are legal for rcl.
+    broken = [_reworded(each) for each in flaws if each.rule != "yaml.number"]
+    if broken:
+        return (), tuple(broken)
+    reading = _Reading(document)
+    reading.walk((), document.root)
+    return tuple(reading.sections), tuple(reading.found)
+
+
+def _reworded(each: Diagnostic) -> Diagnostic:
+    """Make a finding about a manifest's text one about a parameter file's."""
+    if each.rule == "yaml.tag":
+        # rcl reads `!!str`; the reader that is shared with manifests reads no tags at all.
+        message = "cannot check the parameters of this file: it holds a YAML tag"
+        return dataclasses.replace(each, severity=Severity.WARNING, message=message, hint="")
+    hint = _LAYOUT if "manifest_version" in each.hint else each.hint
+    return dataclasses.replace(each, hint=hint, message=each.message.replace("a manifest", "text"))
+
+
+class _Reading:
+    def __init__(self, document: Document) -> None:
+        self._document = document
+        self.sections: list[Section] = []
+        self.found: list[Diagnostic] = []
+
+    def walk(self, place: Place, value: Value) -> None:
+        """Go down namespaces and node names until `ros__parameters`."""
+        if not isinstance(value.data, Mapping):
+            message = f"cannot use {quote(value.plain())} before {PARAMETERS_KEY!r}"
+            self._error(place, message, _LAYOUT)
+            return
+        for key, inner in value.data.items():
+            if key != PARAMETERS_KEY:
+                self.walk((*place, key), inner)
+            elif not place:
+                message = f"cannot use {PARAMETERS_KEY!r} without a node above it"
+                self._error((key,), message, _LAYOUT)
+            elif isinstance(inner.data, Mapping):
+                self._section(place, inner)
+            elif inner.data is not None:
+                self._error((*place, key), f"cannot use {quote(inner.plain())} as parameters")
+
+    def _section(self, place: Place, value: Value) -> None:
+        pattern = re.sub("/+", "/", "/" + "/".join(str(each) for each in place))
+        parameters: list[tuple[str, ParameterValue, Position]] = []
+        self._flatten((*place, PARAMETERS_KEY), "", value, parameters)
+        at = self._document.key_at(place)
+        self.sections.append(Section(pattern=pattern, parameters=tuple(parameters), at=at))
+
+    def _flatten(
+        self,
+        place: Place,
+        prefix: str,
+        value: Value,
+        parameters: list[tuple[str, ParameterValue, Position]],
+    ) -> None:
+        assert isinstance(value.data, Mapping)
+        for key, inner in value.data.items():
+            where: Place = (*place, key)
+            name = f"{prefix}{key}"
+            if isinstance(inner.data, Mapping):
+                self._flatten(where, f"{name}.", inner, parameters)
+            elif isinstance(inner.data, tuple):
+                if (array := self._array(where, inner.data)) is not None:
+                    parameters.append((name, array, self._document.key_at(where)))
+            elif inner.text or inner.quoted:
+                scalar = read_scalar(inner.text, quoted=inner.quoted)
+                parameters.append((name, scalar, self._document.key_at(where)))
+            else:
+                self._error(where, f"cannot leave parameter {name!r} without a value")
+
+    def _array(self, place: Place, items: tuple[Value, ...]) -> ParameterValue | None:
+        if any(isinstance(each.data, (tuple, Mapping)) for each in items):
+            self._error(place, "cannot nest in an array; a ROS array holds scalars of one type")
+            return None
+        values = tuple(read_scalar(each.text, quoted=each.quoted) for each in items)
+        types = list(dict.fromkeys(type_of(each) for each in values))
+        if len(types) > 1:
+            hint = "write the integers as 1.0" if set(types) == {"int", "double"} else ""
+            message = f"cannot mix {' and '.join(types)} in one array; a ROS array holds one type"
+            self._error(place, message, hint)
+            return None
+        return values
+
+    def _error(self, place: Place, message: str, hint: str = "") -> None:
+        at = self._document.key_at(place)
+        self.found.append(error("check.parameter-file", at, message, hint))
+
+
+@dataclasses.dataclass(slots=True, kw_only=True)
+class _File:
+    """A file, read once for all nodes that name it."""
+
+    shown: str
+    sections: tuple[Section, ...] = ()
+    readers: list[Node] = dataclasses.field(default_factory=list)
+    readable: bool = True
+
+
+def check_parameter_files(system: System) -> Iterator[Diagnostic]:
+    """Yield findings about every parameter file that a node names."""
+    files: dict[str, _File] = {}
+    for node in system.manifest.nodes:
+        for index, path in enumerate(node.parameter_files):
+            if path not in files:
+                files[path] = _File(shown=shown_path(path, system.manifest.path))
+                yield from _read(path, files[path], node, index)
+            files[path].readers.append(node)
+    for path, file in files.items():
+        for node in file.readers:
+            if file.readable:
+                yield from _unmatched_node(path, file, node, system.manifest.path)
+                yield from _values(file, node)
+        yield from _unmatched_sections(file, system)
+        yield from _unknown_to_all(file)
+
+
+def shown_path(path: str, manifest: str) -> str:
+    """Return a file's path as the user would write it beside the manifest's."""
+    folder = Path(manifest).parent
+    # relpath, not relative_to: a file may well lie beside the manifest's folder.
+    return os.path.normpath(folder / os.path.relpath(path, folder))
+
+
+def _read(path: str, file: _File, node: Node, index: int) -> Iterator[Diagnostic]:
+    at = node.where(f"parameter_files.{index}")
+    if not os.path.lexists(path):
+        message = f"cannot find the parameter file {file.shown!r}"
+        file.readable = False
+        yield error("check.parameter-file", at, message, nearest_file(Path(path)))
+        return
+    file.sections, found = read_sections(path, shown=file.shown)
+    file.readable = not found
+    yield from found
+
+
+def _unmatched_node(path: str, file: _File, node: Node, manifest: str) -> Iterator[Diagnostic]:
+    name = full_name(node)
+    if any(section.matches(name) for section in file.sections):
+        return
+    at = node.where(f"parameter_files.{node.parameter_files.index(path)}")
+    patterns = [section.pattern for section in file.sections]
+    listed = ", ".join(repr(each) for each in patterns) or "no node"
+    if is_outside(path, manifest, os.environ):
+        listed = "others" if patterns else "no node"
+    message = f"cannot find node {name!r} in {file.shown!r}: it is for {listed}"
+    hint = f"name the section {name}, or /** for every node"
+    yield warning("check.parameter-file-unmatched", at, message, hint)
+
+
+def _unmatched_sections(file: _File, system: System) -> Iterator[Diagnostic]:
+    """Warn of sections for nobody in a file that is of use otherwise: most are misspelt."""
+    names = [full_name(node) for node in system.manifest.nodes]
+    dead = [each for each in file.sections if not any(each.matches(name) for name in names)]
+    if len(dead) == len(file.sections):
+        return  # reported where the file is named
+    for section in dead:
+        message = f"cannot use the parameters of {section.pattern!r}: no node has that name"
+        hint = did_you_mean(section.pattern, names)
+        yield warning("check.parameter-file-unmatched", section.at, message, hint)
+
+
+def _values(file: _File, node: Node) -> Iterator[Diagnostic]:
+    declared = {each.name: each for each in node.interface.parameters}
+    for section in file.sections:
+        if not section.matches(full_name(node)):
+            continue
+        for name, value, at in section.parameters:
+            declaration = declared.get(name)
+            if declaration is not None:
+                if problem := misfit(value, declaration.type):
+                    message = f"cannot set parameter {name!r} of {full_name(node)!r} to {problem}"
+                    hint = suggestion(value, declaration.type)
+                    yield error("check.parameter-type", at, message, hint)
+            elif declared and not section.is_wildcard and not is_implicit(name):
+                message = (
+                    f"cannot set parameter {name!r} of {full_name(node)!r}: "
+                    f"its interface declares no such parameter"
+                )
+                hint = did_you_mean(name, declared)
+                yield error("check.parameter-undeclared", at, message, hint)
+
+
+def _unknown_to_all(file: _File) -> Iterator[Diagnostic]:
+    """Warn of a value for many nodes that none of them declares; some not declaring it is usual."""
+    for section in file.sections:
+        nodes = [node for node in file.readers if section.matches(full_name(node))]
+        if not section.is_wildcard or not nodes:
+            continue
+        if not all(node.interface.parameters for node in nodes):
+            continue
+        known = {each.name for node in nodes for each in node.interface.parameters}
+        for name, _, at in section.parameters:
+            if name not in known and not is_implicit(name):
+                message = f"cannot set parameter {name!r}: no node that reads it declares it"
+                yield warning("check.parameter-undeclared", at, message, did_you_mean(name, known))

@@ -1,1 +1,0 @@
-"""Checks of parameters and parameter files."""

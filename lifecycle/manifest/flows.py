@@ -1,0 +1,501 @@
+"""What every flow need comes to once mappings, links, types and machines are taken into account.
+
+Owns: `FlowNeeds`, which the checks and the planner both read, so that `check` judges what `plan`
+will do. Reads interface definitions; starts nothing.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+
+from lifecycle.errors import LifecycleError
+from lifecycle.manifest.message_size import bounded_size
+from lifecycle.manifest.model import (
+    DiscoveryMode,
+    EndpointKind,
+    FlowIdentification,
+    FlowNeed,
+    FlowTransport,
+    Manifest,
+    Network,
+    Node,
+    RunKind,
+)
+from lifecycle.manifest.names import resolve
+from lifecycle.network.datagram import SAFE_DATAGRAM_BYTES, is_fragmented, max_unfragmented
+from lifecycle.network.dscp import (
+    ECN_MASK,
+    MAX_DSCP,
+    MappedPriority,
+    TransportPriorityMapping,
+    code_points,
+    describe,
+    map_priority,
+)
+from lifecycle.network.five_qi import ClassIssue, check_class, five_qi_of, propose
+from lifecycle.network.nfe import UniqueRequirement
+
+_OPERATOR_SPECIFIC = range(128, 255)  # TS 24.501 §9.11.4.12
+_ANY_LOSS = 1.0
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class FlowClass:
+    """A 5QI and what there is to say of it.
+
+    Attributes:
+        five_qi: 1–254; None if not asked for, or if none fits.
+        reason: why it is this one, or none, for `auto`; else empty.
+        problem: message and hint of why it cannot be; two empty texts if it can.
+        issues: what is declared and the class does not keep.
+    """
+
+    five_qi: int | None = None
+    reason: str = ""
+    problem: tuple[str, str] = ("", "")
+    issues: tuple[ClassIssue, ...] = ()
+
+
+def class_of(need: FlowNeed, *, max_delay_ms: float | None, message_bytes: int | None) -> FlowClass:
+    """Return the class of one publisher's flow.
+
+    Args:
+        need: what it asks for; a declared `rate_hz` asks for a guaranteed rate.
+        max_delay_ms: declared, else that of its links; None without.
+        message_bytes: of its largest message; None if not known.
+    """
+    rate_bps = (
+        need.rate_hz * message_bytes * 8
+        if need.rate_hz is not None and message_bytes is not None
+        else None
+    )
+    if need.five_qi_auto:
+        return _proposed(need, max_delay_ms, message_bytes, rate_bps)
+    if need.five_qi is None:
+        return FlowClass()
+    try:
+        class_ = five_qi_of(need.five_qi)
+    except ValueError as error:
+        if need.five_qi in _OPERATOR_SPECIFIC:
+            # An operator's own class: what it promises, only that operator knows.
+            return FlowClass(five_qi=need.five_qi)
+        message, _, hint = str(error).partition("; ")
+        return FlowClass(five_qi=need.five_qi, problem=(message, hint))
+    issues = check_class(
+        class_,
+        max_delay_ms=max_delay_ms,
+        loss=need.loss,
+        rate_bps=rate_bps,
+        message_bytes=message_bytes,
+    )
+    return FlowClass(five_qi=need.five_qi, issues=issues)
+
+
+def _proposed(
+    need: FlowNeed, max_delay_ms: float | None, message_bytes: int | None, rate_bps: float | None
+) -> FlowClass:
+    if max_delay_ms is None:
+        message = f"cannot propose a 5QI for {need.name!r}: no max_delay_ms is declared"
+        hint = "add 'max_delay_ms', or a link of its topic that has one"
+        return FlowClass(reason=message, problem=(message, hint))
+    loss = _ANY_LOSS if need.loss is None else need.loss
+    # A guaranteed rate must be bought as a number; where none is declared, only if nothing else is
+    # fast enough.
+    for gbr in (False, None) if need.rate_hz is None else (True,):
+        proposal = propose(max_delay_ms, loss, gbr, message_bytes=message_bytes, rate_bps=rate_bps)
+        if proposal.five_qi is not None:
+            break
+    if proposal.five_qi is None:
+        hint = "relax 'max_delay_ms', 'loss', 'rate_hz' or 'max_message_size'"
+        return FlowClass(reason=proposal.why, problem=(proposal.why, hint))
+    return FlowClass(five_qi=proposal.five_qi.value, reason=proposal.why)
+
+
+DIRECT = TransportPriorityMapping(mask=0xFF)
+"""Takes the priority as the TOS byte: Connext Micro's mapping "as-is"."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Marking:
+    """A DSCP and where it comes from.
+
+    Attributes:
+        dscp: 0–63; None if nothing is marked.
+        reason: one phrase for people; empty where the DSCP is written as such.
+        problem: message and hint of why the need cannot be met; two empty texts if it can.
+        notes: what a user should know, one sentence each, each starting with "cannot".
+    """
+
+    dscp: int | None = None
+    reason: str = ""
+    problem: tuple[str, str] = ("", "")
+    notes: tuple[str, ...] = ()
+
+
+def marking_of(need: FlowNeed, network: Network, five_qi: int | None) -> Marking:
+    """Return the marking of one endpoint.
+
+    The priority of a publisher is of its data, that of a subscription of its acknowledgements, and
+    neither follows from the other (*RTI Connext Micro, Transport Priority*, "Configuring transport
+    priority"). A 5QI is of data and marks publishers only.
+
+    Args:
+        need: what it asks for.
+        network: the system's mappings.
+        five_qi: its 5QI, `auto` resolved.
+    """
+    if need.transport_priority is not None and need.dscp is None:
+        mapping = network.transport_priority_mapping or DIRECT
+        return _mapped(map_priority(need.transport_priority, mapping))
+    publishes = need.kind is EndpointKind.PUBLISHER
+    if need.dscp is not None or not publishes or network.five_qi_dscp is None or five_qi is None:
+        return Marking(dscp=need.dscp)
+    name, dscp = network.five_qi_dscp.name, network.five_qi_dscp.dscp_for(five_qi)
+    if dscp is None:
+        return Marking(notes=(f"cannot mark 5QI {five_qi} with a DSCP: mapping {name!r} has none",))
+    return Marking(dscp=dscp, reason=f"for 5QI {five_qi} by mapping {name!r}")
+
+
+def _mapped(result: MappedPriority) -> Marking:
+    mapping, number = result.mapping, result.priority
+    priority = f"transport_priority {number} ({number:#x})"
+    through = f"mask {mapping.mask:#x}, low {mapping.low:#x}, high {mapping.high:#x}"
+    if result.tos is None:
+        return Marking(notes=(f"cannot mark anything with {priority}: the mask is 0",))
+    if result.sets_ecn:
+        clear = result.tos & ~ECN_MASK
+        message = (
+            f"cannot use {priority}: with {through} it is TOS {result.tos} ({result.tos:#04x}), "
+            f"whose two lowest bits are ECN and belong to the transport (RFC 3168)"
+        )
+        return Marking(problem=(message, f"without them it is {describe(clear >> 2)}"))
+    note = (
+        f"cannot map bits {result.ignored_bits:#x} of {priority}: they are outside mask "
+        f"{mapping.mask:#x}; what is left is {describe(result.tos >> 2)}"
+    )
+    return Marking(
+        dscp=result.tos >> 2,
+        reason=f"{priority} with {through}",
+        notes=(note,) if result.ignored_bits else (),
+    )
+
+
+def identifiers(taken: Iterable[int]) -> tuple[int, ...]:
+    """Return the DSCP values that may become identifiers, those that mislead least first.
+
+    First pool 2, `xxxx11`, which RFC 2474 leaves to experimental and local use, then values without
+    a name, then named classes, and 0, which every unmarked packet carries, last.
+
+    Args:
+        taken: values that publishers have already.
+    """
+    named = {each.dscp for each in code_points()}
+    used = set(taken)
+    return tuple(
+        sorted(
+            (each for each in range(MAX_DSCP + 1) if each not in used),
+            key=lambda each: (each == 0, each in named, each & 0b11 != 0b11, each),
+        )
+    )
+
+
+OWN_FLOW = (UniqueRequirement.STRICTLY_REQUIRED, UniqueRequirement.OPTIONALLY_REQUIRED)
+"""Requirements that make us give an endpoint an NFE of its own."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class ResolvedNeed:
+    """One endpoint's need, resolved.
+
+    Attributes:
+        need: as declared.
+        topic: fully qualified name; empty if it cannot be resolved.
+        unique: it must get an NFE of its own.
+        marking: DSCP, of a publisher's data or of a subscription's acknowledgements.
+        flow_class: 5QI; publishers only.
+        max_delay_ms: declared, else the shortest of the links from this node on the topic.
+        max_message_size: declared, else the type's bound, bytes; None without either.
+        max_datagram_bytes: what its participant must not exceed so that IP does not fragment it;
+            None if that cannot happen or cannot be told.
+        transports: all that its participant may use; empty for any.
+        told_apart: every subscription of its topic asks for an NFE of its own, which identifies the
+            flow (weakly unique) whatever the publisher has.
+    """
+
+    need: FlowNeed
+    topic: str
+    unique: bool
+    marking: Marking
+    flow_class: FlowClass
+    max_delay_ms: float | None = None
+    max_message_size: int | None = None
+    max_datagram_bytes: int | None = None
+    transports: tuple[str, ...] = ()
+    told_apart: bool = False
+
+    @property
+    def dscp(self) -> int | None:
+        """The DSCP that its packets are to carry, 0–63."""
+        return self.marking.dscp
+
+    @property
+    def five_qi(self) -> int | None:
+        """The 5QI, 1–254, `auto` resolved."""
+        return self.flow_class.five_qi
+
+    @property
+    def prioritised(self) -> bool:
+        """Whether a network is to treat this flow differently from others."""
+        return self.unique or self.dscp is not None or self.five_qi is not None
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class ParticipantGroup:
+    """Endpoints of one kind and node that share an extra participant.
+
+    Attributes:
+        kind: PUBLISHER, or SUBSCRIPTION: then what they acknowledge with carries the DSCP.
+        names: declared, in the interface's order.
+        unique: it carries one publisher that needs an NFE of its own.
+        five_qi: the class by which a network tells it from others; None if it need not.
+    """
+
+    kind: EndpointKind = EndpointKind.PUBLISHER
+    names: tuple[str, ...]
+    unique: bool
+    dscp: int | None
+    five_qi: int | None
+    transports: tuple[str, ...]
+    max_datagram_bytes: int | None
+    non_blocking_send: bool
+
+
+class FlowNeeds:
+    """All flow needs of a system, resolved."""
+
+    def __init__(self, manifest: Manifest, prefixes: Sequence[Path]) -> None:
+        self._manifest = manifest
+        self._prefixes = prefixes
+        self._addresses = {each.name: each.address for each in manifest.machines}
+        self._machines = {each.key: each.machine for each in manifest.nodes}
+        self._delays: dict[tuple[str, str], float] = {}
+        for link in manifest.links:
+            if link.max_delay_ms is not None:
+                place = (link.from_node, link.topic)
+                self._delays[place] = min(
+                    link.max_delay_ms, self._delays.get(place, link.max_delay_ms)
+                )
+        self._sizes: dict[str, int | None] = {}
+        self._told_apart = _told_apart(manifest)
+        resolved = {
+            (node.key, need.kind, need.name): self._resolve(node, need)
+            for node in manifest.nodes
+            for need in node.flows
+        }
+        if manifest.network.flow_identification is FlowIdentification.DSCP:
+            resolved = _with_identifiers(resolved, manifest)
+        self._resolved = {key: self._with_datagrams(key[0], each) for key, each in resolved.items()}
+
+    def of(self, node_key: str, kind: EndpointKind, name: str) -> ResolvedNeed | None:
+        """Return the need of an endpoint by its declared name; None if it has none."""
+        return self._resolved.get((node_key, kind, name))
+
+    def of_node(self, node: Node) -> Iterator[ResolvedNeed]:
+        """Return all needs of a node, in the order of the manifest."""
+        for need in node.flows:
+            yield self._resolved[node.key, need.kind, need.name]
+
+    def node_transports(self, node: Node) -> tuple[str, ...]:
+        """Return all that a node's own participant may use; empty for any.
+
+        Its subscriptions receive there; so if one must not get its data by shared memory, none of
+        the node's can.
+        """
+        for each in self.of_node(node):
+            if each.need.kind is not EndpointKind.SUBSCRIPTION or each.dscp is not None:
+                continue  # a marked one receives on a participant beside it
+            if each.transports:
+                return each.transports
+        return ()
+
+    def groups(self, node: Node) -> tuple[ParticipantGroup, ...]:
+        """Return the extra participants that a node's endpoints need: as few as meet every need.
+
+        A publisher that needs an NFE of its own shares with none. Others share if they ask for the
+        same DSCP, 5QI, transports and way of sending; the smaller datagram size serves both.
+        Subscriptions need one if they are marked, because acknowledgements leave by the sockets of
+        the participant; they share it with those of the same DSCP and transports, not with
+        publishers: a network that looks at marks must not take the one for the other's flow. Within
+        one node only: a participant belongs to a node, whose hidden node is what the graph shows.
+        """
+        found: dict[object, ParticipantGroup] = {}
+        own = (None, None, self.node_transports(node), False)
+        for endpoint in node.interface.endpoints:
+            each = self.of(node.key, endpoint.kind, endpoint.name)
+            if each is None or endpoint.kind not in (
+                EndpointKind.PUBLISHER,
+                EndpointKind.SUBSCRIPTION,
+            ):
+                continue
+            if endpoint.kind is EndpointKind.SUBSCRIPTION:
+                if each.dscp is not None:
+                    _add_subscription(found, each, each.transports or own[2])
+                continue
+            five_qi = None if each.unique or each.told_apart else each.five_qi
+            transports = each.transports or own[2]
+            class_ = (each.dscp, five_qi, transports, each.need.non_blocking_send)
+            if not each.unique and class_ == own and each.max_datagram_bytes is None:
+                continue
+            key = endpoint.name if each.unique else class_
+            known = found.get(key)
+            sizes = (each.max_datagram_bytes, known.max_datagram_bytes if known else None)
+            found[key] = ParticipantGroup(
+                names=(*(known.names if known else ()), endpoint.name),
+                unique=each.unique,
+                dscp=each.dscp,
+                five_qi=five_qi,
+                transports=transports,
+                max_datagram_bytes=min((size for size in sizes if size is not None), default=None),
+                non_blocking_send=each.need.non_blocking_send,
+            )
+        return tuple(found.values())
+
+    def _resolve(self, node: Node, need: FlowNeed) -> ResolvedNeed:
+        topic = _topic(node, need.kind, need.name)
+        delay, size = self._max_delay_ms(node, need, topic), self._max_message_size(node, need)
+        flow_class = class_of(need, max_delay_ms=delay, message_bytes=size)
+        return ResolvedNeed(
+            need=need,
+            topic=topic,
+            unique=need.unique in OWN_FLOW,
+            marking=marking_of(need, self._manifest.network, flow_class.five_qi),
+            flow_class=flow_class,
+            max_delay_ms=delay,
+            max_message_size=size,
+            transports=self._transports(node) if self._by_participant(need) else (),
+            told_apart=topic in self._told_apart,
+        )
+
+    def _max_delay_ms(self, node: Node, need: FlowNeed, topic: str) -> float | None:
+        if need.max_delay_ms is not None or need.kind is not EndpointKind.PUBLISHER:
+            return need.max_delay_ms
+        return self._delays.get((node.key, topic))
+
+    def _max_message_size(self, node: Node, need: FlowNeed) -> int | None:
+        if need.max_message_size is not None or need.kind is not EndpointKind.PUBLISHER:
+            return need.max_message_size
+        for endpoint in node.interface.endpoints:
+            if (endpoint.kind, endpoint.name) == (need.kind, need.name):
+                if endpoint.type not in self._sizes:
+                    self._sizes[endpoint.type] = bounded_size(endpoint.type, self._prefixes)
+                return self._sizes[endpoint.type]
+        return None
+
+    def _by_participant(self, need: FlowNeed) -> bool:
+        """Whether the need is met by what its participant may use, with no connection at all.
+
+        Where discovery says what participants have, negotiation decides (`lifecycle.plan`).
+        """
+        discovery = self._manifest.discovery
+        return (
+            need.transport is FlowTransport.NETWORK
+            and discovery.mode is DiscoveryMode.DYNAMIC
+            and discovery.transport is FlowTransport.ANY
+        )
+
+    def _transports(self, node: Node) -> tuple[str, ...]:
+        return ("udpv6",) if ":" in self._addresses.get(node.machine, "") else ("udpv4",)
+
+    def _with_datagrams(self, node_key: str, each: ResolvedNeed) -> ResolvedNeed:
+        """Say how small datagrams must be; only a flow that a network knows can be harmed."""
+        if each.need.kind is not EndpointKind.PUBLISHER or not each.prioritised:
+            return each
+        declared = self._manifest.network.max_datagram_bytes
+        ipv6 = ":" in self._addresses.get(self._machines[node_key], "")
+        limit = declared or max_unfragmented(ipv6=ipv6)
+        size = each.max_message_size
+        # Of what size messages are nobody knows; if the path is known to be narrow, be careful.
+        small = declared is None if size is None else not is_fragmented(size, limit)
+        if small:
+            return each
+        return dataclasses.replace(each, max_datagram_bytes=declared or SAFE_DATAGRAM_BYTES)
+
+
+def _add_subscription(
+    found: dict[object, ParticipantGroup], each: ResolvedNeed, transports: tuple[str, ...]
+) -> None:
+    key = (EndpointKind.SUBSCRIPTION, each.dscp, transports)
+    known = found.get(key)
+    found[key] = ParticipantGroup(
+        kind=EndpointKind.SUBSCRIPTION,
+        names=(*(known.names if known else ()), each.need.name),
+        unique=False,
+        dscp=each.dscp,
+        five_qi=None,
+        transports=transports,
+        max_datagram_bytes=None,
+        non_blocking_send=False,
+    )
+
+
+def _topic(node: Node, kind: EndpointKind, name: str) -> str:
+    try:
+        return resolve(
+            name, node_name=node.name, namespace=node.namespace, remap=node.remap, kind=kind
+        )
+    except LifecycleError:
+        return ""
+
+
+def _told_apart(manifest: Manifest) -> frozenset[str]:
+    """Topics whose every subscription gets an NFE of its own."""
+    answers: dict[str, bool] = {}
+    for node in manifest.nodes:
+        needs = {need.name: need for need in node.flows if need.kind is EndpointKind.SUBSCRIPTION}
+        for endpoint in node.interface.endpoints:
+            if endpoint.kind is not EndpointKind.SUBSCRIPTION:
+                continue
+            topic = _topic(node, endpoint.kind, endpoint.name)
+            need = needs.get(endpoint.name)
+            own = need is not None and need.unique in OWN_FLOW and node.run.kind is RunKind.PYTHON
+            answers[topic] = answers.get(topic, True) and own
+    return frozenset(topic for topic, every in answers.items() if every)
+
+
+_Key = tuple[str, EndpointKind, str]
+
+
+def _with_identifiers(
+    resolved: dict[_Key, ResolvedNeed], manifest: Manifest
+) -> dict[_Key, ResolvedNeed]:
+    """Give each publisher that needs a unique flow a DSCP of its own (*Unique Network Flows*).
+
+    A DSCP that is written stays. The others get what nobody else has, over all nodes, in the order
+    of the manifest; when the 64 are used up, the rest have a problem instead.
+    """
+    asking = [
+        key
+        for key, each in resolved.items()
+        if each.unique and each.need.kind is EndpointKind.PUBLISHER
+    ]
+    free = iter(identifiers(each.dscp for each in resolved.values() if each.dscp is not None))
+    nodes = {node.key: node for node in manifest.nodes}
+    found = dict(resolved)
+    for number, key in enumerate(asking, start=1):
+        each = resolved[key]
+        if each.dscp is not None or nodes[key[0]].run.kind is not RunKind.PYTHON:
+            continue
+        dscp = next(free, None)
+        if dscp is None:
+            message = (
+                f"cannot give publisher {key[2]!r} of {key[0]!r} a DSCP of its own: it is number "
+                f"{number} of {len(asking)} publishers that need one, and a DSCP has 64 values"
+            )
+            hint = "use 'flow_identification: participant', or ask for fewer unique publishers"
+            marking = Marking(problem=(message, hint))
+        else:
+            marking = Marking(dscp=dscp, reason="its identifier")
+        found[key] = dataclasses.replace(each, marking=marking)
+    return found

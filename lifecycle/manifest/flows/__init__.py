@@ -1,1 +1,0 @@
-"""What flow needs come to: classes, marks."""

@@ -1,0 +1,157 @@
+"""The ament resource index: which packages, interfaces and NoDL documents are installed.
+
+Owns: where the index lies and how a resource is found in it, as ament_index_python does, but for a
+prefix that AMENT_PREFIX_PATH need not name: wheels install the index under `sys.prefix`. Reads the
+file system; needs no ROS.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import enum
+import functools
+import json
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path, PurePosixPath
+
+from lifecycle.manifest.schema import nearest
+
+_INDEX = Path("share", "ament_index", "resource_index")
+
+
+def search_prefixes(environment: Mapping[str, str] | None = None) -> tuple[Path, ...]:
+    """Return the prefixes to search, first one first: AMENT_PREFIX_PATH, then `sys.prefix`."""
+    variables = os.environ if environment is None else environment
+    listed = variables.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
+    return tuple(dict.fromkeys(Path(each) for each in (*listed, sys.prefix) if each))
+
+
+def find_resource(kind: str, name: str, prefixes: Sequence[Path]) -> Path | None:
+    """Return the file of resource `name` of type `kind` in the first prefix that has it."""
+    for prefix in prefixes:
+        path = prefix / _INDEX / kind / name
+        if path.is_file():
+            return path
+    return None
+
+
+def list_resources(kind: str, prefixes: Sequence[Path]) -> tuple[str, ...]:
+    """Return the names of all resources of type `kind`, sorted."""
+    names: set[str] = set()
+    for prefix in prefixes:
+        folder = prefix / _INDEX / kind
+        if folder.is_dir():
+            # A leading dot marks files that are no resources.
+            names.update(each.name for each in folder.iterdir() if not each.name.startswith("."))
+    return tuple(sorted(names))
+
+
+_RESOURCE = "rosidl_interfaces"
+
+
+class TypeStatus(enum.Enum):
+    """What the index says of a type."""
+
+    EXISTS = "exists"
+    NO_SUCH_TYPE = "no such type"  # the package is installed, the type is not in it
+    NOT_INSTALLED = "package not installed"
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class TypeLookup:
+    """The answer for one type.
+
+    Attributes:
+        nearest: an installed type (NO_SUCH_TYPE) or package (NOT_INSTALLED) with a similar name;
+            empty if there is none.
+    """
+
+    status: TypeStatus
+    nearest: str = ""
+
+
+def look_up(type_: str, prefixes: Sequence[Path]) -> TypeLookup:
+    """Look a type up.
+
+    Args:
+        type_: `package/msg/Type`, `package/srv/Type` or `package/action/Type`.
+        prefixes: where to search, from `ament_index.search_prefixes`.
+    """
+    package, _, name = type_.partition("/")
+    found = find_resource(_RESOURCE, package, prefixes)
+    if found is None:
+        # Packages share endings (`_msgs`, `_interfaces`), so only a near miss is a hint.
+        known = list_resources(_RESOURCE, prefixes)
+        similar = next(iter(difflib.get_close_matches(package, known, n=1, cutoff=0.85)), "")
+        return TypeLookup(status=TypeStatus.NOT_INSTALLED, nearest=similar)
+    types = _types(found)
+    if name in types:
+        return TypeLookup(status=TypeStatus.EXISTS)
+    # A type of the same kind comes first: `msg/Imu` for `msg/IMU`, not `srv/SetCameraInfo`.
+    kind = name.partition("/")[0]
+    same_kind = [each for each in types if each.startswith(f"{kind}/")]
+    similar = nearest(name, same_kind) or nearest(name, types)
+    return TypeLookup(
+        status=TypeStatus.NO_SUCH_TYPE, nearest=f"{package}/{similar}" if similar else ""
+    )
+
+
+def _types(resource: Path) -> tuple[str, ...]:
+    """Return what a package declares: `msg/Image`, each once, in the index's order."""
+    lines = resource.read_text(encoding="utf-8").split()
+    return tuple(dict.fromkeys(str(PurePosixPath(line).with_suffix("")) for line in lines))
+
+
+_SERVICE = ("_Request", "_Response")
+_PARTS = {
+    "msg": ("",),
+    "srv": _SERVICE,
+    "action": (
+        *(f"_SendGoal{each}" for each in _SERVICE),
+        *(f"_GetResult{each}" for each in _SERVICE),
+        "_FeedbackMessage",
+    ),
+}
+"""The messages on the wire, by the kind of an interface."""
+
+
+def join(hashes: Sequence[str]) -> str:
+    """Put the hashes of one interface's messages together; empty if one of them is not known.
+
+    Args:
+        hashes: of a message; of a service's request and response; of an action's goal request and
+            response, result request and response, and feedback message.
+    """
+    return " ".join(hashes) if all(hashes) else ""
+
+
+def installed_hash(type_: str, prefixes: Sequence[Path]) -> str:
+    """Return the hash of a type as it is installed here, `RIHS01_df66…`, for `join` where several.
+
+    Empty if the type is not installed here, or by a distribution that has no hashes (before Iron).
+
+    Args:
+        type_: `package/msg/Type`, `package/srv/Type` or `package/action/Type`.
+        prefixes: where to search, from `ament_index.search_prefixes`.
+    """
+    package, _, rest = type_.partition("/")
+    index = find_resource("rosidl_interfaces", package, prefixes) if rest else None
+    parts = _PARTS.get(rest.partition("/")[0])
+    if index is None or parts is None:
+        return ""
+    # <prefix>/share/ament_index/resource_index/rosidl_interfaces/<package>
+    known = _hashes(index.parents[3] / package / f"{rest}.json")
+    return join([known.get(f"{type_}{part}", "") for part in parts])
+
+
+@functools.lru_cache(maxsize=512)
+def _hashes(path: Path) -> Mapping[str, str]:
+    """Return the hashes that a type description lists, by type name; none if it cannot be read."""
+    try:
+        listed = json.loads(path.read_text(encoding="utf-8"))["type_hashes"]
+        return {str(each["type_name"]): str(each["hash_string"]) for each in listed}
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return {}

@@ -1,1 +1,0 @@
-"""NoDL v2 documents in place of an inline interface."""

@@ -1,0 +1,379 @@
+"""A document against its JSON Schema → diagnostics that people can act on.
+
+Owns: loading the shipped schemas and turning each violation into one `Diagnostic`; the words are
+`wording`'s, and `violation` picks the branch that was meant where a choice failed.
+Pure but for reading the shipped schemas.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import functools
+import itertools
+import json
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from importlib import resources
+from typing import Any
+
+import jsonschema
+from jsonschema.exceptions import ValidationError
+
+from lifecycle.manifest.diagnostics import Diagnostic
+from lifecycle.manifest.yaml.document import Document, Place, error
+from lifecycle.manifest.yaml.yaml_parser import (
+    MAX_FINDINGS,
+    YAML_1_1_BOOLEANS,
+    has_leading_zero,
+    quote,
+)
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Violation:
+    """A value that breaks one keyword.
+
+    Attributes:
+        keyword: the broken keyword, `enum`.
+        operand: what the schema has for that keyword.
+        schema: the subschema that holds the keyword.
+        value: the offending value.
+        place: where that value stands.
+        is_key: the value is a key of the mapping at `place`.
+        name: the key, known to the schema, that the value stands under; empty where the user
+            chooses keys, and in lists.
+        branches: for `anyOf` and `oneOf`, what each branch has against the value.
+    """
+
+    keyword: str
+    operand: Any
+    schema: Mapping[str, Any]
+    value: Any
+    place: Place
+    is_key: bool
+    name: str = ""
+    branches: tuple[tuple[Violation, ...], ...] = ()
+
+    @property
+    def is_way(self) -> bool:
+        """A choice between ways to fill a mapping, each a list of required keys."""
+        return self.keyword in {"anyOf", "oneOf"} and all("required" in x for x in self.operand)
+
+
+def violations(errors: Iterable[ValidationError]) -> Iterator[Violation]:
+    """Type each error; a failed choice becomes the violations of the branch that was meant."""
+    for each in errors:
+        violation = _typed(each)
+        meant = _meant(violation)
+        if meant is None:
+            yield violation
+        else:
+            yield from meant
+
+
+def _typed(each: ValidationError) -> Violation:
+    groups: dict[Any, list[ValidationError]] = {}
+    for inner in each.context or ():
+        groups.setdefault(inner.relative_schema_path[0], []).append(inner)
+    schema = each.schema
+    return Violation(
+        keyword=str(each.validator),
+        operand=each.validator_value,
+        schema=schema if isinstance(schema, Mapping) else {},
+        value=each.instance,
+        place=tuple(each.absolute_path),
+        is_key="propertyNames" in each.absolute_schema_path,
+        name=_name(each),
+        branches=tuple(tuple(violations(group)) for group in groups.values()),
+    )
+
+
+def _name(each: ValidationError) -> str:
+    if not each.absolute_path:
+        return ""
+    last, path = each.absolute_path[-1], list(each.absolute_schema_path)
+    known = any(pair == ("properties", last) for pair in itertools.pairwise(path))
+    return last if known and isinstance(last, str) else ""
+
+
+def _meant(choice: Violation) -> tuple[Violation, ...] | None:
+    """Return what the one branch says whose type fits the value; None if no single one fits."""
+    fitting = [
+        branch
+        for branch in choice.branches
+        if not any(
+            each.keyword in {"type", "required"} and each.place == choice.place for each in branch
+        )
+    ]
+    return fitting[0] if len(fitting) == 1 else None
+
+
+_TYPES = {
+    "string": "a string",
+    "integer": "an integer",
+    "number": "a number",
+    "boolean": "true or false",
+    "array": "a list",
+    "object": "a mapping",
+    "null": "null",
+}
+
+
+MAX_WORDS = 500
+"""Words among which a nearest one is looked for; among more it would take longer than it helps."""
+
+
+def nearest(word: str, known: Collection[str]) -> str:
+    """Return the known word that `word` was most probably meant to be; empty if none is near."""
+    if len(known) > MAX_WORDS:
+        return ""
+    spelled = {each.lower(): each for each in known}
+    close = difflib.get_close_matches(word.lower(), spelled, n=1, cutoff=0.6)
+    return spelled[close[0]] if close else ""
+
+
+def did_you_mean(word: str, known: Collection[str]) -> str:
+    """Return a question for a hint; empty if no known word is near."""
+    found = nearest(word, known)
+    return f"did you mean {found!r}?" if found else ""
+
+
+def unknown_key(key: str, known: Iterable[str]) -> tuple[str, str]:
+    """Return message and hint for a key that the schema does not know."""
+    words = list(known)
+    message = f"cannot use the unknown key {quote(key)}; allowed: {', '.join(words)}"
+    return message, did_you_mean(key, words)
+
+
+def missing_key(key: str, schema: Mapping[str, Any]) -> tuple[str, str]:
+    """Return message and hint for a key that must be there."""
+    example = (schema.get("examples") or [schema.get("const", "…")])[0]
+    return f"cannot do without the key {key!r}", f"add '{key}: {example}'"
+
+
+def bad_key(each: Violation) -> tuple[str, str]:
+    """Return message and hint for a key whose spelling is not allowed."""
+    return f"cannot use {quote(each.value)} as a key here", _pattern(each.schema)
+
+
+def bad_value(each: Violation) -> tuple[str, str]:
+    """Return message and hint for a value that breaks one keyword of its schema."""
+    if each.is_way:
+        return _way(each)
+    name = each.name
+    if each.keyword in {"minItems", "minProperties", "minLength"}:
+        return f"cannot leave {name or 'this'} empty", ""
+    subject = (
+        f"cannot use {name} {quote(each.value)}" if name else f"cannot use {quote(each.value)}"
+    )
+    if isinstance(each.value, (list, dict)) and name:
+        subject = f"cannot use {quote(each.value)} as {name}"
+    allowed, hint = _allowed(each)
+    return f"{subject}; {allowed}" if allowed else subject, hint
+
+
+def _allowed(each: Violation) -> tuple[str, str]:
+    """Say what the broken keyword allows, and a hint."""
+    if each.keyword in {"oneOf", "anyOf"}:
+        own = [inner for branch in each.branches for inner in branch if inner.place == each.place]
+        types = [
+            name for inner in own if inner.keyword == "type" for name in _listed(inner.operand)
+        ]
+        return _types(each.value, types)
+    if each.keyword == "type":
+        return _types(each.value, _listed(each.operand))
+    if each.keyword in {"enum", "const"}:
+        allowed = [each.operand] if each.keyword == "const" else each.operand
+        return f"allowed: {_spell(allowed)}", _closest(each.value, allowed)
+    if each.keyword == "pattern":
+        return "", _pattern(each.schema)
+    return f"allowed: {_range(each.schema)}", ""
+
+
+def _way(each: Violation) -> tuple[str, str]:
+    """Word a failed choice between ways to fill a mapping."""
+    ways: list[list[str]] = [branch["required"] for branch in each.operand]
+    given = [key for key in each.value if any(key in way for way in ways)]
+    only = "exactly one" if each.keyword == "oneOf" else "at least one"
+    spelled = ", ".join(" with ".join(way) for way in ways)
+    whole = [way for way in ways if all(key in given for key in way)]
+    if not whole and given:
+        missing = next(key for way in ways if given[0] in way for key in way if key not in given)
+        return f"cannot use {given[0]} without {missing}", f"add '{missing}: …'"
+    if given:
+        words = f"{', '.join(given[:-1])} and {given[-1]}"
+        return f"cannot use {words} together", f"give {only} of {spelled}"
+    return f"cannot do without any of {spelled}", f"give {only} of them"
+
+
+def _types(value: object, types: list[str]) -> tuple[str, str]:
+    """Say which types are allowed, and how to get there from `value`."""
+    words = [_TYPES[each] for each in types if not (each == "integer" and "number" in types)]
+    words = list(dict.fromkeys(words))
+    joined = " or ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
+    hint = ""
+    if types == ["boolean"] and isinstance(value, str) and value in YAML_1_1_BOOLEANS:
+        hint = "YAML 1.2 has no other words for them"
+    elif isinstance(value, str) and has_leading_zero(value) and {"integer", "number"} & {*types}:
+        hint = "write it without the leading 0, which versions of YAML read differently"
+    elif types == ["string"] and isinstance(value, (bool, int, float)):
+        hint = "put it in quotes"
+    return f"it must be {joined}", hint
+
+
+def _range(schema: Mapping[str, Any]) -> str:
+    low, above, high = (schema.get(k) for k in ("minimum", "exclusiveMinimum", "maximum"))
+    lower = f"more than {above}" if above is not None else f"{low}"
+    upper = f"at most {high}" if above is not None else f"{high}"
+    return f"{lower}, {upper}" if above is not None else f"{lower} to {upper}"
+
+
+def _closest(value: object, allowed: list[object]) -> str:
+    words = [each for each in allowed if isinstance(each, str)]
+    return did_you_mean(value, words) if isinstance(value, str) else ""
+
+
+def _pattern(schema: Mapping[str, Any]) -> str:
+    return str(schema.get("patternErrorMessage") or f"it must match {schema.get('pattern')}")
+
+
+def _spell(values: Iterable[object]) -> str:
+    return ", ".join(each if isinstance(each, str) else quote(each) for each in values)
+
+
+def _listed(types: str | list[str]) -> list[str]:
+    return [types] if isinstance(types, str) else types
+
+
+MANIFEST = "manifest.v1.schema.json"
+"""The file, in schemas/, that says what a manifest may hold."""
+
+_SUBSTITUTION = {"$ref": "#/$defs/substitution"}
+
+
+@functools.cache
+def read_schema(name: str) -> Mapping[str, Any]:
+    """Return a shipped schema as it is in schemas/, for editors and for other programs."""
+    # Wheels hold a copy of schemas/; a checkout holds a link to it.
+    text = (resources.files("lifecycle") / "_schemas" / name).read_text(encoding="utf-8")
+    schema: Mapping[str, Any] = json.loads(text)
+    return schema
+
+
+def validate(
+    document: Document, *, definition: str = "", ignore: Collection[Place] = ()
+) -> tuple[tuple[Place, Diagnostic], ...]:
+    """Check a document whose substitutions are resolved.
+
+    Args:
+        document: what to check.
+        definition: name under `$defs` of the manifest's schema, for a part of a manifest that
+            stands in a file of its own; the whole manifest if empty.
+        ignore: values already reported; nothing is said about them or anything inside.
+
+    Returns:
+        Every violation and the value it is about, at most `MAX_FINDINGS`, in no particular order.
+    """
+    found: list[tuple[Place, Diagnostic]] = []
+    seen: set[tuple[Place, str]] = set()
+    errors = _validator(definition).iter_errors(document.root.plain())
+    broken = list(violations(errors))
+    enums = {each.place for each in broken if each.keyword == "enum"}
+    # The words allowed say more than that they are strings.
+    broken = [each for each in broken if not (each.keyword == "type" and each.place in enums)]
+    # `required` holds for everything that is no mapping, so that several ways seem to be taken.
+    broken = [each for each in broken if isinstance(each.value, dict) or not each.is_way]
+    for place, diagnostic in _diagnose(document, broken):
+        if (place, diagnostic.message) in seen or _inside(place, ignore):
+            continue
+        if len(found) == MAX_FINDINGS:
+            message = f"cannot list more than {MAX_FINDINGS} findings"
+            found.append(
+                ((), error("manifest.too-many", document.at(), message, "fix these first"))
+            )
+            break
+        seen.add((place, diagnostic.message))
+        found.append((place, diagnostic))
+    return tuple(found)
+
+
+@functools.cache
+def _validator(definition: str) -> jsonschema.Draft202012Validator:
+    schema = _resolved_only(read_schema(MANIFEST))
+    assert isinstance(schema, dict)
+    if definition:
+        schema = {"$defs": schema["$defs"], "$ref": f"#/$defs/{definition}"}
+    return jsonschema.Draft202012Validator(schema)
+
+
+def _resolved_only(schema: object) -> object:
+    """Return the schema of documents without substitutions.
+
+    Editors see the document before substitution, so that the shipped schema lets `$(arg x)` stand
+    where a number must; the loader checks what it became.
+    """
+    if isinstance(schema, list):
+        return [_resolved_only(each) for each in schema]
+    if not isinstance(schema, dict):
+        return schema
+    result = {key: _resolved_only(value) for key, value in schema.items()}
+    branches = result.get("anyOf")
+    if isinstance(branches, list) and _SUBSTITUTION in branches:
+        branches = [each for each in branches if each != _SUBSTITUTION]
+        del result["anyOf"]
+        result.update(branches[0] if len(branches) == 1 else {"anyOf": branches})
+    pattern = result.get("pattern")
+    if isinstance(pattern, str):
+        # Python's `$` also matches before a last line break, ECMA 262's does not.
+        result["pattern"] = pattern[:-1] + r"\Z" if pattern.endswith("$") else pattern
+    return result
+
+
+def _inside(place: Place, places: Collection[Place]) -> bool:
+    return any(place[: len(each)] == each for each in places)
+
+
+def _diagnose(document: Document, found: Iterable[Violation]) -> Iterator[tuple[Place, Diagnostic]]:
+    for each in found:
+        place = each.place
+        if each.keyword == "additionalProperties":
+            yield from _unknown_keys(document, each)
+        elif each.keyword == "required":
+            yield from _missing_keys(document, each)
+        elif each.is_key:
+            place = (*place, str(each.value))
+            message, hint = bad_key(each)
+            yield place, error("manifest.key", document.key_at(place), message, hint)
+        elif not (
+            each.is_way and _misspelt(each) & {k for x in each.operand for k in x["required"]}
+        ):
+            rule = _RULES.get(each.keyword, "value")
+            message, hint = bad_value(each)
+            yield place, error(f"manifest.{rule}", document.at(place), message, hint)
+
+
+_RULES = {"type": "type", "oneOf": "choice", "anyOf": "choice", "pattern": "pattern"}
+
+
+def _unknown_keys(document: Document, each: Violation) -> Iterator[tuple[Place, Diagnostic]]:
+    known = list(each.schema["properties"])
+    for key in each.value:
+        if key not in known:
+            place = (*each.place, key)
+            message, hint = unknown_key(key, known)
+            yield place, error("manifest.unknown-key", document.key_at(place), message, hint)
+
+
+def _missing_keys(document: Document, each: Violation) -> Iterator[tuple[Place, Diagnostic]]:
+    known = each.schema.get("properties", {})
+    for key in each.operand:
+        if key not in each.value and key not in _misspelt(each):
+            message, hint = missing_key(key, known.get(key, {}))
+            at = document.key_at(each.place)
+            yield (*each.place, key), error("manifest.missing-key", at, message, hint)
+
+
+def _misspelt(each: Violation) -> set[str]:
+    """Return the known keys that unknown ones stand for: the unknown key is finding enough."""
+    known = each.schema.get("properties", {})
+    return {nearest(key, known) for key in each.value if key not in known}

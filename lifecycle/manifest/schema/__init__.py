@@ -1,1 +1,0 @@
-"""A document against its JSON Schema, in messages that people can act on."""

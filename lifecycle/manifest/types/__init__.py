@@ -1,1 +1,0 @@
-"""Interfaces that are installed: found, read and hashed without ROS."""

@@ -1,0 +1,317 @@
+"""What nodes run, looked for without running it: programs, packages, Python classes, handlers.
+
+Owns: `resolve_programs`, a stage of its own between a valid manifest and its plan, because what it
+finds depends on the host. It looks where `up` would: PATH of the node's environment, the working
+directory, AMENT_PREFIX_PATH, the modules of this interpreter. What Python or exec(3) would refuse
+is an error; what only running would tell, or another host, is named as unresolved.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import re
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+
+from lifecycle.manifest.diagnostics import Diagnostic, Position
+from lifecycle.manifest.model import Endpoint, EndpointKind, Manifest, Node, RunKind
+from lifecycle.manifest.schema import did_you_mean
+from lifecycle.manifest.yaml.document import error, warning
+from lifecycle.plan.command import find_executable
+from lifecycle.plan.model import PlanError
+from lifecycle.plan.python_source import (
+    Handler,
+    NodeClass,
+    NotThereError,
+    Sources,
+    UnknownError,
+)
+
+RULE = "program.missing"
+UNHANDLED = "program.handler"
+UNDECLARED = "program.endpoint"
+
+_WORDS = {
+    EndpointKind.SUBSCRIPTION: ("subscription", "@on_message"),
+    EndpointKind.SERVICE_SERVER: ("service server", "@on_service"),
+    EndpointKind.ACTION_SERVER: ("action server", "@on_action"),
+}
+_PYTHON = re.compile(r"python(3(\.\d+)?)?")
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Unresolved:
+    """Something of a node that could not be looked for here.
+
+    Attributes:
+        at: where the manifest names it; `path` is its place there.
+        subject: what it is, "class 'demo:Talker'".
+        reason: why not, half a sentence.
+    """
+
+    at: Position
+    subject: str
+    reason: str
+
+    def __str__(self) -> str:
+        place = f"{self.at.file}:{self.at.line}:{self.at.column}: {self.at.path}: "
+        return f"{place}could not resolve {self.subject}: {self.reason}"
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Resolution:
+    """What came of looking for everything that a manifest runs.
+
+    Attributes:
+        diagnostics: what would fail, in the order of the manifest.
+        unresolved: what could not be told, likewise.
+    """
+
+    diagnostics: tuple[Diagnostic, ...] = ()
+    unresolved: tuple[Unresolved, ...] = ()
+
+
+def resolve_programs(
+    manifest: Manifest,
+    *,
+    environment: Mapping[str, str],
+    is_ours: Callable[[str], bool] = lambda _: True,
+) -> Resolution:
+    """Look for everything that the nodes of a manifest run.
+
+    Args:
+        manifest: valid.
+        environment: as processes of `up` would inherit it.
+        is_ours: whether a machine, by name, is this host; what is missing here of the others is
+            unresolved. Code that is found here is judged for them, too.
+    """
+    looking = _Looking(environment)
+    for node in manifest.nodes:
+        looking.look(node, is_ours=is_ours(node.machine))
+    return Resolution(diagnostics=tuple(looking.found), unresolved=tuple(looking.unresolved))
+
+
+class _Looking:
+    def __init__(self, environment: Mapping[str, str]) -> None:
+        self.found: list[Diagnostic] = []
+        self.unresolved: list[Unresolved] = []
+        self._environment = environment
+        self._sources: dict[str, Sources] = {}
+        self._classes: dict[tuple[str, str], NodeClass | NotThereError | UnknownError] = {}
+
+    def look(self, node: Node, *, is_ours: bool) -> None:
+        if node.run.kind is RunKind.PYTHON:
+            self._python(node, is_ours=is_ours)
+        elif node.run.kind is RunKind.COMMAND and node.run.command:
+            self._command(node, is_ours=is_ours)
+        elif node.run.kind is RunKind.COMMAND:
+            self._package(node, is_ours=is_ours)
+
+    def _missing(
+        self, node: Node, part: str, subject: str, problem: NotThereError, *, is_ours: bool
+    ) -> None:
+        at = _at(node, part)
+        if is_ours:
+            self.found.append(error(RULE, at, problem.message, problem.hint))
+        else:
+            reason = f"it is for machine {node.machine!r}; here, {_half(problem.message)}"
+            self.unresolved.append(Unresolved(at=at, subject=subject, reason=reason))
+
+    # Python
+
+    def _python(self, node: Node, *, is_ours: bool) -> None:
+        subject = f"class {node.run.python!r}"
+        at = _at(node, "run.python")
+        module, separator, name = node.run.python.partition(":")
+        if not separator or not module or not name.isidentifier():
+            message = f"cannot read {node.run.python!r}; write package.module:Class"
+            self.found.append(error(RULE, at, message))
+            return
+        found = self._class(node)
+        if isinstance(found, NotThereError):
+            # A module that is not here may be there; one that is here lacks the class there, too.
+            remote_nodes = not is_ours and found.message.startswith("cannot find module")
+            self._missing(node, "run.python", subject, found, is_ours=not remote_nodes)
+        elif isinstance(found, UnknownError):
+            self.unresolved.append(Unresolved(at=at, subject=subject, reason=found.message))
+        elif found.is_node is False:
+            message = (
+                f"cannot use {name!r} of {module} ({found.file}) as a node: it is no node class"
+            )
+            hint = "derive it from lifecycle.LifecycleNode, or from rclpy.node.Node"
+            self.found.append(error(RULE, at, message, hint))
+        else:
+            self._interface(node, found, subject)
+
+    def _class(self, node: Node) -> NodeClass | NotThereError | UnknownError:
+        folder = node.run.working_directory or str(Path.cwd())
+        key = (folder, node.run.python)
+        if key not in self._classes:
+            sources = self._sources.setdefault(
+                folder, Sources(list(dict.fromkeys((folder, str(Path.cwd())))))
+            )
+            module, _, name = node.run.python.partition(":")
+            try:
+                self._classes[key] = sources.read_class(module, name)
+            except (NotThereError, UnknownError) as problem:
+                self._classes[key] = problem
+        return self._classes[key]
+
+    def _interface(self, node: Node, found: NodeClass, subject: str) -> None:
+        """Compare what a class handles and asks for with what the node declares."""
+        at = _at(node, "run.python")
+        problems = [*_pairs(node, found, at)] if found.is_ours else []
+        accesses = [*_undeclared(node, found, at)] if found.is_ours else []
+        if found.unknown:
+            of = "handlers" if found.is_ours else "node class"
+            self.unresolved.append(
+                Unresolved(at=at, subject=f"{of} of {subject}", reason=found.unknown)
+            )
+            # What is there is there, whatever else may be.
+            problems = [each for each in problems if each.message.startswith("cannot use")]
+        if found.declares and (problems or accesses):
+            reason = f"its code declares endpoints itself; {problems and problems[0].message}"
+            reason = reason if problems else "its code declares endpoints itself"
+            self.unresolved.append(
+                Unresolved(at=at, subject=f"endpoints of {subject}", reason=reason)
+            )
+            return
+        self.found += problems
+        self.found += accesses
+
+    # Programs
+
+    def _command(self, node: Node, *, is_ours: bool) -> None:
+        words = node.run.command
+        variables = {**self._environment, **dict(node.run.environment)}
+        folder = Path(node.run.working_directory or Path.cwd())
+        subject = f"program {words[0]!r}"
+        try:
+            _find_program(words[0], folder, variables)
+            _find_script(words, folder)
+        except NotThereError as problem:
+            self._missing(node, "run.command", subject, problem, is_ours=is_ours)
+
+    def _package(self, node: Node, *, is_ours: bool) -> None:
+        run = node.run
+        subject = f"executable {run.executable!r} of package {run.package!r}"
+        if not self._environment.get("AMENT_PREFIX_PATH"):
+            reason = "AMENT_PREFIX_PATH is empty; source the setup file of its workspace"
+            at = _at(node, "run.package")
+            self.unresolved.append(Unresolved(at=at, subject=subject, reason=reason))
+            return
+        try:
+            find_executable(run, self._environment, at=node.at)
+        except PlanError as problem:
+            missing = NotThereError(problem.message, hint=problem.hint)
+            self._missing(node, "run.executable", subject, missing, is_ours=is_ours)
+
+
+def _find_program(word: str, folder: Path, variables: Mapping[str, str]) -> None:
+    """Find a program as execvp(3) would, started in `folder`; raises NotThereError."""
+    if not folder.is_dir():
+        raise NotThereError(f"cannot find the working directory {str(folder)!r}")
+    if "/" in word:
+        file = folder / word
+        if not file.exists():
+            near = did_you_mean(file.name, _names(file.parent))
+            where = "" if Path(word).is_absolute() else f" in {str(folder)!r}"
+            raise NotThereError(f"cannot find program {word!r}{where}", hint=near)
+        if not file.is_file() or not os.access(file, os.X_OK):
+            hint = f"chmod +x {word}" if file.is_file() else ""
+            raise NotThereError(f"cannot run {word!r}: it is not executable", hint=hint)
+        return
+    path = variables.get("PATH", os.defpath)
+    folders = os.pathsep.join(str(folder / each) for each in path.split(os.pathsep))
+    if shutil.which(word, path=folders) is None:
+        raise NotThereError(
+            f"cannot find program {word!r} on PATH",
+            hint=f"install it, name its path, or set PATH in run.environment; PATH is {path[:200]}",
+        )
+
+
+def _find_script(words: tuple[str, ...], folder: Path) -> None:
+    """Find the script of a command line that is Python's; raises NotThereError."""
+    if len(words) < 2 or not _PYTHON.fullmatch(Path(words[0]).name) or words[1].startswith("-"):
+        return
+    file = folder / words[1]
+    if not file.exists():
+        near = did_you_mean(file.name, _names(file.parent))
+        raise NotThereError(f"cannot find script {words[1]!r} in {str(folder)!r}", hint=near)
+
+
+def _names(folder: Path) -> tuple[str, ...]:
+    try:
+        return tuple(sorted(each.name for each in folder.iterdir()))
+    except OSError:
+        return ()
+
+
+def _pairs(node: Node, found: NodeClass, at: Position) -> Iterator[Diagnostic]:
+    """Yield what `node.handlers.match` would refuse when the node is configured."""
+    wanted = {(e.kind, e.name): e for e in node.interface.endpoints if e.kind in _WORDS}
+    taken: dict[tuple[EndpointKind, str, bool], Handler] = {}
+    for each in found.handlers:
+        noun, _ = _WORDS[each.kind]
+        if (each.kind, each.name) not in wanted:
+            declared = [name for kind, name in wanted if kind is each.kind]
+            yield error(
+                UNHANDLED,
+                at,
+                f"cannot use handler {each.method} ({each.place}): {each.decorator}({each.name!r}) "
+                f"names no {noun} that {node.key!r} declares",
+                _declared(each.name, declared),
+            )
+        elif first := taken.get((each.kind, each.name, each.decides)):
+            yield error(
+                UNHANDLED,
+                at,
+                f"cannot use two handlers of {noun} {each.name!r}: {first.method} ({first.place}) "
+                f"and {each.method} ({each.place})",
+            )
+        taken.setdefault((each.kind, each.name, each.decides), each)
+    for (kind, name), endpoint in wanted.items():
+        if (kind, name, False) not in taken:
+            yield _unhandled(found, endpoint)
+
+
+def _unhandled(found: NodeClass, endpoint: Endpoint) -> Diagnostic:
+    noun, decorator = _WORDS[endpoint.kind]
+    return error(
+        UNHANDLED,
+        endpoint.at,
+        f"cannot serve {noun} {endpoint.name!r}: no method of {found.name} ({found.file}) is "
+        f"decorated with {decorator}({endpoint.name!r})",
+    )
+
+
+def _undeclared(node: Node, found: NodeClass, at: Position) -> Iterator[Diagnostic]:
+    for each in dict.fromkeys(found.accesses):
+        declared = [e.name for e in node.interface.endpoints if e.kind is each.kind]
+        if each.name not in declared:
+            yield warning(
+                UNDECLARED,
+                at,
+                f"cannot tell what {each.text} ({each.place}) is to get: {node.key!r} declares no "
+                f"{each.kind.noun} {each.name!r}",
+                _declared(each.name, declared),
+            )
+
+
+def _declared(name: str, declared: list[str]) -> str:
+    listed = ", ".join(map(repr, declared)) or "none"
+    near = did_you_mean(name, declared)
+    return f"{near} declared: {listed}" if near else f"declared: {listed}"
+
+
+def _at(node: Node, part: str) -> Position:
+    at = node.where(part)
+    at = node.where("run") if at == node.at else at
+    known = at.path.endswith(part)
+    return at if known else dataclasses.replace(at, path=f"nodes.{node.key}.{part}")
+
+
+def _half(message: str) -> str:
+    return message.replace("cannot find", "there is no", 1)

@@ -1,1 +1,0 @@
-"""What nodes run, found and read without running it."""
