@@ -154,7 +154,7 @@ def chosen(
         UsageError: they do not fit together.
     """
     from lifecycle.programming.apply import TargetOptions, parse_queue, parse_rate
-    from lifecycle.programming.rules.tc_settings import TcMatch
+    from lifecycle.programming.rules.tc import TcMatch
 
     kinds = tuple(dict.fromkeys(targets))
     if "tc" not in kinds and (device or rate or any(guarantees)):

@@ -26,7 +26,7 @@ from lifecycle.cli.standard_streams import Writer
 from lifecycle.node.host.control import Operation
 from lifecycle.printable import json_text, log_line, one_line
 from lifecycle.supervisor.control.status import NodeStatus, SystemStatus
-from lifecycle.supervisor.processes.states import ProcessState
+from lifecycle.supervisor.processes.spawn import ProcessState
 from lifecycle.supervisor.run.events import (
     Event,
     Failure,

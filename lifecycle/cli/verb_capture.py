@@ -68,7 +68,7 @@ def command(
     from lifecycle.export.manifest_yaml import to_manifest
     from lifecycle.manifest.model import Discovery
     from lifecycle.plan.build import effective_domain, effective_range
-    from lifecycle.supervisor.run.capturing import capture_running
+    from lifecycle.supervisor.run.looking import capture_running
 
     _check_name(system)
     discovery = Discovery(domain_id=domain)

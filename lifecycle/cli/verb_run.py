@@ -13,7 +13,7 @@ import click
 from lifecycle.cli.common import load_manifest
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest.model import DiscoveryRange, RunKind
-from lifecycle.middleware.discovery.probe_targets import peers_environment
+from lifecycle.middleware.discovery.probe import peers_environment
 from lifecycle.plan import Plan, PlannedNode, build_plan
 from lifecycle.plan.connections.contacts import reached_hosts
 
@@ -73,8 +73,8 @@ def find_node(plan: Plan, name: str) -> PlannedNode:
 
 def _run_class(plan: Plan, planned: PlannedNode, arguments: list[str], *, lifecycle: str) -> int:
     # Late: everything before this works without ROS, and says what is wrong without it.
-    from lifecycle.node.author.loading import load_class
     from lifecycle.node.author.node import LifecycleNode
+    from lifecycle.node.author.spec import load_class
     from lifecycle.node.host.standalone import run
 
     if planned.run.working_directory:

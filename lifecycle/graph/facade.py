@@ -24,7 +24,7 @@ from lifecycle.graph.scheduler import ThreadScheduler
 from lifecycle.graph.state import GraphState
 from lifecycle.graph.transport import GraphTransport, Remove
 from lifecycle.middleware import GraphObserver, on_graph_change
-from lifecycle.middleware.rcl.spinning import Spinner
+from lifecycle.middleware.rcl.hidden_node import Spinner
 from lifecycle.plan.model import ParticipantConnections
 from lifecycle.verify.observation import NodeConfiguration
 

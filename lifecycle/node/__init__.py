@@ -10,11 +10,11 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from lifecycle.node.actions.goal_run import GoalInterruptedError
+    from lifecycle.node.actions import GoalInterruptedError
     from lifecycle.node.author.handlers import on_action, on_goal, on_message, on_service, on_timer
     from lifecycle.node.author.node import LifecycleNode
     from lifecycle.node.author.returns import ERROR, FAILURE, SUCCESS, TransitionCallbackReturn
-    from lifecycle.node.connections.connection_events import ConnectionEvent, ConnectionEventKind
+    from lifecycle.node.connections.connection_status import ConnectionEvent, ConnectionEventKind
     from lifecycle.node.connections.connections import Connection
     from lifecycle.node.host.standalone import run
 

@@ -1,7 +1,6 @@
 """Plan × Observation → Verdict, and the verdict's reports. Pure: no ROS, no files, no clock."""
 
-from lifecycle.verify.judge import verify
-from lifecycle.verify.missing import missing, not_ok
+from lifecycle.verify.judge import missing, not_ok, verify
 from lifecycle.verify.noise import (
     action_part,
     fold_actions,

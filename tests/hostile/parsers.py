@@ -102,7 +102,7 @@ def _printed(data: bytes, folder: Path) -> object:
 
 def _tc(data: bytes, folder: Path) -> object:
     from lifecycle.programming.apply.tc import TcTarget
-    from lifecycle.programming.rules.tc_settings import TcSettings
+    from lifecycle.programming.rules.tc import TcSettings
 
     tool = FakeTool(("tc", Output(returncode=0, stdout=_text(data), stderr="")))
     settings = TcSettings(device="eth0", link_kbit=20_000)

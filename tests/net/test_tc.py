@@ -23,7 +23,7 @@ from lifecycle.programming.apply.ledger import Ledger
 from lifecycle.programming.apply.tc import TcTarget, probe_features
 from lifecycle.programming.apply.tool import HostTool, Output
 from lifecycle.programming.rules.rules import FlowRule
-from lifecycle.programming.rules.tc_settings import TcFeatures, TcMatch, TcSettings
+from lifecycle.programming.rules.tc import TcFeatures, TcMatch, TcSettings
 from tests.net.hosts import Host, Hosts, lacking
 from tests.unit.programming.apply.samples import ledger_in, rule
 

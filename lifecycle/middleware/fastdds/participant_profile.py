@@ -18,9 +18,9 @@ from xml.etree import ElementTree as ET
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds import url_profile
-from lifecycle.middleware.fastdds.profile_xml import child as _child
-from lifecycle.middleware.fastdds.profile_xml import text as _text
 from lifecycle.middleware.fastdds.profiles import DEFAULT_FILE, PROFILES_FILE_VARIABLE
+from lifecycle.middleware.fastdds.profiles import child as _child
+from lifecycle.middleware.fastdds.profiles import text as _text
 from lifecycle.middleware.fastdds.static_discovery import endpoint_table, own_endpoints
 from lifecycle.network.connection_url import ConnectionUrl
 from lifecycle.network.connection_url import parse as parse_url

@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from xml.etree import ElementTree as ET
 
 from lifecycle.errors import MiddlewareError
 
@@ -95,3 +96,51 @@ def discovery_environment(
             f"cannot write the discovery profile {str(path)!r}: {error.strerror}"
         ) from error
     return {PROFILES_FILE_VARIABLE: str(path)}
+
+
+def child(parent: ET.Element, tag: str) -> ET.Element:
+    """Return the first child of this name; made if there is none."""
+    found = parent.find(tag)
+    return ET.SubElement(parent, tag) if found is None else found
+
+
+def text(parent: ET.Element, tag: str, content: str) -> None:
+    """Add a child with text."""
+    ET.SubElement(parent, tag).text = content
+
+
+def locator(parent: ET.Element, kind: str, address: str, port: int | None) -> None:
+    """Add a UDP locator to a list.
+
+    Args:
+        parent: the list.
+        kind: "udpv4" or "udpv6".
+        address: empty for any.
+        port: None for the well-known one.
+    """
+    element = ET.SubElement(ET.SubElement(parent, "locator"), kind)
+    if address:
+        text(element, "address", address)
+    if port is not None:
+        text(element, "port", str(port))
+
+
+def tcp_locator(
+    parent: ET.Element, address: str, physical: int | None, logical: int | None
+) -> None:
+    """Add a TCP locator over IPv4 to a list.
+
+    Args:
+        parent: the list.
+        address: empty for any.
+        physical: the port that is listened on; None for the transport's.
+        logical: the port inside the connection, which Fast DDS tells traffic apart by; None for
+            the well-known ones.
+    """
+    element = ET.SubElement(ET.SubElement(parent, "locator"), "tcpv4")
+    if address:
+        text(element, "address", address)
+    if physical is not None:
+        text(element, "physical_port", str(physical))
+    if logical is not None:
+        text(element, "port", str(logical))

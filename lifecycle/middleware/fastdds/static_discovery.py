@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from xml.etree import ElementTree as ET
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.fastdds.profile_xml import text
+from lifecycle.middleware.fastdds.profiles import text
 from lifecycle.plan.connections.static_endpoints import GRAPH_TOPIC, GRAPH_TYPE, MAX_USER_ID
 from lifecycle.plan.model import StaticEndpoint, StaticParticipant
 

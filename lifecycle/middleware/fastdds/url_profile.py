@@ -6,28 +6,331 @@ Owns: a participant's transports and where its data arrives. Who is grouped into
 
 from __future__ import annotations
 
+import dataclasses
 import ipaddress
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from xml.etree import ElementTree as ET
 
-from lifecycle.middleware.fastdds.profile_xml import child as _child
-from lifecycle.middleware.fastdds.profile_xml import locator as _locator
-from lifecycle.middleware.fastdds.profile_xml import tcp_locator as _tcp_locator
-from lifecycle.middleware.fastdds.profile_xml import text as _text
-from lifecycle.middleware.fastdds.url_discovery import DISCOVERY_GROUP, add_discovery
-from lifecycle.middleware.fastdds.url_families import (
-    LOOPBACK,
-    SHM,
-    TCPV4,
-    UDPV4,
-    UDPV6,
-    Family,
-    families,
-    leaves_discovery_open,
-)
-from lifecycle.network.connection_url import ConnectionUrl
+from lifecycle.errors import MiddlewareError
+from lifecycle.middleware.fastdds.profiles import child as _child
+from lifecycle.middleware.fastdds.profiles import locator as _locator
+from lifecycle.middleware.fastdds.profiles import tcp_locator as _tcp_locator
+from lifecycle.middleware.fastdds.profiles import text as _text
+from lifecycle.network.connection_url import ConnectionTransport, ConnectionUrl, Peer
 from lifecycle.network.ports import participant_ports
+
+UDPV4, UDPV6, TCPV4, SHM = "udpv4", "udpv6", "tcpv4", "shm"
+LOOPBACK = {UDPV4: "127.0.0.1", UDPV6: "::1"}
+"""The transports that carry UDP, and where each finds this host."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Family:
+    """One transport of a participant: all URLs that it serves.
+
+    Attributes:
+        kind: "udpv4", "udpv6", "tcpv4" or "shm".
+        urls: at least one.
+        interfaces: addresses or names that it is bound to; empty for all.
+    """
+
+    kind: str
+    urls: tuple[ConnectionUrl, ...]
+    interfaces: tuple[str, ...] = ()
+
+    @property
+    def udp(self) -> bool:
+        """Whether it carries UDP, and so may use multicast."""
+        return self.kind in LOOPBACK
+
+    @property
+    def unicast(self) -> tuple[ConnectionUrl, ...]:
+        """Its URLs that are no groups."""
+        return tuple(url for url in self.urls if url.transport is not ConnectionTransport.UDPM)
+
+    @property
+    def groups(self) -> tuple[ConnectionUrl, ...]:
+        """Its URLs that are groups."""
+        return tuple(url for url in self.urls if url.transport is ConnectionTransport.UDPM)
+
+
+def families(urls: Sequence[ConnectionUrl]) -> tuple[Family, ...]:
+    """Return the transports that a participant of these URLs has, in the order of the URLs.
+
+    Raises:
+        MiddlewareError: URLs that one participant cannot have together.
+    """
+    by_kind: dict[str, list[ConnectionUrl]] = {}
+    for url in urls:
+        by_kind.setdefault(transport_of(url), []).append(url)
+    found = tuple(
+        Family(kind=kind, urls=tuple(each), interfaces=_interfaces(each))
+        for kind, each in by_kind.items()
+    )
+    _check(found, urls)
+    return found
+
+
+def leaves_discovery_open(urls: Iterable[ConnectionUrl]) -> bool:
+    """Whether UDP URLs say nothing of where others are looked for.
+
+    Then what the environment says of that still holds (ROS_AUTOMATIC_DISCOVERY_RANGE).
+    """
+    udp = [url for url in urls if transport_of(url) in LOOPBACK]
+    return bool(udp) and not any(
+        url.peers
+        or url.server
+        or not url.multicast
+        or url.metatraffic_port
+        or url.interfaces
+        or (url.address and url.transport is not ConnectionTransport.UDPM)
+        for url in udp
+    )
+
+
+def transport_of(url: ConnectionUrl) -> str:
+    """Return the kind of transport that a URL is served by; a group's is that of its address."""
+    if url.transport is ConnectionTransport.UDPM:
+        return UDPV4 if ipaddress.ip_address(url.address).version == 4 else UDPV6
+    return str(url.transport.value)
+
+
+def _interfaces(urls: Sequence[ConnectionUrl]) -> tuple[str, ...]:
+    """Return what a transport of these URLs is bound to; empty for everything."""
+    found: dict[str, None] = {}
+    free = [url for url in urls if not _bound_to(url)]
+    bound = [url for url in urls if _bound_to(url)]
+    if free and bound and not all(url.transport is ConnectionTransport.UDPM for url in free):
+        raise MiddlewareError(
+            f"cannot use {str(free[0])!r} on all interfaces and {str(bound[0])!r} on some: one "
+            "participant has one transport for both",
+            hint="give both an address or interface=",
+        )
+    for url in bound:
+        found.update(dict.fromkeys(_bound_to(url)))
+    return tuple(found)
+
+
+def _bound_to(url: ConnectionUrl) -> tuple[str, ...]:
+    if url.interfaces:
+        return url.interfaces
+    group = url.transport is ConnectionTransport.UDPM
+    if group or not url.address or ipaddress.ip_address(url.address).is_unspecified:
+        return ()
+    return (url.address,)
+
+
+def _check(found: Sequence[Family], urls: Sequence[ConnectionUrl]) -> None:
+    for family in found:
+        for option in ("ttl", "output_port", "metatraffic_port"):
+            values = {getattr(url, option): url for url in family.urls}
+            values.pop(None, None)
+            if len(values) > 1:
+                spelt = " and ".join(repr(str(url)) for url in values.values())
+                raise MiddlewareError(
+                    f"cannot use {spelt} together: one participant has one {option}",
+                    hint="give them to different connections",
+                )
+        listening = [url for url in family.urls if url.port] if family.kind == TCPV4 else []
+        if len(listening) > 1:
+            raise MiddlewareError(
+                f"cannot listen on {str(listening[0])!r} and {str(listening[1])!r}: one "
+                "participant has one TCP port",
+                hint="give them to different connections",
+            )
+    kinds = {family.kind for family in found}
+    fixed = [url for url in urls if transport_of(url) in LOOPBACK and url.port]
+    if SHM in kinds and fixed:
+        raise MiddlewareError(
+            f"cannot use 'shm://' beside {str(fixed[0])!r}: a profile with fixed ports cannot say "
+            "where shared memory listens, so it would not",
+            hint="leave shm:// or the port out",
+        )
+    servers = [url for url in urls if url.server]
+    peers = [url for url in urls if url.peers]
+    if servers and peers:
+        raise MiddlewareError(
+            f"cannot look for peers {str(peers[0])!r} as a client of {str(servers[0])!r}: a client "
+            "of a discovery server finds nobody else",
+            hint="leave peer= or server= out",
+        )
+
+
+DISCOVERY_GROUP = {UDPV4: "239.255.0.1", UDPV6: "ff1e::ffff:efff:1"}
+"""Where Fast DDS 2.14 announces participants by multicast."""
+
+ANNOUNCED_S = 0.5
+"""A participant announces itself each so many seconds where nobody can ask it to.
+
+Over TCP Fast DDS 2.14 sends nothing while a connection or a port in it is being agreed on, and
+dials again only when there is something to send: what gets lost so comes with the next
+announcement, or with the one after it, which by default is 3 s later.
+"""
+
+_SERVER_ID_BYTE = 2
+"""`fast-discovery-server -i ID` writes ID into the third byte of its GUID prefix."""
+
+_REPLACED = (
+    "metatrafficUnicastLocatorList",
+    "metatrafficMulticastLocatorList",
+    "initialPeersList",
+    "avoid_builtin_multicast",
+    "mutation_tries",
+)
+
+
+def add_discovery(
+    builtin: ET.Element,
+    found: Sequence[Family],
+    urls: Sequence[ConnectionUrl],
+    *,
+    domain_id: int,
+    super_client: bool,
+    localhost_peers: tuple[str, ...] | None,
+) -> None:
+    """Write discovery into <builtin>, whatever that said of it.
+
+    Args:
+        builtin: of the participant's <rtps>.
+        found: the transports of the URLs.
+        urls: at least one.
+        domain_id: 0–232, for TCP's logical ports.
+        super_client: be told of everything by the discovery server, not only of what matches.
+        localhost_peers: look for others on this host and on these only; for URLs that leave
+            discovery open.
+    """
+    for tag in _REPLACED:
+        for element in builtin.findall(tag):
+            builtin.remove(element)
+    if any(url.server for url in urls):
+        _add_servers(builtin, urls, super_client=super_client)
+        _add_metatraffic(builtin, found, domain_id, multicast=False)
+    elif localhost_peers is not None:
+        peers = [Peer(address=each) for each in localhost_peers]
+        _add_metatraffic(builtin, found, domain_id, multicast=False)
+        _add_peers(builtin, found, extra=peers, loopback=True)
+    else:
+        multicast = all(url.multicast for url in urls)
+        _add_metatraffic(builtin, found, domain_id, multicast=multicast)
+        _add_peers(builtin, found, announce=multicast)
+        if not multicast:
+            _text(builtin, "avoid_builtin_multicast", "true")
+    if not all(family.udp for family in found):
+        _announce_each(builtin, ANNOUNCED_S)
+    if _all_ports_fixed(found):
+        # Else Fast DDS would take other ports for busy ones, and nobody would look there.
+        _text(builtin, "mutation_tries", "0")
+
+
+def _add_metatraffic(
+    builtin: ET.Element, found: Sequence[Family], domain_id: int, *, multicast: bool
+) -> None:
+    """Say where discovery arrives, if Fast DDS would not do as asked by itself."""
+    fixed = any(url.metatraffic_port for family in found for url in family.urls)
+    tcp_alone = all(family.kind == TCPV4 for family in found)
+    udp = any(family.udp for family in found)
+    if not (fixed or tcp_alone or (udp and not multicast)):
+        return
+    unicast = ET.SubElement(builtin, "metatrafficUnicastLocatorList")
+    for family in found:
+        if family.udp:
+            port = next((url.metatraffic_port for url in family.urls if url.metatraffic_port), None)
+            addresses = dict.fromkeys(url.address for url in family.unicast) or {"": None}
+            for address in addresses:
+                _locator(unicast, family.kind, address, port)
+        elif family.kind == TCPV4:
+            logical = participant_ports(domain_id, 0).discovery_unicast
+            for url in family.urls:
+                _tcp_locator(unicast, url.address, url.port, logical)
+    if multicast and udp:  # an empty list would be refused
+        groups = ET.SubElement(builtin, "metatrafficMulticastLocatorList")
+        for family in found:
+            if family.udp:
+                _locator(groups, family.kind, DISCOVERY_GROUP[family.kind], None)
+
+
+def _add_peers(
+    builtin: ET.Element,
+    found: Sequence[Family],
+    *,
+    extra: Sequence[Peer] = (),
+    loopback: bool = False,
+    announce: bool = False,
+) -> None:
+    searched = ET.Element("initialPeersList")
+    for family in found:
+        for peer in dict.fromkeys(peer for url in family.urls for peer in url.peers):
+            if family.kind == TCPV4:
+                _tcp_locator(searched, peer.address, peer.port, None)
+            else:
+                _locator(searched, family.kind, peer.address, peer.port)
+        if family.udp:
+            for peer in extra:
+                if _may_be(peer.address, family.kind):
+                    _locator(searched, family.kind, peer.address, None)
+            if loopback:
+                _locator(searched, family.kind, LOOPBACK[family.kind], None)
+    if len(searched):
+        if announce:
+            # Named peers replace the groups by which Fast DDS otherwise announces.
+            for family in found:
+                if family.udp:
+                    _locator(searched, family.kind, DISCOVERY_GROUP[family.kind], None)
+        builtin.append(searched)
+
+
+def _add_servers(builtin: ET.Element, urls: Sequence[ConnectionUrl], *, super_client: bool) -> None:
+    config = _child(builtin, "discovery_config")
+    for tag in ("discoveryProtocol", "discoveryServersList"):
+        for element in config.findall(tag):
+            config.remove(element)
+    _text(config, "discoveryProtocol", "SUPER_CLIENT" if super_client else "CLIENT")
+    servers = ET.SubElement(config, "discoveryServersList")
+    for url in urls:
+        for index, server in enumerate(url.server):
+            prefix = _counted(url.server_prefix, index)
+            remote = ET.SubElement(servers, "RemoteServer", prefix=prefix)
+            listened = ET.SubElement(remote, "metatrafficUnicastLocatorList")
+            if url.transport is ConnectionTransport.TCPV4:
+                # A server's logical port is its physical one.
+                _tcp_locator(listened, server.address, server.port, server.port)
+            else:
+                _locator(listened, transport_of(url), server.address, server.port)
+
+
+def _announce_each(builtin: ET.Element, period_s: float) -> None:
+    config = _child(builtin, "discovery_config")
+    if config.find("leaseAnnouncement") is None:  # the user's own profile may say it
+        period = ET.SubElement(config, "leaseAnnouncement")
+        _text(period, "nanosec", str(round(period_s * 1e9)))
+
+
+def _counted(prefix: str, index: int) -> str:
+    octets = prefix.split(".")
+    octets[_SERVER_ID_BYTE] = f"{(int(octets[_SERVER_ID_BYTE], 16) + index) & 0xFF:02x}"
+    return ".".join(octets)
+
+
+def _all_ports_fixed(found: Sequence[Family]) -> bool:
+    # Shared memory has ports of its own, which must stay free to move.
+    return all(
+        family.udp
+        and any(url.metatraffic_port for url in family.urls)
+        and family.unicast
+        and all(url.port for url in family.unicast)
+        for family in found
+    )
+
+
+def _may_be(address: str, kind: str) -> bool:
+    """Whether a peer can be reached by a family; a name may be, by any."""
+    try:
+        version = ipaddress.ip_address(address).version
+    except ValueError:
+        return True
+    return kind == f"udpv{version}"
+
 
 __all__ = [
     "DISCOVERY_GROUP",

@@ -29,7 +29,7 @@ import typing
 from pathlib import Path
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.process.libc import CLOCK_MONOTONIC, TimerSpec, libc
+from lifecycle.middleware.process.control import CLOCK_MONOTONIC, TimerSpec, libc
 
 _TFD_NONBLOCK = 0o4000
 _TFD_CLOEXEC = 0o2000000

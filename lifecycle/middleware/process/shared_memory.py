@@ -32,7 +32,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.process.libc import libc
+from lifecycle.middleware.process.control import libc
 
 _DIRECTORY = Path("/dev/shm")  # noqa: S108 - where shm_open(3) keeps them
 _FILE = re.compile(

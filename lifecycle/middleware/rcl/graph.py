@@ -14,13 +14,14 @@ import typing
 from collections.abc import Callable, Collection, Iterable, Iterator
 
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.middleware.discovery.dead_connections import give_up_dead_connections, is_used
-from lifecycle.middleware.discovery.dead_participants import (
+from lifecycle.middleware.discovery.dead_peers import (
     PROCESS_DIGITS,
+    give_up_dead_connections,
     is_of_process,
+    is_used,
     remove_participants,
 )
-from lifecycle.middleware.discovery.probe_targets import knock_for
+from lifecycle.middleware.discovery.probe import knock_for
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.rcl.graph_guard import GraphGuard
 from lifecycle.middleware.rcl.graph_queries import endpoints_of, endpoints_of_node, topic_endpoints

@@ -23,7 +23,7 @@ from lifecycle.middleware.rcl.graph_changes import on_graph_change
 if TYPE_CHECKING:
     from rclpy.node import Node
 
-    from lifecycle.middleware.services.action_client import GoalClient
+    from lifecycle.middleware.services.actions import GoalClient
 
     AnyClient: TypeAlias = Client | GoalClient
 

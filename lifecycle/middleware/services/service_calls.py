@@ -17,7 +17,7 @@ from rclpy.task import Future
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.rcl.graph import GraphObserver
-from lifecycle.middleware.rcl.spinning import Spinner
+from lifecycle.middleware.rcl.hidden_node import Spinner
 
 _FIRST_ATTEMPT_S = 0.1
 """So long a server of rmw_fastrtps waits for the client's reader before it drops its reply."""

@@ -18,7 +18,7 @@ from pathlib import Path
 import psutil
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.fastdds.url_families import Family, families
+from lifecycle.middleware.fastdds.url_profile import Family, families
 from lifecycle.network.connection_url import ConnectionTransport, ConnectionUrl
 
 _TABLES = (

@@ -16,7 +16,7 @@ from rclpy.qos import QoSProfile
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import QosProfile
-from lifecycle.node.actions.action_names import resolve_action_name
+from lifecycle.node.actions import resolve_action_name
 from lifecycle.node.author import declaring
 from lifecycle.node.author.handlers import ActionHandler
 from lifecycle.node.author.managed import Managed

@@ -6,10 +6,11 @@ It is reached as `node.lifecycle`, so that authors have every other attribute na
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import TYPE_CHECKING, Any
 
 from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.exceptions import InvalidHandle
 from rclpy.lifecycle import LifecycleState
 from rclpy.node import Node
 from rclpy.task import Future
@@ -21,11 +22,11 @@ from lifecycle.node.author import parameters
 from lifecycle.node.author.declaring import DeclaredInCode
 from lifecycle.node.author.handlers import alternatives
 from lifecycle.node.author.spec import Mode
-from lifecycle.node.author.undeclared import Undeclared
-from lifecycle.node.connections.connection_events import ConnectionEvent, ConnectionEvents
+from lifecycle.node.connections.connection_status import ConnectionEvent, ConnectionEvents
 from lifecycle.node.connections.data_layer import DataLayer
 from lifecycle.node.connections.node_interface import NodeInterface
 from lifecycle.node.connections.remote_interface import RemoteInterface
+from lifecycle.node.endpoints.making import wire_name
 from lifecycle.node.lifecycle.controller import Controller
 from lifecycle.node.lifecycle.execution import SUCCESS, Result
 from lifecycle.node.lifecycle.executor_tasks import Turns
@@ -33,13 +34,51 @@ from lifecycle.node.lifecycle.gate import Gate
 from lifecycle.node.lifecycle.machine import Change, NodeState, Outcome, RefusedError, Request
 from lifecycle.node.lifecycle.services import LifecycleServices
 from lifecycle.node.reporting import configuration
-from lifecycle.node.reporting.changes import ConfigurationChanges
+from lifecycle.node.reporting.configuration import ConfigurationChanges
 from lifecycle.node.reporting.graph_member import GraphMember
 from lifecycle.plan.model import PlannedNode
 from lifecycle.verify.observation import NodeConfiguration
 
 if TYPE_CHECKING:
     from lifecycle.node.author.node import LifecycleNode
+
+
+class Undeclared:
+    """The endpoints that the code of one node made by itself.
+
+    Args:
+        changed: told when one comes or goes.
+    """
+
+    def __init__(self, changed: Callable[[], None]) -> None:
+        self._changed = changed
+        self._made: dict[int, tuple[EndpointKind, Any]] = {}
+
+    def add(self, kind: EndpointKind, entity: Any) -> None:
+        """Note one that rclpy's factory returned; those of the data layer are sorted out later."""
+        self._made[id(entity)] = (kind, entity)
+        self._changed()
+
+    def remove(self, entity: Any) -> None:
+        """Forget one that is being destroyed."""
+        if self._made.pop(id(entity), None) is not None:
+            self._changed()
+
+    def beside(self, declared: Collection[Any]) -> tuple[tuple[EndpointKind, Any], ...]:
+        """Return (kind, rclpy object) of those that stand for nothing declared."""
+        known = {id(each) for each in declared}
+        found = []
+        for key, (kind, entity) in tuple(self._made.items()):
+            if key in known:
+                continue
+            try:
+                wire_name(entity)
+            except InvalidHandle:
+                del self._made[key]  # destroyed behind its node's back
+                continue
+            found.append((kind, entity))
+        return tuple(found)
+
 
 _WITHOUT_DATA_LAYER = (NodeState.INACTIVE_DISCONNECTED, NodeState.UNCONFIGURED, NodeState.FINALIZED)
 """A node that comes to one of these is not the one that was verified any more."""

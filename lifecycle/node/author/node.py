@@ -7,16 +7,28 @@ what they all do is put together in managed.py.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+from rclpy.callback_groups import CallbackGroup
 from rclpy.client import Client
+from rclpy.clock import Clock
 from rclpy.context import Context
 from rclpy.lifecycle import LifecycleState
 from rclpy.logging import LoggingSeverity
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
+from rclpy.service import Service
+from rclpy.subscription import Subscription
 from rclpy.task import Future
+from rclpy.time_source import TimeSource
+from rclpy.timer import Timer
 
 from lifecycle.manifest.model import EndpointKind
+from lifecycle.network.connection_url import ConnectionUrl
 from lifecycle.node.author import parameters
+from lifecycle.node.author.blocking import refuse_to_deadlock
 from lifecycle.node.author.declarations import Declarations
 from lifecycle.node.author.managed import Managed
 from lifecycle.node.author.spec import (
@@ -27,14 +39,217 @@ from lifecycle.node.author.spec import (
     ros_arguments,
     take_construction,
 )
-from lifecycle.node.connections.local_interface import LocalInterface
+from lifecycle.node.connections.connection_status import ConnectionEvent
+from lifecycle.node.connections.connections import Connection, connections_of
 from lifecycle.node.endpoints.publisher import DeclaredPublisher
-from lifecycle.node.lifecycle.gate import Gate
-from lifecycle.node.lifecycle.gated_factories import GatedFactories
+from lifecycle.node.lifecycle.gate import Gate, GatedPublisher, GatedTimer
 from lifecycle.node.lifecycle.machine import NodeState
+from lifecycle.node.reporting import configuration
+from lifecycle.verify.observation import ConnectionReport
 
 if TYPE_CHECKING:
     from rclpy.action import ActionClient
+
+
+class GatedFactories(Node):  # type: ignore[misc]  # rclpy is not typed
+    """Makes and destroys publishers, subscriptions, timers, clients and services as rclpy does."""
+
+    lifecycle: Managed
+    _gate: Gate | None = None
+    """None until rclpy has made its own publishers: those are never held back."""
+
+    def create_publisher(
+        self, msg_type: Any, topic: str, qos_profile: QoSProfile | int, **options: Any
+    ) -> Publisher:
+        """As rclpy's; what is published while the node is not active is dropped."""
+        publisher = super().create_publisher(msg_type, topic, qos_profile, **options)
+        if self._gate is not None:
+            self.lifecycle.undeclared.add(EndpointKind.PUBLISHER, publisher)
+            self._gate.add(publisher, GatedPublisher(publisher, self.get_logger().warning))
+        return publisher
+
+    def create_subscription(
+        self,
+        msg_type: Any,
+        topic: str,
+        callback: Callable[..., Any],
+        qos_profile: QoSProfile | int,
+        **options: Any,
+    ) -> Subscription:
+        """As rclpy's; messages that arrive while the node is not active are dropped."""
+        subscription = super().create_subscription(
+            msg_type, topic, callback, qos_profile, **options
+        )
+        # /clock belongs to rclpy: simulated time must pass in every state.
+        is_clock = isinstance(getattr(callback, "__self__", None), TimeSource)
+        if self._gate is not None and not is_clock:
+            self.lifecycle.undeclared.add(EndpointKind.SUBSCRIPTION, subscription)
+            self._gate.add_subscription(subscription, self.lifecycle.call_soon)
+        return subscription
+
+    def create_timer(
+        self,
+        timer_period_sec: float,
+        callback: Callable[..., Any] | None,
+        callback_group: CallbackGroup | None = None,
+        clock: Clock | None = None,
+        autostart: bool = True,
+    ) -> Timer:
+        """As rclpy's; the timer runs only while the node is active, and then starts anew."""
+        timer = super().create_timer(timer_period_sec, callback, callback_group, clock, autostart)
+        # No callback is rclpy.Rate's: a thread that sleeps must wake up.
+        if self._gate is not None and callback is not None:
+            self._gate.add(timer, GatedTimer(timer, wanted=autostart))
+        return timer
+
+    def create_client(self, srv_type: Any, srv_name: str, **options: Any) -> Client:
+        """As rclpy's, by default in a reentrant group: awaiting it in a callback is safe."""
+        if options.get("callback_group") is None:
+            options["callback_group"] = self.lifecycle.client_group
+        client = super().create_client(srv_type, srv_name, **options)
+        refuse_to_deadlock(client)
+        self.lifecycle.undeclared.add(EndpointKind.SERVICE_CLIENT, client)
+        return client
+
+    def create_service(
+        self, srv_type: Any, srv_name: str, callback: Callable[..., Any], **options: Any
+    ) -> Service:
+        """As rclpy's."""
+        service = super().create_service(srv_type, srv_name, callback, **options)
+        if self._gate is not None:
+            self.lifecycle.undeclared.add(EndpointKind.SERVICE_SERVER, service)
+        return service
+
+    def destroy_publisher(self, publisher: Publisher) -> bool:
+        """As rclpy's."""
+        self._forget(publisher)
+        return bool(super().destroy_publisher(publisher))
+
+    def destroy_subscription(self, subscription: Subscription) -> bool:
+        """As rclpy's."""
+        self._forget(subscription)
+        return bool(super().destroy_subscription(subscription))
+
+    def destroy_client(self, client: Client) -> bool:
+        """As rclpy's."""
+        self._forget(client)
+        return bool(super().destroy_client(client))
+
+    def destroy_service(self, service: Service) -> bool:
+        """As rclpy's."""
+        self._forget(service)
+        return bool(super().destroy_service(service))
+
+    def destroy_timer(self, timer: Timer) -> bool:
+        """As rclpy's."""
+        self._forget(timer)
+        return bool(super().destroy_timer(timer))
+
+    def _forget(self, entity: object) -> None:
+        if self._gate is not None:
+            self._gate.remove(entity)
+            self.lifecycle.undeclared.remove(entity)
+
+
+class LocalInterface(Node):  # type: ignore[misc]  # rclpy is not typed
+    """Makes connections and maps endpoints onto them, in callbacks from on_configure to cleanup."""
+
+    lifecycle: Managed
+
+    def connect_to(self, *urls: str | ConnectionUrl, name: str = "") -> Connection:
+        """Make a connection that endpoints can be mapped onto: a DDS participant of its own.
+
+        Args:
+            urls: its transports, `udpv4://10.77.0.1:7911?peer=10.77.0.2:7910`; at least one.
+            name: letters, digits and underscores; empty makes one up.
+
+        Returns:
+            The connection; the present one if it has these URLs.
+
+        Raises:
+            ConnectError: not a URL, not a name, in use for other URLs, or the middleware refused.
+            NotConfiguredError: not in this state.
+
+        Example:
+            >>> net = self.connect_to("udpv4://10.77.0.1:7911", name="net")
+            >>> self.map_to("video", net)
+        """
+        return self.lifecycle.interface.connect_to(name, connections_of(urls))
+
+    def map_to(self, endpoint: str, connection: Connection | str) -> Future:
+        """Map a declared endpoint onto a connection, or hand it over from where it is.
+
+        A handover makes before it breaks: an endpoint that has peers lives on both connections
+        until the new one has as many, at most 4 s; nothing is lost and nothing is delivered twice.
+        `self.publisher(name)` stays the same handle; ask for clients anew with `self.client(name)`.
+
+        Args:
+            endpoint: `video`, or `publishers/video` where another kind has the name too.
+            connection: what `connect_to` returned, or its name; "" is the node's own participant.
+
+        Returns:
+            Done once the endpoint is on the new connection alone; await it or ignore it.
+
+        Raises:
+            UnknownEndpointError: nothing, or more than one thing, is declared so.
+            UnknownConnectionError: no such connection.
+            ConnectError: it cannot be made there; where it was it still is.
+            NotConfiguredError: not in this state.
+        """
+        return self.lifecycle.interface.map_to(endpoint, connection)
+
+    def disconnect(self, connection: Connection | str) -> None:
+        """Unmake a connection; endpoints that are still mapped onto it are then mapped nowhere.
+
+        Raises:
+            UnknownConnectionError: no such connection.
+            ConnectError: it is the node's own participant.
+            NotConfiguredError: not in this state.
+        """
+        self.lifecycle.interface.disconnect(connection)
+
+    def remap(self, endpoint: str, name: str) -> None:
+        """Give a declared endpoint another topic or service name; "" gives back its own.
+
+        Raises:
+            UnknownEndpointError: nothing, or more than one thing, is declared so.
+            LifecycleError: not a name; the endpoint is as it was.
+        """
+        self.lifecycle.interface.remap(endpoint, name)
+
+    def alias(self, endpoint: str, *names: str) -> None:
+        """Give a publisher, subscription or service server these further names, and no others.
+
+        Raises:
+            UnknownEndpointError: nothing, or more than one thing, is declared so.
+            LifecycleError: not a name, or of a kind with one name only; it is as it was.
+        """
+        self.lifecycle.interface.alias(endpoint, names)
+
+    @property
+    def connections(self) -> tuple[ConnectionReport, ...]:
+        """Every connection as it is now, the node's own participant (with the empty name) first."""
+        return configuration.connection_reports(self.lifecycle.spec, self.lifecycle.data_layer)
+
+    @property
+    def mappings(self) -> tuple[tuple[str, str | None], ...]:
+        """(`publishers/video`, name of its connection) of every declared endpoint.
+
+        The name is empty for the node's own participant, None for what is mapped nowhere.
+        """
+        return tuple(
+            (each.spelling, each.connection.name if each.connection is not None else None)
+            for each in self.lifecycle.data_layer.mappings
+        )
+
+    def on_connection_event(self, callback: Callable[[ConnectionEvent], Any]) -> Callable[[], None]:
+        """Call back, sync or async, when a connection or mapping is established or lost.
+
+        Returns:
+            What ends it.
+        """
+        return self.lifecycle.connection_events.listen(callback)
+
 
 TransitionCallbackReturn = Any
 """What a callback may return: rclpy's TransitionCallbackReturn, or None for SUCCESS."""

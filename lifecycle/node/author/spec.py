@@ -11,19 +11,24 @@ import contextlib
 import contextvars
 import dataclasses
 import enum
+import importlib
+import importlib.util
 import inspect
 import re
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lifecycle.errors import LifecycleError
+from lifecycle.errors import BringUpError, LifecycleError
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import EndpointPolicy, Run, RunKind, Timeouts
+from lifecycle.node.author.handlers import nearest
 from lifecycle.plan.model import PlannedNode
 
 if TYPE_CHECKING:
     from rclpy.context import Context
+    from rclpy.node import Node
 
 
 class Mode(enum.Enum):
@@ -139,3 +144,44 @@ def ros_arguments(spec: PlannedNode) -> list[str]:
     for file in spec.parameter_files:
         words += ["--params-file", file]
     return ["--ros-args", *words] if words else []
+
+
+def load_class(reference: str) -> type[Node]:
+    """Import `package.module:Class`; the working directory is looked in, as `python -m` does.
+
+    Raises:
+        BringUpError: malformed, no such module, no such class, or not an rclpy node. What the
+            module itself raises while it is imported passes through.
+    """
+    from rclpy.node import Node
+
+    module_name, separator, class_name = reference.partition(":")
+    if not separator or not module_name or not class_name.isidentifier():
+        raise BringUpError(f"cannot read {reference!r}; write package.module:Class")
+    here = str(Path.cwd())
+    if here not in sys.path and "" not in sys.path:
+        sys.path.insert(0, here)
+    try:
+        module = importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        # A module that itself lacks one is another matter: let its traceback be seen.
+        if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
+            raise
+        raise BringUpError(
+            f"cannot import {reference!r}: no module {error.name!r}",
+            hint=f"it is looked for in {here} and in what is installed",
+        ) from error
+    found = getattr(module, class_name, None)
+    if not isinstance(found, type) or not issubclass(found, Node):
+        nodes = [
+            name
+            for name, value in vars(module).items()
+            if isinstance(value, type) and issubclass(value, Node)
+        ]
+        near = nearest(class_name, nodes)
+        what = "has no" if found is None else "has, but not as a node class,"
+        raise BringUpError(
+            f"cannot use {reference!r}: {module_name} {what} {class_name!r}",
+            hint=f"did you mean {near!r}?" if near else f"node classes there: {nodes or 'none'}",
+        )
+    return found

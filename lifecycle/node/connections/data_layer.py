@@ -17,15 +17,13 @@ from rclpy.task import Future
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import Authority, EndpointKind
-from lifecycle.node.connections.connection_events import ConnectionEvent
-from lifecycle.node.connections.connection_status import Standing
+from lifecycle.node.connections.connection_status import ConnectionEvent, Standing
 from lifecycle.node.connections.connections import ConnectError, Connection, Connections
 from lifecycle.node.endpoints.endpoint_table import EndpointTable
-from lifecycle.node.endpoints.handover import After
 from lifecycle.node.endpoints.making import Maker
 from lifecycle.node.endpoints.mapper import Mapper
 from lifecycle.node.endpoints.mapping import Mapping
-from lifecycle.node.endpoints.placing import Placer
+from lifecycle.node.endpoints.placing import After, Placer
 from lifecycle.node.endpoints.planned_places import PlannedPlaces
 from lifecycle.plan.model import ParticipantConnections, PlannedEndpoint, PlannedNode
 

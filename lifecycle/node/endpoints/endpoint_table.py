@@ -18,8 +18,7 @@ from lifecycle.node.author.handlers import alternatives
 from lifecycle.node.endpoints import endpoint_names
 from lifecycle.node.endpoints.endpoint_names import Key, UnknownEndpointError
 from lifecycle.node.endpoints.mapping import Mapping
-from lifecycle.node.endpoints.publisher import DeclaredPublisher
-from lifecycle.node.endpoints.transient_local_cache import Kept
+from lifecycle.node.endpoints.publisher import DeclaredPublisher, Kept
 from lifecycle.plan.model import PlannedEndpoint
 
 if TYPE_CHECKING:

@@ -17,8 +17,7 @@ from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware import create_publisher, create_subscription, to_rclpy
-from lifecycle.node.actions.action_names import resolve_action_name
-from lifecycle.node.actions.goals import ActionWords, Goals
+from lifecycle.node.actions import ActionWords, Goals, resolve_action_name
 from lifecycle.node.lifecycle.execution import positional_count
 from lifecycle.plan.model import PlannedEndpoint
 
@@ -243,7 +242,7 @@ class Maker:
         handler: Callable[..., Any] | None,
         name: str,
     ) -> Any:
-        from lifecycle.middleware.services.action_server import GoalServer  # late: numpy, 100 ms
+        from lifecycle.middleware.services.actions import GoalServer  # late: numpy, 100 ms
 
         assert handler is not None
         logger = self._node.get_logger()
@@ -280,7 +279,7 @@ class Maker:
         handler: Callable[..., Any] | None,  # noqa: ARG002 - it has none
         name: str,
     ) -> Any:
-        from lifecycle.middleware.services.action_client import GoalClient
+        from lifecycle.middleware.services.actions import GoalClient
         from lifecycle.node.author.blocking import refuse_to_block
 
         return self._action(

@@ -15,9 +15,8 @@ from rclpy.signals import SignalHandlerOptions
 
 from lifecycle.errors import LifecycleError
 from lifecycle.middleware import ParticipantSettings, participant_settings
-from lifecycle.node.author.loading import load_class
 from lifecycle.node.author.node import LifecycleNode
-from lifecycle.node.author.spec import Construction, Mode, constructing, ros_arguments
+from lifecycle.node.author.spec import Construction, Mode, constructing, load_class, ros_arguments
 from lifecycle.node.host.control import HostSpec
 from lifecycle.plan.command import parameter_text
 from lifecycle.plan.model import PlannedNode

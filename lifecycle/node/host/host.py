@@ -14,8 +14,7 @@ from typing import NoReturn
 
 from lifecycle import codec
 from lifecycle.manifest.model import DiscoveryRange
-from lifecycle.node.host.control import HostSpec
-from lifecycle.node.host.host_channel import HostChannel, give_up
+from lifecycle.node.host.control import HostChannel, HostSpec, give_up
 from lifecycle.node.host.preloading import preload
 
 __all__ = ["main", "preload", "serve"]

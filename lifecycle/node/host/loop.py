@@ -28,10 +28,57 @@ from rclpy.node import Node
 
 from lifecycle.middleware.discovery.rediscovery import tell_names
 from lifecycle.middleware.fastdds.participant import hidden_nodes
+from lifecycle.middleware.process.busy_timer import BusySign
 from lifecycle.middleware.process.teardown import leave_and_exit
 from lifecycle.node.author.node import LifecycleNode
-from lifecycle.node.host.watchdog import Watchdog
 from lifecycle.node.lifecycle.execution import hint
+
+
+class Watchdog:
+    """Keeps the busy sign of one executor; called in its thread only.
+
+    Args:
+        sign: this process's side.
+        on_overlong: told how many seconds a callback took that came back after all.
+    """
+
+    def __init__(self, sign: BusySign, on_overlong: Callable[[float], None]) -> None:
+        self._sign = sign
+        self._on_overlong = on_overlong
+        self._running = False
+        self._changing: set[str] = set()
+
+    def add(self, node: LifecycleNode) -> None:
+        """Leave the transitions of `node` to their own deadlines."""
+        node.lifecycle.add_listener(self._follow)
+
+    def begin(self) -> None:
+        """Note that a callback begins."""
+        self._running = True
+        if not self._changing:
+            self._sign.begin()
+
+    def end(self) -> None:
+        """Note that it has ended."""
+        self._running = False
+        self._idle()
+
+    def _follow(self, node: LifecycleNode) -> None:
+        """A transition begins or ends, inside a callback as everything does."""
+        name = node.lifecycle.full_name
+        if not node.lifecycle.state.steady:
+            self._changing.add(name)
+            self._idle()
+            return
+        self._changing.discard(name)
+        if self._running and not self._changing:
+            self._sign.begin()
+
+    def _idle(self) -> None:
+        busy_s = self._sign.end()
+        if busy_s is not None:
+            self._on_overlong(busy_s)
+
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _LEAVE_S = 2.0

@@ -7,8 +7,12 @@ live node. It is served at `~/get_configuration` and sent to a supervisor.
 from __future__ import annotations
 
 import dataclasses
+import functools
+import hashlib
 import os
-from collections.abc import Iterable
+import traceback
+from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rclpy.utilities import get_rmw_implementation_identifier
@@ -34,16 +38,14 @@ from lifecycle.network.nfe import (
 )
 from lifecycle.node.author import parameters
 from lifecycle.node.author.declaring import interface_name
-from lifecycle.node.connections import supported
 from lifecycle.node.connections.connections import Connection
 from lifecycle.node.connections.data_layer import DataLayer
 from lifecycle.node.endpoints.making import CLIENTS, wire_name
-from lifecycle.node.endpoints.mapping import Mapping
-from lifecycle.node.endpoints.matches import count_peers
+from lifecycle.node.endpoints.mapping import Mapping, count_peers
 from lifecycle.node.lifecycle.machine import NodeState
-from lifecycle.node.reporting.checksum import checksum
 from lifecycle.node.reporting.machine_id import machine_id
 from lifecycle.plan.model import PlannedNode
+from lifecycle.plan.negotiation.data_layer import PARADIGMS, SERIALIZATIONS
 from lifecycle.verify.observation import (
     ConnectionReport,
     EndpointReport,
@@ -53,6 +55,61 @@ from lifecycle.verify.observation import (
 
 if TYPE_CHECKING:
     from rclpy.node import Node
+
+    from lifecycle.node.lifecycle.gate import Later
+
+
+__all__ = ["PARADIGMS", "SERIALIZATIONS", "transports"]
+
+_CONFIGURABLE_RMW = "rmw_fastrtps_cpp"
+_SHARED_MEMORY = Path("/dev/shm")  # noqa: S108 - what Fast DDS uses
+_IPV6_ADDRESSES = Path("/proc/net/if_inet6")
+
+
+@functools.lru_cache(maxsize=1)
+def transports() -> tuple[str, ...]:
+    """Return what nodes of this process can be connected by, as connection URLs spell it.
+
+    Empty where the RMW's transports are not ours to choose: then what its endpoints' NFEs tell is
+    all that is known.
+    """
+    if get_rmw_implementation_identifier() != _CONFIGURABLE_RMW:
+        return ()
+    found = ["tcpv4", "udpm", "udpv4"]
+    if os.access(_SHARED_MEMORY, os.W_OK):
+        found.append("shm")
+    try:
+        if _IPV6_ADDRESSES.read_text(encoding="ascii").strip():
+            found.append("udpv6")
+    except OSError:
+        pass  # a kernel without IPv6
+    return tuple(sorted(found))
+
+
+_DIGITS = 16
+
+
+def checksum(configuration: NodeConfiguration) -> str:
+    """Return 16 hex digits that change exactly when a reader must read the document again.
+
+    State, matches and what follows from them (whether a connection is established) change
+    all the time and are told by events, so they do not count.
+    """
+    stable = dataclasses.replace(
+        configuration,
+        state="",
+        connected=False,
+        checksum="",
+        endpoints=tuple(
+            dataclasses.replace(each, matched=None, peers=None, server_matched=None)
+            for each in configuration.endpoints
+        ),
+        connections=tuple(
+            dataclasses.replace(each, established=False) for each in configuration.connections
+        ),
+    )
+    return hashlib.sha256(codec.to_json(stable)).hexdigest()[:_DIGITS]
+
 
 _OTHER = {
     EndpointKind.PUBLISHER: EndpointKind.SUBSCRIPTION,
@@ -93,9 +150,9 @@ def collect(
         state=state.seen.label,
         connected=state.connected,
         rmw=get_rmw_implementation_identifier(),
-        transports=supported.transports() or _transports(endpoints),
-        serializations=supported.SERIALIZATIONS,
-        paradigms=supported.PARADIGMS,
+        transports=transports() or _transports(endpoints),
+        serializations=SERIALIZATIONS,
+        paradigms=PARADIGMS,
         endpoints=endpoints,
         connections=connection_reports(spec, data_layer),
         parameters=parameters.reports(node),
@@ -261,3 +318,54 @@ def _transport(nfe: NetworkFlowEndpoint) -> str:
         return "shm"
     version = {InternetProtocol.IPV4: "v4", InternetProtocol.IPV6: "v6"}
     return f"{nfe.transport_protocol.value}{version.get(nfe.internet_protocol, '')}"
+
+
+Listener = Callable[["NodeConfiguration"], None]
+
+
+class ConfigurationChanges:
+    """The listeners of one node's configuration.
+
+    Args:
+        later: runs a function in the node's executor.
+        collect: returns the configuration as it is now.
+        failed: told with a traceback that it could not be collected; nobody is told then.
+    """
+
+    def __init__(
+        self,
+        later: Later,
+        collect: Callable[[], NodeConfiguration],
+        *,
+        failed: Callable[[str], None],
+    ) -> None:
+        self._later = later
+        self._collect = collect
+        self._failed = failed
+        self._listeners: list[Listener] = []
+        self._scheduled = False
+
+    def listen(self, listener: Listener) -> None:
+        """Call `listener` with the configuration, in the executor, after each change."""
+        self._listeners.append(listener)
+
+    def touch(self) -> None:
+        """Something of the configuration has changed, match counts included."""
+        if self._listeners and not self._scheduled:
+            self._scheduled = bool(self._later(self._tell))
+
+    def _tell(self) -> None:
+        self._scheduled = False
+        configuration = self.collect()
+        if configuration is None:
+            return
+        for listener in tuple(self._listeners):
+            listener(configuration)
+
+    def collect(self) -> NodeConfiguration | None:
+        """Return the configuration as it is now; None, and a word in the log, if that fails."""
+        try:
+            return self._collect()
+        except Exception:  # noqa: BLE001 - describing itself must not end the node
+            self._failed(traceback.format_exc())
+            return None

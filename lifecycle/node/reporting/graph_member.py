@@ -12,7 +12,7 @@ from rclpy.node import Node
 
 from lifecycle.graph.dds import DdsTransport, steady_timer
 from lifecycle.graph.reporter import GraphReporter
-from lifecycle.node.connections.connection_events import ConnectionEvent, ConnectionEventKind
+from lifecycle.node.connections.connection_status import ConnectionEvent, ConnectionEventKind
 
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup

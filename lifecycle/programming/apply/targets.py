@@ -25,7 +25,7 @@ from lifecycle.programming.apply.settings import (
     load_settings,
 )
 from lifecycle.programming.apply.tool import Tool
-from lifecycle.programming.rules.tc_settings import DEFAULT_QUEUE_MS, TcMatch, TcSettings
+from lifecycle.programming.rules.tc import DEFAULT_QUEUE_MS, TcMatch, TcSettings
 
 KINDS = (nft.KIND, tc.KIND, nef.KIND, camara.KIND)
 

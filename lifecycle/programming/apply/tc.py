@@ -33,16 +33,19 @@ from lifecycle.programming.apply.tool import (
     refused,
 )
 from lifecycle.programming.rules.rules import FlowRule, rules_digest
-from lifecycle.programming.rules.tc import render_tc, render_tc_removal
-from lifecycle.programming.rules.tc_classes import class_of
-from lifecycle.programming.rules.tc_filters import TcFilter, anchors, tc_filters
-from lifecycle.programming.rules.tc_settings import (
+from lifecycle.programming.rules.tc import (
     CLASSIFIERS,
     OWNED_HANDLE,
     QDISCS,
     TcFeatures,
+    TcFilter,
     TcMatch,
     TcSettings,
+    anchors,
+    class_of,
+    render_tc,
+    render_tc_removal,
+    tc_filters,
 )
 
 KIND = "tc"

@@ -18,8 +18,7 @@ from lifecycle.programming.rules.flows_csv import flows_to_csv
 from lifecycle.programming.rules.nef import NefSettings, render_nef
 from lifecycle.programming.rules.nftables import render_nft, render_nft_json
 from lifecycle.programming.rules.rules import RuleSet, SourceAddress, flow_rules, rules_digest
-from lifecycle.programming.rules.tc import render_tc
-from lifecycle.programming.rules.tc_settings import TcSettings
+from lifecycle.programming.rules.tc import TcSettings, render_tc
 from lifecycle.programming.rules.zenoh import render_zenoh
 from lifecycle.verify.verdict import FlowReport
 

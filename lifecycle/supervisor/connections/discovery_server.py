@@ -17,8 +17,7 @@ from lifecycle.plan.model import PlannedProcess, PlannedServer
 from lifecycle.supervisor.nodes.bring_up import died
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.process import COMMAND_ESCALATION, ManagedProcess
-from lifecycle.supervisor.processes.spawn import Spawner
-from lifecycle.supervisor.processes.states import ProcessState
+from lifecycle.supervisor.processes.spawn import ProcessState, Spawner
 from lifecycle.supervisor.run.failure import DEADLINE, START_FAILED, StepFailedError, finding_of
 from lifecycle.verify.verdict import Finding
 

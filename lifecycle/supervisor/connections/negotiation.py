@@ -7,12 +7,14 @@ to nodes and to the verifier. The rules of negotiation are lifecycle.plan's. Pur
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 
-from lifecycle.manifest.model import EndpointKind, EndpointPolicy
+from lifecycle.manifest.model import Authority, DataLayerSource, EndpointKind, EndpointPolicy
 from lifecycle.network.connection_url import ConnectionTransport, parse
+from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan import (
     DataLayerGraph,
+    NegotiatedConnection,
     NegotiationProblem,
     ParticipantConnections,
     Party,
@@ -27,10 +29,108 @@ from lifecycle.plan import (
     wishes_of,
     with_graph,
 )
-from lifecycle.plan.connections.contacts import ports_of
+from lifecycle.plan.connections.contacts import contacts_of, ports_of
+from lifecycle.plan.negotiation.data_layer import RMW_DEFAULT, TRANSPORTS, PartyEndpoint
+from lifecycle.plan.negotiation.parties import FAST_DDS, endpoint_of, transports_of
 from lifecycle.supervisor.connections.desired_state import Instructions, planned_instructions
-from lifecycle.verify.observation import EndpointReport, NodeConfiguration
-from lifecycle.verify.party import party_of
+from lifecycle.supervisor.connections.unwired import not_wired
+from lifecycle.verify.observation import (
+    ConnectionReport,
+    EndpointReport,
+    NodeConfiguration,
+    Observation,
+)
+from lifecycle.verify.verdict import Finding
+
+_OWN_FLOW = (UniqueRequirement.STRICTLY_REQUIRED, UniqueRequirement.OPTIONALLY_REQUIRED)
+
+
+def party_of(
+    configuration: NodeConfiguration,
+    host: str,
+    *,
+    planned: PlannedNode | None = None,
+    negotiated: Collection[str] = (),
+) -> Party:
+    """Return a node as a party, from what it says of itself.
+
+    What `planned` asks for an endpoint wins over the node's own hints. Endpoints that were made in
+    code take part under their resolved names.
+
+    Args:
+        configuration: as the node reports it.
+        host: its host, see `lifecycle.plan.connections.hosts`.
+        planned: the node as the manifest declares it; None if it does not.
+        negotiated: names of connections that a negotiation made before: it may unmake them. Others
+            are somebody else's, and what is mapped onto them stays there.
+    """
+    known = configuration.rmw.startswith(FAST_DDS)
+    own_urls = planned.connections.urls if planned else ()
+    own = next((each for each in configuration.connections if not each.name), None)
+    if own is not None and own.urls:
+        own_urls = own.urls
+    default = (planned.transports if planned else ()) or RMW_DEFAULT
+    others = [
+        each for each in configuration.connections if each.name and each.name not in {*negotiated}
+    ]
+    taken = {each.name for each in others}
+    if planned is not None:
+        taken |= {each.connection for each in planned.participants if each.connection}
+    return Party(
+        key=planned.key if planned else configuration.name,
+        full_name=configuration.name,
+        host=host,
+        process=str(configuration.identity.process_id),
+        transports=(configuration.transports or TRANSPORTS) if known else (),
+        own=(transports_of(own_urls) or default) if known else (),
+        connectable=known,
+        serializations=configuration.serializations,
+        paradigms=configuration.paradigms,
+        endpoints=tuple(
+            _endpoint(each, planned, others)
+            for each in configuration.endpoints
+            if each.kind.is_topic
+        ),
+        connections=tuple(sorted(taken)),
+        contacts=contacts_of(host, own_urls),
+    )
+
+
+def _endpoint(
+    report: EndpointReport, planned: PlannedNode | None, others: Collection[ConnectionReport]
+) -> PartyEndpoint:
+    declared = next(
+        (
+            each
+            for each in (planned.endpoints if planned else ())
+            if (each.kind, each.name) == (report.kind, report.name)
+        ),
+        None,
+    )
+    carrier = next((each for each in others if each.name == report.connection), None)
+    if declared is not None and planned is not None:
+        endpoint = endpoint_of(planned, declared)
+        endpoint = dataclasses.replace(
+            endpoint,
+            resolved=report.resolved or endpoint.resolved,
+            lossy=report.lossy if endpoint.lossy is None else endpoint.lossy,
+            size_bytes=report.size_bytes if endpoint.size_bytes is None else endpoint.size_bytes,
+        )
+    else:
+        endpoint = PartyEndpoint(
+            kind=report.kind,
+            name=report.name or report.resolved,
+            resolved=report.resolved,
+            type=report.type,
+            qos=report.qos,
+            alone=report.kind is EndpointKind.PUBLISHER and report.unique in _OWN_FLOW,
+            lossy=report.lossy,
+            size_bytes=report.size_bytes,
+        )
+    if carrier is None:
+        return endpoint
+    return dataclasses.replace(endpoint, by=transports_of(carrier.urls) or RMW_DEFAULT, fixed=True)
+
 
 _RMW = "RMW_IMPLEMENTATION"
 
@@ -247,3 +347,73 @@ def _label(report: EndpointReport) -> str:
 
 def _words(problem: NegotiationProblem) -> str:
     return f"{problem.message}; {problem.hint}" if problem.hint else problem.message
+
+
+def is_negotiated(plan: Plan) -> bool:
+    """Whether a plan's connections are decided from what its nodes report while they run."""
+    layer = plan.data_layer
+    return layer.authority is Authority.SUPERVISOR and layer.source is DataLayerSource.DYNAMIC
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Expectation:
+    """What must be, as far as an onlooker can know.
+
+    Attributes:
+        plan: with the connections and the endpoints made in code that must be seen now.
+        findings: pairs of declared nodes that nothing can connect.
+    """
+
+    plan: Plan
+    findings: tuple[Finding, ...] = ()
+
+    @classmethod
+    def of(cls, plan: Plan, observation: Observation) -> Expectation:
+        """Negotiate again from what was seen; what is not negotiated is expected as it is planned.
+
+        A connection that no negotiation would have made, because somebody else called connect_to,
+        is not expected, and what is mapped onto it is mapped wrongly. The URLs of one that fits
+        are not judged: only its authority knows which ports it gave out.
+        """
+        if not is_negotiated(plan):
+            return cls(plan=plan)
+        known = {each.name: each for each in observation.configurations}
+        source = _negotiated_again(plan, known)
+        return cls(
+            plan=source.expected,
+            findings=tuple(not_wired(plan.system, each) for each in source.problems),
+        )
+
+
+def _negotiated_again(plan: Plan, known: Mapping[str, NodeConfiguration]) -> NegotiatedSource:
+    """Find those of the reported connections that a negotiation comes to, and what it comes to.
+
+    It begins with all of them, and each round leaves out those that nobody would have made; an
+    endpoint on one of these stays there, which may make another superfluous.
+    """
+    before = DataLayerGraph(connections=tuple(_reported(plan, known)))
+    while True:
+        source = NegotiatedSource(plan, before=before)
+        source.instructions(known)
+        made = {(each.node, each.name) for each in source.graph.connections}
+        stays = tuple(each for each in before.connections if (each.node, each.name) in made)
+        if stays == before.connections:
+            return source
+        before = DataLayerGraph(connections=stays)
+
+
+def _reported(plan: Plan, known: Mapping[str, NodeConfiguration]) -> Iterator[NegotiatedConnection]:
+    """Yield the connections that nodes have and no manifest declares."""
+    planned = {each.full_name: each for each in plan.nodes}
+    for name, configuration in known.items():
+        node = planned.get(name)
+        declared = {each.connection for each in node.participants} if node else set()
+        for each in configuration.connections:
+            if each.name and not each.error and each.name not in declared:
+                yield NegotiatedConnection(
+                    node=node.key if node else name,
+                    name=each.name,
+                    urls=each.urls,
+                    map=tuple(sorted(each.mappings)),
+                    reason="",
+                )

@@ -22,9 +22,8 @@ from lifecycle.graph.waiting import set_within
 from lifecycle.plan.model import Plan
 from lifecycle.run_directory import LEDGER_NAME, RunDirectory
 from lifecycle.supervisor.run.events import Emitter, Event, Notice, VerdictChanged
-from lifecycle.supervisor.run.failure import NOT_PROGRAMMED, StepFailedError
+from lifecycle.supervisor.run.failure import NOT_PROGRAMMED, StepFailedError, Worker, ended
 from lifecycle.supervisor.run.options import UpOptions
-from lifecycle.supervisor.run.tasks import Worker, ended
 from lifecycle.verify.verdict import FlowReport, Verdict
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ import dataclasses
 
 from lifecycle.manifest.model import RunKind, UniqueHow
 from lifecycle.supervisor.nodes.system import NodeRun, System
-from lifecycle.supervisor.processes.states import ProcessState
+from lifecycle.supervisor.processes.spawn import ProcessState
 from lifecycle.supervisor.run.events import Reach
 from lifecycle.verify import not_ok
 from lifecycle.verify.observation import ConnectionReport

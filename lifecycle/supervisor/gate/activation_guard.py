@@ -18,7 +18,7 @@ from lifecycle.plan.model import Plan
 from lifecycle.supervisor.nodes.driver import ACTIVE
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.run.events import Notice, Reach
-from lifecycle.supervisor.run.tasks import ended
+from lifecycle.supervisor.run.failure import ended
 from lifecycle.verify.observation import Observation
 from lifecycle.verify.rules.state import ACTIVATED_AT_CLOSED_GATE
 from lifecycle.verify.verdict import Finding, Outcome

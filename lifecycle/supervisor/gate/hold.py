@@ -20,9 +20,9 @@ from lifecycle.supervisor.control.orders import (
     NotBegunError,
     Order,
     Pending,
+    Revisions,
     check_order,
 )
-from lifecycle.supervisor.control.revision import Revisions
 from lifecycle.supervisor.gate.gate import VerificationError
 from lifecycle.supervisor.gate.sequence import GateSequence
 from lifecycle.supervisor.gate.verification_loop import Changes, VerificationLoop
@@ -30,8 +30,7 @@ from lifecycle.supervisor.gate.watch import Watch
 from lifecycle.supervisor.health.process_monitor import ProcessMonitor
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.run.events import Emitter, Notice
-from lifecycle.supervisor.run.failure import StepFailedError
-from lifecycle.supervisor.run.tasks import ended
+from lifecycle.supervisor.run.failure import StepFailedError, ended
 from lifecycle.verify.verdict import Stage
 
 

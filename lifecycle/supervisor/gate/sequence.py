@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Callable, Coroutine, Iterable
+from collections import Counter
+from collections.abc import Callable, Collection, Coroutine, Iterable, Mapping
 from typing import Any
 
 from lifecycle.errors import BringUpError
@@ -24,20 +25,59 @@ from lifecycle.supervisor.control.orders import (
     OrderKind,
     node_of,
 )
-from lifecycle.supervisor.gate.first_contact import TRIES, UNCHANGED_S, undiscovered
 from lifecycle.supervisor.gate.gate import Gate, Permit, VerificationError, behind_s, closes
 from lifecycle.supervisor.gate.verification_loop import VerificationLoop
 from lifecycle.supervisor.nodes.bring_up import BringUp
 from lifecycle.supervisor.nodes.system import NodeRun, System
-from lifecycle.supervisor.processes.spawn import Spawner
-from lifecycle.supervisor.processes.states import ProcessState
+from lifecycle.supervisor.processes.spawn import ProcessState, Spawner
 from lifecycle.supervisor.run.events import Emitter, GateOpened, Notice, Reach, SystemReached
-from lifecycle.supervisor.run.failure import START_FAILED, StepFailedError
+from lifecycle.supervisor.run.failure import START_FAILED, StepFailedError, together
 from lifecycle.supervisor.run.shutdown import TakeDown
-from lifecycle.supervisor.run.tasks import together
 from lifecycle.verify import not_ok
-from lifecycle.verify.missing import taken_on_trust
-from lifecycle.verify.verdict import Stage, Verdict
+from lifecycle.verify.judge import taken_on_trust
+from lifecycle.verify.rules import About, rule
+from lifecycle.verify.rules.nodes import MISSING_NODE
+from lifecycle.verify.verdict import Outcome, Stage, Verdict
+
+UNCHANGED_S = 5.0
+"""Who is discovered at all over TCP is after 0.1–1.6 s, on a machine with both processors busy
+after 1–4 s; findings that have not changed for so long do not change any more."""
+
+TRIES = 3
+"""So many nodes are started again before a gate at most: each takes 1–5 s of the bring-up."""
+
+
+def undiscovered(
+    verdict: Verdict, restartable: Collection[str], tries: Mapping[str, int]
+) -> str | None:
+    """Return the full name of the node to start again; None where that would mend nothing.
+
+    Of two ends that do not match either may be the one that is not heard: it is who lacks most,
+    then who was started again least often, then the last by name.
+
+    Args:
+        verdict: that keeps the gate closed.
+        restartable: full names of nodes that get fresh ports when they are started again, and whose
+            process is ours and holds no active node.
+        tries: how often each was started again before.
+    """
+    violated = [each for each in verdict.findings if each.outcome is Outcome.VIOLATED]
+    if not all(rule(each.rule).if_unheard for each in violated):
+        return None
+    missing = [each for each in violated if each.rule == MISSING_NODE.id]
+    # Who is not there yet, or not so far, keeps others waiting that nothing is wrong with.
+    coming = (each for each in violated if rule(each.rule).about is About.PROGRESS)
+    awaited = {each.node for each in (*missing, *coming)}
+    unmatched = (each for each in violated if rule(each.rule).about is About.MATCH)
+    pairs = (each.ends for each in unmatched if awaited.isdisjoint(each.ends))
+    lacks = Counter(
+        name
+        for names in (*pairs, *((each.node,) for each in missing))
+        for name in names
+        if name in restartable
+    )
+    return max(lacks, key=lambda name: (lacks[name], -tries.get(name, 0), name), default=None)
+
 
 Alive = Callable[[Coroutine[Any, Any, object]], Coroutine[Any, Any, None]]
 """Runs a step; the unexpected end of any process ends it."""

@@ -10,8 +10,8 @@ import asyncio
 from lifecycle.supervisor.gate.verification_loop import SETTLED_S, Changes, VerificationLoop
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.process import ManagedProcess
-from lifecycle.supervisor.processes.states import ProcessState
-from lifecycle.verify.missing import not_ok
+from lifecycle.supervisor.processes.spawn import ProcessState
+from lifecycle.verify.judge import not_ok
 from lifecycle.verify.verdict import Outcome, Stage
 
 

@@ -20,7 +20,7 @@ from lifecycle.supervisor.health.liveliness import Cause
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.supervisor.run.events import MachineConnection
-from lifecycle.supervisor.run.tasks import ended
+from lifecycle.supervisor.run.failure import ended
 
 CALL_EACH_S = 0.25
 """While somebody is missing."""

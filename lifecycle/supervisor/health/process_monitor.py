@@ -13,8 +13,7 @@ from lifecycle.supervisor.gate.watch import first_death
 from lifecycle.supervisor.nodes.bring_up import ALSO_S, died
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.process import ManagedProcess
-from lifecycle.supervisor.run.failure import StepFailedError
-from lifecycle.supervisor.run.tasks import ended
+from lifecycle.supervisor.run.failure import StepFailedError, ended
 
 _SPEAK_S = 0.7 + ALSO_S
 """A step notices its node's death itself within this, and knows what the node was doing."""

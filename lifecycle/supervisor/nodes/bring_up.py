@@ -27,8 +27,7 @@ from lifecycle.supervisor.processes.control_channel import (
     HostFailedError,
 )
 from lifecycle.supervisor.processes.process import ManagedProcess
-from lifecycle.supervisor.processes.spawn import Spawner
-from lifecycle.supervisor.processes.states import ProcessState
+from lifecycle.supervisor.processes.spawn import ProcessState, Spawner
 from lifecycle.supervisor.run.events import Reach
 from lifecycle.supervisor.run.failure import (
     DEADLINE,
@@ -37,8 +36,8 @@ from lifecycle.supervisor.run.failure import (
     START_FAILED,
     TRANSITION_FAILED,
     StepFailedError,
+    ended,
 )
-from lifecycle.supervisor.run.tasks import ended
 
 T = TypeVar("T")
 

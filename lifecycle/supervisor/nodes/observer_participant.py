@@ -152,7 +152,7 @@ class ObserverParticipant:
 
     def send_again_soon(self) -> None:
         """Have what waits for a link to come back be sent soon when it does."""
-        from lifecycle.middleware.discovery.retransmission import send_again_soon
+        from lifecycle.middleware.discovery.rediscovery import send_again_soon
 
         send_again_soon()
 
@@ -187,7 +187,7 @@ class ObserverParticipant:
 
     def prepare_to_leave(self) -> None:
         """Let go of connections that nobody answers: whatever is sent would wait for their ends."""
-        from lifecycle.middleware.discovery.dead_connections import give_up_dead_connections
+        from lifecycle.middleware.discovery.dead_peers import give_up_dead_connections
 
         give_up_dead_connections()
 

@@ -1,7 +1,7 @@
 """Takes dead processes out of the ROS graph at once, before the DDS lease of their nodes ends.
 
 Owns: `StaleNodes`: which participants were a process's, and when everybody is made to forget them.
-How is lifecycle.middleware.discovery.dead_participants'. Must not import rclpy.
+How is lifecycle.middleware.discovery.dead_peers'. Must not import rclpy.
 """
 
 from __future__ import annotations
@@ -10,9 +10,11 @@ import asyncio
 from collections.abc import Iterable
 from typing import Protocol
 
+from lifecycle.supervisor.gate.verification_loop import Changes
+from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.processes.process import ManagedProcess
-from lifecycle.supervisor.processes.states import ProcessState
+from lifecycle.supervisor.processes.spawn import ProcessState
 from lifecycle.supervisor.run.events import Event, ProcessChanged
 
 AGAIN_S = (0.1, 0.5, 1.0, 2.0, 4.0)
@@ -105,3 +107,40 @@ def _reported(node: NodeRun) -> Iterable[str]:
     yield configuration.identity.node_id.rpartition("@")[2]
     for each in configuration.endpoints:
         yield each.gid[:_PREFIX_DIGITS]
+
+
+_LEASE_S = 21.0
+"""Fast DDS forgets a participant that left without a word after 20 s, by default."""
+
+
+class Sightings:
+    """Who is in the graph of one system, as an event to wait for."""
+
+    def __init__(
+        self, system: System, observer_participant: ObserverParticipant, changes: Changes
+    ) -> None:
+        self._system = system
+        self._observer_participant = observer_participant
+        self._changes = changes
+
+    async def appears(self, name: str) -> None:
+        """Wait until discovery shows a node of this name; the caller sets the limit."""
+        while True:
+            count = self._changes.count
+            if await self._is_there(name):
+                return
+            await self._changes.beyond(count, None)
+
+    async def vanishes(self, name: str) -> None:
+        """Wait until discovery shows no node of this name, or its lease must have run out."""
+        loop = asyncio.get_running_loop()
+        deadline = loop.time() + _LEASE_S
+        while (left_s := deadline - loop.time()) > 0:
+            count = self._changes.count
+            if not await self._is_there(name):
+                return
+            await self._changes.beyond(count, left_s)
+
+    async def _is_there(self, name: str) -> bool:
+        observation = await self._observer_participant.observe(self._system.plan)
+        return any(each.full_name == name for each in observation.nodes)

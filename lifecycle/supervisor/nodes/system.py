@@ -24,7 +24,7 @@ from lifecycle.supervisor.nodes.driver import NodeDriver, Standing
 from lifecycle.supervisor.nodes.remote_nodes import RemoteNode
 from lifecycle.supervisor.processes.logs import LogDirectory
 from lifecycle.supervisor.processes.process import ManagedProcess
-from lifecycle.supervisor.processes.states import ProcessState
+from lifecycle.supervisor.processes.spawn import ProcessState
 from lifecycle.supervisor.run.events import Emitter, NodeChanged, Notice, Reach, RequestSent
 from lifecycle.verify.observation import NodeConfiguration, Observation
 

@@ -27,8 +27,7 @@ from lifecycle.supervisor.processes.fork_server_protocol import (
     Report,
 )
 from lifecycle.supervisor.processes.orphans import children, descendants
-from lifecycle.supervisor.processes.spawn import SpawnRequest
-from lifecycle.supervisor.processes.states import ProcessExit
+from lifecycle.supervisor.processes.spawn import ProcessExit, SpawnRequest
 from lifecycle.supervisor.run.events import Emitter, Notice
 
 _STATUS_WAIT_S = 1.0

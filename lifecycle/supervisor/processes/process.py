@@ -15,8 +15,14 @@ from collections.abc import Callable, Sequence
 from lifecycle.plan.model import PlannedProcess
 from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.supervisor.processes.logs import LineReader, LogDirectory, ProcessLog
-from lifecycle.supervisor.processes.spawn import Child, Spawner, SpawnRequest
-from lifecycle.supervisor.processes.states import ProcessExit, ProcessState, change
+from lifecycle.supervisor.processes.spawn import (
+    Child,
+    ProcessExit,
+    ProcessState,
+    Spawner,
+    SpawnRequest,
+    change,
+)
 from lifecycle.supervisor.run.events import Emitter, LogLine, ProcessChanged
 
 Escalation = Sequence[tuple[int, float]]

@@ -14,15 +14,14 @@ from collections.abc import Callable
 
 from lifecycle.errors import UsageError
 from lifecycle.manifest.model import EndpointPolicy
-from lifecycle.middleware.discovery.probe_targets import peers_environment
+from lifecycle.middleware.discovery.probe import peers_environment
 from lifecycle.plan.connections.contacts import reached_hosts
 from lifecycle.plan.model import Plan
 from lifecycle.run_directory import run_name, runtime_root
-from lifecycle.supervisor.connections.renegotiation import Expectation, is_negotiated
+from lifecycle.supervisor.connections.negotiation import Expectation, is_negotiated
 from lifecycle.supervisor.control.client import look, running
 from lifecycle.supervisor.gate.gate import closes
-from lifecycle.supervisor.gate.grace_period import GracePeriod
-from lifecycle.supervisor.gate.verification_loop import with_findings
+from lifecycle.supervisor.gate.verification_loop import GracePeriod, with_findings
 from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 from lifecycle.supervisor.run.options import onlooker_connections, own_machines
 from lifecycle.verify import verify

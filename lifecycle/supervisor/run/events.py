@@ -14,8 +14,8 @@ from typing import ClassVar, Union
 
 from lifecycle.codec import to_plain
 from lifecycle.node.host.control import Operation
-from lifecycle.supervisor.processes.states import ProcessState
-from lifecycle.verify.report.json_document import plain_findings
+from lifecycle.supervisor.processes.spawn import ProcessState
+from lifecycle.verify.report import plain_findings
 from lifecycle.verify.verdict import Stage, Verdict
 
 

@@ -7,19 +7,38 @@ is export's. Must not import rclpy.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Iterator, Mapping
+import contextlib
+import dataclasses
+import logging
+import os
+from collections.abc import Awaitable, Callable, Collection, Iterator, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
 
+from lifecycle.errors import MiddlewareError
+from lifecycle.export.captured import CapturedParameter, CapturedSystem, capture
 from lifecycle.export.picture import Picture, Supervised, build_picture
+from lifecycle.graph.waiting import set_within
+from lifecycle.manifest.model import DiscoveryRange
 from lifecycle.plan.model import Plan
 from lifecycle.run_directory import is_held, run_name, runtime_root
 from lifecycle.supervisor.control.client import look
 from lifecycle.supervisor.control.server import Look, follow
 from lifecycle.supervisor.control.status import SystemStatus
-from lifecycle.supervisor.processes.states import ProcessState
+from lifecycle.supervisor.processes.spawn import ProcessState
 from lifecycle.supervisor.run.attach import Seen, following, judge_running
 from lifecycle.supervisor.run.events import Reach
 from lifecycle.verify import Stage, verify
+from lifecycle.verify.noise import known_node
+from lifecycle.verify.observation import (
+    NodeConfiguration,
+    Observation,
+    ObservedEndpoint,
+    ObservedNode,
+)
+
+if TYPE_CHECKING:
+    from lifecycle.middleware import GraphObserver, NodeClients
 
 
 def supervisor_of(environment: Mapping[str, str], plan: Plan, machine: str) -> Path | None:
@@ -97,3 +116,146 @@ def _supervised(status: SystemStatus) -> dict[str, Supervised]:
         )
         for each in status.nodes
     }
+
+
+T = TypeVar("T")
+
+_logger = logging.getLogger(__name__)
+_QUIET_S = 0.5
+"""Discovery has settled once nothing changed for so long and everything has a node."""
+
+_ASK_S = 2.0
+"""A node that answers at all answers within milliseconds."""
+
+Snapshot = tuple[tuple[ObservedNode, ...], tuple[ObservedEndpoint, ...]]
+
+
+def capture_running(
+    *,
+    system: str,
+    domain_id: int,
+    discovery_range: DiscoveryRange,
+    namespaces: tuple[str, ...] = (),
+    wait_s: float,
+) -> CapturedSystem:
+    """Return what runs in a domain now.
+
+    Args:
+        system: name to give it.
+        domain_id: 0–232.
+        discovery_range: how far to look.
+        namespaces: take only nodes in or below one of these; empty takes all.
+        wait_s: seconds, > 0, that discovery may take to settle.
+
+    Raises:
+        MiddlewareError: no participant can be made.
+    """
+    from lifecycle.middleware import GraphObserver, NodeClients
+
+    os.environ["ROS_DOMAIN_ID"] = str(domain_id)
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = discovery_range.name
+    with GraphObserver(domain_id) as graph:
+        clients = NodeClients(graph)
+        try:
+            observation, parameters, unsettled = asyncio.run(_look(graph, clients, wait_s))
+        finally:
+            clients.destroy()
+    return capture(
+        observation,
+        parameters,
+        system=system,
+        domain_id=domain_id,
+        discovery_range=discovery_range,
+        namespaces=namespaces,
+        unsettled=unsettled,
+    )
+
+
+_Parameters = dict[str, "tuple[CapturedParameter, ...] | None"]
+
+
+async def _look(
+    graph: GraphObserver, clients: NodeClients, wait_s: float
+) -> tuple[Observation, _Parameters, str]:
+    (nodes, endpoints), unsettled = await _settled(graph, wait_s)
+    serving = {
+        node.full_name
+        for node in nodes
+        if graph.offers(node.full_name, f"{node.full_name}/list_parameters")
+    }
+    answers = await asyncio.gather(
+        *(_ask(clients, node, parameters=node.full_name in serving) for node in nodes)
+    )
+    observation = Observation(
+        nodes=tuple(node for node, _, _ in answers),
+        endpoints=endpoints,
+        configurations=tuple(each for _, each, _ in answers if each is not None),
+    )
+    told = {
+        node.full_name: parameters for node, _, parameters in answers if node.full_name in serving
+    }
+    return observation, told, unsettled
+
+
+async def _settled(graph: GraphObserver, wait_s: float) -> tuple[Snapshot, str]:
+    """Wait until the graph stands still; return it, and what it still lacked in the end."""
+    loop = asyncio.get_running_loop()
+    deadline = loop.time() + wait_s
+    changed = asyncio.Event()
+
+    def wake() -> None:
+        with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
+            loop.call_soon_threadsafe(changed.set)
+
+    remove = graph.on_change(wake)
+    try:
+        while True:
+            changed.clear()
+            snapshot = graph.snapshot()
+            pending = _pending(snapshot, settling_s=graph.settling_s())
+            left_s = deadline - loop.time()
+            if left_s <= 0:
+                what = ", ".join(pending) or "it still changed"
+                return snapshot, f"discovery had not settled after {wait_s:g} s: {what}"
+            stirred = await set_within(changed, min(_QUIET_S, left_s))
+            if not stirred and not pending and left_s >= _QUIET_S:
+                return snapshot, ""
+    finally:
+        remove()
+
+
+def _pending(snapshot: Snapshot, *, settling_s: float) -> Collection[str]:
+    """Say what discovery still has to tell."""
+    _, endpoints = snapshot
+    pending = dict.fromkeys(
+        f"nobody tells whose {each.name} is" for each in endpoints if not known_node(each.node)
+    )
+    if settling_s > 0:
+        pending["a participant answered whose node is not known"] = None
+    return tuple(pending)
+
+
+async def _ask(
+    clients: NodeClients, node: ObservedNode, *, parameters: bool
+) -> tuple[ObservedNode, NodeConfiguration | None, tuple[CapturedParameter, ...] | None]:
+    """Ask a node for its state, its configuration and its parameters, all at once."""
+    name = node.full_name
+    state, configuration, told = await asyncio.gather(
+        _or_none(clients.get_state(name, timeout_s=_ASK_S)) if node.managed else _nothing(),
+        _or_none(clients.get_configuration(name, timeout_s=_ASK_S)),
+        _or_none(clients.get_parameters(name, timeout_s=_ASK_S)) if parameters else _nothing(),
+    )
+    return dataclasses.replace(node, state=state), configuration, told
+
+
+async def _or_none(asked: Awaitable[T]) -> T | None:
+    """Return an answer; None where there is none, which becomes a gap."""
+    try:
+        return await asked
+    except MiddlewareError as error:
+        _logger.info("not told: %s", error)
+        return None
+
+
+async def _nothing() -> None:
+    return None

@@ -16,7 +16,7 @@ from lifecycle.run_directory import ChildRecord, RunDirectory, start_ticks
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.orphans import Family
 from lifecycle.supervisor.run.events import Emitter, Notice
-from lifecycle.supervisor.run.tasks import Worker
+from lifecycle.supervisor.run.failure import Worker
 
 _AGAIN_S = 2.0
 """How often a record is tried that could not be written."""

@@ -19,8 +19,7 @@ from lifecycle.run_directory import RunDirectory
 from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.connections.authority import authority_of
 from lifecycle.supervisor.connections.networks import Networks
-from lifecycle.supervisor.control.orders import ACTIVE, HELD, PAUSED
-from lifecycle.supervisor.control.revision import Revisions
+from lifecycle.supervisor.control.orders import ACTIVE, HELD, PAUSED, Revisions
 from lifecycle.supervisor.control.server import ControlServer, Look
 from lifecycle.supervisor.control.status import SystemStatus, system_status
 from lifecycle.supervisor.gate.activation_guard import ActivationGuard
@@ -31,11 +30,10 @@ from lifecycle.supervisor.gate.verification_loop import Changes, VerificationLoo
 from lifecycle.supervisor.health.agreement import Agreement
 from lifecycle.supervisor.health.peer_supervisors import PeerSupervisors
 from lifecycle.supervisor.health.process_monitor import ProcessMonitor
-from lifecycle.supervisor.nodes.appearance import Sightings
 from lifecycle.supervisor.nodes.bring_up import BringUp
 from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 from lifecycle.supervisor.nodes.remote_nodes import RemoteNodes
-from lifecycle.supervisor.nodes.stale_nodes import StaleNodes
+from lifecycle.supervisor.nodes.stale_nodes import Sightings, StaleNodes
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.fork_server import ForkServer
 from lifecycle.supervisor.processes.orphans import end_strays, reap_adopted
@@ -47,13 +45,12 @@ from lifecycle.supervisor.run.events import (
     Stopping,
     SystemReached,
 )
-from lifecycle.supervisor.run.failure import StepFailedError, with_failure
+from lifecycle.supervisor.run.failure import StepFailedError, Worker, ended, with_failure
 from lifecycle.supervisor.run.options import Until, UpOptions, UpResult
 from lifecycle.supervisor.run.records import Records
 from lifecycle.supervisor.run.shutdown import TakeDown
 from lifecycle.supervisor.run.signals import ENDED_BY, Ending
-from lifecycle.supervisor.run.tasks import Worker, ended
-from lifecycle.verify.missing import missing, not_ok
+from lifecycle.verify.judge import missing, not_ok
 from lifecycle.verify.verdict import NOT_JUDGED, Outcome, RunEnd, Stage, Verdict
 
 _GLANCE_S = 1.0

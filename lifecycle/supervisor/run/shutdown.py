@@ -23,7 +23,7 @@ from lifecycle.supervisor.processes.process import (
     STUCK_ESCALATION,
     ManagedProcess,
 )
-from lifecycle.supervisor.processes.states import ProcessState
+from lifecycle.supervisor.processes.spawn import ProcessState
 from lifecycle.supervisor.run.events import Emitter, Notice, Reach, WiringChanged
 
 _UNDO = {

@@ -15,7 +15,7 @@ from collections.abc import Awaitable, Callable, Collection, Iterable, Iterator,
 
 from lifecycle.errors import ExitCode, LifecycleError
 from lifecycle.manifest.model import Authority, DataLayerSource, EndpointPolicy, RunKind
-from lifecycle.middleware.discovery.probe_targets import discovery_peers, peers_environment
+from lifecycle.middleware.discovery.probe import discovery_peers, peers_environment
 from lifecycle.middleware.fastdds.profiles import discovery_environment
 from lifecycle.middleware.process.control import adopt_orphans, check_threads, exit_after
 from lifecycle.middleware.process.shared_memory import check_room, sweep
@@ -39,7 +39,7 @@ from lifecycle.supervisor.processes.fork_server import ForkServer, ForkServerPro
 from lifecycle.supervisor.processes.logs import check_log_root, log_directory
 from lifecycle.supervisor.processes.orphans import end_run
 from lifecycle.supervisor.run.events import Emitter, Event, Listener, Notice, RunStarted
-from lifecycle.supervisor.run.failure import StepFailedError, never_connected, with_failure
+from lifecycle.supervisor.run.failure import StepFailedError, Worker, never_connected, with_failure
 from lifecycle.supervisor.run.options import (
     UpOptions,
     UpResult,
@@ -50,7 +50,6 @@ from lifecycle.supervisor.run.options import (
 from lifecycle.supervisor.run.records import Records, noting
 from lifecycle.supervisor.run.session import Session
 from lifecycle.supervisor.run.signals import Ending
-from lifecycle.supervisor.run.tasks import Worker
 from lifecycle.verify.verdict import NOT_JUDGED
 
 LEAVE_S = 10.0

@@ -21,10 +21,10 @@ from lifecycle import LifecycleNode, codec, on_message, on_service
 from lifecycle.manifest.model import Authority
 from lifecycle.manifest.qos import Durability
 from lifecycle.network.nfe import TransportProtocol, UniqueRequirement
-from lifecycle.node.connections.connection_events import ConnectionEvent, ConnectionEventKind
+from lifecycle.node.connections.connection_status import ConnectionEvent, ConnectionEventKind
 from lifecycle.node.connections.connections import ConnectError, UnknownConnectionError
 from lifecycle.node.connections.node_interface import NotConfiguredError
-from lifecycle.node.endpoints import handover
+from lifecycle.node.endpoints import placing
 from lifecycle.node.endpoints.endpoint_names import UnknownEndpointError
 from lifecycle.plan.model import ParticipantConnections, PlannedParticipant
 from lifecycle.verify.observation import NodeConfiguration
@@ -81,7 +81,7 @@ def build(driver: Driver, context: rclpy.Context) -> Build:
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """A client that is handed over has no peers that could end its patience."""
-    monkeypatch.setattr(handover, "PATIENCE_S", 0.1)
+    monkeypatch.setattr(placing, "PATIENCE_S", 0.1)
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from planning import built_with, planned, server
 from std_srvs.srv import Trigger
 
 from lifecycle import LifecycleNode, on_service
-from lifecycle.node.endpoints.handover import PATIENCE_S, SETTLE_S, Handover, Overlap
+from lifecycle.node.endpoints.placing import PATIENCE_S, SETTLE_S, Handover, Overlap
 
 
 class Clock:

@@ -9,7 +9,7 @@ from rclpy.serialization import deserialize_message
 from std_msgs.msg import Header, String
 
 from lifecycle.manifest.qos import Durability, History, QosProfile
-from lifecycle.node.endpoints.transient_local_cache import Kept
+from lifecycle.node.endpoints.publisher import Kept
 
 
 class FakePublisher:

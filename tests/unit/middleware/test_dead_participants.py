@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 import struct
 
-from lifecycle.middleware.discovery.dead_participants import (
+from lifecycle.middleware.discovery.dead_peers import (
     disposal,
     is_of_process,
     remove_participants,

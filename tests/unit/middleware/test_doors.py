@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.middleware.discovery.probe_targets import chosen_otherwise, knock_for
+from lifecycle.middleware.discovery.probe import chosen_otherwise, knock_for
 from lifecycle.network.connection_url import parse
 
 _WAIT_S = 5.0

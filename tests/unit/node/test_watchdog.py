@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from lifecycle.node.host.watchdog import Watchdog
+from lifecycle.node.host.loop import Watchdog
 from lifecycle.node.lifecycle.machine import NodeState
 
 

@@ -39,9 +39,8 @@ from lifecycle.plan import (
     wishes_of,
 )
 from lifecycle.supervisor.connections.desired_state import Wired, planned_instructions, steps
-from lifecycle.supervisor.connections.negotiation import NegotiatedSource
+from lifecycle.supervisor.connections.negotiation import NegotiatedSource, party_of
 from lifecycle.verify.observation import EndpointReport, Identity, NodeConfiguration
-from lifecycle.verify.party import party_of
 from tests.unit.plan.samples import at, link, manifest, need, node, planned, publisher, subscription
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION

@@ -15,7 +15,7 @@ from lifecycle.supervisor.gate.gate import Gate, Permit, VerificationError
 from lifecycle.supervisor.gate.verification_loop import Changes, VerificationLoop
 from lifecycle.supervisor.health.process_monitor import ProcessMonitor
 from lifecycle.supervisor.nodes.bring_up import ALSO_S
-from lifecycle.supervisor.processes.states import ProcessExit, ProcessState
+from lifecycle.supervisor.processes.spawn import ProcessExit, ProcessState
 from lifecycle.supervisor.run.events import Notice, ProcessChanged, Reach, RequestSent
 from lifecycle.supervisor.run.failure import StepFailedError, with_failure
 from lifecycle.supervisor.run.shutdown import TakeDown

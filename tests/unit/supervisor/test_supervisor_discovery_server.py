@@ -16,7 +16,7 @@ from lifecycle.plan.model import ParticipantConnections, Plan, PlannedServer
 from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.gate.watch import first_death
 from lifecycle.supervisor.nodes.system import System
-from lifecycle.supervisor.processes.states import ProcessExit, ProcessState
+from lifecycle.supervisor.processes.spawn import ProcessExit, ProcessState
 from lifecycle.supervisor.run.failure import StepFailedError
 from lifecycle.supervisor.run.options import observer_connections, onlooker_connections
 from tests.unit.supervisor.fakes import FakeSpawner, World, plan_of, planned_node

@@ -12,7 +12,7 @@ from lifecycle.manifest.model import Condition
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.nodes.remote_nodes import RemoteNode, RemoteNodes
 from lifecycle.supervisor.nodes.system import System
-from lifecycle.supervisor.run.tasks import ended
+from lifecycle.supervisor.run.failure import ended
 from lifecycle.verify.observation import Identity, NodeConfiguration, Observation, ObservedNode
 from tests.unit.supervisor.fakes import World, plan_of, planned_node, run
 

@@ -6,7 +6,7 @@ import dataclasses
 
 import pytest
 
-from lifecycle.supervisor.gate.first_contact import undiscovered
+from lifecycle.supervisor.gate.sequence import undiscovered
 from lifecycle.verify.verdict import Finding, Outcome, Verdict
 
 OURS = frozenset(("/talker", "/listener", "/neighbour"))

@@ -13,8 +13,8 @@ import pytest
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.node.host.control import Event
 from lifecycle.plan.model import Plan
-from lifecycle.supervisor.gate.grace_period import PASSING_S
 from lifecycle.supervisor.gate.verification_loop import (
+    PASSING_S,
     Changes,
     VerificationLoop,
     with_findings,
@@ -27,7 +27,7 @@ from lifecycle.supervisor.nodes.driver import Standing
 from lifecycle.supervisor.nodes.remote_nodes import RemoteNode
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.process import ManagedProcess
-from lifecycle.supervisor.processes.states import ProcessExit, ProcessState
+from lifecycle.supervisor.processes.spawn import ProcessExit, ProcessState
 from lifecycle.supervisor.run.events import NodeJoined, Reach, VerdictChanged
 from lifecycle.verify.observation import (
     NodeConfiguration,

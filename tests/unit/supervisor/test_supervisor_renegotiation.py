@@ -10,8 +10,7 @@ from lifecycle.manifest.model import DataLayer, EndpointKind, FlowTransport
 from lifecycle.node.host.control import Operation
 from lifecycle.plan import Plan
 from lifecycle.supervisor.connections.desired_state import steps, wired
-from lifecycle.supervisor.connections.negotiation import NegotiatedSource
-from lifecycle.supervisor.connections.renegotiation import Expectation
+from lifecycle.supervisor.connections.negotiation import Expectation, NegotiatedSource
 from lifecycle.verify.observation import NodeConfiguration, Observation
 from tests.unit.plan.samples import at
 from tests.unit.supervisor.fakes import rewired

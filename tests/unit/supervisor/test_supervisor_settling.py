@@ -9,7 +9,7 @@ import pytest
 from lifecycle.manifest.model import EndpointKind, FlowTransport
 from lifecycle.plan import Plan
 from lifecycle.supervisor.connections.negotiation import NegotiatedSource
-from lifecycle.supervisor.gate.grace_period import PASSING_S, GracePeriod
+from lifecycle.supervisor.gate.verification_loop import PASSING_S, GracePeriod
 from lifecycle.verify import Finding, Outcome, Verdict
 from tests.unit.supervisor.fakes import verdict_of
 from tests.unit.supervisor.test_supervisor_negotiation import LISTENER, TALKER, known, plan_of

@@ -10,7 +10,7 @@ from typing import Any, cast
 
 from lifecycle.supervisor.nodes.stale_nodes import StaleNodes
 from lifecycle.supervisor.nodes.system import System
-from lifecycle.supervisor.processes.states import ProcessState
+from lifecycle.supervisor.processes.spawn import ProcessState
 from lifecycle.supervisor.run.events import ProcessChanged
 
 PREFIX = "010f7f015d3c1b4c00000000"

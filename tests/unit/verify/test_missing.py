@@ -9,7 +9,7 @@ import pytest
 from lifecycle.manifest.model import EndpointKind, Policy
 from lifecycle.plan import build_plan
 from lifecycle.verify import RULES, Finding, Outcome, Stage, Verdict, missing, not_ok, verify
-from lifecycle.verify.missing import taken_on_trust
+from lifecycle.verify.judge import taken_on_trust
 from tests.unit.plan.samples import teleop
 from tests.unit.verify.edits import (
     Edit,

@@ -13,9 +13,9 @@ from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan.connections.contacts import Contact
 from lifecycle.plan.model import ParticipantConnections, PlannedNode, PlannedParticipant
 from lifecycle.plan.negotiation.data_layer import RMW_DEFAULT, TRANSPORTS, Party, PartyEndpoint
+from lifecycle.supervisor.connections.negotiation import party_of
 from lifecycle.verify import EndpointReport, Identity, NodeConfiguration
 from lifecycle.verify.observation import ConnectionReport
-from lifecycle.verify.party import party_of
 from tests.unit.plan.samples import need, node, planned, publisher, subscription
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION

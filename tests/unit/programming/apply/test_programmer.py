@@ -32,7 +32,7 @@ from lifecycle.programming.apply.targets import TargetOptions, Targets
 from lifecycle.programming.rules.rules import flow_rules
 from lifecycle.supervisor.connections import networks as keeper_module
 from lifecycle.supervisor.connections.networks import Keeper
-from lifecycle.supervisor.run.tasks import Worker
+from lifecycle.supervisor.run.failure import Worker
 from lifecycle.verify.verdict import FlowReport, Outcome
 from tests.unit.programming.apply.fakes import FakeTarget
 from tests.unit.programming.apply.samples import (

@@ -9,10 +9,18 @@ from pathlib import Path
 import pytest
 
 from lifecycle.network.dscp import MAX_DSCP
-from lifecycle.programming.rules.tc import render_tc, render_tc_removal
-from lifecycle.programming.rules.tc_classes import class_of, classes_of, divide
-from lifecycle.programming.rules.tc_filters import MAX_FILTERS, tc_filters
-from lifecycle.programming.rules.tc_settings import TcFeatures, TcMatch, TcSettings
+from lifecycle.programming.rules.tc import (
+    MAX_FILTERS,
+    TcFeatures,
+    TcMatch,
+    TcSettings,
+    class_of,
+    classes_of,
+    divide,
+    render_tc,
+    render_tc_removal,
+    tc_filters,
+)
 from tests.unit.programming.rules.samples import (
     EXPECTED,
     LEFT_OUT,

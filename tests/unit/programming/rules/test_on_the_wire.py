@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from lifecycle.programming.rules.nftables import render_nft
-from lifecycle.programming.rules.tc import render_tc
-from lifecycle.programming.rules.tc_settings import TcFeatures, TcMatch, TcSettings
+from lifecycle.programming.rules.tc import TcFeatures, TcMatch, TcSettings, render_tc
 from tests.unit.programming.rules.samples import in_a_network_namespace, rule
 
 RULES = (

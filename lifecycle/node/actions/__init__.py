@@ -1,1 +1,0 @@
-"""Goals of actions, and the handlers at work on them."""

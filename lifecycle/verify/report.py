@@ -1,0 +1,395 @@
+"""The verdict as text for people. Pure.
+
+Owns: layout and wording; the findings' own sentences come from the rules.
+"""
+
+from __future__ import annotations
+
+import json
+import textwrap
+from collections.abc import Iterable, Sequence
+from urllib.parse import quote
+from xml.etree import ElementTree as ET
+
+from lifecycle import codec
+from lifecycle.manifest.model import UniqueHow
+from lifecycle.network.dscp import describe
+from lifecycle.plan.model import Plan
+from lifecycle.printable import json_text, lines, one_line
+from lifecycle.verify.rules import RULES
+from lifecycle.verify.rules.catalogue import Rule
+from lifecycle.verify.transport import NETWORK
+from lifecycle.verify.verdict import Finding, FlowReport, Outcome, RunEnd, Verdict
+
+_COLOURS = {Outcome.OK: "\x1b[32m", Outcome.VIOLATED: "\x1b[31m", Outcome.UNVERIFIABLE: "\x1b[33m"}
+_RESET = "\x1b[0m"
+_UNIQUE = {
+    UniqueHow.NOT: "not unique",
+    UniqueHow.WEAKLY: "weakly unique",
+    UniqueHow.STRONGLY: "strongly unique",
+    None: "uniqueness unknown",
+}
+
+
+def render_text(
+    verdict: Verdict, *, colour: bool = False, flows: bool = True, width: int = 100
+) -> str:
+    """Write a verdict: violated findings first, then unverifiable ones, the flows, the run's end.
+
+    Args:
+        verdict: what to write.
+        colour: mark outcomes with ANSI colours.
+        flows: list the flows too.
+        width: columns to wrap sentences at, >= 40.
+
+    Returns:
+        Lines, each ended by a newline.
+    """
+    lines = [_paint(_headline(verdict), verdict.verdict, colour=colour)]
+    for outcome in (Outcome.VIOLATED, Outcome.UNVERIFIABLE):
+        findings = [each for each in verdict.findings if each.outcome is outcome]
+        for finding in findings:
+            lines += ["", *_finding(finding, colour=colour, width=max(width, 40))]
+    if verdict.open_endpoints:
+        lines += ["", "endpoints that `endpoints: open` allows"]
+        lines += [
+            one_line(f"  {each.kind.noun} of {each.name} in {each.node}, {each.type}")
+            for each in verdict.open_endpoints
+        ]
+    if verdict.tolerated:
+        named = ", ".join(each.describe() for each in verdict.tolerated)
+        lines += ["", *_wrap(named, max(width, 40), first="tolerated: ")]
+    if flows and verdict.flows:
+        lines += ["", "flows", *_flows(verdict.flows, colour=colour)]
+    if verdict.run is not None:
+        lines += ["", *_wrap(verdict.run.describe(), max(width, 40))]
+    return "\n".join(lines) + "\n"
+
+
+def _headline(verdict: Verdict) -> str:
+    parts = []
+    for outcome in (Outcome.VIOLATED, Outcome.UNVERIFIABLE):
+        count = sum(each.outcome is outcome for each in verdict.findings)
+        if count:
+            parts.append(f"{count} {outcome.value}")
+    count = len(verdict.flows)
+    if count:
+        parts.append(f"{count} flow{'s' if count > 1 else ''}")
+    return f"verdict: {verdict.verdict.value}" + (f" ({', '.join(parts)})" if parts else "")
+
+
+def _finding(finding: Finding, *, colour: bool, width: int) -> list[str]:
+    head = _paint(finding.outcome.value, finding.outcome, colour=colour)
+    lines = [f"{head} {finding.rule}: {one_line(finding.subject)}"]
+    rows = [
+        ("", finding.message),
+        ("expected", finding.expected),
+        ("observed", finding.observed),
+        ("at", finding.at),
+        ("to do", finding.hint),
+    ]
+    for label, text in rows:
+        if text:
+            indent = "  " + (f"{label:<10}" if label else "")
+            lines += _wrap(text, width, first=indent)
+    return lines
+
+
+def _wrap(text: str, width: int, *, first: str = "") -> list[str]:
+    """Wrap between words only: names and addresses stay whole. `first` starts the first line."""
+    return textwrap.wrap(
+        one_line(text),
+        width,
+        initial_indent=first,
+        subsequent_indent=" " * len(first),
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+
+
+def _flows(flows: Sequence[FlowReport], *, colour: bool) -> list[str]:
+    rows = [
+        (
+            one_line(flow.topic),
+            one_line(f"{flow.publisher} → {flow.subscription}"),
+            _UNIQUE[flow.unique],
+            "" if flow.dscp is None else describe(flow.dscp),
+            flow.effective_transport,
+        )
+        for flow in flows
+    ]
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    lines = []
+    for flow, row in zip(flows, rows, strict=True):
+        cells = [cell.ljust(size) for cell, size in zip(row, widths, strict=True) if size]
+        outcome = _paint(flow.outcome.value, flow.outcome, colour=colour)
+        lines.append("  " + "  ".join([*cells, outcome]))
+        if flow.effective_transport in NETWORK:
+            lines += [one_line(f"    {each.describe()}") for each in flow.tuples]
+    return lines
+
+
+def _paint(text: str, outcome: Outcome, *, colour: bool) -> str:
+    return f"{_COLOURS[outcome]}{text}{_RESET}" if colour else text
+
+
+_IDS = frozenset(each.id for each in RULES)
+
+
+def to_junit(verdict: Verdict, plan: Plan | None, *, strict: bool = False) -> str:
+    """Write JUnit XML.
+
+    Args:
+        verdict: what the cases come to.
+        plan: None where there is none, because the manifest cannot be used.
+        strict: what cannot be verified refuses the system, whatever its policy says.
+    """
+    name = f"lifecycle verify {plan.system}" if plan else "lifecycle verify"
+    root = ET.Element("testsuites", name=_legal(name))
+    writer = _Cases(verdict, plan, strict=strict)
+    suite = ET.SubElement(root, "testsuite", name="manifest")
+    writer.of_manifest(suite)
+    families: dict[str, list[Rule]] = {}
+    for rule in RULES:
+        families.setdefault(rule.id.partition(".")[0], []).append(rule)
+    for family, rules in families.items():
+        suite = ET.SubElement(root, "testsuite", name=family)
+        for rule in rules:
+            writer.of_rule(suite, rule)
+        if family == "run":
+            writer.of_end(suite)
+        if family == "flow" and verdict.flows:
+            _note(suite, "".join(f"{_flow(each)}\n" for each in verdict.flows))
+    total = [0, 0, 0]
+    for suite in root:
+        _count(suite, total)
+    for key, value in zip(("tests", "failures", "skipped"), total, strict=True):
+        root.set(key, str(value))
+    ET.indent(root)
+    return '<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(root, encoding="unicode") + "\n"
+
+
+class _Cases:
+    """Writes the cases of one verdict."""
+
+    def __init__(self, verdict: Verdict, plan: Plan | None, *, strict: bool) -> None:
+        self._verdict = verdict
+        self._blocks = strict or (plan is not None and plan.policy.unverifiable_blocks)
+        self._strict = strict
+        self._may_block = {each.id: each.may_block for each in RULES}
+
+    def of_manifest(self, suite: ET.Element) -> None:
+        """Hold what is wrong with the manifest itself: no rule of the running system."""
+        case = ET.SubElement(suite, "testcase", classname="manifest", name="the manifest is valid")
+        self._findings(case, [each for each in self._verdict.findings if each.rule not in _IDS])
+
+    def of_rule(self, suite: ET.Element, rule: Rule) -> None:
+        """Hold all findings of one rule."""
+        case = ET.SubElement(suite, "testcase", classname=rule.id, name=_legal(rule.meaning))
+        findings = [each for each in self._verdict.findings if each.rule == rule.id]
+        self._findings(case, findings)
+        if not findings and not self._verdict.judged:
+            _not_judged(case)
+
+    def of_end(self, suite: ET.Element) -> None:
+        """Fail where the run was no success: one whose system nobody judged must not read well."""
+        case = ET.SubElement(suite, "testcase", classname="run", name="end")
+        run = self._verdict.run
+        if run is None and self._verdict.judged:
+            return
+        run = run or RunEnd(reason="nothing was judged", reached=None, exit_code=1)
+        if run.exit_code == 0:
+            _note(case, run.describe() + "\n")
+        else:
+            _failure(case, run.reason, run.describe() + "\n")
+
+    def _findings(self, case: ET.Element, findings: list[Finding]) -> None:
+        if not findings:
+            return
+        bad = [each for each in findings if self._refuses(each)]
+        for first in bad[:1] or findings[:1]:
+            if first.at:
+                file, line, _ = first.at.rsplit(":", 2)
+                case.set("file", _legal(file))
+                case.set("line", line)
+        if bad:
+            more = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
+            _failure(case, bad[0].message + more, _described(bad))
+        allowed = [each for each in findings if each not in bad]
+        if allowed:
+            _note(case, _described(allowed))
+
+    def _refuses(self, finding: Finding) -> bool:
+        """Whether a finding keeps the gate closed."""
+        if finding.outcome is Outcome.UNVERIFIABLE:
+            return self._blocks and (self._strict or self._may_block.get(finding.rule, True))
+        return finding.outcome is Outcome.VIOLATED
+
+
+def _described(findings: Iterable[Finding]) -> str:
+    return "\n".join(
+        f"{each.outcome.value} {each.rule}: {one_line(each.subject)}\n{one_line(each.message)}\n"
+        f"expected: {one_line(each.expected)}\nobserved: {one_line(each.observed)}\n"
+        f"at: {one_line(each.at)}\nto do: {one_line(each.hint)}\n"
+        for each in findings
+    )
+
+
+def _flow(flow: FlowReport) -> str:
+    return one_line(f"{flow.topic}: {flow.publisher} → {flow.subscription}: {flow.outcome.value}")
+
+
+def _failure(case: ET.Element, message: str, text: str) -> None:
+    ET.SubElement(case, "failure", message=_legal(message)).text = _legal(text)
+
+
+def _note(place: ET.Element, text: str) -> None:
+    ET.SubElement(place, "system-out").text = _legal(text)
+
+
+def _not_judged(case: ET.Element) -> None:
+    ET.SubElement(case, "skipped", message="not judged; see the end of the run")
+
+
+def _count(suite: ET.Element, total: list[int]) -> None:
+    """Fill in a suite's counts and add them to the total."""
+    counts = (
+        len(suite.findall("testcase")),
+        len(suite.findall("testcase/failure")),
+        len(suite.findall("testcase/skipped")),
+    )
+    for index, (name, value) in enumerate(
+        zip(("tests", "failures", "skipped"), counts, strict=True)
+    ):
+        suite.set(name, str(value))
+        total[index] += value
+
+
+def _legal(text: str) -> str:
+    return lines(text)
+
+
+_SCHEMA = "https://json.schemastore.org/sarif-2.1.0.json"
+_LEVELS = {Outcome.VIOLATED: "error", Outcome.UNVERIFIABLE: "warning", Outcome.OK: "none"}
+
+_Json = dict[str, object]
+
+
+def to_sarif(verdict: Verdict) -> str:
+    """Write a SARIF log with one run; every rule is described, found or not."""
+    index = {rule.id: position for position, rule in enumerate(RULES)}
+    rules = [
+        {
+            "id": rule.id,
+            "shortDescription": {"text": rule.meaning},
+            "help": {"text": rule.fix},
+            "defaultConfiguration": {"level": _LEVELS[rule.outcomes[0]]},
+        }
+        for rule in RULES
+    ]
+    log = {
+        "$schema": _SCHEMA,
+        "version": "2.1.0",
+        "runs": [
+            {
+                "tool": {"driver": {"name": "lifecycle", "rules": rules}},
+                "columnKind": "unicodeCodePoints",
+                "results": [
+                    *(_result(each, index.get(each.rule)) for each in verdict.findings),
+                    *_end_result(verdict),
+                ],
+                "properties": {"verdict": verdict.verdict.value},
+                **_invocations(verdict.run),
+            }
+        ],
+    }
+    return json_text(json.dumps(log, ensure_ascii=False, indent=2)) + "\n"
+
+
+def _invocations(run: RunEnd | None) -> _Json:
+    if run is None:
+        return {}
+    ended = {
+        "executionSuccessful": run.exit_code == 0,
+        "exitCode": run.exit_code,
+        "exitCodeDescription": run.describe(),
+    }
+    return {"invocations": [ended]}
+
+
+def _end_result(verdict: Verdict) -> list[_Json]:
+    """Return what a log without an error has to say of a run that was no success."""
+    run = verdict.run
+    if run is None or run.exit_code == 0:
+        return []
+    if any(each.outcome is Outcome.VIOLATED for each in verdict.findings):
+        return []
+    return [{"ruleId": "run.end", "level": "error", "message": {"text": run.describe()}}]
+
+
+def _result(finding: Finding, rule_index: int | None) -> _Json:
+    location: _Json = {
+        "logicalLocations": [{"fullyQualifiedName": finding.subject, "kind": "resource"}]
+    }
+    if finding.at:
+        file, line, column = finding.at.rsplit(":", 2)
+        location["physicalLocation"] = {
+            "artifactLocation": {"uri": quote(file)},
+            "region": {"startLine": int(line), "startColumn": int(column)},
+        }
+    return {
+        "ruleId": finding.rule,
+        **({} if rule_index is None else {"ruleIndex": rule_index}),
+        "level": _LEVELS[finding.outcome],
+        "message": {
+            "text": f"{finding.message}; {finding.hint}" if finding.hint else finding.message
+        },
+        "locations": [location],
+        "properties": {
+            "outcome": finding.outcome.value,
+            "expected": finding.expected,
+            "observed": finding.observed,
+        },
+    }
+
+
+def to_json(verdict: Verdict, *, indent: int | None = None) -> str:
+    """Write `{"verdict": …, "findings": [...], "flows": [...]}`.
+
+    There are `open_endpoints` and `tolerated`, too, where there are any. The last verdict of a run
+    has `run`: why it ended, how far it came, its exit code, and what its gate took on trust, if
+    anything. Where no system was judged it has `"judged": false`, and its findings are why.
+
+    Args:
+        verdict: what to write.
+        indent: spaces per level; None for one line.
+    """
+    document: dict[str, object] = {
+        "verdict": verdict.verdict.value,
+        "findings": plain_findings(verdict),
+        "flows": codec.to_plain(verdict.flows),
+    }
+    if not verdict.judged:
+        document["judged"] = False
+    if verdict.open_endpoints:
+        document["open_endpoints"] = codec.to_plain(verdict.open_endpoints)
+    if verdict.tolerated:
+        document["tolerated"] = codec.to_plain(verdict.tolerated)
+    if verdict.run is not None:
+        run = codec.to_plain(verdict.run)
+        assert isinstance(run, dict)
+        document["run"] = {name: value for name, value in run.items() if value or name != "trusted"}
+    separators = (",", ":") if indent is None else None
+    text = json.dumps(document, ensure_ascii=False, indent=indent, separators=separators)
+    return json_text(text)
+
+
+def plain_findings(verdict: Verdict) -> list[dict[str, object]]:
+    """Return the findings as JSON holds them: of the two ends their subject says enough."""
+    found = []
+    for each in verdict.findings:
+        plain = codec.to_plain(each)
+        assert isinstance(plain, dict)
+        del plain["ends"]
+        found.append(plain)
+    return found
