@@ -11,7 +11,7 @@ GUIDE = Path(__file__).parents[3] / "docs/manifest.md"
 
 
 def test_the_manifest_of_the_guide_loads_without_a_finding(tmp_path: Path) -> None:
-    (text,) = re.findall(r"```yaml\n(.*?)```", GUIDE.read_text(encoding="utf-8"), flags=re.DOTALL)
+    text = re.findall(r"```yaml\n(.*?)```", GUIDE.read_text(encoding="utf-8"), flags=re.DOTALL)[0]
     path = tmp_path / "patrol.lifecycle.yaml"
     path.write_text(text, encoding="utf-8")
     loaded = load(path)

@@ -1,0 +1,227 @@
+"""The documents: every page is on the site, links lead somewhere, keys and events are explained."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, get_args
+
+import pytest
+import yaml
+
+from lifecycle.manifest import load
+from lifecycle.supervisor.run import events
+from lifecycle.verify import RULES
+
+ROOT = Path(__file__).parents[3]
+PAGES = sorted((ROOT / "docs").glob("*.md"))
+DOCUMENTS = [ROOT / f"{name}.md" for name in ("README", "ARCHITECTURE", "CONTRIBUTING")] + PAGES
+SITE = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))
+each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+each_document = pytest.mark.parametrize("document", DOCUMENTS, ids=lambda each: each.name)
+
+
+def read(path: Path) -> str:
+    return path.read_text(encoding="utf-8")
+
+
+def prose(path: Path) -> str:
+    """A document without blocks of code, line by line."""
+    text = re.sub(r"^ *```.*?^ *```$", _blank, read(path), flags=re.MULTILINE | re.DOTALL)
+    return re.sub(r"^ {4}.*$", "", text, flags=re.MULTILINE)
+
+
+def _blank(match: re.Match[str]) -> str:
+    return "\n" * match[0].count("\n")
+
+
+def anchors(path: Path) -> set[str]:
+    """Anchors of the headings, as the forge and the site make them."""
+    titles = re.findall(r"^#+ (.+)$", prose(path), flags=re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title).strip().lower().replace(" ", "-") for title in titles}
+
+
+def in_nav(entry: object) -> Iterator[str]:
+    if isinstance(entry, str):
+        yield entry
+    elif isinstance(entry, dict):
+        for value in entry.values():
+            yield from in_nav(value)
+    elif isinstance(entry, list):
+        for value in entry:
+            yield from in_nav(value)
+
+
+def test_every_document_is_once_in_the_nav_of_the_site() -> None:
+    nav = list(in_nav(SITE["nav"]))
+    pages = [f"docs/{page.name}" for page in PAGES]
+    roots = ["README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", "CHANGELOG.md"]
+    assert sorted(nav) == sorted([*roots, *pages, "examples/teleop/README.md"])
+
+
+def test_what_the_site_is_built_from_is_what_is_read_on_the_forge() -> None:
+    folder = ROOT / SITE["docs_dir"]
+    assert {each.name: each.resolve() for each in folder.iterdir()} == {
+        each.name: (ROOT / each.name).resolve() for each in folder.iterdir()
+    }
+
+
+@each_document
+def test_a_link_between_documents_leads_to_a_file_and_a_heading(document: Path) -> None:
+    broken = []
+    for target in re.findall(r"\]\(([^)\s]+)\)", prose(document)):
+        if re.match(r"\w+:", target):
+            continue
+        name, _, anchor = target.partition("#")
+        file = (document.parent / name).resolve() if name else document
+        if not file.is_file() or (anchor and anchor not in anchors(file)):
+            broken.append(target)
+    assert broken == []
+
+
+@each_page
+def test_a_page_starts_with_what_its_reader_can_do_afterwards(page: Path) -> None:
+    title, first = read(page).split("\n\n")[:2]
+    assert re.fullmatch(r"# \S.*", title)
+    assert re.fullmatch(r"After reading this page you can [^.]+(?:\.\w+[^.]*)*\.", first, re.DOTALL)
+
+
+IDIOM = re.compile(
+    r"\b(tells?|told|telling|hears?|heard|hearing|stands?|stood|standing|somebody|nobody|whoever"
+    r"|words?|voices?|ears?|eyes?|hands)\b",
+    re.IGNORECASE,
+)
+
+
+@each_document
+def test_a_document_uses_the_field_s_terms(document: Path) -> None:
+    text = re.sub(r"`[^`]*`|“[^”]*”", _blank, prose(document))
+    for rule in RULES:  # quoted as the program prints them
+        text = text.replace(f"\n{rule.meaning[0].upper()}{rule.meaning[1:]}.\n", "\n\n")
+    found = [
+        f"{document.name}:{number}: {match[0]}"
+        for number, line in enumerate(text.splitlines(), 1)
+        for match in IDIOM.finditer(line)
+    ]
+    assert found == [], "say it in the field's terms (notified, receives, is, another, name, …)"
+
+
+def test_the_architecture_fits_two_pages_and_names_folders_that_are_there() -> None:
+    lines = read(ROOT / "ARCHITECTURE.md").splitlines()
+    assert len(lines) <= 120
+    assert [line for line in lines if len(line) > 100] == []
+
+
+@pytest.mark.parametrize("name", ["ARCHITECTURE.md", "docs/decisions.md"])
+def test_a_folder_that_is_named_is_there(name: str) -> None:
+    named = re.findall(r"`([a-z_]+(?:/[a-z_]+)*/)`", read(ROOT / name))
+    assert named
+    missing = {each for each in named if not (ROOT / each).is_dir()}
+    assert {each for each in missing if not (ROOT / "lifecycle" / each).is_dir()} == set()
+
+
+def keys_of(schema: Any) -> Iterator[str]:
+    if isinstance(schema, dict):
+        properties = schema.get("properties", {})
+        yield from properties
+        for value in (*properties.values(), *schema.values()):
+            yield from keys_of(value)
+    elif isinstance(schema, list):
+        for value in schema:
+            yield from keys_of(value)
+
+
+def test_every_key_of_the_manifest_is_in_the_prose_of_its_page() -> None:
+    spans = " ".join(re.findall(r"`([^`]+)`", prose(ROOT / "docs/manifest.md")))
+    schema = json.loads(read(ROOT / "schemas/manifest.v1.schema.json"))
+    assert {each for each in keys_of(schema) if not re.search(rf"\b{each}\b", spans)} == set()
+
+
+def blocks(page: str, language: str) -> list[str]:
+    found = re.findall(rf"^```{language}\n(.*?)^```$", read(ROOT / page), re.DOTALL | re.MULTILINE)
+    return [str(each) for each in found]
+
+
+def test_the_examples_of_the_manifest_s_page_are_valid(tmp_path: Path) -> None:
+    named = {}
+    for block in blocks("docs/manifest.md", "yaml")[1:]:
+        name = block.partition("\n")[0].removeprefix("# ")
+        named[name] = tmp_path / name
+        named[name].write_text(block, encoding="utf-8")
+    (tmp_path / "config").mkdir()
+    for name in ("all", "camera"):
+        (tmp_path / f"config/{name}.yaml").write_text("/**: {ros__parameters: {rate: 15.0}}\n")
+
+    arms = load(named["two_arms.lifecycle.yaml"])
+    assert arms.warnings == ()
+    assert [f"{each.namespace.rstrip('/')}/{each.name}" for each in arms.manifest.nodes] == [
+        "/monitor",
+        "/left/driver",
+        "/left/controller",
+        "/right/driver",
+        "/right/controller",
+    ]
+    speeds = [dict(each.parameters).get("speed") for each in arms.manifest.nodes]
+    assert speeds == [None, 0.5, None, 0.25, None]
+    assert [each.topic for each in arms.manifest.links] == ["/left/joints", "/right/joints"]
+
+    loaded = load(named["surroundings.lifecycle.yaml"])
+    assert loaded.warnings == ()
+    (camera,) = loaded.manifest.nodes
+    assert dict(camera.run.environment) == {"CAMERA_SERIAL": "A1234", "OMP_NUM_THREADS": "2"}
+    assert camera.run.working_directory == str(tmp_path / "calibration")
+    assert dict(camera.parameters) == {"exposure.auto": False, "exposure.time_ms": 4.0}
+
+
+def test_the_node_of_its_page_fits_its_manifest(tmp_path: Path) -> None:
+    page = "docs/writing_a_node.md"
+    node, alone = blocks(page, "python")
+    (manifest,) = blocks(page, "yaml")
+    (tmp_path / "bump_counter.py").write_text(f"{node}\n{alone}", encoding="utf-8")
+    (tmp_path / "bumps.lifecycle.yaml").write_text(manifest, encoding="utf-8")
+    check = [sys.executable, "-m", "lifecycle.cli", "check", "--strict", "bumps.lifecycle.yaml"]
+    result = subprocess.run(check, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert result.stdout == "bumps: 1 node, 3 endpoints, 0 links: ok\n"
+    ruff = [sys.executable, "-m", "ruff", "check", "--isolated", "--select", "E9,F", "."]
+    result = subprocess.run(ruff, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stdout
+
+
+def test_the_page_of_events_has_every_event_with_its_fields() -> None:
+    table = re.findall(r"^\| `(\w+)` \| ([^|]+) \|", read(ROOT / "docs/events.md"), re.MULTILINE)
+    assert [(name, re.findall(r"`(\w+)`", fields)) for name, fields in table] == [
+        (event.kind, [each.name for each in dataclasses.fields(event)])
+        for event in get_args(events.Event)
+    ]
+
+
+@pytest.mark.skipif(
+    importlib.util.find_spec("mkdocs") is None
+    or importlib.util.find_spec("mkdocstrings_handlers") is None,
+    reason="needs the extra `docs`: make docs",
+)
+def test_the_site_is_built_without_a_warning_and_loads_nothing_from_elsewhere(
+    tmp_path: Path,
+) -> None:
+    result = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict", "--site-dir", tmp_path],
+        cwd=ROOT,
+        env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (result.returncode, result.stdout + result.stderr) == (0, "")
+    loaded = re.compile(r'<(?:script|link|img|iframe)\b[^>]*(?:src|href)="?https?:[^>]*>')
+    for page in tmp_path.rglob("*.html"):
+        assert loaded.findall(read(page)) == []
+    api = read(tmp_path / "docs/api.html")
+    for name in ("LifecycleNode.on_configure", "on_service", "graph.Graph.wait_for"):
+        assert f'id="lifecycle.{name}"' in api
