@@ -1,7 +1,7 @@
 """The command line: one file per verb, thin. Owns argument parsing and the one error boundary.
 
 A verb's module is imported only when it is used, so that ROS-free verbs start fast. Each module
-`lifecycle.cli.verb_NAME` holds one click command named `command` whose function returns an exit
+`lifecycle.cli.verbs.NAME` holds one click command named `command` whose function returns an exit
 code (None means 0).
 """
 
@@ -64,10 +64,10 @@ class _Verbs(click.Group):
         ctx: click.Context,  # noqa: ARG002 - click's signature
         cmd_name: str,
     ) -> click.Command | None:
-        """Import `lifecycle.cli.verb_<cmd_name>`."""
+        """Import `lifecycle.cli.verbs.<cmd_name>`."""
         if cmd_name not in VERBS:
             return None
-        command: click.Command = importlib.import_module(f"lifecycle.cli.verb_{cmd_name}").command
+        command: click.Command = importlib.import_module(f"lifecycle.cli.verbs.{cmd_name}").command
         return command
 
     def format_commands(

@@ -24,9 +24,13 @@ if TYPE_CHECKING:
     from lifecycle.middleware.rcl.graph import GraphObserver
     from lifecycle.middleware.rcl.graph_changes import on_graph_change
     from lifecycle.middleware.rcl.graph_queries import EndpointInfo, endpoints_of
-    from lifecycle.middleware.rcl.interface_types import UnknownInterfaceError, import_interface
     from lifecycle.middleware.rcl.matched_peers import guid_of, matched_with
-    from lifecycle.middleware.rcl.qos import from_rclpy, to_rclpy
+    from lifecycle.middleware.rcl.qos import (
+        UnknownInterfaceError,
+        from_rclpy,
+        import_interface,
+        to_rclpy,
+    )
     from lifecycle.middleware.rcl.unique import (
         UniqueFlowNotFeasible,
         create_publisher,
@@ -94,7 +98,7 @@ _HOME = {
     "ServerWatch": "services.server_watch",
     "ServiceUnansweredError": "services.service_calls",
     "UniqueFlowNotFeasible": "rcl.unique",
-    "UnknownInterfaceError": "rcl.interface_types",
+    "UnknownInterfaceError": "rcl.qos",
     "adopt_orphans": "process.control",
     "create_publisher": "rcl.unique",
     "create_subscription": "rcl.unique",
@@ -108,7 +112,7 @@ _HOME = {
     "get_network_flow_endpoints": "sockets.nfe",
     "guid_of": "rcl.matched_peers",
     "has_shared_memory": "sockets.nfe",
-    "import_interface": "rcl.interface_types",
+    "import_interface": "rcl.qos",
     "is_server_matched": "services.server_watch",
     "leave_and_exit": "process.teardown",
     "leftovers": "process.shared_memory",

@@ -38,12 +38,12 @@ __all__ = [
 
 _HOME = {
     "Connection": "connections.connections",
-    "ConnectionEvent": "connections.connection_events",
-    "ConnectionEventKind": "connections.connection_events",
+    "ConnectionEvent": "connections.connection_status",
+    "ConnectionEventKind": "connections.connection_status",
     "ERROR": "author.returns",
     "FAILURE": "author.returns",
     "SUCCESS": "author.returns",
-    "GoalInterruptedError": "actions.goal_run",
+    "GoalInterruptedError": "actions",
     "LifecycleNode": "author.node",
     "TransitionCallbackReturn": "author.returns",
     "on_action": "author.handlers",

@@ -39,9 +39,10 @@ _ASKS: Mapping[str, Any] = {
 
 _VERB = """
 import sys
-from lifecycle.cli import flows_program, main, verb_flows
-if not hasattr(verb_flows.command, "commands"):
-    verb_flows.command = flows_program.with_subcommands(verb_flows.command)
+from lifecycle.cli import main
+from lifecycle.cli.verbs import flows, flows_program
+if not hasattr(flows.command, "commands"):
+    flows.command = flows_program.with_subcommands(flows.command)
 sys.exit(main(["flows", *sys.argv[1:]]))
 """
 

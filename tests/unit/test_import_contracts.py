@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import importlib
 import subprocess
 import sys
 from pathlib import Path
@@ -59,3 +61,30 @@ def test_networks_are_programmed_without_ros_and_loaded_without_httpx() -> None:
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False
     )
     assert result.returncode == 0, result.stderr
+
+
+@pytest.mark.parametrize("room", ["node", "middleware", "graph", "supervisor"])
+def test_a_name_that_a_room_loads_on_first_use_is_in_the_module_that_it_names(room: str) -> None:
+    folder = ROOT / "lifecycle" / room
+    homes = importlib.import_module(f"lifecycle.{room}")._HOME
+    missing = [
+        f"{name} in {home}"
+        for name, home in homes.items()
+        if name not in _bound(folder.joinpath(*home.split(".")).with_suffix(".py"))
+    ]
+    assert missing == []
+
+
+def _bound(path: Path) -> set[str]:
+    """Names that a module binds, read without importing it."""
+    bound: set[str] = set()
+    for node in ast.parse(path.read_text()).body:
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            bound.add(node.name)
+        elif isinstance(node, ast.ImportFrom):
+            bound.update(each.asname or each.name for each in node.names)
+        elif isinstance(node, ast.Assign):
+            bound.update(each.id for each in node.targets if isinstance(each, ast.Name))
+        elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+            bound.add(node.target.id)
+    return bound

@@ -25,7 +25,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from lifecycle.middleware.discovery.probe import HEADER, Door, doors_of, send
 from lifecycle.middleware.fastdds.url_profile import UDPV4, UDPV6
-from lifecycle.middleware.sockets.sockets import own_udp_socket, socket_descriptors
+from lifecycle.middleware.sockets.dscp import own_udp_socket, socket_descriptors
 from lifecycle.middleware.sockets.url_check import open_sockets
 from lifecycle.network.connection_url import ConnectionUrl
 

@@ -36,7 +36,7 @@ from lifecycle.middleware.fastdds.url_profile import (
     families,
     leaves_discovery_open,
 )
-from lifecycle.middleware.sockets.sockets import own_udp_socket
+from lifecycle.middleware.sockets.dscp import own_udp_socket
 from lifecycle.middleware.sockets.url_check import open_sockets
 from lifecycle.network.connection_url import ConnectionUrl
 from lifecycle.network.ports import DG, PARTICIPANTS_PER_DOMAIN, participant_ports

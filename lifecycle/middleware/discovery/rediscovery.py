@@ -39,7 +39,7 @@ from lifecycle.middleware.fastdds.url_profile import (
     families,
     leaves_discovery_open,
 )
-from lifecycle.middleware.sockets.sockets import own_udp_socket, socket_descriptors
+from lifecycle.middleware.sockets.dscp import own_udp_socket, socket_descriptors
 from lifecycle.network.connection_url import ConnectionUrl
 from lifecycle.network.ports import participant_ports
 

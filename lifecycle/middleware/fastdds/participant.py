@@ -28,15 +28,18 @@ from rclpy.subscription import Subscription
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.fastdds import default_qos, shared_executor
-from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
-from lifecycle.middleware.fastdds.static_discovery import endpoint_profiles, find_endpoint
+from lifecycle.middleware.fastdds.participant_profile import (
+    ParticipantSettings,
+    endpoint_profiles,
+    find_endpoint,
+)
 from lifecycle.middleware.fastdds.url_profile import LOOPBACK, transport_of
 from lifecycle.middleware.rcl import unique as flows
 from lifecycle.middleware.rcl.hidden_node import forget_hidden, hidden_nodes, quiet_node
 from lifecycle.middleware.rcl.qos import to_rclpy
 from lifecycle.middleware.sockets import dscp as marks
+from lifecycle.middleware.sockets.dscp import never_wait
 from lifecycle.middleware.sockets.nfe import get_network_flow_endpoints, has_shared_memory
-from lifecycle.middleware.sockets.sockets import never_wait
 from lifecycle.middleware.sockets.url_check import open_sockets
 from lifecycle.network.connection_url import ConnectionTransport, ConnectionUrl
 from lifecycle.network.nfe import NetworkFlowEndpoint, UniqueRequirement

@@ -12,19 +12,120 @@ import copy
 import dataclasses
 import ipaddress
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds import url_profile
-from lifecycle.middleware.fastdds.profiles import DEFAULT_FILE, PROFILES_FILE_VARIABLE
+from lifecycle.middleware.fastdds.profiles import DEFAULT_FILE, PROFILES_FILE_VARIABLE, text
 from lifecycle.middleware.fastdds.profiles import child as _child
 from lifecycle.middleware.fastdds.profiles import text as _text
-from lifecycle.middleware.fastdds.static_discovery import endpoint_table, own_endpoints
 from lifecycle.network.connection_url import ConnectionUrl
 from lifecycle.network.connection_url import parse as parse_url
+from lifecycle.plan.connections.static_endpoints import GRAPH_TOPIC, GRAPH_TYPE, MAX_USER_ID
 from lifecycle.plan.model import ParticipantConnections, StaticEndpoint, StaticParticipant
+
+
+def endpoint_table(participants: Sequence[StaticParticipant]) -> str:
+    """Return the table as XML, <staticdiscovery>.
+
+    Raises:
+        MiddlewareError: an id is out of range or stands twice.
+    """
+    seen: dict[int, str] = {}
+    root = ET.Element("staticdiscovery")
+    for participant in participants:
+        element = ET.SubElement(root, "participant")
+        text(element, "name", participant.name)
+        for endpoint in participant.endpoints:
+            _check(endpoint, participant, seen)
+            line = ET.SubElement(element, "writer" if endpoint.writer else "reader")
+            text(line, "userId", str(endpoint.user_id))
+            text(line, "topicName", endpoint.topic)
+            text(line, "topicDataType", endpoint.type)
+            text(line, "topicKind", "NO_KEY")
+            reliability = "RELIABLE" if endpoint.reliable else "BEST_EFFORT"
+            text(line, "reliabilityQos", f"{reliability}_RELIABILITY_QOS")
+            durability = "TRANSIENT_LOCAL" if endpoint.transient_local else "VOLATILE"
+            text(line, "durabilityQos", f"{durability}_DURABILITY_QOS")
+    return ET.tostring(root, encoding="unicode")
+
+
+def endpoint_profiles(endpoints: Sequence[StaticEndpoint]) -> str:
+    """Return profiles that give endpoints the ids of their lines in the table."""
+    root = ET.Element("dds", xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles")
+    profiles = ET.SubElement(root, "profiles")
+    for endpoint in endpoints:
+        tag = "data_writer" if endpoint.writer else "data_reader"
+        element = ET.SubElement(profiles, tag, profile_name=endpoint.profile)
+        text(element, "userDefinedID", str(endpoint.user_id))
+    return ET.tostring(root, encoding="unicode", xml_declaration=True)
+
+
+def own_endpoints(
+    name: str, participants: Sequence[StaticParticipant]
+) -> tuple[StaticEndpoint, ...]:
+    """Return the lines of one participant.
+
+    Raises:
+        MiddlewareError: it is not in the table, or has no line for what every participant has.
+    """
+    own = next((each for each in participants if each.name == name), None)
+    if own is None:
+        known = ", ".join(repr(each.name) for each in participants)
+        raise MiddlewareError(
+            f"cannot find participant {name!r} in the table of static discovery: it has {known}"
+        )
+    for writer in (True, False):
+        if not any(each.topic == GRAPH_TOPIC and each.writer is writer for each in own.endpoints):
+            what = "writer" if writer else "reader"
+            raise MiddlewareError(
+                f"cannot discover endpoints of {name!r} statically: the table has no {what} of "
+                f"{GRAPH_TOPIC!r} for it, which every participant of rmw_fastrtps has",
+                hint=f"add one of type {GRAPH_TYPE}, reliable and transient local",
+            )
+    return own.endpoints
+
+
+def find_endpoint(
+    endpoints: Sequence[StaticEndpoint], *, writer: bool, profile: str, type_name: str
+) -> StaticEndpoint:
+    """Return the line of an endpoint that is about to be made.
+
+    Args:
+        endpoints: the participant's.
+        writer: a writer, else a reader.
+        profile: the name by which rmw looks for its profile, the fully qualified topic name.
+        type_name: DDS name of its type.
+
+    Raises:
+        MiddlewareError: the table has none like it: nobody would ever find this endpoint.
+    """
+    for each in endpoints:
+        if (each.writer, each.profile, each.type) == (writer, profile, type_name):
+            return each
+    what = "writers" if writer else "readers"
+    listed = [f"{e.profile} ({e.type})" for e in endpoints if e.writer is writer]
+    raise MiddlewareError(
+        f"cannot make a {what[:-1]} of {profile!r} ({type_name}): the table of static discovery "
+        f"has only these {what} for this participant: {', '.join(listed) or 'none'}",
+        hint="declare the endpoint, and check or plan again",
+    )
+
+
+def _check(endpoint: StaticEndpoint, participant: StaticParticipant, seen: dict[int, str]) -> None:
+    what = f"{endpoint.profile!r} of {participant.name!r}"
+    if not 1 <= endpoint.user_id <= MAX_USER_ID:
+        raise MiddlewareError(
+            f"cannot use id {endpoint.user_id} for {what}: allowed are 1–{MAX_USER_ID}"
+        )
+    if endpoint.user_id in seen:
+        raise MiddlewareError(
+            f"cannot use id {endpoint.user_id} for {what}: {seen[endpoint.user_id]} has it"
+        )
+    seen[endpoint.user_id] = what
+
 
 _SKIP_DEFAULT_FILE_VARIABLE = "SKIP_DEFAULT_XML"
 _BUILTIN_TRANSPORTS_VARIABLE = "FASTDDS_BUILTIN_TRANSPORTS"

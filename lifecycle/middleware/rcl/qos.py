@@ -7,6 +7,11 @@ RMW_DURATION_INFINITE (what discovery shows), which mean the same on Fast DDS.
 
 from __future__ import annotations
 
+import difflib
+import importlib
+import re
+from typing import Any
+
 from rclpy.duration import Duration
 from rclpy.qos import (
     DurabilityPolicy,
@@ -16,6 +21,7 @@ from rclpy.qos import (
     ReliabilityPolicy,
 )
 
+from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.qos import Durability, History, Liveliness, QosProfile, Reliability
 
 _UNSPECIFIED_NS = 0
@@ -62,3 +68,43 @@ def _duration(nanoseconds: int | None) -> Duration:
 def _nanoseconds(duration: Duration) -> int | None:
     value = int(duration.nanoseconds)
     return None if value in (_UNSPECIFIED_NS, _INFINITE_NS) else value
+
+
+_NAME = re.compile(r"(?P<package>[a-z][a-z0-9_]*)/(?P<kind>msg|srv|action)/(?P<type>[A-Z]\w*)")
+
+
+class UnknownInterfaceError(MiddlewareError):
+    """An interface type that is not spelled as ROS does, or is not installed."""
+
+
+def import_interface(name: str) -> type[Any]:
+    """Return the class of `package/msg/Type`, `package/srv/Type` or `package/action/Type`.
+
+    Raises:
+        UnknownInterfaceError: malformed, or the package or the type is not installed.
+    """
+    parts = _NAME.fullmatch(name)
+    if parts is None:
+        raise UnknownInterfaceError(
+            f"cannot read interface type {name!r}: write package/msg/Type, package/srv/Type or "
+            "package/action/Type"
+        )
+    package, kind, type_ = parts["package"], parts["kind"], parts["type"]
+    try:
+        module = importlib.import_module(f"{package}.{kind}")
+    except ModuleNotFoundError as error:
+        if error.name not in (package, f"{package}.{kind}"):
+            raise
+        raise UnknownInterfaceError(
+            f"cannot find interface type {name!r}: no package {package!r} with {kind} interfaces "
+            "is installed",
+            hint=f"install {package}, or source the workspace that has it",
+        ) from error
+    found = getattr(module, type_, None)
+    if not isinstance(found, type):
+        near = difflib.get_close_matches(type_, dir(module), n=1)
+        raise UnknownInterfaceError(
+            f"cannot find interface type {name!r}: package {package!r} has no {kind} {type_!r}",
+            hint=f"did you mean {package}/{kind}/{near[0]}?" if near else "",
+        )
+    return found

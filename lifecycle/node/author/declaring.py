@@ -20,9 +20,8 @@ from lifecycle.manifest.model import EndpointKind, EndpointPolicy
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware import from_rclpy
 from lifecycle.node.author.handlers import Handlers, match, needs_handler
-from lifecycle.node.connections.data_layer import DataLayer
-from lifecycle.node.connections.node_interface import CONFIGURED
-from lifecycle.node.endpoints.endpoint_names import Key, find
+from lifecycle.node.connections.data_layer import CONFIGURED, DataLayer
+from lifecycle.node.endpoints.mapping import Key, find_endpoint
 from lifecycle.node.lifecycle.machine import NodeState
 from lifecycle.plan.model import PlannedEndpoint, PlannedNode
 
@@ -182,7 +181,7 @@ class DeclaredInCode:
         """Keep a hint for negotiation; raises UnknownEndpointError."""
         if self._state() is NodeState.UNCONFIGURED:
             declared = [(each.kind, each.name) for each in self.spec.endpoints]
-            self._hints[find(spelling, declared, node=self._node)] = (lossy, size_bytes)
+            self._hints[find_endpoint(spelling, declared, node=self._node)] = (lossy, size_bytes)
         else:
             self._data_layer.endpoints.hint(
                 self._data_layer.endpoints.find(spelling).key, lossy, size_bytes

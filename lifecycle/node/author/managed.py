@@ -23,16 +23,14 @@ from lifecycle.node.author.declaring import DeclaredInCode
 from lifecycle.node.author.handlers import alternatives
 from lifecycle.node.author.spec import Mode
 from lifecycle.node.connections.connection_status import ConnectionEvent, ConnectionEvents
-from lifecycle.node.connections.data_layer import DataLayer
-from lifecycle.node.connections.node_interface import NodeInterface
+from lifecycle.node.connections.data_layer import DataLayer, NodeInterface
 from lifecycle.node.connections.remote_interface import RemoteInterface
 from lifecycle.node.endpoints.making import wire_name
 from lifecycle.node.lifecycle.controller import Controller
 from lifecycle.node.lifecycle.execution import SUCCESS, Result
-from lifecycle.node.lifecycle.executor_tasks import Turns
 from lifecycle.node.lifecycle.gate import Gate
 from lifecycle.node.lifecycle.machine import Change, NodeState, Outcome, RefusedError, Request
-from lifecycle.node.lifecycle.services import LifecycleServices
+from lifecycle.node.lifecycle.services import LifecycleServices, Turns
 from lifecycle.node.reporting import configuration
 from lifecycle.node.reporting.configuration import ConfigurationChanges
 from lifecycle.node.reporting.graph_member import GraphMember

@@ -7,6 +7,8 @@ what they all do is put together in managed.py.
 
 from __future__ import annotations
 
+import functools
+import inspect
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -25,10 +27,10 @@ from rclpy.task import Future
 from rclpy.time_source import TimeSource
 from rclpy.timer import Timer
 
+from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.network.connection_url import ConnectionUrl
 from lifecycle.node.author import parameters
-from lifecycle.node.author.blocking import refuse_to_deadlock
 from lifecycle.node.author.declarations import Declarations
 from lifecycle.node.author.managed import Managed
 from lifecycle.node.author.spec import (
@@ -49,6 +51,53 @@ from lifecycle.verify.observation import ConnectionReport
 
 if TYPE_CHECKING:
     from rclpy.action import ActionClient
+
+
+_SPINNING = ("rclpy.executors", "_spin_once_impl")
+
+
+class DeadlockError(LifecycleError):
+    """A blocking call was made in the thread that would have to bring its answer."""
+
+
+def refuse_to_deadlock(client: Client) -> None:
+    """Make `client.call` raise DeadlockError inside the executor; elsewhere it is rclpy's own."""
+    blocking = client.call
+
+    @functools.wraps(blocking)
+    def call(*arguments: Any, **options: Any) -> Any:
+        refuse_to_block(f"service {client.srv_name!r}", "client.call_async(request)")
+        return blocking(*arguments, **options)
+
+    client.call = call
+
+
+def refuse_to_block(what: str, instead: str) -> None:
+    """Raise DeadlockError inside the executor, where waiting for `what` would never end.
+
+    Args:
+        what: that an answer is awaited of.
+        instead: what can be awaited.
+    """
+    if _in_executor():
+        raise DeadlockError(
+            f"cannot wait for {what} in a callback: the answer comes by the executor that waits "
+            "for this callback",
+            hint=f"write `async def` and `await {instead}`",
+        )
+
+
+def _in_executor() -> bool:
+    """Tell whether this thread is inside a single-threaded executor's turn.
+
+    A multi-threaded one runs callbacks in other threads than the one that spins.
+    """
+    frame = inspect.currentframe()
+    while frame is not None:
+        if (frame.f_globals.get("__name__"), frame.f_code.co_name) == _SPINNING:
+            return True
+        frame = frame.f_back
+    return False
 
 
 class GatedFactories(Node):  # type: ignore[misc]  # rclpy is not typed

@@ -15,8 +15,7 @@ from collections.abc import Mapping as AbstractMapping
 from typing import TYPE_CHECKING, Any
 
 from lifecycle.node.connections.connections import Connection, Connections
-from lifecycle.node.endpoints.endpoint_names import Key
-from lifecycle.node.endpoints.mapping import Mapping, count_peers
+from lifecycle.node.endpoints.mapping import Key, Mapping, count_peers
 
 if TYPE_CHECKING:
     from lifecycle.node.lifecycle.gate import Later

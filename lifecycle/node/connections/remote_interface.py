@@ -19,7 +19,7 @@ from rclpy.node import Node
 
 from lifecycle.errors import LifecycleError
 from lifecycle.node.connections.connections import connections_of
-from lifecycle.node.connections.node_interface import NodeInterface
+from lifecycle.node.connections.data_layer import NodeInterface
 
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup

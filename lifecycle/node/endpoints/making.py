@@ -223,7 +223,7 @@ class Maker:
             return self._node.create_client(
                 interface, name or endpoint.name, **_qos_profile(endpoint)
             )
-        from lifecycle.node.author.blocking import refuse_to_deadlock
+        from lifecycle.node.author.node import refuse_to_deadlock
 
         client = connection.participant.create_client(
             interface,
@@ -280,7 +280,7 @@ class Maker:
         name: str,
     ) -> Any:
         from lifecycle.middleware.services.actions import GoalClient
-        from lifecycle.node.author.blocking import refuse_to_block
+        from lifecycle.node.author.node import refuse_to_block
 
         return self._action(
             endpoint,

@@ -15,9 +15,8 @@ from rclpy.task import Future
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.node.connections.connection_status import Standing
 from lifecycle.node.connections.connections import Connection, Connections
-from lifecycle.node.endpoints.endpoint_names import Key
 from lifecycle.node.endpoints.making import CLIENTS
-from lifecycle.node.endpoints.mapping import Mapping, Placement
+from lifecycle.node.endpoints.mapping import Key, Mapping, Placement
 from lifecycle.node.endpoints.placing import After, Handover, Overlap, Placer
 
 if TYPE_CHECKING:

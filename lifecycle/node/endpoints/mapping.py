@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 from rclpy.event_handler import (
@@ -15,8 +15,10 @@ from rclpy.event_handler import (
 )
 from rclpy.publisher import Publisher
 
+from lifecycle.errors import LifecycleError
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.node.author.handlers import nearest
 from lifecycle.node.connections.connections import Connection
-from lifecycle.node.endpoints.endpoint_names import Key
 from lifecycle.node.endpoints.making import wire_name
 from lifecycle.plan.model import PlannedEndpoint
 
@@ -26,6 +28,55 @@ if TYPE_CHECKING:
     from rclpy.subscription import Subscription
 
     from lifecycle.middleware.services.server_watch import ServerWatch
+
+
+Key = tuple[EndpointKind, str]
+"""Kind and declared name: what identifies an endpoint within its node."""
+
+
+class UnknownEndpointError(LifecycleError, KeyError):
+    """Code asked for an endpoint by a name that no interface declares."""
+
+
+def find_endpoint(spelling: str, declared: Iterable[Key], *, node: str) -> Key:
+    """Return the endpoint that a spelling means.
+
+    Args:
+        spelling: `publishers/video`, or the declared name alone where no other kind has it.
+        declared: every declared endpoint.
+        node: fully qualified node name, for messages.
+
+    Raises:
+        UnknownEndpointError: it means none, or more than one.
+    """
+    keys = list(declared)
+    by_spelling = {kind.spell(name): (kind, name) for kind, name in keys}
+    if spelling in by_spelling:
+        return by_spelling[spelling]
+    named = [key for key in keys if key[1] == spelling]
+    if len(named) == 1:
+        return named[0]
+    if named:
+        choices = " or ".join(repr(kind.spell(name)) for kind, name in named)
+        raise UnknownEndpointError(
+            f"cannot tell which {spelling!r} of {node} is meant", hint=f"write {choices}"
+        )
+    if not keys:
+        raise UnknownEndpointError(
+            f"cannot find endpoint {spelling!r} of {node}",
+            hint="endpoints are declared at configure; ask from on_configure on",
+        )
+    near = nearest(spelling, by_spelling)
+    if not near:
+        kind, _, name = spelling.partition("/")
+        is_kind = kind in {each.value for each in EndpointKind}
+        near_name = nearest(name if is_kind else spelling, [name for _, name in keys])
+        near = next((each for each, key in by_spelling.items() if key[1] == near_name), "")
+    listed = ", ".join(repr(each) for each in by_spelling)
+    raise UnknownEndpointError(
+        f"cannot find endpoint {spelling!r} of {node}",
+        hint=(f"did you mean {near!r}? " if near else "") + f"declared: {listed}",
+    )
 
 
 def count_peers(entity: Publisher | Subscription) -> int:

@@ -24,7 +24,7 @@ from lifecycle.middleware.discovery.rediscovery import send_again_soon
 from lifecycle.middleware.process.busy_timer import BusySign
 from lifecycle.middleware.process.teardown import leave_and_exit
 from lifecycle.node.author.node import LifecycleNode
-from lifecycle.node.connections.node_interface import NodeInterface
+from lifecycle.node.connections.data_layer import NodeInterface
 from lifecycle.node.host.constructing import Participants, class_of, construct
 from lifecycle.node.host.control import (
     Command,

@@ -22,9 +22,9 @@ from typing import Any, NoReturn, Protocol
 from urllib.parse import quote, unquote, urlsplit
 
 from lifecycle.network.address import is_loopback
-from lifecycle.programming.apply.deadline import Deadline
 from lifecycle.programming.apply.errors import HttpError, MissingFeatureError, SettingsError
 from lifecycle.programming.apply.settings import Token
+from lifecycle.programming.apply.tool import Deadline
 
 try:
     import httpx

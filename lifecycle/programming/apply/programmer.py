@@ -23,10 +23,10 @@ from lifecycle.network.address import canonical, is_loopback
 from lifecycle.network.five_qi import DscpMapping
 from lifecycle.plan.model import Plan, PlannedNode
 from lifecycle.programming.apply.changes import Changes, Target
-from lifecycle.programming.apply.deadline import Deadline
 from lifecycle.programming.apply.errors import PartlyError
 from lifecycle.programming.apply.ledger import Ledger, has_ledger, owner_is_dead
 from lifecycle.programming.apply.targets import TargetOptions, Targets
+from lifecycle.programming.apply.tool import Deadline
 from lifecycle.programming.rules.rules import FlowRule, LeftOut, RuleSet, SourceAddress, flow_rules
 from lifecycle.run_directory import is_held, run_name, runtime_root
 from lifecycle.verify.verdict import FlowReport, Outcome

@@ -13,7 +13,6 @@ from pathlib import Path
 from lifecycle.errors import UsageError
 from lifecycle.programming.apply import camara, nef, nft, tc
 from lifecycle.programming.apply.changes import Target
-from lifecycle.programming.apply.deadline import Deadline
 from lifecycle.programming.apply.errors import SettingsError
 from lifecycle.programming.apply.http import Api, Clock, Patience
 from lifecycle.programming.apply.ledger import Ledger, TargetRecord
@@ -24,7 +23,7 @@ from lifecycle.programming.apply.settings import (
     Settings,
     load_settings,
 )
-from lifecycle.programming.apply.tool import Tool
+from lifecycle.programming.apply.tool import Deadline, Tool
 from lifecycle.programming.rules.tc import DEFAULT_QUEUE_MS, TcMatch, TcSettings
 
 KINDS = (nft.KIND, tc.KIND, nef.KIND, camara.KIND)

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
-from lifecycle.programming.rules.flows_csv import flows_to_csv
-from lifecycle.programming.rules.registry import EXPORTS, ExportInput, ExportSettings, export_input
+from lifecycle.programming.rules.registry import (
+    EXPORTS,
+    ExportInput,
+    ExportSettings,
+    export_input,
+    flows_to_csv,
+)
 from lifecycle.programming.rules.rules import FlowRule, LeftOut, RuleSet, flow_rules
 
 __all__ = [

@@ -245,7 +245,7 @@ def test_a_package_that_fails_to_import_is_not_said_to_be_missing(
         raise ModuleNotFoundError("No module named 'numpy'", name="numpy")
 
     monkeypatch.setattr(
-        "lifecycle.middleware.rcl.interface_types.importlib",
+        "lifecycle.middleware.rcl.qos.importlib",
         SimpleNamespace(import_module=import_module),
     )
     with pytest.raises(ModuleNotFoundError, match="numpy"):

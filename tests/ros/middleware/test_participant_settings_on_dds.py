@@ -27,7 +27,7 @@ from lifecycle.middleware import (
     has_shared_memory,
     participant_settings,
 )
-from lifecycle.middleware.discovery.discovery_range import without_localhost
+from lifecycle.middleware.fastdds.settings import without_localhost
 from lifecycle.network.nfe import NetworkFlowEndpoint, TransportProtocol
 from lifecycle.verify.observation import Identity
 from lifecycle.verify.transport import carrier

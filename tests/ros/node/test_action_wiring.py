@@ -22,7 +22,7 @@ from test_msgs.action import Fibonacci
 from lifecycle import LifecycleNode, on_message
 from lifecycle.errors import LifecycleError
 from lifecycle.middleware.services.actions import ActionClientGoneError
-from lifecycle.node.author.blocking import DeadlockError
+from lifecycle.node.author.node import DeadlockError
 
 Active = Callable[..., Any]
 Ask = Callable[..., Asking]

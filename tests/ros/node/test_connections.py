@@ -23,9 +23,9 @@ from lifecycle.manifest.qos import Durability
 from lifecycle.network.nfe import TransportProtocol, UniqueRequirement
 from lifecycle.node.connections.connection_status import ConnectionEvent, ConnectionEventKind
 from lifecycle.node.connections.connections import ConnectError, UnknownConnectionError
-from lifecycle.node.connections.node_interface import NotConfiguredError
+from lifecycle.node.connections.data_layer import NotConfiguredError
 from lifecycle.node.endpoints import placing
-from lifecycle.node.endpoints.endpoint_names import UnknownEndpointError
+from lifecycle.node.endpoints.mapping import UnknownEndpointError
 from lifecycle.plan.model import ParticipantConnections, PlannedParticipant
 from lifecycle.verify.observation import NodeConfiguration
 

@@ -24,7 +24,7 @@ from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import EndpointPolicy, ParameterDeclaration, Timeouts
 from lifecycle.manifest.qos import Durability, QosProfile
 from lifecycle.middleware import to_rclpy
-from lifecycle.node.endpoints.endpoint_names import UnknownEndpointError
+from lifecycle.node.endpoints.mapping import UnknownEndpointError
 from lifecycle.node.lifecycle.machine import NodeState
 from lifecycle.plan.model import PlannedNode
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from lifecycle.cli import verb_flows, verb_up
-from lifecycle.cli.verb_flows import NAMES, Export
+from lifecycle.cli.verbs import flows, up
+from lifecycle.cli.verbs.flows import NAMES, Export
 from lifecycle.errors import UsageError
 from lifecycle.programming.rules import EXPORTS
 from tests.unit.programming.apply.samples import nef_settings, settings_file
@@ -93,7 +93,7 @@ def test_an_export_without_what_it_needs_is_refused(name: str, message: str) -> 
     ],
 )
 def test_flows_refuses_options_that_do_not_fit(options: list[str], message: str) -> None:
-    result = CliRunner().invoke(verb_flows.command, ["m.yaml", *options])
+    result = CliRunner().invoke(flows.command, ["m.yaml", *options])
 
     assert str(result.exception) == message
 
@@ -115,6 +115,6 @@ def test_flows_refuses_options_that_do_not_fit(options: list[str], message: str)
 def test_up_refuses_options_that_do_not_fit(options: list[str], message: str) -> None:
     manifest = Path(__file__).parents[3] / "manifests" / "first_node.lifecycle.yaml"
 
-    result = CliRunner().invoke(verb_up.command, [str(manifest), *options])
+    result = CliRunner().invoke(up.command, [str(manifest), *options])
 
     assert str(result.exception) == message

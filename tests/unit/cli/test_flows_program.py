@@ -9,7 +9,7 @@ import click
 import pytest
 from click.testing import CliRunner
 
-from lifecycle.cli import flows_program
+from lifecycle.cli.verbs import flows_program
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.programming.apply import MissingFeatureError, TargetOptions
 from tests.unit.programming.apply.samples import nef_settings, settings_file

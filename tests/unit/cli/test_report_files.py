@@ -16,7 +16,7 @@ import pytest
 
 from lifecycle.cli.report import Report, open_report
 from lifecycle.cli.up_output import output
-from lifecycle.cli.verb_up import _finished
+from lifecycle.cli.verbs.up import _finished
 from lifecycle.errors import ExitCode, MiddlewareError, UsageError
 from lifecycle.manifest import Diagnostic, ManifestError, Position, Severity
 from lifecycle.plan import build_plan

@@ -10,7 +10,8 @@ from pathlib import Path
 import jsonschema
 import pytest
 
-from lifecycle.cli import main, verb_check
+from lifecycle.cli import main
+from lifecycle.cli.verbs import check
 from lifecycle.manifest.schema import read_schema
 from lifecycle.plan.programs import Resolution
 
@@ -26,7 +27,7 @@ def corpus(monkeypatch: pytest.MonkeyPatch, without_programs: None) -> None:
 @pytest.fixture
 def without_programs(monkeypatch: pytest.MonkeyPatch) -> None:
     """Look for nothing that nodes run: what manifests of the corpus run is made up."""
-    monkeypatch.setattr(verb_check, "resolve", lambda *_: Resolution())
+    monkeypatch.setattr(check, "resolve", lambda *_: Resolution())
 
 
 @pytest.mark.usefixtures("corpus")
@@ -98,7 +99,8 @@ def test_json_fits_its_schema(
 def test_checking_imports_nothing_of_ros() -> None:
     program = f"""
 import sys
-from lifecycle.cli import main, verb_check
+from lifecycle.cli import main
+from lifecycle.cli.verbs import check
 code = main(["check", {str(ROOT / "manifests" / "first_node.lifecycle.yaml")!r}])
 heavy = ("rclpy", "rcl_interfaces", "lifecycle_msgs", "sensor_msgs", "std_msgs", "ctypes.util")
 print(sorted(name for name in heavy if name in sys.modules))

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from lifecycle.cli import verb_up
+from lifecycle.cli.verbs import up
 from lifecycle.errors import ExitCode, UsageError
 
 
@@ -41,10 +41,10 @@ def test_an_interrupt_while_the_manifest_is_read_is_told(
     manifest = tmp_path / "m.lifecycle.yaml"
     manifest.write_text("manifest_version: 1\nsystem: s\n")
     monkeypatch.setattr("lifecycle.supervisor.run.up.Forerunner", _NoForerunner)
-    monkeypatch.setattr(verb_up, "load_manifest", lambda *_, **__: signal.raise_signal(number))
+    monkeypatch.setattr(up, "load_manifest", lambda *_, **__: signal.raise_signal(number))
     report = tmp_path / "report.json"
     words = [str(manifest), "--report", str(report)]
-    result = CliRunner().invoke(verb_up.command, words, standalone_mode=False)
+    result = CliRunner().invoke(up.command, words, standalone_mode=False)
     assert result.return_value == exit_code
     assert json.loads(report.read_text())["run"]["exit_code"] == exit_code
     assert result.stderr == f"ended before anything was started: {reason}\n"
@@ -57,14 +57,14 @@ def test_a_report_that_cannot_be_written_is_refused_before_anything_is_started(
     monkeypatch.setattr("lifecycle.supervisor.run.up.Forerunner", lambda: pytest.fail("it started"))
     words = [str(tmp_path / "m.lifecycle.yaml"), "--report", str(tmp_path / "no" / "report.xml")]
     with pytest.raises(UsageError, match=r"cannot write report .*: No such file or directory"):
-        CliRunner().invoke(verb_up.command, words, standalone_mode=False, catch_exceptions=False)
+        CliRunner().invoke(up.command, words, standalone_mode=False, catch_exceptions=False)
 
 
 def test_a_wrong_option_leaves_no_report_of_an_earlier_run(tmp_path: Path) -> None:
     report = tmp_path / "report.xml"
     report.write_text("<testsuites failures='0'/>")
     words = ["m.lifecycle.yaml", "--until", "tomorrow", "--report", str(report)]
-    result = CliRunner().invoke(verb_up.command, words)
+    result = CliRunner().invoke(up.command, words)
     assert result.exit_code == ExitCode.USAGE
     assert report.read_text() == ""
 

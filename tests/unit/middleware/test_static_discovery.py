@@ -8,7 +8,7 @@ from xml.etree import ElementTree as ET
 import pytest
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.fastdds.static_discovery import (
+from lifecycle.middleware.fastdds.participant_profile import (
     endpoint_profiles,
     endpoint_table,
     find_endpoint,

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from lifecycle.cli.verb_plan import command
+from lifecycle.cli.verbs.plan import command
 from lifecycle.manifest.model import (
     Authority,
     Condition,

@@ -12,21 +12,21 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lifecycle.cli.common import format_option, load_manifest, manifest_arguments, timeout_option
-from lifecycle.cli.flows_program import (
+from lifecycle.cli.standard_streams import echo_while_read
+from lifecycle.cli.verbs.flows_program import (
     chosen,
     network_options,
     treatment_of,
     treatment_options,
     with_subcommands,
 )
-from lifecycle.cli.standard_streams import echo_while_read
 from lifecycle.codec import to_json
 from lifecycle.errors import UsageError
 from lifecycle.manifest.model import UniqueHow
 from lifecycle.network.dscp import describe
 from lifecycle.network.nfe import NetworkFlowEndpoint
 from lifecycle.printable import json_text, lines, one_line
-from lifecycle.programming.rules.flows_csv import flows_to_csv
+from lifecycle.programming.rules.registry import flows_to_csv
 from lifecycle.verify import FlowReport
 
 if TYPE_CHECKING:
@@ -216,7 +216,7 @@ def _show(
     One line per network flow: its 5-tuple, on IPv6 its flow label, DSCP and TOS byte, how unique it
     is, what was required and the verdict. Exits as `lifecycle verify` does.
     """
-    from lifecycle.cli.verb_verify import exit_code
+    from lifecycle.cli.verbs.verify import exit_code
     from lifecycle.plan import build_plan
     from lifecycle.supervisor.run.attach import follow_running, judge_running
     from lifecycle.verify import Verdict

@@ -7,8 +7,13 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lifecycle.cli.common import format_option, load_manifest, manifest_arguments, timeout_option
-from lifecycle.cli.flows_program import chosen, program_options, treatment_of, treatment_options
 from lifecycle.cli.report import Report, report_option, written_or_said
+from lifecycle.cli.verbs.flows_program import (
+    chosen,
+    program_options,
+    treatment_of,
+    treatment_options,
+)
 from lifecycle.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:

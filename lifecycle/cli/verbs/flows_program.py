@@ -365,7 +365,7 @@ def _judged(manifest: str, assignments: tuple[str, ...], timeout_s: float) -> tu
 
 
 def _exit_code(verdict: Verdict) -> int:
-    from lifecycle.cli.verb_verify import exit_code
+    from lifecycle.cli.verbs.verify import exit_code
 
     return exit_code(verdict, strict=False)
 
