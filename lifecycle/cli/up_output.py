@@ -1,7 +1,11 @@
 """What `lifecycle up` shows: JSON lines, plain lines, or a live table on a terminal.
 
-Owns: the choice between them and the two line formats; the table is live.py's. Everything comes
-from the supervisor's events.
+Owns: the choice between them and the two line formats. Everything comes from the supervisor's
+events.
+
+The live table of `lifecycle up` on a terminal. Owns: how a run looks while it happens. Log
+lines and notices scroll above the table; the table shows each node's process, state, matched
+endpoints and flows, and is drawn again at every event.
 """
 
 from __future__ import annotations

@@ -2,6 +2,10 @@
 
 Owns: how what a graph tells is written in the manifest's words, and `# gap:` on every line whose
 value it does not tell. What is written passes `lifecycle check`. Pure.
+
+Data as YAML text that reads back the same here, in YAML 1.1 and in YAML 1.2. Owns: when a
+scalar needs quotes, how comments stand beside what they are about, and that the same data give
+the same text.
 """
 
 from __future__ import annotations

@@ -2,6 +2,13 @@
 
 Owns: `FlowNeeds`, which the checks and the planner both read, so that `check` judges what `plan`
 will do. Reads interface definitions; starts nothing.
+
+Which 5QI a publisher's need comes to, and whether that class keeps what is declared. Owns:
+`five_qi: auto`, and the check of a 5QI that is written. The table is `lifecycle.network`'s.
+
+Which DSCP an endpoint's need comes to, and why. Owns: the ways to a DSCP besides writing it: a
+TRANSPORT_PRIORITY through its mapping, a 5QI through a mapping, and a value of one's own where
+the DSCP is the identifier.
 """
 
 from __future__ import annotations

@@ -3,6 +3,15 @@
 Owns: where the index lies and how a resource is found in it, as ament_index_python does, but for a
 prefix that AMENT_PREFIX_PATH need not name: wheels install the index under `sys.prefix`. Reads the
 file system; needs no ROS.
+
+Whether an interface type exists, told by the ament index alone. Owns: the three answers to "is
+there a `sensor_msgs/msg/Image`?". Imports no message package, so that a manifest is checked
+without ROS installed or sourced.
+
+The type hash (REP-2016) of an interface as it is installed here, from its type description.
+Owns: reading `share/<package>/<kind>/<Type>.json`, which rosidl installs beside every
+definition, and how the hashes of a service's and an action's messages are put together. Imports
+no message package. Reads the file system.
 """
 
 from __future__ import annotations

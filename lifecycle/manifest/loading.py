@@ -1,7 +1,10 @@
 """A manifest file → a checked system: the door of this room.
 
-Owns: reading, validation, includes, arguments and checks in their order, and what is left of a
-document without what is wrong in it, so that all findings come at once.
+Owns: `load`: the run of source → arguments → schema → build for a manifest and everything it
+includes, then of the checks, with every finding gathered on the way. A part that something is wrong
+in is left out, and the rest is checked in the same run. It is imported when `load` is asked for: a
+process that hosts a node needs a manifest's types, but never YAML nor JSON Schema, and those are
+half of what it would import. Touches the file system; needs no ROS.
 """
 
 from __future__ import annotations

@@ -2,6 +2,10 @@
 
 Owns: the bound of a type's serialized size, from the `.idl` file that every interface package
 installs, also for what was written as `.msg`. Imports no message package. Reads the file system.
+
+The part of OMG IDL that ROS interfaces are installed in: one structure, its fields and
+typedefs. Owns: reading `struct Name { … }` out of an `.idl` file as rosidl writes or accepts it
+(https://design.ros2.org/articles/idl_interface_definition.html). Everything else is skipped.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """The frozen manifest: what a document says once it is valid, arguments and includes resolved.
 
-Owns: the types that cross from this room into plan/, all of which can be had from here: the words
-are in choices.py, what is said of one node in node_model.py. Nothing here knows YAML. Pure.
+Owns: the types that cross from this room into plan/: the system, and of each node how it runs, its
+interface, its flows and its connections. Closed sets of words are in choices.py. Nothing here knows
+YAML. Pure.
 """
 
 from __future__ import annotations

@@ -4,6 +4,10 @@ Owns: resolving references (`local://relative/path`, `nodl://package/name`) with
 include, and turning a document into an `Interface`. The document format is nodl.schema.yaml of
 ros-tooling/nodl 2.0. What this package does not use of it is reported as a warning; what breaks
 it is an error. Writing NoDL (`to_nodl`) is left for later and belongs here as well.
+
+One NoDL v2 document's entries → endpoints and parameter declarations. Owns: the field names and
+defaults of nodl.schema.yaml and parameter.schema.yaml (the shape of
+generate_parameter_library), and what is said of fields that nothing here uses.
 """
 
 from __future__ import annotations

@@ -3,6 +3,13 @@
 Owns: loading the shipped schemas and turning each violation into one `Diagnostic`; the words are
 `wording`'s, and `violation` picks the branch that was meant where a choice failed.
 Pure but for reading the shipped schemas.
+
+The words of messages about values that do not fit the schema. Owns: what is allowed, said by a
+schema's keywords, in a phrase; the nearest spelling. Every message starts with "cannot" and
+quotes the value.
+
+One broken keyword of a JSON Schema, typed. Owns: the adapter around jsonschema's
+`ValidationError`, whose fields are untyped and optional.
 """
 
 from __future__ import annotations

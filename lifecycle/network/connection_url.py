@@ -1,8 +1,8 @@
 """Connection URLs: what `connect_to` is told, transport and addresses.
 
 Owns: their grammar, `TRANSPORT://[ADDRESS][:PORT][?OPTION=VALUE&…]`, both ways. The idea is that of
-*Topological Discovery and Communication Negotiation* ("Statically Configured Nodes"); the options
-are in connection_options.py, and what a URL becomes is middleware/'s. Pure.
+*Topological Discovery and Communication Negotiation* ("Statically Configured Nodes"); what
+a URL becomes is middleware/'s. Pure.
 
     udpv4://10.77.0.1:7911?metatraffic_port=7910&output_port=7999&peer=10.77.0.2:7910&multicast=off
     udpv6://[fd77::1]:7911?metatraffic_port=7910&peer=[fd77::2]:7910&multicast=off
@@ -10,6 +10,9 @@ are in connection_options.py, and what a URL becomes is middleware/'s. Pure.
     tcpv4://10.77.0.1:5100?peer=10.77.0.2:5100
     tcpv4://10.77.0.1:5101?server=10.77.0.3:42100
     shm://
+
+The options of connection URLs: `?peer=10.77.0.2:7910&multicast=off`. Owns: which transport has
+which option, how a value is read and spelled, and the words that occur in them.
 """
 
 from __future__ import annotations

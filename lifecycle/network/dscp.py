@@ -5,6 +5,10 @@ Owns: every spelling of a DSCP that a user may write or read. Pure.
 A DSCP is the upper six bits of the byte that IPv4 calls TOS and IPv6 calls traffic class; the lower
 two are ECN (RFC 2474, RFC 3168). Products differ in which of the two numbers they ask for, so both
 are always shown side by side.
+
+TRANSPORT_PRIORITY → TOS byte as RTI Connext Micro computes it, for systems that number so.
+Owns: the mapping of *Connext Micro, Transport Priority*, "Using transport priority with UDP",
+and what it silently loses.
 """
 
 from __future__ import annotations

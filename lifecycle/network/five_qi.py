@@ -2,6 +2,10 @@
 
 Owns: 3GPP TS 23.501 Table 5.7.4-1 as data with its sources, and the judgement whether a class can
 keep what a flow declares. Pure.
+
+5QI ↔ DSCP mappings: published ones with their provenance, and a user's own. Owns: reading them
+and looking up in them. No mapping is the default, because none is normative: what a network
+does is configured in that network.
 """
 
 from __future__ import annotations

@@ -11,6 +11,10 @@ path on which the network cannot tell the endpoints apart.
 
 A publisher's NFE is the source of a flow and a subscription's the destination, two different places
 of the tuple; so publishers are compared with publishers and subscriptions with subscriptions.
+
+Network flows as tuples: what a source and a destination NFE make together. Owns: which NFEs of
+a publisher and a subscription form a flow, as *Unique Network Flows* describes it: a 5-tuple,
+on IPv6 a flow label beside it, and the DSCP.
 """
 
 from __future__ import annotations

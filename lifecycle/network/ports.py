@@ -5,6 +5,9 @@ ranges, and the limits that follow (the article *The ROS_DOMAIN_ID*). Pure.
 
 These are the ports a participant asks for. A busy one is replaced by the implementation, so the
 ports of a running system are read from it, never inferred from here.
+
+Whether so many participants and unique subscriptions fit on one host. Owns the judgement.
+`ports` knows the arithmetic; this module says what to tell a person whose system overflows.
 """
 
 from __future__ import annotations

@@ -2,6 +2,14 @@
 
 Owns: what a handler's return value or exception makes of its goal, and how a goal that can be
 worked on no longer is taken from its handler. Which goals are accepted when is making.py's.
+
+One handler at work on one goal of an action, and how it is stopped. Owns: driving the handler
+by hand, so that it can be stopped where it awaits.
+
+What an action is called in the graph, as rcl resolves it for a running node. Owns: the rule
+that rcl of ROS 2 Jazzy remaps an action's hidden topics and services one by one and never the
+action, so that its name is what is left of theirs. `manifest.names.resolve` is the same without
+ROS.
 """
 
 from __future__ import annotations

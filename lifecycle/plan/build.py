@@ -3,6 +3,15 @@
 Owns: `build_plan`, which puts the parts of this room together, and `check_plan`, which only says
 whether that can be done. Nothing here starts anything. Pure but for the environment, for finding
 executables and for reading parameter files.
+
+Dependency levels: which nodes wait for which. Owns: `dependency_levels`, the longest-path
+layering of the `after:` graph.
+
+Flows: every publisher → subscription pair of the computational graph. Owns: which pairs a
+system has, and what `links:` demand of them.
+
+Operating system processes: which nodes share one, and what each is started with. Owns: grouping
+nodes into processes, their argv and environment. Pure but for finding executables.
 """
 
 from __future__ import annotations

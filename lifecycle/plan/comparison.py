@@ -6,6 +6,10 @@ includes and arguments: not where it is written, nor what follows from the host 
 same checksum from the same manifest. The order of entries counts where the manifest says it does:
 in a command line and among parameter files, and for nodes where ports are given out in their order.
 Pure.
+
+What a supervisor announces of its plan, so that others can compare it with their own. Owns:
+`PlanNotice`, its text on the wire with bounds in both directions, and `concerns`: whose plan
+has to be the same as ours. How two plans differ is `comparison`'s.
 """
 
 from __future__ import annotations

@@ -2,6 +2,8 @@
 
 Owns: the types that cross from this room into verify/, middleware/, node/ and supervisor/.
 Every name in it is fully qualified. JSON-able through `lifecycle.codec`. Pure.
+
+The one way planning fails. Owns: `PlanError`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Extra participants for endpoints that need a network flow or a mark of their own.
 
-Owns: naming and describing the participants that `manifest/flows/flow_needs.py` groups
+Owns: naming and describing the participants that `manifest/flows.py` groups
 endpoints into, and what one costs. On Fast DDS a publisher's
 network flow endpoints are its participant's sender sockets, so only a participant of its own makes
 it unique, and only all publishers of one participant together can carry a DSCP. From the same

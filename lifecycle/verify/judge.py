@@ -1,6 +1,12 @@
 """Plan × Observation → Verdict.
 
 Owns: `verify`, and when a verdict closes the gate. Everything it needs is in its arguments. Pure.
+
+One report per planned flow: what carries it, how unique it is, and whether it is as declared.
+Owns: turning the view and the findings into FlowReports.
+
+What a verdict still waits for, or takes on trust, in one line. Owns: `missing`, `not_ok`,
+`taken_on_trust`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,21 @@
 """The verdict as text for people. Pure.
 
 Owns: layout and wording; the findings' own sentences come from the rules.
+
+The verdict as JUnit XML, for continuous integration. Owns: which test cases there are, and what
+each comes to. Their names and number are always the same, so that reports can be compared case
+by case: one for the manifest, one for each rule, one for the end of the run. What refuses the
+system is a failure. What could not be verified and was allowed is in the case's system-out, as
+flows are in their suite's; a case is skipped only where nothing was judged, and then the end of
+the run fails.
+
+The verdict as SARIF 2.1.0, for editors and code scanning. Source of the format: OASIS SARIF
+2.1.0. Violated is an error, unverifiable a warning; a finding points at the declaration in the
+manifest. A run that was no success has at least one error; its rule is `run.end` where no
+finding is to blame, so that an unjudged system does not look good.
+
+The verdict as JSON. Owns: the document of schemas/verdict.v1.schema.json, and how findings are
+written in any.
 """
 
 from __future__ import annotations

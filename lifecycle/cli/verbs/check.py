@@ -1,4 +1,9 @@
-"""`lifecycle check`: judge a manifest without running anything. Imports nothing of ROS."""
+"""`lifecycle check`: judge a manifest without running anything. Imports nothing of ROS.
+
+What `lifecycle check` found, as text, JSON, SARIF 2.1.0 or JUnit. Owns: `CheckReport` and its
+formats. The tests of a JUnit report are the same four whatever was found, so that a CI's
+history can follow them; none is ever skipped.
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,11 @@
 """`lifecycle flows`: show every network flow and how unique it is, and program networks with them.
 
-Owns: the table. Exports are flows_export.py's; apply, diff and remove are flows_program.py's.
+`apply`, `diff` and `remove` are flows_program.py's.
+
+Flows as a table, JSON or CSV. Owns: the columns of the table, and words for the unknown.
+
+`lifecycle flows --export`: verified flows as the file of another system. Owns: from options to
+what an export needs, and its refusals. The texts are `programming.rules`'s.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""`lifecycle status`: show what a running supervisor sees."""
+"""`lifecycle status`: show what a running supervisor sees.
+
+A status as plain text. Owns: its columns.
+"""
 
 from __future__ import annotations
 

@@ -2,6 +2,9 @@
 
 Owns: the page: what stands on it, in which order, and that nothing of a graph is ever taken for
 markup. The script only filters and lights up what is there already. Pure.
+
+The style sheet and the script of the HTML page. Owns how it looks and what hovering does.
+Without the script everything is there; it filters rows and lights up what belongs together.
 """
 
 from __future__ import annotations

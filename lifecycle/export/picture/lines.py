@@ -1,4 +1,14 @@
-"""What a picture shows between nodes: topics, services, actions, flows and participants."""
+"""What a picture shows between nodes: topics, services, actions, flows and participants.
+
+The lines of a picture: topics, services and actions, and who is on them. Owns: which ends and
+arrows a line has, and what is said of them.
+
+The flows of a picture: what carries each, between which participants, and how unique it is.
+Owns: turning flow reports and undeclared pairs into PicturedFlows.
+
+The participants of a picture's nodes: as planned, as their nodes tell, and which carries what.
+Owns: laying planned and reported participants side by side.
+"""
 
 from __future__ import annotations
 

@@ -2,6 +2,13 @@
 
 Owns: the types; JSON-able through `lifecycle.codec` (schema: schemas/graph.v1.schema.json). How
 they are filled is build.py's. Pure.
+
+How states, presence and outcomes look in every picture, and in its legend. Owns: colours,
+symbols and words. Colours are those of Okabe and Ito (*Color Universal Design*, 2008), which
+colour-blind readers tell apart; each also has a symbol, and the word stands beside it.
+
+What a picture is drawn from: plan and observation side by side, and the verdict on them. Owns:
+what a plan alone changes, and which findings stand where.
 """
 
 from __future__ import annotations

@@ -2,6 +2,10 @@
 
 Owns: what stands in which row and column: the computational graph has nodes and what they publish
 and offer, the data layer graph participants and flows. Pure.
+
+Where everything of a picture stands: columns for who, rows for what goes between them. Owns:
+the arithmetic. Nothing ever overlaps, however much there is: many columns stand upright words,
+a few lie. All text is monospaced, so that its width is known without a font.
 """
 
 from __future__ import annotations

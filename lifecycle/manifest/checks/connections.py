@@ -2,6 +2,10 @@
 
 Owns: check.unpublished, check.unheard, check.no-server. How severe they are is the manifest's
 policy. Pure.
+
+Checks of the connections that nodes spell out: what they carry, and what flows ask of that.
+Owns: check.connection-endpoint, check.connection-name, check.connection-foreign,
+check.connection-flow. Their addresses and ports are `connection_urls`'.
 """
 
 from __future__ import annotations

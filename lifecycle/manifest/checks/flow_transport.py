@@ -1,6 +1,9 @@
 """Checks of how flows travel: by which transport, and in how large datagrams.
 
 Owns: check.flow-transport, check.flow-fragments, check.ipv6-transports. Pure.
+
+Checks of flow needs against what the RMW can do. Owns: check.rmw. The capability table is
+`lifecycle.network`'s, and what happens at run time decides; this only fails earlier.
 """
 
 from __future__ import annotations

@@ -2,6 +2,13 @@
 
 Owns: check.flow-unknown-endpoint, check.flow-dscp, check.transport-priority, check.flow-five-qi,
 check.five-qi-class, check.flow-impossible, check.flow-foreign. Pure.
+
+Checks of DSCP values that are to tell flows apart. Owns: check.dscp-exhausted,
+check.dscp-not-unique, check.dscp-repurposed: the limits that *Unique Network Flows* gives for
+the DSCP as an identifier.
+
+Checks of links: their ends exist, meet on the topic, and ask for what the link demands. Owns:
+check.link-unknown-node, check.link-topic, check.link-not-unique.
 """
 
 from __future__ import annotations

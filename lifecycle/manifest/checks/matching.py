@@ -2,6 +2,9 @@
 
 Owns: check.qos-incompatible, check.qos-doubtful. The rule itself is `lifecycle.manifest.qos`'s.
 Pure.
+
+Checks of types: they exist, and all ends of one name agree on one. Owns: check.type-unknown,
+check.type-not-installed, check.type-mismatch. Reads the ament index.
 """
 
 from __future__ import annotations
@@ -40,7 +43,7 @@ def _judge(
 ) -> Iterator[Diagnostic]:
     offered, requested = offering.endpoint.qos, requesting.endpoint.qos
     if offered is None or requested is None or offering.endpoint.type != requesting.endpoint.type:
-        return  # types that differ are `types`'s finding
+        return  # types that differ are `check_types`'s finding
     other = requesting if at is offering else offering
     doubtful = []
     unknown = _left_open(offering) | _left_open(requesting)

@@ -1,6 +1,10 @@
 """Checks of names: legal ones, and none of them twice.
 
 Owns: check.name, check.duplicate-node, check.duplicate-endpoint. Pure.
+
+Checks of remap rules: readable, used, and not tying two endpoints of a node together. Owns:
+check.remap-rule, check.remap-identity, check.remap-action, check.remap-unused,
+check.remap-shadowed, check.remap-collision.
 """
 
 from __future__ import annotations

@@ -2,6 +2,18 @@
 
 Owns: check.parameter-undeclared, check.parameter-type, check.parameter-unused. An interface that
 declares no parameters says nothing about them, so nothing is checked then. Pure.
+
+Checks of parameter files: there, readable, for a node of this system, and fitting its
+interface. Owns: check.parameter-file, check.parameter-file-unmatched, and the parameter rules
+for values that stand in files. Reads the files.
+
+Types of parameter values, as rcl_interfaces/ParameterType has them. Owns: whether a value fits
+a declared type, and what rcl makes of a scalar in a parameter file.
+
+ROS parameter files: text → sections, one for each node or pattern that the file names. Owns:
+the layout that rcl_yaml_param_parser reads (namespaces and node names down to
+`ros__parameters`, parameters nested with dots) and how rclcpp and rclpy match a section to a
+node.
 """
 
 from __future__ import annotations

@@ -2,6 +2,10 @@
 
 Owns: resolving all names once, so that each check compares names that are already whole. An
 endpoint whose name cannot be resolved is left out here and reported by `names`. Pure.
+
+Endpoints that every ROS 2 node, or every managed one, has without declaring them. Owns: their
+names, so that what talks to them is not called unconnected. Sources: rcl's rosout and type
+description service, rclpy's parameter services, rcl_lifecycle's services and event.
 """
 
 from __future__ import annotations

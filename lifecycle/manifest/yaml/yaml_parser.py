@@ -3,6 +3,14 @@
 Owns: every limit on what a document may hold (values, depth, aliases, tags, keys). The limits
 are checked event by event, before anything is built or expanded, so that a hostile document
 costs no more than reading it up to the offence. No constructor of PyYAML ever runs. Pure.
+
+What an unquoted scalar means: YAML 1.2's core schema, and the limits on numbers. Owns: the one
+place where text becomes bool, int, float, null or string; used for scalars as written and again
+for a scalar that was one whole substitution. Source of the rules: YAML 1.2.2 §10.3.2. So `yes`,
+`on`, `off` and `1:30` are strings here, and `0o17` is octal. In one thing they are narrower, as
+JSON is: an integer does not begin with 0. Of `017` YAML 1.1 makes fifteen and 1.2 seventeen, of
+`018` a string and eighteen, and writers of 1.1 do write the string '018' bare. A string is what
+no reader can take for another number.
 """
 
 from __future__ import annotations

@@ -11,6 +11,17 @@ It also never uses a connection whose first answer came before the thread that d
 what to ask for next (BIND_CONNECTION_RESPONSE in RTCPMessageManager::processRTCPMessage; seen in
 packets: the request, its answer, and nothing more). Only another participant, on another port,
 helps then.
+
+Removing the DDS participants of a dead process from the graph at once, before their lease ends.
+Owns: the RTPS message by which a participant leaves (DDSI-RTPS 2.3 §8.5.3.3.2, §9.6.3.4,
+§9.6.3.9), written for one whose process was killed and cannot write it, and where it is sent.
+Must not import rclpy.
+
+Whoever knew the participant forgets it and all of its endpoints as if it had left properly
+(Fast DDS 2.14: PDPListener::onNewCacheChangeAdded; measured: within a millisecond). Without it,
+peers and observers show a killed process until its lease has run out, 20 s by default. There is
+no way to check in the message who wrote it, so callers must know that the process is dead, and
+that the participant was that process's.
 """
 
 from __future__ import annotations

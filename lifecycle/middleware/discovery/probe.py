@@ -8,6 +8,12 @@ the same host comes too early and is lost; the one who answered stays quiet for 
 (measured: in about half of all tries). A gate that opens meanwhile has not seen that participant.
 An announcement sent once we do listen, under a name of its own, is answered to our participant's
 port, and to a socket of ours that counts who is there.
+
+Where to knock for everybody that an observer could meet. Owns: which participants' discovery
+ports are asked, for what the environment says of discovery and for connection URLs, and where
+that is impossible: nobody can be asked over shared memory or TCP, nor behind a discovery
+server. Nothing is sent where the system's own discovery would send nothing. Must not import
+rclpy.
 """
 
 from __future__ import annotations

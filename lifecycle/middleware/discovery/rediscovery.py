@@ -6,6 +6,11 @@ each announces itself once in 3 s. `call_out` makes both sides announce themselv
 hears the announcement of a participant that does not exist answers to where it seems to be (see
 probe.py). And rmw_dds_common keeps the name of a node that was forgotten out of the graph until
 its participant tells its entities anew, which `tell_names` makes it do.
+
+TCP connections over a link that is down, tried often enough to heal with it. Owns: how long the
+kernel waits at most before it sends again what nobody acknowledged: it waits twice as long each
+time, up to 120 s, so that after an outage nothing passes for about as long again (RFC 6298
+§5.5). Must not import rclpy.
 """
 
 from __future__ import annotations
@@ -62,7 +67,7 @@ def call_out(
 
     Only as this participant's own discovery would: to its listed peers' ports where it has a list,
     by multicast where that is how others are found, and not at all over TCP and shared memory or
-    behind a discovery server. Those announce themselves each 0.5 s anyway (url_discovery.py).
+    behind a discovery server. Those announce themselves each 0.5 s anyway (url_profile.py).
 
     Args:
         domain_id: 0–232.

@@ -5,6 +5,9 @@ per participant, so a publisher is told apart on the network by getting a partic
 Network Flows*, "Alternatives". A connection (`connect_to` of *Topological Discovery and
 Communication Negotiation*) is one as well, made from connection URLs. One costs about 2.5 MB,
 7 threads, 6 sockets and 6–10 ms.
+
+What a participant was asked for by its URLs, and what of that it has got. Owns: the one DSCP of
+a participant, the sockets on ports that its URLs name, and whether it has shared memory.
 """
 
 from __future__ import annotations

@@ -4,6 +4,12 @@ Owns: the XML, made from what the participant needs, from the default participan
 force anyway (the user's own, or our quick discovery) and from the discovery that rmw_fastrtps would
 have set up. Nothing of a profile of the user's is changed or lost; where it already chooses
 transports, it is refused to choose others. Must not import rclpy; nothing is applied here.
+
+Endpoints that participants know of each other without announcing them (Fast DDS STATIC EDP).
+Owns: the table of all participants' endpoints and the endpoint profiles that tie an endpoint to
+its line of the table. Participants still announce themselves, and in that which lines of the
+table exist: who they are and where is announced, what they publish is not. Must not import
+rclpy.
 """
 
 from __future__ import annotations

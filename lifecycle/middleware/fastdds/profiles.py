@@ -4,6 +4,9 @@ Owns: the quick discovery profile. Fast DDS announces a new participant five tim
 then once each 3 s; when those five are lost or come too early, discovery stalls in steps of 3 s.
 Forty announcements at 50 ms remove the stall. The environment is used, not Fast DDS's C++ API: the
 children of a supervisor, whatever they are written in, inherit it. Must not import rclpy.
+
+The few shapes of elements that Fast DDS profiles are made of. Owns: text elements and locators,
+as Fast DDS 2.14's XML parser reads them. Must not import rclpy.
 """
 
 from __future__ import annotations

@@ -2,6 +2,13 @@
 
 Owns: bringing a ParticipantSettings into force at the only moment there is: while rmw_fastrtps
 makes the participant, which is when the first node of a context is constructed.
+
+How far a context's participant looks for others, as rmw will be told when it makes it. Owns:
+reading that, and taking it out of rmw_fastrtps's hands. For LOCALHOST it adds a shared memory
+and a UDP transport to whatever a profile says (create_participant of rmw_fastrtps_shared_cpp),
+so a participant without shared memory has to bring the same discovery in its own profile; for
+SUBNET it adds a multicast group as soon as there is a static peer. Layouts are those of rmw 7:
+rmw/{init,init_options,discovery_options}.h.
 """
 
 from __future__ import annotations

@@ -2,6 +2,15 @@
 
 Owns: a participant's transports and where its data arrives. Who is grouped into which transport is
 `url_families`, discovery is `url_discovery`. Must not import rclpy; reads no environment.
+
+How a participant of connection URLs finds others and is found, in its Fast DDS profile. Owns:
+where discovery arrives, whom it is sent to, discovery servers, and how often a participant
+announces itself. Must not import rclpy; reads no environment.
+
+The transports that connection URLs make, and which URLs one participant cannot have together.
+Owns: the grouping of URLs into Fast DDS transports. Two URLs of one family (IPv4 UDP and a
+group over IPv4) share one transport: Fast DDS would send everything twice by two of a kind.
+Must not import rclpy; reads no environment.
 """
 
 from __future__ import annotations

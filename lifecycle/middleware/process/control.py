@@ -2,6 +2,8 @@
 
 Owns: prctl(2), the deadman timer of timer_create(2), both through ctypes, and whether threads can
 be started. Linux only. Must not import rclpy: a fork server uses it before rclpy is loaded.
+
+The C library, for what Python does not wrap. Owns: loading it, and timers' arguments.
 """
 
 from __future__ import annotations

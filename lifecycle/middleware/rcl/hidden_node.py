@@ -1,6 +1,8 @@
 """Hidden nodes: a participant of its own with nothing on it that the user did not ask for.
 
 Owns: how such a node and its context are made, and which of them this process has.
+
+A thread that spins a node of our own, beside whatever loop the program has.
 """
 
 from __future__ import annotations

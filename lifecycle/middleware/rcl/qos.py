@@ -3,6 +3,9 @@
 Owns: the conversion both ways. Policies go by name: both sides use rmw's. Infinite durations are
 None on our side; rmw spells them RMW_DURATION_UNSPECIFIED (0, what a default profile holds) or
 RMW_DURATION_INFINITE (what discovery shows), which mean the same on Fast DDS.
+
+Message, service and action classes by their ROS name. Owns: `package/msg/Type` → Python class,
+and the message that says what is wrong with a name.
 """
 
 from __future__ import annotations

@@ -2,6 +2,10 @@
 
 Owns: the private names of `rclpy.action.client` that this takes. Import it late: rclpy.action
 imports numpy, 100 ms.
+
+rclpy's action server, whose goals can be ended from outside and whose answers are sent at once.
+Owns: the private names of `rclpy.action.server` that this takes. What works on a goal, and when
+one has to end, is `lifecycle.node`'s. Import it late: rclpy.action imports numpy, 100 ms.
 """
 
 from __future__ import annotations

@@ -7,6 +7,10 @@ needs no privilege.
 A participant's UDP sender sockets are all there before its first publisher is: Fast DDS looks for
 interfaces once, and opens none for one that appears later (measured: neither a new interface nor a
 new peer changes them). TCP connections come later, are in no NFE list, and are not marked.
+
+The sockets of this process that network flow endpoints stand for. Owns: finding them by
+protocol, address and port among the process's descriptors (proc(5)), and what they say of
+themselves. Fast DDS shows its sockets to nobody.
 """
 
 from __future__ import annotations

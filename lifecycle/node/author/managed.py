@@ -2,6 +2,9 @@
 
 Owns: putting controller, gate, data layer, parameters, timers and services of one node together.
 It is reached as `node.lifecycle`, so that authors have every other attribute name to themselves.
+
+Endpoints that code makes with rclpy's own factories: on no interface, and yet of the node.
+Owns: knowing them, so that the node configuration can tell of them.
 """
 
 from __future__ import annotations

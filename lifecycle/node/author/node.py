@@ -1,8 +1,20 @@
 """LifecycleNode: what people subclass.
 
 Owns: the node as its author sees it: how it is constructed, its callbacks, and access to what is
-declared. Its further methods are in declarations.py, local_interface.py and gated_factories.py;
-what they all do is put together in managed.py.
+declared. Declaring in code is in declarations.py; what all of it does is put together in
+managed.py.
+
+rclpy's factories, gated: what a node's own code makes sends and receives only while active.
+Owns: which of rclpy's factories are overridden, and that what they make is known.
+
+The node interface as a node's own code uses it; remote_interface.py is the same for others.
+Owns: the signatures. What they do is in data_layer.py. See *Topological Discovery and
+Communication Negotiation*, "Node Interface".
+
+A call of a service or action that would wait for ever is an error at once. Owns: the guard
+around rclpy's blocking `Client.call` and its like. Called from a callback, it waits for an
+answer that only the executor can bring, and the executor waits for the callback (rclcpp#2213
+and its like are the oldest trap of lifecycle callbacks).
 """
 
 from __future__ import annotations

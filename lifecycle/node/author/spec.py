@@ -3,6 +3,8 @@
 Owns: the construction context through which a host hands a class its part of the plan, so that
 `Camera()` works under the supervisor, alone with a manifest, and alone without one; and the plan
 of a node that has no manifest, filled by its own `declare_…` calls. Imports no rclpy.
+
+From `module:Class` to a node object. Owns: finding the class, and saying why it cannot be.
 """
 
 from __future__ import annotations

@@ -1,6 +1,11 @@
 """How connections and mappings stand: which have peers, which are established, and telling so.
 
 Owns: the rules by which a connection counts as established or lost, and every connection event.
+
+What becomes of a node's connections and mappings, told as events. Owns: the event type, who is
+called with it and when: in the node's executor, in order, after the callback in which it
+happened. See *Topological Discovery and Communication Negotiation*, "Node Interface"
+(introspection by notification).
 """
 
 from __future__ import annotations

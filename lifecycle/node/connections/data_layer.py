@@ -5,6 +5,10 @@ Owns: the order in which connections and mappings are made and unmade, and what 
 that the plan says, *disconnect* takes everything away. In between `connect_to`, `map_to`,
 `disconnect_from`, `remap` and `alias` change single ones. See *Topological Discovery and
 Communication Negotiation*, "Node Interface".
+
+The node interface: connect_to, map_to, disconnect, remap, alias, and when they are allowed.
+Owns: the one implementation behind the local API, the ROS services and the control channel. See
+*Topological Discovery and Communication Negotiation*, "Node Interface".
 """
 
 from __future__ import annotations

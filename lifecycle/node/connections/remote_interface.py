@@ -1,6 +1,6 @@
 """The node interface for everybody else: five services of a standard type.
 
-Owns: translation between rcl_interfaces/srv/SetParameters and node_interface.py, nothing else. A
+Owns: translation between rcl_interfaces/srv/SetParameters and data_layer.py, nothing else. A
 request is a list of names and values, the answer says of each whether it succeeded and why not:
 
     ros2 service call /camera/connect_to rcl_interfaces/srv/SetParameters \

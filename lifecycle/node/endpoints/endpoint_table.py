@@ -2,6 +2,9 @@
 
 Owns: what is declared, the handles that authors publish by, and finding an endpoint by what people
 call it. Where an endpoint is mapped is not its business.
+
+Where the plan wants the endpoints of a node. Owns: which connection a planned endpoint belongs
+on, and mapping all of them there, or none.
 """
 
 from __future__ import annotations

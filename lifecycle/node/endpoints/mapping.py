@@ -1,4 +1,12 @@
-"""One declared endpoint and what stands for it now. Owns: the type, no behaviour of its own."""
+"""One declared endpoint and what stands for it now. Owns: the type, no behaviour of its own.
+
+Told when the peers of a topic endpoint change. Owns: rclpy's matched events on our executor.
+The event is handled in a group of the framework's: an author's callback that awaits something
+must not hold back the news that a peer has come or gone.
+
+How endpoints are called in requests and messages: `video`, or `publishers/video`. Owns: what a
+spelling means, and what is said when a spelling names nothing or too much.
+"""
 
 from __future__ import annotations
 

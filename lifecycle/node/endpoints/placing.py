@@ -2,6 +2,11 @@
 
 Owns: that a placement is made whole or not at all, that a strictly unique flow is not shared, and
 how a new placement takes over from an old one.
+
+From one connection to another without a gap: make before break. Owns: how long both placements
+of an endpoint live side by side, and that nothing is delivered twice meanwhile. Both ends of a
+flow learn of each other at different moments, so a match seen here does not prove that the
+other side has seen it: the old placement stays a little longer than that.
 """
 
 from __future__ import annotations

@@ -2,6 +2,10 @@
 
 Owns: the handle that `self.publisher("video")` returns. It exists from configure until cleanup;
 the rclpy publisher behind it comes with connect and goes with disconnect.
+
+What a TRANSIENT_LOCAL publisher has said, so that it goes along from connection to connection.
+Owns: `Kept`. DDS keeps such a history in the writer, for subscriptions that come later, and
+each connection has a writer of its own (DDS 1.4, 2.2.3.4).
 """
 
 from __future__ import annotations

@@ -3,6 +3,9 @@
 Owns: the messages, one JSON object per line over an inherited AF_UNIX stream socket. It carries
 what the lifecycle services and `~/get_configuration` carry, without waiting for discovery; both
 ways drive the same state machine. End of file from the supervisor makes a host shut down. Pure.
+
+A host's end of the control channel (control.py). Owns: reading and writing its lines, and the
+descriptors that come beside the first byte.
 """
 
 from __future__ import annotations

@@ -3,6 +3,10 @@
 Owns: the order of a host's life: construct every node, say "ready", obey, and at end of file shut
 down and leave; and what is told unasked. It holds no state of its nodes. While the user's modules
 are imported there is nothing to shut down: then it ends at once, and silently.
+
+What a supervisor's commands do to the nodes of a process. Owns: each Operation of control.py,
+and that each command is answered exactly once. They drive the same state machines that the
+lifecycle services do.
 """
 
 from __future__ import annotations

@@ -3,6 +3,12 @@
 Owns: the executor's thread, signals, and the bounded way down (shutdown transitions, then leaving
 DDS). rclpy's own signal handlers are not used: they end the context under the nodes' feet, and
 nothing could be said or done after that.
+
+Says when the executor of this process hangs in a callback. Owns: what counts as hanging. An
+executor that waits is idle, whatever it waits for; a callback of a transition has a deadline of
+its own; everything else may take as long as the nodes' `silent_s`. Who notices is at the other
+end of the busy sign (middleware/process/busy_timer.py): it need not be this process, whose
+interpreter may be locked by the very callback that hangs.
 """
 
 from __future__ import annotations

@@ -2,6 +2,12 @@
 
 Owns: what happens between the shell and the node: rclpy.init with the command line's --ros-args,
 the drive up in auto mode, one printed line per change of state, and the way out.
+
+A node that nobody supervises is heard all the same by a supervisor that attaches to it. Owns:
+what such a node tells of its liveliness. DDS asserts that its process runs; that its executor
+hangs is noticed by a thread of its own, which sleeps until then. A callback that also holds the
+lock of the interpreter keeps that thread from telling, and only a supervisor of its own would
+see.
 """
 
 from __future__ import annotations

@@ -3,6 +3,9 @@
 Owns: translation between messages and the state machine, nothing else. Names, types and QoS are
 rcl_lifecycle's (rcl_lifecycle/src/com_interface.c). A request that the state does not allow is
 answered with success=False; it never raises.
+
+Turns of the executor that spins a node, and timers that run in every state. Owns: how the parts
+of a node come to run in its executor. None of it passes the gate.
 """
 
 from __future__ import annotations

@@ -4,6 +4,11 @@ Owns: what `discovery:` comes to: the transport of the control plane, the discov
 every own participant the connection URLs with ports that are given out in the plan's order
 (metatraffic, user data, source port; observers first, then processes, then extra participants).
 Pure.
+
+How supervisors' own participants are connected, so that they see what they must judge. Owns:
+`connect_observers`. An observer is on the control plane like the nodes' own participants; for
+connections by other transports it gets those as well, as far as one participant can have them:
+where ports are fixed, not shared memory beside UDP.
 """
 
 from __future__ import annotations

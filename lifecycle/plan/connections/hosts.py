@@ -3,6 +3,10 @@
 Owns: `Hosts` and `PortPool`. Machines of one address are one host, and so are those of none, which
 stand for this host. Ports are given out in a fixed order, so that equal plans have equal ports.
 Pure.
+
+What a plan asks of its machines: participants and the UDP ports they will ask for. Owns:
+counting the participants of each machine. The ports are those of the formula; a busy one is
+replaced when it is taken, so the real ones are read from the running system.
 """
 
 from __future__ import annotations

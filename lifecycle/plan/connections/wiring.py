@@ -2,6 +2,15 @@
 
 Owns: `wire`, in this order: ports that are written down are kept free, own participants and
 observers are connected, endpoints are negotiated for, observers learn to see the outcome. Pure.
+
+What a wired plan asks of participants that they cannot do. Owns: `infeasible`. Services and
+actions whose two ends have no transport in common, marks and ports of their own where no UDP
+socket is. Topics are negotiated, which finds the like (`negotiate`); what is negotiated while
+the system runs is judged there.
+
+Connections that a manifest spells out → participants of the plan. Owns: placing a node's
+endpoints on the connections that `connections:` declares for it, with what `flows:` asks of
+them.
 """
 
 from __future__ import annotations

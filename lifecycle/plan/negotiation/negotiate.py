@@ -3,6 +3,10 @@
 Owns: `negotiate`, which chooses a medium for every publisher → subscription pair and gives a node a
 connection only where its own participant would not carry the data anyway. Deterministic, and
 independent of the order of the parties. Pure.
+
+Connections of negotiated endpoints: as few as carry them, with names, ports, groups and URLs.
+Owns: `connections_of`. What exists already keeps its name and, while its transports are the
+same, its URLs.
 """
 
 from __future__ import annotations

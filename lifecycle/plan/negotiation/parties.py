@@ -1,6 +1,9 @@
 """Nodes of a plan as parties of a negotiation, and what was negotiated back in the plan.
 
 Owns: `party_of_node`, `place_negotiated` and the wishes that links make. Pure.
+
+What a plan gives to a negotiation, before anything runs and while it does. Owns: `terms_of` and
+`Terms` of a plan in the making: ports that are taken, groups, observers.
 """
 
 from __future__ import annotations

@@ -2,6 +2,9 @@
 
 Owns: how they are started, bounded and asked in English, and what their refusals mean: a missing
 program, a missing privilege and a missing kernel feature are each one sentence of their own.
+
+Deadline and cancellation of blocking work on networks, from another thread or a signal. Owns:
+`Deadline`, which everything shares that one Programmer calls. Pure but for its clock.
 """
 
 from __future__ import annotations

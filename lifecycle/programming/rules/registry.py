@@ -1,6 +1,9 @@
 """Every export of flows by the name that the command line gives it.
 
 Owns: the names, and what an export needs beside the flows. Pure.
+
+Flow reports as CSV, one line per network flow, for spreadsheets and other tools. Owns: the
+columns. They are only ever added to at the end.
 """
 
 from __future__ import annotations

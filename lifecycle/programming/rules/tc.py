@@ -5,6 +5,22 @@ is the mark of ownership: tc has no comments, so only what hangs below this hand
 `tc -batch` is neither atomic nor dry-runnable, and a second `qdisc add` fails: look whether the
 handle is there first, and then send `render_tc(…, with_qdisc=False)`, whose lines all replace.
 Pure.
+
+Which traffic classes a link has for a set of rules, in which order and with what rate. Owns:
+the ranking of DSCPs and 5QIs on one link and how its rate is divided.
+
+The kernel's own queues do not rank by DSCP as people expect: pfifo_fast and prio put EF, CS6
+and DF into one band. So each class of the rules gets a queue of its own here.
+
+Filters of `tc`: which packets of a device go to which class. Owns: matching a flow or a mark
+with flower and with u32, and the handles of filters.
+
+Filters carry an explicit preference and handle, which makes them replaceable one by one. u32
+names its root tables in the order in which they are made, so a filter that matches nothing
+holds the first place of each family.
+
+How one network device is to treat flows, and what its kernel can do. Owns: the settings of the
+tc export.
 """
 
 from __future__ import annotations
