@@ -1,7 +1,8 @@
 """ROS names: which are legal, what a declared name becomes, and which rules remap it.
 
 Owns: the rules of rmw_validate_node_name, rmw_validate_namespace, rmw_validate_full_topic_name,
-rcl_validate_topic_name, rcl_expand_topic_name and the order in which rcl applies them. plan/ resolves every endpoint through `resolve`. Pure.
+rcl_validate_topic_name, rcl_expand_topic_name and the order in which rcl applies
+them. plan/ resolves every endpoint through `resolve`. Pure.
 
 Remap rules as `ros2 run … --ros-args -r RULE` takes them: what each one matches. Owns: the
 grammar of one rule, as rcl's argument parser has it (rcl/arguments.c, rcl/lexer.c):
