@@ -269,12 +269,15 @@ class FakeProcess:
             if await self._cannot_host(writer):
                 return
             nodes = [node.full_name for node in spec.nodes]
+            self._spawner.begin(nodes)
             if not await self._act(f"{self._name} start", writer, Event(kind="ready"), *nodes):
                 return
             while line := await reader.readline():
                 command = from_json(line, Command)
                 state, connected = _STATES.get(command.operation, ("active", True))
-                what = " ".join(filter(None, (command.node, command.operation.value, _what(command))))
+                what = " ".join(
+                    filter(None, (command.node, command.operation.value, _what(command)))
+                )
                 reply = Event(
                     kind="reply", node=command.node, id=command.id, state=state, connected=connected
                 )
@@ -314,8 +317,15 @@ class FakeProcess:
         if way:
             kind = "failed" if answer.kind == "ready" else answer.kind
             state = "unconfigured" if what.endswith("configure") else "inactive"
+            before = self._spawner.interfaces.get(answer.node)
             answer = Event(
-                kind=kind, node=answer.node, id=answer.id, ok=False, error=way, state=state
+                kind=kind,
+                node=answer.node,
+                id=answer.id,
+                ok=False,
+                error=way,
+                state=state if before is None else before.state,
+                connected=before is not None and before.connected,
             )
         else:
             self._spawner.came(self._name, *nodes)
@@ -364,6 +374,13 @@ class FakeSpawner:
         """One that no process can have."""
         self._pid += 1
         return self._pid
+
+    def begin(self, nodes: list[str]) -> None:
+        """Construct nodes anew."""
+        for name in nodes:
+            if (report := self.interfaces.get(name)) is not None:
+                fresh = dataclasses.replace(report, state="unconfigured", connected=False)
+                self.interfaces[name] = fresh
 
     def came(self, process: str, *nodes: str) -> None:
         """Show the nodes of a process in the graph."""
