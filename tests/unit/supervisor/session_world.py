@@ -62,12 +62,17 @@ class FakeForkServer(FakeSpawner):
 
     Attributes:
         cannot_start: why it cannot start processes; empty while it can.
+        lingers_s: seconds for which discovery shows the nodes of a process that has ended.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self.tells = True
         self.cannot_start = ""
+        self.lingers_s = 0.0
+
+    def gone(self, process: str) -> None:
+        asyncio.get_running_loop().call_later(self.lingers_s, super().gone, process)
 
     @property
     def pid(self) -> int:
@@ -110,6 +115,7 @@ class FakeParticipant:
         mute: nodes whose state cannot be learnt from the graph.
         services: of the nodes in `others`.
         changes: so far.
+        dropped: nodes whose reports were forgotten.
     """
 
     def __init__(self, hosts: FakeForkServer) -> None:
@@ -118,6 +124,7 @@ class FakeParticipant:
         self.mute: set[str] = set()
         self.services = FakeServices(self, hosts.log)
         self.changes = 0
+        self.dropped: list[str] = []
         self._hosts = hosts
         self._reports: dict[str, NodeConfiguration] = {}
         self._changed = asyncio.Event()
@@ -148,6 +155,7 @@ class FakeParticipant:
         self._reports[configuration.name] = configuration
 
     def drop_configuration(self, node: str) -> None:
+        self.dropped.append(node)
         self._reports.pop(node, None)
 
     def driver(self, node: PlannedNode) -> NodeDriver:
@@ -294,14 +302,22 @@ class InlineWorker(Worker):
 
 
 class _Story(list[str]):
-    """Lines in the order in which they happen, which can be waited for."""
+    """Lines in the order in which they happen, which can be waited for.
+
+    Attributes:
+        in_the_moment: done once, before anything else, when a line that begins so is told.
+    """
 
     def __init__(self) -> None:
         super().__init__()
+        self.in_the_moment: dict[str, Callable[[], None]] = {}
         self._more = asyncio.Event()
 
     def append(self, line: str) -> None:
         super().append(line)
+        for start in tuple(self.in_the_moment):
+            if line.startswith(start):
+                self.in_the_moment.pop(start)()
         self._more.set()
         self._more = asyncio.Event()
 

@@ -266,6 +266,36 @@ def test_a_node_that_cannot_be_connected_ends_the_run_and_nothing_is_judged_or_a
     run(main())
 
 
+def test_a_process_that_dies_while_its_node_waits_for_another_is_noticed_at_once(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        plan = plan_of(
+            planned_node("camera"), planned_node("viewer", after={"camera": Condition.CONFIGURED})
+        )
+        world = SessionWorld(plan, tmp_path)
+        world.hosts.takes_s["/camera configure"] = 20.0
+
+        async def die() -> None:
+            await world.story.until("[process] viewer running")
+            await asyncio.sleep(1.0)
+            world.kill("viewer")
+
+        await world.run(die())
+        assert world.since("[failure]")[:2] == [
+            "[failure] run.process-died /viewer",
+            "[stopping] at 2.2 s: rolling back",
+        ]
+        assert world.messages == [
+            (
+                "cannot keep '/viewer' running: pid 5000002 died while waits to configure until "
+                "/camera is configured: killed by SIGSEGV"
+            )
+        ]
+
+    run(main())
+
+
 def test_a_bring_up_that_takes_too_long_names_what_is_missing(tmp_path: Path) -> None:
     async def main() -> None:
         plan = plan_of(
@@ -343,6 +373,7 @@ def test_a_node_that_does_not_appear_is_waited_for_as_long_as_there_is_time_and_
 ) -> None:
     async def main() -> None:
         world = SessionWorld(CHAIN, tmp_path, timeout_s=8.0)
+        world.hosts.takes_s["/camera configure"] = 3.0
         world.graph.unseen = {"/viewer"}
         await world.run()
         assert world.since("[system] connected")[1:] == [
@@ -487,6 +518,54 @@ def test_what_changes_between_two_requests_and_heals_is_judged_again_and_then_th
             "[verdict] connected ok",
             "/viewer activate",
             "[system] active at 3.0 s",
+        ]
+
+    run(main())
+
+
+def test_what_changes_in_the_moment_in_which_a_request_leaves_keeps_it_back(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path)
+        world.story.in_the_moment["[request] /viewer activate"] = world.intrude
+        await world.run()
+        assert world.since("[gate]")[:4] == [
+            OPENED,
+            "/camera activate",
+            f"[verdict] connected violated {INTRUDED}",
+            f"[stopping] at 0.5 s: {CHANGED}",
+        ]
+
+    run(main())
+
+
+def test_the_time_for_which_a_change_is_judged_is_not_that_of_the_node_that_waits_for_it(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        after = {"camera": Condition.ACTIVE}
+        limits = Timeouts(activate_s=1.0)
+        plan = plan_of(planned_node("camera"), planned_node("viewer", after=after, timeouts=limits))
+        world = SessionWorld(plan, tmp_path, stop_after_s=0.0)
+
+        def hide() -> None:
+            world.graph.unseen = {"/camera"}
+            world.graph.note()
+
+        async def show() -> None:
+            await world.story.until("[verdict] connected violated")
+            await asyncio.sleep(4.0)
+            world.graph.unseen.clear()
+            world.graph.note()
+
+        world.story.in_the_moment["/camera activate"] = hide
+        await world.run(show())
+        assert world.since("[gate]")[:6] == [
+            OPENED,
+            "/camera activate",
+            "[verdict] connected violated graph.missing-node /camera",
+            "[verdict] connected ok",
+            "/viewer activate",
+            "[system] active at 4.0 s",
         ]
 
     run(main())
@@ -820,6 +899,61 @@ def test_one_node_is_restarted_through_the_gate_and_the_others_stay_active(tmp_p
             *DOWN,
             *over(0),
         ]
+
+    run(main())
+
+
+def test_a_restart_waits_until_nobody_takes_the_new_node_for_a_second_one_and_is_watched_anew(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path)
+        world.hosts.lingers_s = 2.0
+
+        async def order() -> None:
+            await world.story.until("[system] active")
+            assert await world.order(Ask.RESTART, "viewer") == "0"
+            world.kill("viewer")
+
+        await world.run(order())
+        assert world.since("viewer start", 2) == [
+            "viewer start",
+            "/viewer configure",
+            "/viewer connect",
+            "[system] connected at 2.0 s",
+            "[system] verified at 2.0 s",
+            "networks programmed (ok)",
+            "[gate] ok: /viewer",
+            "/viewer activate",
+            "[system] active at 2.0 s",
+            "[failure] run.process-died /viewer",
+            "[stopping] at 2.0 s: rolling back",
+            "/camera deactivate",
+            *CAMERA_DOWN,
+            *over(6),
+        ]
+        assert world.graph.dropped == ["/viewer"]
+
+    run(main())
+
+
+def test_an_order_to_a_system_that_is_not_up_is_refused_and_not_kept(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path)
+        world.hosts.takes_s["/camera configure"] = 5.0
+
+        async def order() -> None:
+            await world.story.until("/camera configure")
+            for ask, hint in (
+                (Ask.PAUSE, "only an active system can be paused"),
+                (Ask.RESTART, "only a system that is active or paused can be restarted"),
+            ):
+                assert await world.order(ask) == (
+                    f"2 cannot {ask.value} 'robot': it is connecting; {hint}"
+                )
+            assert await world.order(Ask.DOWN) == "6"
+
+        await world.run(order())
 
     run(main())
 
