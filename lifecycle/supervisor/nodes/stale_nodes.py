@@ -11,8 +11,7 @@ from collections.abc import Iterable
 from typing import Protocol
 
 from lifecycle.supervisor.gate.verification_loop import Changes
-from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
-from lifecycle.supervisor.nodes.system import NodeRun, System
+from lifecycle.supervisor.nodes.system import GraphObserver, NodeRun, System
 from lifecycle.supervisor.processes.process import ManagedProcess
 from lifecycle.supervisor.processes.spawn import ProcessState
 from lifecycle.supervisor.run.events import Event, ProcessChanged
@@ -28,7 +27,7 @@ _PREFIX_DIGITS = 24
 
 
 class Graph(Protocol):
-    """Where participants are seen and removed, see eyes.ObserverParticipant."""
+    """Where participants are seen and removed, see ObserverParticipant."""
 
     def participants_of(
         self, pid: int, *, nodes: Iterable[str], reported: Iterable[str]
@@ -116,11 +115,9 @@ _LEASE_S = 21.0
 class Sightings:
     """Who is in the graph of one system, as an event to wait for."""
 
-    def __init__(
-        self, system: System, observer_participant: ObserverParticipant, changes: Changes
-    ) -> None:
+    def __init__(self, system: System, observer: GraphObserver, changes: Changes) -> None:
         self._system = system
-        self._observer_participant = observer_participant
+        self._observer = observer
         self._changes = changes
 
     async def appears(self, name: str) -> None:
@@ -142,5 +139,5 @@ class Sightings:
             await self._changes.beyond(count, left_s)
 
     async def _is_there(self, name: str) -> bool:
-        observation = await self._observer_participant.observe(self._system.plan)
+        observation = await self._observer.observe(self._system.plan)
         return any(each.full_name == name for each in observation.nodes)

@@ -314,16 +314,21 @@ Listener = Callable[[Event], None]
 
 
 class Emitter:
-    """Hands every event to every listener, in the order of their registration."""
+    """Hands every event to every listener, in the order of their registration.
 
-    def __init__(self) -> None:
+    Args:
+        clock: seconds, on any clock that only goes forward.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._listeners: list[Listener] = []
-        self._began = time.monotonic()
+        self._clock = clock
+        self._began = clock()
 
     @property
     def elapsed_s(self) -> float:
         """Seconds since this emitter, and with it the run, began."""
-        return time.monotonic() - self._began
+        return self._clock() - self._began
 
     def listen(self, listener: Listener) -> None:
         """Add a listener; it runs in the supervisor's loop and must not block."""

@@ -12,12 +12,13 @@ import dataclasses
 import os
 import signal
 from collections.abc import AsyncIterator, Coroutine, Iterable, Iterator
-from typing import Any
+from typing import Any, Protocol
 
 from lifecycle.errors import ExitCode
+from lifecycle.plan.model import PlannedNode
 from lifecycle.run_directory import RunDirectory
 from lifecycle.supervisor.connections import discovery_server
-from lifecycle.supervisor.connections.authority import authority_of
+from lifecycle.supervisor.connections.authority import Reaching, authority_of
 from lifecycle.supervisor.connections.networks import Networks
 from lifecycle.supervisor.control.orders import ACTIVE, HELD, PAUSED, Revisions
 from lifecycle.supervisor.control.server import ControlServer, Look
@@ -27,16 +28,18 @@ from lifecycle.supervisor.gate.gate import Gate, VerificationError, closes
 from lifecycle.supervisor.gate.hold import Holding
 from lifecycle.supervisor.gate.sequence import GateSequence
 from lifecycle.supervisor.gate.verification_loop import Changes, VerificationLoop
+from lifecycle.supervisor.health import agreement, peer_supervisors
 from lifecycle.supervisor.health.agreement import Agreement
 from lifecycle.supervisor.health.peer_supervisors import PeerSupervisors
 from lifecycle.supervisor.health.process_monitor import ProcessMonitor
+from lifecycle.supervisor.nodes import stale_nodes
 from lifecycle.supervisor.nodes.bring_up import BringUp
-from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
+from lifecycle.supervisor.nodes.driver import NodeDriver
 from lifecycle.supervisor.nodes.remote_nodes import RemoteNodes
 from lifecycle.supervisor.nodes.stale_nodes import Sightings, StaleNodes
-from lifecycle.supervisor.nodes.system import System
-from lifecycle.supervisor.processes.fork_server import ForkServer
-from lifecycle.supervisor.processes.orphans import end_strays, reap_adopted
+from lifecycle.supervisor.nodes.system import GraphObserver, System
+from lifecycle.supervisor.processes.orphans import Family, end_strays, reap_adopted
+from lifecycle.supervisor.processes.spawn import Spawner
 from lifecycle.supervisor.run.events import (
     Emitter,
     LogLine,
@@ -85,6 +88,35 @@ class _End:
     verdict: Verdict | None = None
 
 
+class SessionParticipant(
+    GraphObserver, peer_supervisors.Air, agreement.Air, Reaching, stale_nodes.Graph, Protocol
+):
+    """What a session needs of its participant in the graph, see nodes/observer_participant.py.
+
+    The parts are the Protocols of those who use them; here is what the session itself asks.
+    """
+
+    def driver(self, node: PlannedNode) -> NodeDriver:
+        """Return the driver of a managed node that is not in a host of ours."""
+
+    def drop_configuration(self, node: str) -> None:
+        """Forget what a node reported whose process ended."""
+
+    def prepare_to_leave(self) -> None:
+        """Close connections that nobody answers, so that leaving does not wait for them."""
+
+
+class SessionForkServer(Spawner, Family, Protocol):
+    """What a session needs of its fork server, see processes/fork_server.py."""
+
+    @property
+    def waited_for(self) -> tuple[int, ...]:
+        """Pids of processes whose ends the fork server reads: nobody else may reap them."""
+
+    def note_stops(self) -> None:
+        """Look, after SIGCHLD, which children were stopped or continue."""
+
+
 class Session:
     """A supervisor of one system.
 
@@ -94,7 +126,7 @@ class Session:
         directory: acquired for this run.
         records: of this run.
         fork_server: forks the processes.
-        eyes: see the graph; made before any process.
+        observer_participant: sees the graph and reaches foreign nodes; made before any process.
         networks: programmed while the system is active.
         emit: where events go.
         ending: knows of signals that came before.
@@ -108,8 +140,8 @@ class Session:
         *,
         directory: RunDirectory,
         records: Records,
-        fork_server: ForkServer,
-        observer_participant: ObserverParticipant,
+        fork_server: SessionForkServer,
+        observer_participant: SessionParticipant,
         networks: Networks,
         emit: Emitter,
         ending: Ending,

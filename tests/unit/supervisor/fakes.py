@@ -218,14 +218,15 @@ def _what(command: Command) -> str:
     return " ".join(filter(None, (command.endpoint, command.connection)))
 
 
+_FIRST_PID = 5_000_000
+"""Beyond the kernel's largest, 4194304."""
+
+
 class FakeProcess:
     """A host that lives in the loop; see FakeSpawner for what it can be told to do."""
 
-    _next_pid = 1000
-
     def __init__(self, spawner: FakeSpawner, request: SpawnRequest) -> None:
-        FakeProcess._next_pid += 1
-        self.pid = FakeProcess._next_pid
+        self.pid = spawner.next_pid()
         self.exited: asyncio.Future[ProcessExit] = asyncio.get_running_loop().create_future()
         self.signals: list[int] = []
         self._spawner = spawner
@@ -235,6 +236,8 @@ class FakeProcess:
         if request.control is not None:
             control = socket.socket(fileno=os.dup(request.control))
             self._task = asyncio.ensure_future(self._serve(control))
+        else:
+            self._task = asyncio.ensure_future(self._appear())
 
     def signal(self, number: int) -> None:
         self.signals.append(number)
@@ -248,9 +251,15 @@ class FakeProcess:
                 self._task.cancel()
             os.close(self._stdout)
             self.exited.set_result(how)
+            self._spawner.gone(self._name)
 
     def say(self, line: str) -> None:
         os.write(self._stdout, line.encode() + b"\n")
+
+    async def _appear(self) -> None:
+        """A plain command says nothing of itself, but its node comes into the graph."""
+        await asyncio.sleep(self._spawner.takes_s.get(f"{self._name} start", 0.0))
+        self._spawner.came(self._name, f"/{self._name}")
 
     async def _serve(self, control: socket.socket) -> None:
         control.setblocking(False)
@@ -259,24 +268,20 @@ class FakeProcess:
             spec = from_json(await reader.readline(), HostSpec)
             if await self._cannot_host(writer):
                 return
-            if not await self._act(f"{self._name} start", writer, Event(kind="ready")):
+            nodes = [node.full_name for node in spec.nodes]
+            self._spawner.begin(nodes)
+            if not await self._act(f"{self._name} start", writer, Event(kind="ready"), *nodes):
                 return
-            del spec
             while line := await reader.readline():
                 command = from_json(line, Command)
                 state, connected = _STATES.get(command.operation, ("active", True))
-                await self._act(
-                    " ".join(filter(None, (command.node, command.operation.value, _what(command)))),
-                    writer,
-                    Event(
-                        kind="reply",
-                        node=command.node,
-                        id=command.id,
-                        state=state,
-                        connected=connected,
-                        configuration=self._spawner.carry_out(command, state, connected=connected),
-                    ),
+                what = " ".join(
+                    filter(None, (command.node, command.operation.value, _what(command)))
                 )
+                reply = Event(
+                    kind="reply", node=command.node, id=command.id, state=state, connected=connected
+                )
+                await self._act(what, writer, reply, command=command)
         if self._name not in self._spawner.ends_at:
             self.end(ProcessExit(status=0))
 
@@ -291,7 +296,15 @@ class FakeProcess:
             self.end(ProcessExit(status=1))
         return bool(failures)
 
-    async def _act(self, what: str, writer: asyncio.StreamWriter, answer: Event) -> bool:
+    async def _act(
+        self,
+        what: str,
+        writer: asyncio.StreamWriter,
+        answer: Event,
+        *nodes: str,
+        command: Command | None = None,
+    ) -> bool:
+        """Do one thing in the way that the spawner says; whether the process goes on."""
         self._spawner.log.append(what)
         way = self._spawner.ways.get(what, "")
         await asyncio.sleep(self._spawner.takes_s.get(what, 0.0))
@@ -304,11 +317,28 @@ class FakeProcess:
         if way:
             kind = "failed" if answer.kind == "ready" else answer.kind
             state = "unconfigured" if what.endswith("configure") else "inactive"
+            before = self._spawner.interfaces.get(answer.node)
             answer = Event(
-                kind=kind, node=answer.node, id=answer.id, ok=False, error=way, state=state
+                kind=kind,
+                node=answer.node,
+                id=answer.id,
+                ok=False,
+                error=way,
+                state=state if before is None else before.state,
+                connected=before is not None and before.connected,
             )
+        else:
+            self._spawner.came(self._name, *nodes)
+        if command is not None:
+            answer = dataclasses.replace(answer, configuration=self._carry_out(command, answer))
+        if self._spawner.tells and answer.configuration is not None:
+            told = dataclasses.replace(answer, kind="configuration", id=0, ok=True, error="")
+            writer.write(to_json(told) + b"\n")
         writer.write(to_json(answer) + b"\n")
         return True
+
+    def _carry_out(self, command: Command, answer: Event) -> NodeConfiguration | None:
+        return self._spawner.carry_out(command, answer.state, connected=answer.connected)
 
 
 class FakeSpawner:
@@ -322,6 +352,9 @@ class FakeSpawner:
         ends_at: processes that do not end by themselves, and the signal that ends them.
         processes: by name.
         interfaces: what a node reports, by full name; steps of wiring change it.
+        tells: hosts tell unasked what nodes report whenever that changes, as ours do.
+        nodes: full names of the nodes that are in the graph, by process.
+        changed: called whenever the graph looks otherwise.
     """
 
     def __init__(self) -> None:
@@ -332,6 +365,33 @@ class FakeSpawner:
         self.ends_at: dict[str, int] = {}
         self.processes: dict[str, FakeProcess] = {}
         self.interfaces: dict[str, NodeConfiguration] = {}
+        self.tells = False
+        self.nodes: dict[str, tuple[str, ...]] = {}
+        self.changed: Callable[[], None] = lambda: None
+        self._pid = _FIRST_PID
+
+    def next_pid(self) -> int:
+        """One that no process can have."""
+        self._pid += 1
+        return self._pid
+
+    def begin(self, nodes: list[str]) -> None:
+        """Construct nodes anew."""
+        for name in nodes:
+            if (report := self.interfaces.get(name)) is not None:
+                fresh = dataclasses.replace(report, state="unconfigured", connected=False)
+                self.interfaces[name] = fresh
+
+    def came(self, process: str, *nodes: str) -> None:
+        """Show the nodes of a process in the graph."""
+        if nodes:
+            self.nodes[process] = nodes
+            self.changed()
+
+    def gone(self, process: str) -> None:
+        """Show the nodes of a process in the graph no more."""
+        if self.nodes.pop(process, ()):
+            self.changed()
 
     def carry_out(
         self, command: Command, state: str, *, connected: bool

@@ -1,0 +1,527 @@
+"""A whole session of the supervisor in the world of fakes, told as a story line by line.
+
+Owns: the participant and the fork server that a `Session` gets there, `SessionWorld`, and what
+holds in every run whatever happens in it: no activate request reaches a node before a gate that
+opened for it on a verdict that is not violated, no process is left, and the end is reported.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import signal
+from collections.abc import Awaitable, Callable, Coroutine, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+from lifecycle.codec import from_json, to_json
+from lifecycle.manifest.model import RunKind
+from lifecycle.node.host.control import Operation
+from lifecycle.plan.model import Plan, PlannedNode
+from lifecycle.run_directory import RunDirectory, short_path
+from lifecycle.supervisor.connections.networks import Networks
+from lifecycle.supervisor.control.server import Answer, Ask, Question
+from lifecycle.supervisor.health.peer_supervisors import Listener
+from lifecycle.supervisor.nodes.driver import NodeDriver, ServiceDriver, ServiceHand
+from lifecycle.supervisor.nodes.system import System
+from lifecycle.supervisor.processes.orphans import end_strays
+from lifecycle.supervisor.processes.spawn import ProcessExit
+from lifecycle.supervisor.run.events import (
+    Emitter,
+    Event,
+    Failure,
+    GateOpened,
+    NodeChanged,
+    NodeJoined,
+    NodeLeft,
+    Notice,
+    ProcessChanged,
+    RequestSent,
+    Stopped,
+    Stopping,
+    SystemReached,
+    VerdictChanged,
+)
+from lifecycle.supervisor.run.failure import StepFailedError, Worker
+from lifecycle.supervisor.run.options import UpOptions, UpResult
+from lifecycle.supervisor.run.records import Records
+from lifecycle.supervisor.run.session import Session
+from lifecycle.supervisor.run.signals import Ending
+from lifecycle.verify.observation import NodeConfiguration, Observation, ObservedNode
+from lifecycle.verify.verdict import Verdict
+from tests.unit.supervisor.fakes import FakeSpawner, interface_of
+
+T = TypeVar("T")
+
+SHUTDOWN_S = 30.0
+"""However a node or a process resists, a system of the size of these is down within so long."""
+
+
+class FakeForkServer(FakeSpawner):
+    """A fork server whose children are coroutines.
+
+    Attributes:
+        cannot_start: why it cannot start processes; empty while it can.
+        lingers_s: seconds for which discovery shows the nodes of a process that has ended.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tells = True
+        self.cannot_start = ""
+        self.lingers_s = 0.0
+
+    def gone(self, process: str) -> None:
+        asyncio.get_running_loop().call_later(self.lingers_s, super().gone, process)
+
+    @property
+    def pid(self) -> int:
+        return self._pid
+
+    @property
+    def waited_for(self) -> tuple[int, ...]:
+        return ()
+
+    def family(self) -> frozenset[int]:
+        return frozenset()
+
+    def note_stops(self) -> None:
+        """No child is of the kernel's."""
+
+    async def ready(self) -> None:
+        if self.cannot_start:
+            raise StepFailedError(self.cannot_start, rule="run.start-failed", subject="robot")
+
+
+class _Connection:
+    """Carries nothing: no other supervisor is in this world."""
+
+    def destroy(self) -> None:
+        """Nothing to destroy."""
+
+    def announce(self, text: str) -> None:
+        """Nobody reads it."""
+
+    def tell(self, silent: Mapping[str, str]) -> None:
+        """Nobody reads it."""
+
+
+class FakeParticipant:
+    """Sees the nodes of the fake hosts, and those that others run; reaches the latter.
+
+    Attributes:
+        others: nodes that no host of ours runs, and their states, "" for a plain one.
+        unseen: nodes that discovery does not show.
+        mute: nodes whose state cannot be learnt from the graph.
+        services: of the nodes in `others`.
+        changes: so far.
+        dropped: nodes whose reports were forgotten.
+    """
+
+    def __init__(self, hosts: FakeForkServer) -> None:
+        self.others: dict[str, str] = {}
+        self.unseen: set[str] = set()
+        self.mute: set[str] = set()
+        self.services = FakeServices(self, hosts.log)
+        self.changes = 0
+        self.dropped: list[str] = []
+        self._hosts = hosts
+        self._reports: dict[str, NodeConfiguration] = {}
+        self._changed = asyncio.Event()
+        hosts.changed = self.note
+
+    def note(self) -> None:
+        """The graph looks otherwise than before."""
+        self.changes += 1
+        self._changed.set()
+
+    async def wait_change(self) -> None:
+        await self._changed.wait()
+        self._changed.clear()
+
+    async def observe(self, plan: Plan) -> Observation:
+        del plan
+        hosted = [name for names in self._hosts.nodes.values() for name in names]
+        there = {name: "" for name in hosted if name not in self.unseen} | self.others
+        return Observation(
+            nodes=tuple(
+                ObservedNode(full_name=name, state=None if name in self.mute else state or None)
+                for name, state in there.items()
+            ),
+            configurations=tuple(report for name, report in self._reports.items() if name in there),
+        )
+
+    def put_configuration(self, configuration: NodeConfiguration) -> None:
+        self._reports[configuration.name] = configuration
+
+    def drop_configuration(self, node: str) -> None:
+        self.dropped.append(node)
+        self._reports.pop(node, None)
+
+    def driver(self, node: PlannedNode) -> NodeDriver:
+        return ServiceDriver(self.services, node)
+
+    def hand(self, node: str) -> ServiceHand:
+        return ServiceHand(self.services, node)
+
+    def participants_of(
+        self, pid: int, *, nodes: Iterable[str], reported: Iterable[str]
+    ) -> frozenset[str]:
+        del pid, nodes, reported
+        return frozenset()
+
+    def remove_participants(self, prefixes: Iterable[str], pids: Iterable[int]) -> None:
+        raise AssertionError(f"nothing is left in this graph: {prefixes} {pids}")
+
+    def machine_voice(self, system: str, machine: str) -> _Connection:
+        raise AssertionError(f"{system} has no other machine than {machine}")
+
+    def machine_ear(self, system: str, machine: str, to: Listener) -> _Connection:
+        raise AssertionError(f"{system} has no machine {machine}: {to}")
+
+    def node_ear(self, node: str, to: Listener) -> _Connection:
+        del node, to
+        return _Connection()
+
+    def plan_notices(self, on_notice: Callable[[str], None]) -> _Connection:
+        del on_notice
+        return _Connection()
+
+    def call_out(self, addresses: Iterable[str]) -> None:
+        """Nobody is far away."""
+
+    def send_again_soon(self) -> None:
+        """No link is ever lost."""
+
+    def tell_names(self) -> None:
+        """No name is ever forgotten."""
+
+    def prepare_to_leave(self) -> None:
+        """Everybody answers."""
+
+
+_REACHED = {
+    "configure": "inactive",
+    "activate": "active",
+    "deactivate": "inactive",
+    "cleanup": "unconfigured",
+    "shutdown": "finalized",
+}
+
+
+class FakeServices:
+    """The lifecycle services of the nodes that others run.
+
+    Attributes:
+        matched_after_s: of a request, as `/base activate`: seconds before it can leave.
+    """
+
+    def __init__(self, graph: FakeParticipant, log: list[str]) -> None:
+        self.matched_after_s: dict[str, float] = {}
+        self._graph = graph
+        self._log = log
+
+    async def get_state(self, node: str, *, timeout_s: float) -> str:
+        del timeout_s
+        return self._graph.others[node]
+
+    async def get_available_transitions(self, node: str, *, timeout_s: float) -> tuple[str, ...]:
+        del node, timeout_s
+        return tuple(_REACHED)
+
+    async def change_state(
+        self,
+        node: str,
+        transition: str,
+        *,
+        timeout_s: float,
+        before: Callable[[], Awaitable[None]] | None = None,
+    ) -> bool:
+        del timeout_s
+        await asyncio.sleep(self.matched_after_s.get(f"{node} {transition}", 0.0))
+        if before is not None:
+            await before()
+        self._log.append(f"{node} {transition}")
+        self._graph.others[node] = _REACHED[transition]
+        self._graph.note()
+        return True
+
+    async def get_configuration(self, node: str, *, timeout_s: float) -> NodeConfiguration | None:
+        del node, timeout_s
+        return None
+
+    async def connect_to(
+        self, node: str, name: str, urls: Iterable[str], *, timeout_s: float
+    ) -> None:
+        raise AssertionError(f"no authority connects {node} to {name} {urls} {timeout_s}")
+
+    async def map_to(self, node: str, endpoint: str, connection: str, *, timeout_s: float) -> None:
+        raise AssertionError(f"no authority maps {node} {endpoint} {connection} {timeout_s}")
+
+    async def disconnect(self, node: str, name: str, *, timeout_s: float) -> None:
+        raise AssertionError(f"no authority disconnects {node} {name} {timeout_s}")
+
+
+class FakeNetworks(Networks):
+    """Networks that take their time, and may fail.
+
+    Attributes:
+        takes_s: seconds to program them.
+        fails: why they cannot be programmed; empty while they can.
+    """
+
+    def __init__(self, log: list[str]) -> None:
+        self.takes_s = 0.0
+        self.fails = ""
+        self._log = log
+
+    async def begin(self, verdict: Verdict, timeout_s: float | None = None) -> None:
+        del timeout_s
+        self._log.append(f"networks programmed ({verdict.verdict.value})")
+        await asyncio.sleep(self.takes_s)
+        if self.fails:
+            raise StepFailedError(self.fails, rule="run.not-programmed", subject="robot")
+
+    async def close(self, hurry: asyncio.Event | None = None) -> None:
+        del hurry
+        self._log.append("networks restored")
+
+
+class InlineWorker(Worker):
+    """Does what blocks at once: a thread's time is not that of the loop.
+
+    Attributes:
+        strays: pids of what escaped, which is to be found and ended.
+    """
+
+    def __init__(self) -> None:
+        self.strays: tuple[int, ...] = ()
+
+    async def run(self, work: Callable[..., Any], *arguments: object) -> Any:
+        return self.strays if work is end_strays else work(*arguments)
+
+
+class _Story(list[str]):
+    """Lines in the order in which they happen, which can be waited for.
+
+    Attributes:
+        in_the_moment: done once, before anything else, when a line that begins so is told.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.in_the_moment: dict[str, Callable[[], None]] = {}
+        self._more = asyncio.Event()
+
+    def append(self, line: str) -> None:
+        super().append(line)
+        for start in tuple(self.in_the_moment):
+            if line.startswith(start):
+                self.in_the_moment.pop(start)()
+        self._more.set()
+        self._more = asyncio.Event()
+
+    async def until(self, start: str, times: int = 1) -> None:
+        """Wait for the line that begins so, for the second or third with `times`."""
+        while sum(line.startswith(start) for line in self) < times:
+            await self._more.wait()
+
+
+_DETAIL = ("[process]", "[node]", "[request]", "[joined]", "[left]", "[log]")
+
+
+def _line(event: Event, now_s: float) -> str:
+    if isinstance(event, ProcessChanged):
+        detail = f" ({event.detail})" if event.detail else ""
+        return f"[process] {event.process} {event.state.value}{detail}"
+    if isinstance(event, NodeChanged):
+        state = f" ({event.state})" if event.state else ""
+        return f"[node] {event.node} {event.reach.value}{state}"
+    if isinstance(event, RequestSent):
+        return f"[request] {event.node} {event.operation.value}"
+    if isinstance(event, VerdictChanged):
+        found = ", ".join(f"{each.rule} {each.subject}" for each in event.verdict.findings)
+        return f"[verdict] {event.stage.value} {event.verdict.verdict.value} {found}".rstrip()
+    if isinstance(event, GateOpened):
+        return f"[gate] {event.outcome}: {', '.join(event.nodes)}"
+    if isinstance(event, SystemReached):
+        return f"[system] {event.reached} at {event.elapsed_s:.1f} s"
+    if isinstance(event, Failure):
+        goes_on = "" if event.ends_run else ", and the run goes on"
+        return f"[failure] {event.rule} {event.subject}{goes_on}"
+    if isinstance(event, Notice):
+        return f"[notice] {event.message}"
+    if isinstance(event, Stopping):
+        return f"[stopping] at {now_s:.1f} s: {event.reason}"
+    if isinstance(event, Stopped):
+        return f"[stopped] {event.exit_code}"
+    if isinstance(event, NodeJoined):
+        return f"[joined] {event.node}"
+    if isinstance(event, NodeLeft):
+        return f"[left] {event.node}"
+    return f"[{event.kind}]"
+
+
+async def _beside(
+    running: Coroutine[Any, Any, T], scenarios: Iterable[Coroutine[Any, Any, None]]
+) -> T:
+    """Return what a run comes to; a scenario that fails ends it, and is raised."""
+    run = asyncio.ensure_future(running)
+    acting = [asyncio.ensure_future(each) for each in scenarios]
+    await asyncio.wait({run, *acting}, return_when=asyncio.FIRST_EXCEPTION)
+    if not run.done():
+        run.cancel()
+        await asyncio.wait({run})
+    for each in acting:
+        if each.done():
+            each.result()
+    await asyncio.gather(*acting)
+    return run.result()
+
+
+class SessionWorld:
+    """One session with all that it acts on; make it, prepare it, `run` it once.
+
+    Attributes:
+        story: what reached the hosts (`camera start`, `/camera configure`, `camera SIGTERM`) and
+            all events in brackets, in the order in which they happened.
+        hosts: start, and obey or not, as they are told.
+        graph: what discovery shows beside the nodes of the hosts.
+        networks: to be programmed.
+        result: of the run; None before its end.
+    """
+
+    def __init__(self, plan: Plan, tmp_path: Path, **options: Any) -> None:
+        loop = asyncio.get_running_loop()
+        self.story = _Story()
+        self.hosts = FakeForkServer()
+        self.hosts.log = self.story
+        self.graph = FakeParticipant(self.hosts)
+        self.networks = FakeNetworks(self.story)
+        self.worker = InlineWorker()
+        self.ending = Ending()
+        self.result: UpResult | None = None
+        self._stopping_at_s: float | None = None
+        self._tmp_path = tmp_path
+        self._emit = Emitter(loop.time)
+        self._emit.listen(self._take)
+        self._options = UpOptions(**options)
+        (tmp_path / "logs").mkdir()
+        self.system = System(
+            plan, emit=self._emit, logs=tmp_path / "logs", processes=plan.processes
+        )
+        for node in plan.nodes:
+            if node.run.kind is RunKind.ATTACH:
+                self.graph.others[node.full_name] = "unconfigured"
+            elif node.managed:
+                self.hosts.interfaces[node.full_name] = interface_of(node.full_name)
+        self._directory: RunDirectory | None = None
+
+    @property
+    def outline(self) -> list[str]:
+        """The story without the states of single processes and nodes."""
+        return [line for line in self.story if not line.startswith(_DETAIL)]
+
+    def since(self, start: str, times: int = 1) -> list[str]:
+        """The outline from the line on that begins so, for the second or third with `times`."""
+        outline = self.outline
+        found = [index for index, line in enumerate(outline) if line.startswith(start)]
+        return outline[found[times - 1] :]
+
+    @property
+    def report(self) -> str:
+        """How the run says that it ended."""
+        assert self.result is not None
+        assert self.result.verdict.run is not None
+        return self.result.verdict.run.describe()
+
+    @property
+    def messages(self) -> list[str]:
+        """What the last verdict says."""
+        assert self.result is not None
+        return [each.message for each in self.result.verdict.findings]
+
+    async def run(self, *scenarios: Coroutine[Any, Any, None]) -> None:
+        """Run the session to its end, and beside it what happens to it."""
+        with self.ending, self._run_directory() as directory:
+            session = Session(
+                self.system,
+                self._options,
+                directory=directory,
+                records=Records(directory, self.system, self.hosts, self.worker, self._emit),
+                fork_server=self.hosts,
+                observer_participant=self.graph,
+                networks=self.networks,
+                emit=self._emit,
+                ending=self.ending,
+                worker=self.worker,
+            )
+            self.result = await _beside(session.run(), scenarios)
+            await session.leave()
+        self._check()
+
+    @contextlib.contextmanager
+    def _run_directory(self) -> Iterator[RunDirectory]:
+        self._directory = RunDirectory.acquire(self._tmp_path / "runs", "robot", "0")
+        try:
+            yield self._directory
+        finally:
+            self._directory.release()
+
+    async def order(self, ask: Ask, node: str = "") -> str:
+        """Order something through the control socket; return the answer, `0` or `4 cannot …`."""
+        assert self._directory is not None
+        with short_path(self._directory.socket_path) as path:
+            reader, writer = await asyncio.open_unix_connection(path)
+        writer.write(to_json(Question(ask=ask, node=node)) + b"\n")
+        answer = from_json(await reader.readline(), Answer)
+        writer.close()
+        await writer.wait_closed()
+        return f"{answer.exit_code} {answer.error}".rstrip()
+
+    def intrude(self) -> None:
+        """Let a node appear that nobody declared."""
+        self.graph.others["/intruder"] = ""
+        self.graph.note()
+
+    def retreat(self) -> None:
+        """Let the intruder leave."""
+        del self.graph.others["/intruder"]
+        self.graph.note()
+
+    def kill(self, process: str) -> None:
+        """Let a process end as by a crash."""
+        self.hosts.processes[process].end(ProcessExit(signal=signal.SIGSEGV))
+
+    def _take(self, event: Event) -> None:
+        if isinstance(event, Stopping):
+            self._stopping_at_s = self._emit.elapsed_s
+        self.story.append(_line(event, self._emit.elapsed_s))
+
+    def _check(self) -> None:
+        """What holds in every run."""
+        assert self.result is not None
+        assert self.result.verdict.run is not None
+        exit_code = int(self.result.exit_code)
+        assert self.story[-1] == f"[stopped] {exit_code}"
+        assert self.result.verdict.run.exit_code == exit_code
+        assert self.story.count("networks restored") == 1
+        assert all(each.exited.done() for each in self.hosts.processes.values())
+        assert self._stopping_at_s is not None
+        assert self._emit.elapsed_s - self._stopping_at_s < SHUTDOWN_S
+        self._check_gate()
+
+    def _check_gate(self) -> None:
+        opened: set[str] = set()
+        verdict = "none"
+        for line in self.story:
+            kind, _, rest = line.partition(" ")
+            if kind == "[verdict]":
+                verdict = rest.split()[1]
+            elif kind == "[gate]":
+                opened = set(rest.partition(": ")[2].split(", "))
+            elif kind == "[stopping]" or rest == Operation.DEACTIVATE.value:
+                opened.clear()
+            elif rest == Operation.ACTIVATE.value and not kind.startswith("["):
+                assert kind in opened, f"{kind} was activated while its gate was closed"
+                assert verdict in ("ok", "unverifiable"), f"{kind} was activated on {verdict}"

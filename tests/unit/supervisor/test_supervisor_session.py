@@ -1,0 +1,1315 @@
+"""Whole runs of the supervisor: what it does in which order, how it ends, and what it reports.
+
+Each test prepares a world, lets a session run in it from its first process to its last, and
+compares the whole outline. What must hold in every run (the gate, nothing left, a report) is
+checked by `SessionWorld.run` each time.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from lifecycle.manifest.model import Condition, RunKind, Timeouts
+from lifecycle.supervisor.control.server import Ask
+from lifecycle.supervisor.run.options import Until
+from tests.unit.supervisor.fakes import plan_of, planned_node, run
+from tests.unit.supervisor.session_world import SessionWorld
+
+CHAIN = plan_of(planned_node("camera"), planned_node("viewer", after={"camera": Condition.ACTIVE}))
+
+CONNECTED = [
+    "camera start",
+    "viewer start",
+    "/camera configure",
+    "/viewer configure",
+    "/camera connect",
+    "/viewer connect",
+    "[system] connected at 0.0 s",
+]
+VERIFIED = ["[verdict] connected ok", "[system] verified at 0.0 s", "networks programmed (ok)"]
+OPENED = "[gate] ok: /camera, /viewer"
+ACTIVATED = [OPENED, "/camera activate", "/viewer activate", "[system] active at 0.0 s"]
+UP = [*CONNECTED, *VERIFIED, *ACTIVATED]
+
+CAMERA_DOWN = ["/camera disconnect", "/camera cleanup", "/camera shutdown"]
+VIEWER_DOWN = ["/viewer disconnect", "/viewer cleanup", "/viewer shutdown"]
+DOWN = ["/viewer deactivate", *VIEWER_DOWN, "/camera deactivate", *CAMERA_DOWN]
+"""In reverse order of what was done, and of who waited for whom."""
+
+KILLED = ["camera SIGTERM", "[notice] process 'camera' had to be ended with SIGTERM"]
+"""It is in the middle of a step, and not asked for anything more."""
+
+BACK = [*VIEWER_DOWN, *CAMERA_DOWN]
+"""Of a system that was connected and not activated."""
+
+ATTACHED = plan_of(
+    planned_node("camera"),
+    planned_node("base", kind=RunKind.ATTACH, after={"camera": Condition.ACTIVE}),
+)
+"""Another program runs `base`; the supervisor configures and activates it."""
+
+CHANGED = "the system changed before every node was activated"
+
+REFUSED = """cannot activate: the verdict is violated
+  graph.undeclared-node: cannot allow node /intruder: the manifest does not declare it"""
+
+REFUSED_AGAIN = """cannot activate: the system changed before every node was activated, and its \
+verdict now is violated
+  graph.undeclared-node: cannot allow node /intruder: the manifest does not declare it"""
+
+INTRUDED = "graph.undeclared-node /intruder"
+
+
+def over(exit_code: int) -> list[str]:
+    return ["networks restored", f"[stopped] {exit_code}"]
+
+
+# Bring-up
+
+
+def test_a_system_is_brought_up_along_its_order_held_and_taken_down_in_reverse(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        plan = plan_of(
+            planned_node("arm", after={"base": Condition.CONNECTED}), planned_node("base")
+        )
+        world = SessionWorld(plan, tmp_path, stop_after_s=10.0)
+        world.hosts.takes_s["base start"] = 1.0
+        world.hosts.takes_s["/base configure"] = 1.0
+        world.hosts.takes_s["/base activate"] = 1.0
+        await world.run()
+        assert world.story == [
+            "[process] arm starting",
+            "[process] base starting",
+            "arm start",
+            "base start",
+            "[node] /arm started (unconfigured)",
+            "[process] arm running",
+            "[request] /arm configure",
+            "/arm configure",
+            "[node] /arm started (inactive)",
+            "[node] /arm configured (inactive)",
+            "[node] /base started (unconfigured)",
+            "[process] base running",
+            "[request] /base configure",
+            "/base configure",
+            "[node] /base started (inactive)",
+            "[node] /base configured (inactive)",
+            "[request] /base connect",
+            "/base connect",
+            "[node] /base configured (inactive)",
+            "[node] /base connected (inactive)",
+            "[request] /arm connect",
+            "/arm connect",
+            "[node] /arm configured (inactive)",
+            "[node] /arm connected (inactive)",
+            "[system] connected at 2.0 s",
+            "[joined] /arm",
+            "[joined] /base",
+            "[verdict] connected ok",
+            "[system] verified at 2.0 s",
+            "networks programmed (ok)",
+            "[gate] ok: /arm, /base",
+            "[request] /arm activate",
+            "[request] /base activate",
+            "/arm activate",
+            "/base activate",
+            "[node] /arm connected (active)",
+            "[node] /arm active (active)",
+            "[node] /base connected (active)",
+            "[node] /base active (active)",
+            "[system] active at 3.0 s",
+            "[stopping] at 13.0 s: done",
+            "[request] /arm deactivate",
+            "/arm deactivate",
+            "[node] /arm active (inactive)",
+            "[request] /arm disconnect",
+            "/arm disconnect",
+            "[node] /arm active (inactive)",
+            "[request] /arm cleanup",
+            "/arm cleanup",
+            "[node] /arm active (unconfigured)",
+            "[request] /arm shutdown",
+            "/arm shutdown",
+            "[node] /arm active (finalized)",
+            "[process] arm stopping",
+            "[request] /base deactivate",
+            "/base deactivate",
+            "[process] arm exited (exit status 0)",
+            "[node] /base active (inactive)",
+            "[node] /arm stopped (finalized)",
+            "[request] /base disconnect",
+            "/base disconnect",
+            "[node] /base active (inactive)",
+            "[request] /base cleanup",
+            "/base cleanup",
+            "[node] /base active (unconfigured)",
+            "[request] /base shutdown",
+            "/base shutdown",
+            "[node] /base active (finalized)",
+            "[process] base stopping",
+            "[process] base exited (exit status 0)",
+            "[node] /base stopped (finalized)",
+            "networks restored",
+            "[stopped] 0",
+        ]
+        assert world.report == "ended after it was active, exit code 0: done"
+
+    run(main())
+
+
+@pytest.mark.parametrize(
+    ("condition", "reached", "held"),
+    [
+        (Condition.STARTED, "a start", "b start"),
+        (Condition.CONFIGURED, "/a configure", "/b configure"),
+        (Condition.CONNECTED, "/a connect", "/b connect"),
+        (Condition.ACTIVE, "/a activate", "/b activate"),
+    ],
+)
+def test_a_step_is_not_asked_for_before_what_it_comes_after_is_done(
+    tmp_path: Path, condition: Condition, reached: str, held: str
+) -> None:
+    async def main() -> None:
+        plan = plan_of(planned_node("b", after={"a": condition}), planned_node("a"))
+        world = SessionWorld(plan, tmp_path, stop_after_s=0.0)
+        world.hosts.takes_s[reached] = 5.0
+        began = asyncio.get_running_loop().time()
+
+        async def watch() -> None:
+            await world.story.until(held)
+            assert asyncio.get_running_loop().time() - began >= 5.0
+
+        await world.run(watch())
+        assert world.story.index(reached) < world.story.index(held)
+        assert world.report == "ended after it was active, exit code 0: done"
+
+    run(main())
+
+
+@pytest.mark.parametrize(
+    ("until", "outline", "report"),
+    [
+        (
+            Until.CONNECTED,
+            [*CONNECTED, "[verdict] connected ok"],
+            "ended when connected, before it was verified, exit code 0: done",
+        ),
+        (
+            Until.VERIFIED,
+            [*CONNECTED, *VERIFIED[:2]],
+            "ended when verified, before it was active, exit code 0: done",
+        ),
+    ],
+)
+def test_a_system_that_is_not_to_be_active_gets_no_activate_request(
+    tmp_path: Path, until: Until, outline: list[str], report: str
+) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path, until=until)
+        await world.run()
+        assert world.outline == [*outline, "[stopping] at 0.0 s: done", *BACK, *over(0)]
+        assert world.report == report
+
+    run(main())
+
+
+@pytest.mark.parametrize(
+    ("way", "failure", "message"),
+    [
+        (
+            "no display",
+            "run.transition-failed",
+            "cannot connect '/viewer': no display",
+        ),
+        (
+            "die",
+            "run.process-died",
+            "cannot keep '/viewer' running: pid 5000002 died while connecting: killed by SIGSEGV",
+        ),
+        (
+            "hang",
+            "run.deadline",
+            "cannot bring up '/viewer': it was still connecting after 4 s",
+        ),
+    ],
+)
+def test_a_node_that_cannot_be_connected_ends_the_run_and_nothing_is_judged_or_activated(
+    tmp_path: Path, way: str, failure: str, message: str
+) -> None:
+    async def main() -> None:
+        limits = Timeouts(connect_s=4.0)
+        after = {"camera": Condition.CONNECTED}
+        plan = plan_of(planned_node("camera"), planned_node("viewer", after=after, timeouts=limits))
+        world = SessionWorld(plan, tmp_path, stop_after_s=10.0)
+        world.hosts.ways["/viewer connect"] = way
+        await world.run()
+        ended_s = {"hang": 4.5}.get(way, 0.0)
+        assert world.since("[failure]") == [
+            f"[failure] {failure} /viewer",
+            f"[stopping] at {ended_s:.1f} s: rolling back",
+            *(VIEWER_DOWN[1:] if way == "no display" else []),
+            *CAMERA_DOWN,
+            *over(6),
+        ]
+        assert world.report == (
+            f"ended before it was connected, exit code 6: failed: /viewer ({failure})"
+        )
+        assert world.messages == [message]
+
+    run(main())
+
+
+def test_a_process_that_dies_while_its_node_waits_for_another_is_noticed_at_once(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        plan = plan_of(
+            planned_node("camera"), planned_node("viewer", after={"camera": Condition.CONFIGURED})
+        )
+        world = SessionWorld(plan, tmp_path)
+        world.hosts.takes_s["/camera configure"] = 20.0
+
+        async def die() -> None:
+            await world.story.until("[process] viewer running")
+            await asyncio.sleep(1.0)
+            world.kill("viewer")
+
+        await world.run(die())
+        assert world.since("[failure]")[:2] == [
+            "[failure] run.process-died /viewer",
+            "[stopping] at 2.2 s: rolling back",
+        ]
+        assert world.messages == [
+            (
+                "cannot keep '/viewer' running: pid 5000002 died while waits to configure until "
+                "/camera is configured: killed by SIGSEGV"
+            )
+        ]
+
+    run(main())
+
+
+def test_a_bring_up_that_takes_too_long_names_what_is_missing(tmp_path: Path) -> None:
+    async def main() -> None:
+        plan = plan_of(
+            planned_node("camera", timeouts=Timeouts(configure_s=60.0)),
+            planned_node("viewer", after={"camera": Condition.CONFIGURED}),
+        )
+        world = SessionWorld(plan, tmp_path, timeout_s=20.0)
+        world.hosts.takes_s["/camera configure"] = 60.0
+        await world.run()
+        assert world.since("[failure]")[:2] == [
+            "[failure] run.deadline /camera",
+            "[stopping] at 20.0 s: rolling back",
+        ]
+        assert world.report == (
+            "ended before it was connected, exit code 6: failed: /camera (run.deadline)"
+        )
+        assert world.messages == [
+            (
+                "cannot bring up 'robot' within 20 s: /camera is still configuring; "
+                "/viewer waits to configure until /camera is configured"
+            )
+        ]
+
+    run(main())
+
+
+# The gate
+
+
+def test_nothing_is_activated_before_the_verdict_is_ok(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path, stop_after_s=0.0)
+        world.graph.unseen = {"/viewer"}
+
+        async def appear() -> None:
+            await world.story.until("[system] connected")
+            await asyncio.sleep(7.0)
+            world.graph.unseen.clear()
+            world.graph.note()
+
+        await world.run(appear())
+        assert world.since("[system] connected")[1:5] == [
+            "[verdict] connected violated graph.missing-node /viewer",
+            "[verdict] connected ok",
+            "[system] verified at 7.0 s",
+            "networks programmed (ok)",
+        ]
+        assert world.report == "ended after it was active, exit code 0: done"
+
+    run(main())
+
+
+def test_a_violated_verdict_rolls_everything_back(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path, stop_after_s=10.0)
+        world.intrude()
+        await world.run()
+        assert world.outline == [
+            *CONNECTED,
+            f"[verdict] connected violated {INTRUDED}",
+            "[stopping] at 0.5 s: the verdict keeps the gate closed",
+            *BACK,
+            *over(4),
+        ]
+        assert world.report == (
+            "ended when connected, before it was verified, exit code 4: "
+            "the verdict keeps the gate closed; wrong: /intruder (graph.undeclared-node)"
+        )
+
+    run(main())
+
+
+def test_a_node_that_does_not_appear_is_waited_for_as_long_as_there_is_time_and_then_named(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path, timeout_s=8.0)
+        world.hosts.takes_s["/camera configure"] = 3.0
+        world.graph.unseen = {"/viewer"}
+        await world.run()
+        assert world.since("[system] connected")[1:] == [
+            "[verdict] connected violated graph.missing-node /viewer",
+            "[stopping] at 8.0 s: the verdict keeps the gate closed",
+            *BACK,
+            *over(4),
+        ]
+        assert world.messages == ["cannot find node /viewer in domain 30"]
+
+    run(main())
+
+
+@pytest.mark.parametrize("strict", [False, True])
+def test_what_cannot_be_verified_is_taken_on_trust_by_name_or_refused_if_strict(
+    tmp_path: Path, strict: bool
+) -> None:
+    async def main() -> None:
+        world = SessionWorld(ATTACHED, tmp_path, stop_after_s=0.0, strict=strict)
+        world.graph.mute = {"/base"}
+        await world.run()
+        judged = world.since("[system] connected")[1:]
+        assert judged[0] == "[verdict] connected unverifiable state.unverifiable /base"
+        if strict:
+            assert judged[1:] == [
+                "[stopping] at 3.5 s: the verdict keeps the gate closed",
+                "/base cleanup",
+                *CAMERA_DOWN,
+                *over(5),
+            ]
+            assert world.report == (
+                "ended when connected, before it was verified, exit code 5: the verdict keeps the "
+                "gate closed; unknown: /base (state.unverifiable)"
+            )
+        else:
+            assert judged[1:6] == [
+                "[system] verified at 0.0 s",
+                "networks programmed (unverifiable)",
+                "[gate] unverifiable: /camera, /base",
+                "/camera activate",
+                "/base activate",
+            ]
+            assert world.report == (
+                "ended after it was active, exit code 0: done; "
+                "taken on trust: /base (state.unverifiable)"
+            )
+
+    run(main())
+
+
+def test_what_changes_while_networks_are_programmed_keeps_the_gate_closed(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path)
+        world.networks.takes_s = 3.0
+
+        async def intrude() -> None:
+            await world.story.until("networks programmed")
+            await asyncio.sleep(1.0)
+            world.intrude()
+
+        await world.run(intrude())
+        assert world.since("networks programmed") == [
+            "networks programmed (ok)",
+            f"[verdict] connected violated {INTRUDED}",
+            f"[stopping] at 3.5 s: {CHANGED}",
+            *BACK,
+            *over(4),
+        ]
+
+    run(main())
+
+
+def test_networks_that_cannot_be_programmed_keep_the_gate_closed(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path)
+        world.networks.fails = "cannot program networks for 'robot': no"
+        await world.run()
+        assert world.since("networks programmed") == [
+            "networks programmed (ok)",
+            "[failure] run.not-programmed robot",
+            "[stopping] at 0.0 s: rolling back",
+            *BACK,
+            *over(6),
+        ]
+        assert world.messages == ["cannot program networks for 'robot': no"]
+
+    run(main())
+
+
+def test_what_changes_between_two_requests_has_the_rest_not_asked_and_all_rolled_back(
+    tmp_path: Path,
+) -> None:
+    """The permit of the first node is stale for the second."""
+
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path)
+        world.hosts.takes_s["/camera activate"] = 3.0
+
+        async def intrude() -> None:
+            await world.story.until("/camera activate")
+            await asyncio.sleep(1.0)
+            world.intrude()
+
+        await world.run(intrude())
+        assert world.since("[gate]") == [
+            OPENED,
+            "/camera activate",
+            f"[verdict] connected violated {INTRUDED}",
+            f"[stopping] at 3.5 s: {CHANGED}",
+            *VIEWER_DOWN,
+            "/camera deactivate",
+            *CAMERA_DOWN,
+            *over(4),
+        ]
+        assert world.report == (
+            f"ended when verified, before it was active, exit code 4: {CHANGED}; "
+            "wrong: /intruder (graph.undeclared-node)"
+        )
+
+    run(main())
+
+
+def test_what_changes_between_two_requests_and_heals_is_judged_again_and_then_they_go_on(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path, stop_after_s=0.0)
+        world.hosts.takes_s["/camera activate"] = 3.0
+
+        async def come_and_go() -> None:
+            await world.story.until("/camera activate")
+            await asyncio.sleep(2.9)
+            world.intrude()
+            await world.story.until("[verdict] connected violated")
+            world.retreat()
+
+        await world.run(come_and_go())
+        assert world.since("[gate]")[:6] == [
+            OPENED,
+            "/camera activate",
+            f"[verdict] connected violated {INTRUDED}",
+            "[verdict] connected ok",
+            "/viewer activate",
+            "[system] active at 3.0 s",
+        ]
+
+    run(main())
+
+
+def test_what_changes_in_the_moment_in_which_a_request_leaves_keeps_it_back(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path)
+        world.story.in_the_moment["[request] /viewer activate"] = world.intrude
+        await world.run()
+        assert world.since("[gate]")[:4] == [
+            OPENED,
+            "/camera activate",
+            f"[verdict] connected violated {INTRUDED}",
+            f"[stopping] at 0.5 s: {CHANGED}",
+        ]
+
+    run(main())
+
+
+def test_the_time_for_which_a_change_is_judged_is_not_that_of_the_node_that_waits_for_it(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        after = {"camera": Condition.ACTIVE}
+        limits = Timeouts(activate_s=1.0)
+        plan = plan_of(planned_node("camera"), planned_node("viewer", after=after, timeouts=limits))
+        world = SessionWorld(plan, tmp_path, stop_after_s=0.0)
+
+        def hide() -> None:
+            world.graph.unseen = {"/camera"}
+            world.graph.note()
+
+        async def show() -> None:
+            await world.story.until("[verdict] connected violated")
+            await asyncio.sleep(4.0)
+            world.graph.unseen.clear()
+            world.graph.note()
+
+        world.story.in_the_moment["/camera activate"] = hide
+        await world.run(show())
+        assert world.since("[gate]")[:6] == [
+            OPENED,
+            "/camera activate",
+            "[verdict] connected violated graph.missing-node /camera",
+            "[verdict] connected ok",
+            "/viewer activate",
+            "[system] active at 4.0 s",
+        ]
+
+    run(main())
+
+
+def test_what_changes_before_a_request_to_a_foreign_node_leaves_keeps_it_back(
+    tmp_path: Path,
+) -> None:
+    """It may be long until a service is matched: the verdict of before is not worth it then."""
+
+    async def main() -> None:
+        world = SessionWorld(ATTACHED, tmp_path)
+        world.graph.services.matched_after_s["/base activate"] = 2.0
+
+        async def intrude() -> None:
+            await world.story.until("[request] /base activate")
+            await asyncio.sleep(1.0)
+            world.intrude()
+
+        await world.run(intrude())
+        assert world.since("[gate]") == [
+            "[gate] ok: /camera, /base",
+            "/camera activate",
+            f"[verdict] connected violated {INTRUDED}",
+            f"[stopping] at 2.5 s: {CHANGED}",
+            "/base cleanup",
+            "/camera deactivate",
+            *CAMERA_DOWN,
+            *over(4),
+        ]
+
+    run(main())
+
+
+def test_what_became_active_is_judged_again_and_must_be_what_was_verified(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path)
+        world.hosts.takes_s["/viewer activate"] = 3.0
+
+        async def intrude() -> None:
+            await world.story.until("/viewer activate")
+            world.intrude()
+
+        await world.run(intrude())
+        assert world.since("/viewer activate") == [
+            "/viewer activate",
+            f"[verdict] active violated {INTRUDED}",
+            "[stopping] at 3.5 s: what became active is not what was verified",
+            *DOWN,
+            *over(4),
+        ]
+
+    run(main())
+
+
+@pytest.mark.parametrize(
+    ("way", "failure", "message"),
+    [
+        ("no light", "run.transition-failed", "cannot activate '/viewer': no light"),
+        (
+            "die",
+            "run.process-died",
+            "cannot keep '/viewer' running: pid 5000002 died while activating: killed by SIGSEGV",
+        ),
+    ],
+)
+def test_a_node_that_cannot_be_activated_has_everything_rolled_back(
+    tmp_path: Path, way: str, failure: str, message: str
+) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path)
+        world.hosts.ways["/viewer activate"] = way
+        await world.run()
+        assert world.since("/viewer activate") == [
+            "/viewer activate",
+            f"[failure] {failure} /viewer",
+            "[stopping] at 0.0 s: rolling back",
+            *([] if way == "die" else VIEWER_DOWN),
+            "/camera deactivate",
+            *CAMERA_DOWN,
+            *over(6),
+        ]
+        assert world.messages == [message]
+        assert world.report == (
+            f"ended when verified, before it was active, exit code 6: failed: /viewer ({failure})"
+        )
+
+    run(main())
+
+
+def test_a_process_that_dies_while_the_system_is_judged_ends_the_run(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path)
+        world.graph.unseen = {"/viewer"}
+
+        async def die() -> None:
+            await world.story.until("[verdict]")
+            await asyncio.sleep(2.0)
+            world.kill("camera")
+
+        await world.run(die())
+        assert world.since("[failure]") == [
+            "[failure] run.process-died /camera",
+            "[stopping] at 3.2 s: rolling back",
+            *VIEWER_DOWN,
+            *over(6),
+        ]
+        assert world.report == (
+            "ended when connected, before it was verified, exit code 6: "
+            "failed: /camera (run.process-died)"
+        )
+
+    run(main())
+
+
+# Hold
+
+
+@pytest.mark.parametrize("heals", [False, True])
+def test_a_violation_while_holding_is_told_and_makes_the_end_no_success_even_if_it_heals(
+    tmp_path: Path, heals: bool
+) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path, stop_after_s=10.0)
+
+        async def intrude() -> None:
+            await world.story.until("[system] active")
+            await asyncio.sleep(3.0)
+            world.intrude()
+            await asyncio.sleep(2.0)
+            if heals:
+                world.retreat()
+
+        await world.run(intrude())
+        assert world.since("[system] active")[1:] == [
+            f"[verdict] active violated {INTRUDED}",
+            *(["[verdict] active ok"] if heals else []),
+            "[stopping] at 10.0 s: done",
+            *DOWN,
+            *over(4),
+        ]
+        violated = "violated meanwhile, wrong" if heals else "violated; wrong"
+        assert world.report == (
+            "ended after it was active, exit code 4: "
+            f"done, but {violated}: /intruder (graph.undeclared-node)"
+        )
+
+    run(main())
+
+
+def test_a_passing_moment_is_no_violation_of_what_is_held(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path, stop_after_s=10.0)
+
+        async def pass_by() -> None:
+            await world.story.until("[system] active")
+            await asyncio.sleep(3.0)
+            world.intrude()
+            await asyncio.sleep(0.2)
+            world.retreat()
+
+        await world.run(pass_by())
+        assert world.since("[system] active")[1:] == [
+            f"[verdict] active violated {INTRUDED}",
+            "[verdict] active ok",
+            "[stopping] at 10.0 s: done",
+            *DOWN,
+            *over(0),
+        ]
+
+    run(main())
+
+
+@pytest.mark.parametrize("keep_going", [False, True])
+def test_a_process_that_dies_while_holding_ends_the_run_unless_it_is_to_keep_going(
+    tmp_path: Path, keep_going: bool
+) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path, stop_after_s=10.0, keep_going=keep_going)
+
+        async def die() -> None:
+            await world.story.until("[system] active")
+            await asyncio.sleep(3.0)
+            world.kill("camera")
+
+        await world.run(die())
+        gone = "graph.missing-node /camera"
+        if keep_going:
+            held = [
+                "[failure] run.process-died /camera, and the run goes on",
+                f"[verdict] active violated {gone}",
+                "[stopping] at 10.0 s: done",
+            ]
+        else:
+            held = ["[failure] run.process-died /camera", "[stopping] at 3.0 s: rolling back"]
+        down = ["/viewer deactivate", *VIEWER_DOWN]
+        assert world.since("[system] active")[1:] == [*held, *down, *over(6)]
+        assert world.report == (
+            "ended after it was active, exit code 6: "
+            + ("done, but " if keep_going else "")
+            + "failed: /camera (run.process-died)"
+        )
+
+    run(main())
+
+
+# Orders
+
+
+def test_a_paused_system_is_inactive_until_it_is_judged_anew(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path)
+
+        async def order() -> None:
+            await world.story.until("[system] active")
+            assert await world.order(Ask.RESUME) == (
+                "2 cannot resume 'robot': it is active; only a paused system can be resumed"
+            )
+            assert await world.order(Ask.PAUSE) == "0"
+            await asyncio.sleep(3.0)
+            assert await world.order(Ask.RESUME) == "0"
+            assert await world.order(Ask.DOWN) == "0"
+
+        await world.run(order())
+        assert world.since("[system] active")[1:] == [
+            "/viewer deactivate",
+            "/camera deactivate",
+            "[system] paused at 0.0 s",
+            "[system] verified at 3.0 s",
+            "networks programmed (ok)",
+            *ACTIVATED[:-1],
+            "[system] active at 3.0 s",
+            "[stopping] at 3.0 s: lifecycle down",
+            *DOWN,
+            *over(0),
+        ]
+
+    run(main())
+
+
+def test_a_system_that_is_wrong_stays_paused_and_can_be_resumed_once_it_is_right(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path)
+
+        async def order() -> None:
+            await world.story.until("[system] active")
+            assert await world.order(Ask.PAUSE) == "0"
+            world.intrude()
+            assert await world.order(Ask.RESUME) == f"4 {REFUSED}"
+            world.retreat()
+            assert await world.order(Ask.RESUME) == "0"
+            assert await world.order(Ask.DOWN) == "0"
+
+        await world.run(order())
+        assert world.since("[system] paused")[1:-11] == [
+            f"[verdict] connected violated {INTRUDED}",
+            f"[notice] {REFUSED}",
+            "[verdict] connected ok",
+            "[system] verified at 0.5 s",
+            "networks programmed (ok)",
+            *ACTIVATED[:-1],
+            "[system] active at 0.5 s",
+        ]
+        assert world.report == "ended after it was active, exit code 0: lifecycle down"
+
+    run(main())
+
+
+def test_what_changes_while_a_system_is_resumed_has_it_paused_again(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path)
+
+        async def order() -> None:
+            await world.story.until("[system] active")
+            assert await world.order(Ask.PAUSE) == "0"
+            world.hosts.takes_s["/camera activate"] = 3.0
+            resumed = asyncio.ensure_future(world.order(Ask.RESUME))
+            await world.story.until("/camera activate", 2)
+            await asyncio.sleep(1.0)
+            world.intrude()
+            assert await resumed == f"4 {REFUSED_AGAIN}"
+            world.retreat()
+            assert await world.order(Ask.RESUME) == "0"
+            assert await world.order(Ask.DOWN) == "0"
+
+        await world.run(order())
+        assert world.since("[gate]", 2)[:7] == [
+            OPENED,
+            "/camera activate",
+            f"[verdict] connected violated {INTRUDED}",
+            "[notice] the gate closed again: /camera is deactivated",
+            "/camera deactivate",
+            f"[notice] {REFUSED_AGAIN}",
+            "[verdict] connected ok",
+        ]
+        assert world.since("[gate]", 3)[:4] == [
+            OPENED,
+            "/camera activate",
+            "/viewer activate",
+            "[system] active at 6.5 s",
+        ]
+
+    run(main())
+
+
+def test_one_node_is_restarted_through_the_gate_and_the_others_stay_active(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path)
+
+        async def order() -> None:
+            await world.story.until("[system] active")
+            assert await world.order(Ask.RESTART, "viewer") == "0"
+            assert await world.order(Ask.DOWN) == "0"
+
+        await world.run(order())
+        assert world.since("[system] active")[1:] == [
+            "/viewer deactivate",
+            *VIEWER_DOWN,
+            "viewer start",
+            "/viewer configure",
+            "/viewer connect",
+            "[system] connected at 0.0 s",
+            "[system] verified at 0.0 s",
+            "networks programmed (ok)",
+            "[gate] ok: /viewer",
+            "/viewer activate",
+            "[system] active at 0.0 s",
+            "[stopping] at 0.0 s: lifecycle down",
+            *DOWN,
+            *over(0),
+        ]
+
+    run(main())
+
+
+def test_a_restart_waits_until_nobody_takes_the_new_node_for_a_second_one_and_is_watched_anew(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path)
+        world.hosts.lingers_s = 2.0
+
+        async def order() -> None:
+            await world.story.until("[system] active")
+            assert await world.order(Ask.RESTART, "viewer") == "0"
+            world.kill("viewer")
+
+        await world.run(order())
+        assert world.since("viewer start", 2) == [
+            "viewer start",
+            "/viewer configure",
+            "/viewer connect",
+            "[system] connected at 2.0 s",
+            "[system] verified at 2.0 s",
+            "networks programmed (ok)",
+            "[gate] ok: /viewer",
+            "/viewer activate",
+            "[system] active at 2.0 s",
+            "[failure] run.process-died /viewer",
+            "[stopping] at 2.0 s: rolling back",
+            "/camera deactivate",
+            *CAMERA_DOWN,
+            *over(6),
+        ]
+        assert world.graph.dropped == ["/viewer"]
+
+    run(main())
+
+
+def test_an_order_to_a_system_that_is_not_up_is_refused_and_not_kept(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path)
+        world.hosts.takes_s["/camera configure"] = 5.0
+
+        async def order() -> None:
+            await world.story.until("/camera configure")
+            for ask, hint in (
+                (Ask.PAUSE, "only an active system can be paused"),
+                (Ask.RESTART, "only a system that is active or paused can be restarted"),
+            ):
+                assert await world.order(ask) == (
+                    f"2 cannot {ask.value} 'robot': it is connecting; {hint}"
+                )
+            assert await world.order(Ask.DOWN) == "6"
+
+        await world.run(order())
+
+    run(main())
+
+
+def test_a_restarted_node_stays_inactive_while_the_system_is_wrong_and_can_be_resumed(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path)
+
+        async def order() -> None:
+            await world.story.until("[system] active")
+            world.intrude()
+            assert await world.order(Ask.RESTART, "viewer") == f"4 {REFUSED}"
+            world.retreat()
+            await asyncio.sleep(1.0)
+            assert await world.order(Ask.RESUME) == "0"
+            assert await world.order(Ask.DOWN) == "0"
+
+        await world.run(order())
+        assert world.since("[verdict] active violated")[1:-11] == [
+            "/viewer deactivate",
+            *VIEWER_DOWN,
+            "viewer start",
+            "/viewer configure",
+            "/viewer connect",
+            "[system] connected at 0.0 s",
+            f"[notice] {REFUSED}",
+            "[verdict] connected ok",
+            "[system] verified at 1.5 s",
+            "networks programmed (ok)",
+            "[gate] ok: /viewer",
+            "/viewer activate",
+            "[system] active at 1.5 s",
+        ]
+        assert world.report == "ended after it was active, exit code 0: lifecycle down"
+
+    run(main())
+
+
+def test_a_restart_that_cannot_begin_leaves_everything_as_it_is(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path)
+        why = "the fork server does not answer within 10 s"
+
+        async def order() -> None:
+            await world.story.until("[system] active")
+            world.hosts.cannot_start = why
+            assert await world.order(Ask.RESTART) == (
+                f"6 cannot restart 'robot': {why}; everything stays as it is"
+            )
+            assert await world.order(Ask.DOWN) == "0"
+
+        await world.run(order())
+        assert world.since("[system] active")[1:] == [
+            "[stopping] at 0.0 s: lifecycle down",
+            *DOWN,
+            *over(0),
+        ]
+
+    run(main())
+
+
+def test_a_restart_in_which_a_step_fails_ends_the_run(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path)
+
+        async def order() -> None:
+            await world.story.until("[system] active")
+            world.hosts.ways["/viewer configure"] = "no display"
+            assert await world.order(Ask.RESTART, "/viewer") == (
+                "6 cannot configure '/viewer': no display"
+            )
+
+        await world.run(order())
+        assert world.since("viewer start", 2) == [
+            "viewer start",
+            "/viewer configure",
+            "[failure] run.transition-failed /viewer",
+            "[stopping] at 0.0 s: rolling back",
+            "/viewer shutdown",
+            "/camera deactivate",
+            *CAMERA_DOWN,
+            *over(6),
+        ]
+
+    run(main())
+
+
+def test_a_paused_system_is_restarted_as_far_as_it_was(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path)
+
+        async def order() -> None:
+            await world.story.until("[system] active")
+            assert await world.order(Ask.PAUSE) == "0"
+            assert await world.order(Ask.RESTART) == "0"
+            assert await world.order(Ask.DOWN) == "0"
+
+        await world.run(order())
+        assert world.since("[system] paused")[1:] == [
+            *BACK,
+            *CONNECTED,
+            "[system] paused at 0.0 s",
+            "[stopping] at 0.0 s: lifecycle down",
+            *BACK,
+            *over(0),
+        ]
+
+    run(main())
+
+
+def test_an_order_that_is_open_when_the_system_is_taken_down_is_answered(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path)
+
+        async def order() -> None:
+            await world.story.until("[system] active")
+            world.hosts.takes_s["/viewer deactivate"] = 2.0
+            paused = asyncio.ensure_future(world.order(Ask.PAUSE))
+            await world.story.until("/viewer deactivate")
+            signal.raise_signal(signal.SIGTERM)
+            assert await paused == "6 cannot go on: 'robot' is being taken down"
+
+        await world.run(order())
+
+    run(main())
+
+
+# Signals
+
+
+def _connecting(world: SessionWorld) -> str:
+    world.hosts.takes_s["/camera configure"] = 5.0
+    return "/camera configure"
+
+
+def _verifying(world: SessionWorld) -> str:
+    world.graph.unseen = {"/viewer"}
+    return "[verdict]"
+
+
+def _programming(world: SessionWorld) -> str:
+    world.networks.takes_s = 5.0
+    return "networks programmed"
+
+
+def _activating(world: SessionWorld) -> str:
+    world.hosts.takes_s["/camera activate"] = 5.0
+    return "/camera activate"
+
+
+def _active(world: SessionWorld) -> str:
+    del world
+    return "[system] active"
+
+
+@pytest.mark.parametrize(
+    ("number", "why", "cut_short", "active"),
+    [
+        (signal.SIGINT, "interrupted", 130, 130),
+        (signal.SIGTERM, "terminated", 143, 0),
+        (signal.SIGHUP, "the terminal was closed", 129, 0),
+    ],
+)
+@pytest.mark.parametrize(
+    ("prepare", "ended", "waits", "down"),
+    [
+        (
+            _connecting,
+            "before it was connected",
+            "; /camera is still configuring",
+            [*VIEWER_DOWN, *KILLED],
+        ),
+        (
+            _verifying,
+            "when connected, before it was verified",
+            "; missing: /viewer (node)",
+            BACK,
+        ),
+        (_programming, "when verified, before it was active", "", BACK),
+        (
+            _activating,
+            "when verified, before it was active",
+            "; /camera is still activating; /viewer waits to activate until /camera is active",
+            [*VIEWER_DOWN, *KILLED],
+        ),
+        (_active, "after it was active", "", DOWN),
+    ],
+)
+def test_a_signal_ends_the_run_at_every_stage_and_says_what_was_waited_for(
+    tmp_path: Path,
+    number: int,
+    why: str,
+    cut_short: int,
+    active: int,
+    prepare: Callable[[SessionWorld], str],
+    ended: str,
+    waits: str,
+    down: list[str],
+) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path)
+        begun = prepare(world)
+
+        async def send() -> None:
+            await world.story.until(begun)
+            await asyncio.sleep(1.0)
+            signal.raise_signal(number)
+
+        await world.run(send())
+        exit_code = active if prepare is _active else cut_short
+        assert world.since("[stopping]") == [
+            f"[stopping] at 1.0 s: {why}",
+            *down,
+            *over(exit_code),
+        ]
+        assert world.report == f"ended {ended}, exit code {exit_code}: {why}{waits}"
+
+    run(main())
+
+
+def test_a_signal_that_came_before_the_session_ends_it_at_once(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path)
+        with world.ending, world.ending.noted():
+            signal.raise_signal(signal.SIGTERM)
+        await world.run()
+        assert "/camera configure" not in world.story
+        assert world.report == (
+            "ended before it was connected, exit code 143: "
+            "terminated; /camera is still starting; /viewer is still starting"
+        )
+
+    run(main())
+
+
+def test_a_run_that_is_bound_to_stay_is_cut_short_by_a_signal(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path, stop_after_s=10.0)
+
+        async def send() -> None:
+            await world.story.until("[system] active")
+            signal.raise_signal(signal.SIGTERM)
+
+        await world.run(send())
+        assert world.report == (
+            "ended after it was active, exit code 143: "
+            "terminated; it did not hold for the 10 s of --stop-after"
+        )
+
+    run(main())
+
+
+@pytest.mark.parametrize(
+    ("phase", "report"),
+    [
+        ("paused", "exit code 0: terminated"),
+        (
+            "restarting",
+            "exit code 143: terminated; the system was connecting, not active",
+        ),
+        ("held", "exit code 4: terminated; held at the gate, and not active"),
+    ],
+)
+def test_a_run_is_a_success_only_if_its_system_is_as_it_was_ordered(
+    tmp_path: Path, phase: str, report: str
+) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path)
+
+        async def order() -> None:
+            await world.story.until("[system] active")
+            ordered = None
+            if phase == "paused":
+                assert await world.order(Ask.PAUSE) == "0"
+            elif phase == "held":
+                world.intrude()
+                assert await world.order(Ask.RESTART, "viewer") == f"4 {REFUSED}"
+                world.retreat()
+            else:
+                world.hosts.takes_s["/viewer configure"] = 4.0
+                ordered = asyncio.ensure_future(world.order(Ask.RESTART, "viewer"))
+                await world.story.until("/viewer configure", 2)
+            await asyncio.sleep(1.0)
+            signal.raise_signal(signal.SIGTERM)
+            if ordered is not None:
+                assert await ordered == "6 cannot go on: 'robot' is being taken down"
+
+        await world.run(order())
+        assert world.report == f"ended after it was active, {report}"
+
+    run(main())
+
+
+def test_a_second_interrupt_ends_what_is_left_at_once(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path, stop_after_s=0.0)
+        world.hosts.takes_s["/viewer deactivate"] = 4.0
+
+        async def send() -> None:
+            await world.story.until("/viewer deactivate")
+            await asyncio.sleep(1.0)
+            signal.raise_signal(signal.SIGINT)
+
+        await world.run(send())
+        assert world.since("[stopping]") == [
+            "[stopping] at 0.0 s: done",
+            "/viewer deactivate",
+            "viewer SIGKILL",
+            "camera SIGKILL",
+            *over(130),
+        ]
+        assert world.report == (
+            "ended after it was active, exit code 130: done; interrupted while it was taken down"
+        )
+
+    run(main())
+
+
+# Taking down
+
+
+def test_nodes_and_processes_that_resist_are_ended_within_limits(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path, stop_after_s=0.0)
+        world.hosts.ways["/viewer deactivate"] = "hang"
+        world.hosts.ends_at = {"viewer": signal.SIGRTMAX, "camera": signal.SIGTERM}
+        await world.run()
+        assert world.since("[stopping]") == [
+            "[stopping] at 0.0 s: done",
+            "/viewer deactivate",
+            "[notice] cannot deactivate '/viewer' within 5 s; its process is ended all the same",
+            "/camera deactivate",
+            *CAMERA_DOWN,
+            "viewer SIGTERM",
+            "viewer SIGKILL",
+            "[notice] process 'viewer' had to be ended with SIGKILL",
+            "camera SIGINT",
+            "camera SIGTERM",
+            "[notice] process 'camera' had to be ended with SIGTERM",
+            *over(0),
+        ]
+
+    run(main())
+
+
+def test_what_escaped_is_ended_and_named(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path, stop_after_s=0.0)
+        world.worker.strays = (4711, 4712)
+        await world.run()
+        assert world.outline[-3:] == [
+            "networks restored",
+            "[notice] ended processes that were left behind: 4711, 4712",
+            "[stopped] 0",
+        ]
+
+    run(main())
