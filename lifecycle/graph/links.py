@@ -1,21 +1,22 @@
 """Who is connected to whom, and by what.
 
-Owns: the judgement of one publisher → subscription pair from what both nodes say of themselves, by
-the conditions of `lifecycle.verify` (types, QoS, matches, carrier). Three outcomes: what neither
-end tells is unverifiable. Pure.
+Owns: the link of one publisher → subscription pair from what both nodes say of themselves. Whether
+the two are matched is judged as `lifecycle.verify` judges it (`verify/rules/matching.py`). Pure.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 from lifecycle.graph.event import NodeLiveliness
 from lifecycle.graph.view import NodeView
-from lifecycle.manifest.qos import Certainty, incompatibilities
 from lifecycle.network.flow import FlowTuple, flow_tuples
 from lifecycle.verify.observation import EndpointReport, Identity
+from lifecycle.verify.rules.matching import MatchEnd, match, obstacle
 from lifecycle.verify.transport import NETWORK, NONE, carrier
 from lifecycle.verify.verdict import Outcome
+from lifecycle.verify.view import UNKNOWN_QOS
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,10 +34,10 @@ class Link:
     Attributes:
         topic: the name by which they meet.
         connected: OK: data can go from one to the other; VIOLATED: they cannot; UNVERIFIABLE:
-            nobody tells.
+            that is not known.
         reason: why it is not OK; empty if it is.
         transport: what carries the data: "intraprocess", "shm", "udpv4", "udpv6", "tcpv4", "tcpv6";
-            "none" if the two have nothing in common, "unknown" where nobody tells.
+            "none" if the two have nothing in common, "unknown" where that is not known.
         flows: the network flows that the data can take; empty if no network carries them.
     """
 
@@ -55,7 +56,12 @@ class Link:
 
 
 def link(
-    topic: str, publisher: End, subscription: End, *, publishers: int, subscriptions: int
+    topic: str,
+    publisher: End,
+    subscription: End,
+    *,
+    publishers: Sequence[MatchEnd],
+    subscriptions: Sequence[MatchEnd],
 ) -> Link:
     """Judge one pair.
 
@@ -63,8 +69,8 @@ def link(
         topic: the name by which they meet.
         publisher: one end.
         subscription: the other end.
-        publishers: how many publishers there are of this topic and type.
-        subscriptions: likewise. An end that matched as many has matched every one of them.
+        publishers: every publisher of this topic, see `match_ends`.
+        subscriptions: every subscription of it.
     """
     source, destination = publisher.endpoint.nfes or (), subscription.endpoint.nfes or ()
     transport = carrier(source, destination, _identity(publisher), _identity(subscription))
@@ -81,14 +87,40 @@ def link(
 
 
 def _judged(
-    publisher: End, subscription: End, transport: str, publishers: int, subscriptions: int
+    publisher: End,
+    subscription: End,
+    transport: str,
+    publishers: Sequence[MatchEnd],
+    subscriptions: Sequence[MatchEnd],
 ) -> tuple[Outcome, str]:
-    obstacle = _missing(publisher) or _missing(subscription) or _mismatch(publisher, subscription)
-    if not obstacle and transport == NONE:
-        obstacle = "they have no transport in common"
-    if obstacle:
-        return Outcome.VIOLATED, obstacle
-    return _matched(publisher.endpoint, subscription.endpoint, publishers, subscriptions)
+    source, destination = _match_end(publisher), _match_end(subscription)
+    cause = _missing(publisher) or _missing(subscription) or obstacle(source, destination)
+    if not cause and transport == NONE:
+        cause = "they have no transport in common"
+    if cause:
+        return Outcome.VIOLATED, cause
+    found = match(source, destination, publishers, subscriptions)
+    return found or (Outcome.UNVERIFIABLE, "neither end reports whom it is matched with")
+
+
+def _match_end(end: End) -> MatchEnd:
+    """Return an end as the rules of matching take it; the state holds no tools."""
+    endpoint = end.endpoint
+    return MatchEnd(
+        kind=endpoint.kind,
+        type=endpoint.type,
+        qos=endpoint.qos or UNKNOWN_QOS,
+        gid=endpoint.gid,
+        report=endpoint,
+        expected=True,
+    )
+
+
+def match_ends(ends: Sequence[End]) -> tuple[MatchEnd, ...]:
+    """Return the ends that can be matched; DDS forgets a silent one in time."""
+    return tuple(
+        _match_end(each) for each in ends if each.node.liveliness is not NodeLiveliness.SILENT
+    )
 
 
 def _missing(end: End) -> str:
@@ -100,42 +132,6 @@ def _missing(end: End) -> str:
     if not end.endpoint.mapped and not end.endpoint.gid:
         return f"{end.node.name} has not mapped it onto a connection"
     return ""
-
-
-def _mismatch(publisher: End, subscription: End) -> str:
-    """Return why two ends cannot match (DDS 1.4 §2.2.2.5, §2.2.3); empty if they can."""
-    types = publisher.endpoint.type, subscription.endpoint.type
-    if types[0] != types[1]:
-        return f"the types differ, {types[0]} and {types[1]}"
-    offered, requested = publisher.endpoint.qos, subscription.endpoint.qos
-    if offered is None or requested is None:
-        return ""
-    found = incompatibilities(offered, requested)
-    certain = any(each.severity is Certainty.CERTAIN for each in found)
-    return "the QoS is incompatible" if certain else ""
-
-
-def _matched(
-    publisher: EndpointReport, subscription: EndpointReport, publishers: int, subscriptions: int
-) -> tuple[Outcome, str]:
-    """Conclude from the peers of each end, or from their number where it cannot tell them apart."""
-    counts = (publisher.matched, subscriptions), (subscription.matched, publishers)
-    named = [
-        other.gid in end.peers
-        for end, other in ((publisher, subscription), (subscription, publisher))
-        if end.peers is not None and other.gid and len(end.peers) == end.matched
-    ]
-    if named:
-        matched = all(named)
-        return (Outcome.OK, "") if matched else (Outcome.VIOLATED, "they have not matched")
-    if any(matched is not None and matched >= there for matched, there in counts):
-        return Outcome.OK, ""
-    if 0 in (publisher.matched, subscription.matched):
-        return Outcome.VIOLATED, "they have not matched"
-    known = [f"{matched} of {there}" for matched, there in counts if matched is not None]
-    if known:
-        return Outcome.UNVERIFIABLE, f"matched {' and '.join(known)}, nobody tells which"
-    return Outcome.UNVERIFIABLE, "neither end tells its matches"
 
 
 def _identity(end: End) -> Identity | None:

@@ -9,13 +9,11 @@ Threads: may be asked from any thread, and an answer does not change afterwards.
 from __future__ import annotations
 
 import threading
-from collections import Counter
 from collections.abc import Callable
 
 from lifecycle.graph.endpoints import Owned
-from lifecycle.graph.event import NodeLiveliness
 from lifecycle.graph.events import GraphEvents
-from lifecycle.graph.links import End, Link, link
+from lifecycle.graph.links import End, Link, link, match_ends
 from lifecycle.graph.record import Record
 from lifecycle.graph.running import Running, up_and_running
 from lifecycle.graph.view import NodeView
@@ -118,14 +116,14 @@ class GraphQueries:
         self, topic: str, publishes: Callable[[End], bool], subscribes: Callable[[End], bool]
     ) -> tuple[Link, ...]:
         publishers, subscriptions = self.publishers_of(topic), self.subscriptions_of(topic)
-        publishing, subscribing = _by_type(publishers), _by_type(subscriptions)
+        publishing, subscribing = match_ends(publishers), match_ends(subscriptions)
         return tuple(
             link(
                 topic,
                 publisher,
                 subscription,
-                publishers=publishing[subscription.endpoint.type],
-                subscriptions=subscribing[publisher.endpoint.type],
+                publishers=publishing,
+                subscriptions=subscribing,
             )
             for publisher in publishers
             if publishes(publisher)
@@ -144,10 +142,3 @@ class GraphQueries:
 
 def _any(_: End) -> bool:
     return True
-
-
-def _by_type(ends: tuple[End, ...]) -> Counter[str]:
-    """Count the ends that can be matched; DDS forgets a silent one in time."""
-    return Counter(
-        each.endpoint.type for each in ends if each.node.liveliness is not NodeLiveliness.SILENT
-    )

@@ -75,11 +75,15 @@ def state_of(*nodes: NodeConfiguration) -> GraphState:
             ),
             (),
         ),
-        ((talker(matched=0), listener(matched=0)), (f"{FLOW}: they have not matched",), ()),
+        (
+            (talker(matched=0), listener(matched=0)),
+            (f"{FLOW}: the publisher matched 0 of 1, the subscription matched 0 of 1",),
+            (),
+        ),
         (
             (talker(matched=None), listener(matched=None)),
             (),
-            (f"{FLOW}: neither end tells its matches",),
+            (f"{FLOW}: neither end reports whom it is matched with",),
         ),
     ],
 )
