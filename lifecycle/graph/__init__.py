@@ -10,11 +10,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
-from lifecycle.graph.endpoints import EndpointChange
-from lifecycle.graph.event import EventKind, GraphEvent, Member, NodeLiveliness
 from lifecycle.graph.events import FORGET_AFTER_S, SILENT_AFTER_S, GraphEvents
-from lifecycle.graph.links import End, Link
-from lifecycle.graph.memory import InMemoryNetwork, InMemoryTransport
 from lifecycle.graph.messages import (
     AliveNotice,
     ConfigurationChanged,
@@ -35,19 +31,31 @@ from lifecycle.graph.messages import (
     encode,
     new_incarnation,
 )
+from lifecycle.graph.model import (
+    End,
+    EndpointChange,
+    EventKind,
+    GraphChange,
+    GraphEvent,
+    Link,
+    Member,
+    NodeLiveliness,
+    NodeView,
+)
 from lifecycle.graph.observer import Observer
 from lifecycle.graph.reporter import HEARTBEAT_PERIOD_S, Every, GraphReporter
 from lifecycle.graph.running import Running
 from lifecycle.graph.scheduler import (
     LoopScheduler,
     ManualScheduler,
+    Remove,
     Scheduler,
     ThreadScheduler,
     every,
+    set_within,
 )
 from lifecycle.graph.state import Fetch, GraphState
-from lifecycle.graph.transport import GraphTransport, Remove
-from lifecycle.graph.view import GraphChange, NodeView
+from lifecycle.graph.transport import GraphTransport, InMemoryNetwork, InMemoryTransport
 
 if TYPE_CHECKING:
     from lifecycle.graph.dds import GRAPH_QOS, DdsTransport, steady_timer
@@ -103,6 +111,7 @@ __all__ = [
     "encode",
     "every",
     "new_incarnation",
+    "set_within",
     "steady_timer",
 ]
 

@@ -19,8 +19,7 @@ from rclpy.node import Node
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
-from lifecycle.graph.scheduler import Scheduler
-from lifecycle.graph.transport import Remove
+from lifecycle.graph.scheduler import Remove, Scheduler
 from lifecycle.verify.observation import ConfigurationError, NodeConfiguration, decode_configuration
 
 _logger = logging.getLogger(__name__)

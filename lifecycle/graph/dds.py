@@ -23,7 +23,7 @@ from rclpy.subscription import Subscription
 from std_msgs.msg import String
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.graph.transport import Remove
+from lifecycle.graph.scheduler import Remove
 from lifecycle.verify.noise import GRAPH_TOPIC
 
 _logger = logging.getLogger(__name__)

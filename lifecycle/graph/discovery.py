@@ -17,7 +17,7 @@ from rclpy.subscription import Subscription
 
 from lifecycle.graph.asking import Asker
 from lifecycle.graph.events import GraphEvents
-from lifecycle.graph.transport import Remove
+from lifecycle.graph.scheduler import Remove
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.middleware.rcl.graph_queries import endpoints_of_node
 from lifecycle.middleware.rcl.stale_node_filter import StaleNodeFilter

@@ -1,8 +1,8 @@
-"""Layer 2 of the graph interface: what happens in the graph, told to subscribers.
+"""Layer 2 of the graph interface: what happens in the graph, and who is notified of it.
 
-Owns: who is told of what; membership.py says what happened. Duplicates are dropped, messages that
-come too early wait, and what stays missing becomes a GAP: read that node again. A node of which
-nothing is heard is SILENT, and ALIVE again afterwards.
+Owns: the subscribers by what they ask for; membership.py says what happened. Duplicates are
+dropped, messages that come too early wait, and what stays missing becomes a GAP: read that node
+again. A node that sends nothing any more is SILENT, and ALIVE again afterwards.
 
 Threads: everything runs in the scheduler. Subscribers are called there, one after another, each
 event to all of them before the next; so they must be quick, and may call any method here. Every
@@ -15,19 +15,96 @@ import functools
 import logging
 import threading
 import typing
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 
-from lifecycle.graph.endpoints import EndpointChange, EndpointIndex
-from lifecycle.graph.event import EventKind, GraphEvent, Member, NodeLiveliness
 from lifecycle.graph.membership import Membership, endpoint_event
 from lifecycle.graph.messages import GraphMessageError, decode
-from lifecycle.graph.scheduler import Scheduler
-from lifecycle.graph.subscribers import Subscribers, call
-from lifecycle.graph.transport import GraphTransport, Remove
+from lifecycle.graph.model import (
+    EndpointChange,
+    EndpointIndex,
+    EventKind,
+    GraphEvent,
+    Member,
+    NodeLiveliness,
+    names_of,
+)
+from lifecycle.graph.scheduler import Remove, Scheduler
+from lifecycle.graph.transport import GraphTransport
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.verify.observation import EndpointReport
 
 _logger = logging.getLogger(__name__)
+
+About = str | tuple[EndpointKind, str] | None
+"""A node, an endpoint's kind and name, or anything."""
+
+Callback = Callable[[GraphEvent], None]
+
+
+class Subscribers:
+    """Callbacks of one graph. `add` from any thread; the rest from the scheduler."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._callbacks: dict[tuple[EventKind, About], tuple[tuple[object, Callback], ...]] = {}
+        self._outbox: list[GraphEvent] = []
+        self._telling = False
+
+    def add(self, wanted: Iterable[tuple[EventKind, About]], callback: Callback) -> Remove:
+        """Have `callback` called with what is wanted; return what takes it away."""
+        token = object()
+        places = tuple(wanted)
+        with self._lock:
+            for place in places:
+                self._callbacks[place] = (*self._callbacks.get(place, ()), (token, callback))
+
+        def remove() -> None:
+            with self._lock:
+                for place in places:
+                    left = tuple(
+                        each for each in self._callbacks.get(place, ()) if each[0] is not token
+                    )
+                    if left:
+                        self._callbacks[place] = left
+                    else:
+                        self._callbacks.pop(place, None)
+
+        return remove
+
+    def tell(self, events: Iterable[GraphEvent]) -> None:
+        """Tell each event to all who asked for it, before the next event.
+
+        What a callback makes happen meanwhile is told after that.
+        """
+        self._outbox += events
+        if self._telling:
+            return
+        self._telling = True
+        try:
+            while self._outbox:
+                event = self._outbox.pop(0)
+                for place in _places(event):
+                    for _, callback in self._callbacks.get(place, ()):
+                        call(callback, event)
+        finally:
+            self._telling = False
+
+
+def call(callback: Callback, event: GraphEvent) -> None:
+    """Call back; an exception is logged, and ends nothing."""
+    try:
+        callback(event)
+    except Exception:
+        _logger.exception("cannot handle %s of %s", event.kind.value, event.node)
+
+
+def _places(event: GraphEvent) -> Iterator[tuple[EventKind, About]]:
+    yield event.kind, None
+    yield event.kind, event.node
+    if event.endpoint is not None:
+        for name in names_of(event.endpoint):
+            yield event.kind, (event.endpoint.kind, name)
+
 
 SILENT_AFTER_S = 7.0
 """Three heartbeats and a half: one or two may be lost without an alarm."""

@@ -18,11 +18,11 @@ from rclpy.node import Node
 from lifecycle.graph.asking import Asker
 from lifecycle.graph.dds import DdsTransport
 from lifecycle.graph.discovery import Discovery
-from lifecycle.graph.event import EventKind, GraphEvent
 from lifecycle.graph.events import SILENT_AFTER_S, GraphEvents
-from lifecycle.graph.scheduler import ThreadScheduler
+from lifecycle.graph.model import EventKind, GraphEvent
+from lifecycle.graph.scheduler import Remove, ThreadScheduler
 from lifecycle.graph.state import GraphState
-from lifecycle.graph.transport import GraphTransport, Remove
+from lifecycle.graph.transport import GraphTransport
 from lifecycle.middleware import GraphObserver, on_graph_change
 from lifecycle.middleware.rcl.spinning import Spinner
 from lifecycle.plan.model import ParticipantConnections

@@ -1,32 +1,310 @@
 """Who is a member of the graph, and what each message of it means.
 
-Owns: joining, leaving and restarting; the order in which the messages of a node count, and how long
-a missing one is waited for; and what follows when nothing is heard. Events come out of it; who is
-told of them is events.py's to say.
+Owns: joining, leaving and restarting; the order in which the messages of a node count, what is a
+duplicate and how long a missing one is waited for; what follows when no message comes; and which
+members report others as silent or stuck. Events come out of it; who is notified of them is
+events.py's to say. Pure; all but `Membership`'s queries in the scheduler.
 """
 
 from __future__ import annotations
 
 import functools
 import threading
-from collections.abc import Callable, Iterable
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
 
-from lifecycle.graph.deadlines import Deadlines
-from lifecycle.graph.endpoints import EndpointIndex
-from lifecycle.graph.event import EventKind, GraphEvent, Member, NodeLiveliness
 from lifecycle.graph.messages import (
     AliveNotice,
+    ConfigurationChanged,
     GraphMessage,
     Heartbeat,
     Joined,
     Left,
     SilentNotice,
+    StateChanged,
     StuckNotice,
 )
-from lifecycle.graph.notices import Notices, liveliness_event
-from lifecycle.graph.scheduler import Scheduler
-from lifecycle.graph.sender import Sender
+from lifecycle.graph.model import EndpointIndex, EventKind, GraphEvent, Member, NodeLiveliness
+from lifecycle.graph.scheduler import Deadlines, Remove, Scheduler
 from lifecycle.verify.observation import EndpointReport
+
+WINDOW = 64
+"""So many messages that came too early are held; then what is missing counts as lost. The depth of
+the graph topic's QoS: what a writer no longer has, it cannot send again."""
+
+
+class Sequencer:
+    """Orders the messages of one incarnation.
+
+    Args:
+        first: the first message that was heard, whatever its number: what came before is unknown.
+    """
+
+    def __init__(self, first: GraphMessage) -> None:
+        beats = isinstance(first, Heartbeat)
+        self.last = first.sequence if beats else first.sequence - 1
+        """Number of the last message that was handed on."""
+        self._held: dict[int, GraphMessage] = {}
+        self._beat: Heartbeat | None = None
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether something is missing before what has come."""
+        return bool(self._held) or self._beat is not None
+
+    @property
+    def is_full(self) -> bool:
+        """Whether too much is held to wait any longer."""
+        return len(self._held) >= WINDOW
+
+    def take(self, message: GraphMessage) -> tuple[GraphMessage, ...] | None:
+        """Return what may be handed on now, in order; None if the message says nothing new.
+
+        A heartbeat older than what was handed on says nothing; one that is ahead waits.
+        """
+        if isinstance(message, Heartbeat):
+            if message.sequence < self.last:
+                return None
+            if message.sequence == self.last:
+                return (message,)
+            if self._beat is None or message.sequence >= self._beat.sequence:
+                self._beat = message
+            return ()
+        if message.sequence <= self.last or message.sequence in self._held:
+            return None
+        self._held[message.sequence] = message
+        return self._ready()
+
+    def give_up(self) -> tuple[GraphMessage, ...]:
+        """Count what is missing as lost, and return all that was held, in order."""
+        found: list[GraphMessage] = []
+        while self._held:
+            self.last = min(self._held) - 1
+            found += self._ready()
+        if self._beat is not None:
+            found.append(self._beat)
+            self.last, self._beat = self._beat.sequence, None
+        return tuple(found)
+
+    def _ready(self) -> tuple[GraphMessage, ...]:
+        found: list[GraphMessage] = []
+        while (message := self._held.pop(self.last + 1, None)) is not None:
+            found.append(message)
+            self.last += 1
+        if self._beat is not None and self._beat.sequence <= self.last:
+            if self._beat.sequence == self.last:
+                found.append(self._beat)
+            self._beat = None
+        return tuple(found)
+
+
+_REMEMBERED = 8
+"""Incarnations that left and whose late messages must not bring them back."""
+
+
+class Sender:
+    """One member of the graph, or one that was."""
+
+    def __init__(self, node: str) -> None:
+        self.node = node
+        self.incarnation = ""
+        self.present = False
+        """It joined and did not leave."""
+        self.order: Sequencer | None = None
+        """None while it has sent nothing."""
+        self.stop_waiting: Remove | None = None
+        """Cancels the wait for a missing message; None if there is none."""
+        self.departed: deque[str] = deque(maxlen=_REMEMBERED)
+        self._state: str | None = None
+        self._connected: bool | None = None
+        self._checksum: str | None = None
+        self._troubles: dict[str, tuple[NodeLiveliness, str]] = {}
+        self._overruled: set[str] = set()
+
+    def begin(self, incarnation: str = "", first: GraphMessage | None = None) -> None:
+        """Be another instance from now on, or the first one; without a message, as discovered."""
+        self.cancel_wait()
+        self.incarnation = incarnation
+        self.present = True
+        self.order = None if first is None else Sequencer(first)
+        self._state = self._connected = self._checksum = None
+        self._troubles, self._overruled = {}, set()
+
+    def adopt(self, incarnation: str, first: GraphMessage) -> None:
+        """Send messages from now on, having been seen by discovery only."""
+        self.incarnation = incarnation
+        self.order = Sequencer(first)
+
+    def end(self, *, for_good: bool) -> None:
+        """Be no member any more. `for_good`: this incarnation said so, and does not come back."""
+        self.cancel_wait()
+        self.present = False
+        self._troubles, self._overruled = {}, set()
+        if for_good and self.incarnation:
+            self.departed.append(self.incarnation)
+
+    def is_next(self, message: GraphMessage) -> bool:
+        """Tell whether a message of another instance, or of one that left, begins the next one.
+
+        The later incarnation wins. An earlier one only comes forth when the later is not heard any
+        more: then the wall clock was set back between the two.
+        """
+        if isinstance(message, Left):
+            self.departed.append(message.incarnation)
+            return False
+        if message.incarnation in self.departed:
+            return False
+        if not self.present or message.incarnation > self.incarnation:
+            return True
+        return self.liveliness is NodeLiveliness.SILENT
+
+    def learn(self, message: GraphMessage) -> None:
+        """Keep what a message, in its turn, tells of state and checksum."""
+        if isinstance(message, Joined | Heartbeat | StateChanged):
+            self._state, self._connected = message.state, message.connected
+        if isinstance(message, Joined | Heartbeat | ConfigurationChanged):
+            self._checksum = message.checksum
+
+    def trouble(
+        self, source: str, liveliness: NodeLiveliness, reason: str, *, again: bool = False
+    ) -> bool:
+        """Hold what `source` says of us; ALIVE takes it back. Return whether our state changed.
+
+        Args:
+            source: who says so.
+            liveliness: what it says.
+            reason: for people.
+            again: it has said so before: then it counts only if we were not heard meanwhile.
+        """
+        before = self.liveliness
+        if again and source in self._overruled and liveliness is NodeLiveliness.SILENT:
+            return False
+        self._overruled.discard(source)
+        if liveliness is NodeLiveliness.ALIVE:
+            self._troubles.pop(source, None)
+        else:
+            held, text = self._troubles.get(source, (None, ""))
+            self._troubles[source] = (liveliness, reason or (text if held is liveliness else ""))
+        return self.liveliness is not before
+
+    def heard(self) -> bool:
+        """Be not silent, whoever says so: we heard of it. Return whether that is a change."""
+        before = self.liveliness
+        if before is not NodeLiveliness.SILENT:
+            return False
+        silent = {
+            source
+            for source, (liveliness, _) in self._troubles.items()
+            if liveliness is NodeLiveliness.SILENT
+        }
+        self._overruled |= silent
+        for source in silent:
+            del self._troubles[source]
+        return True
+
+    @property
+    def liveliness(self) -> NodeLiveliness:
+        """The worst that anybody says of it."""
+        if not self._troubles:
+            return NodeLiveliness.ALIVE
+        held = {liveliness for liveliness, _ in self._troubles.values()}
+        return NodeLiveliness.SILENT if NodeLiveliness.SILENT in held else NodeLiveliness.STUCK
+
+    @property
+    def reason(self) -> str:
+        """Why it is not alive; empty if it is."""
+        worst = self.liveliness
+        reasons = (text for held, text in self._troubles.values() if held is worst and text)
+        return ", ".join(dict.fromkeys(reasons))
+
+    @property
+    def member(self) -> Member:
+        """What is known of it."""
+        return Member(
+            node=self.node,
+            incarnation=self.incarnation,
+            state=self._state,
+            connected=self._connected,
+            checksum=self._checksum,
+            liveliness=self.liveliness,
+            reason=self.reason,
+        )
+
+    def cancel_wait(self) -> None:
+        """Wait for no missing message any more."""
+        if self.stop_waiting is not None:
+            self.stop_waiting()
+            self.stop_waiting = None
+
+
+class Notices:
+    """The troubles of the members of one graph.
+
+    Args:
+        senders: every member by name, as they are now.
+    """
+
+    def __init__(self, senders: Mapping[str, Sender]) -> None:
+        self._senders = senders
+        self._given: dict[str, set[str]] = {}
+        """Sender of notices → whom they are about."""
+
+    def hold(
+        self,
+        node: str,
+        source: str,
+        liveliness: NodeLiveliness,
+        reason: str,
+        *,
+        again: bool = False,
+    ) -> list[GraphEvent]:
+        """Hold what `source` says of `node`, as `Sender.trouble`; return what that changes."""
+        sender = self._senders.get(node)
+        if sender is None or not sender.present:
+            return []
+        changed = sender.trouble(source, liveliness, reason, again=again)
+        return [liveliness_event(sender)] if changed else []
+
+    def take(
+        self, source: str, message: SilentNotice | StuckNotice | AliveNotice
+    ) -> list[GraphEvent]:
+        """Take a notice that a member gives of another."""
+        self._given.setdefault(source, set()).add(message.about)
+        return self.hold(message.about, source, NodeLiveliness(message.kind.value), message.reason)
+
+    def renew(self, source: str, beat: Heartbeat) -> list[GraphEvent]:
+        """Hold exactly what a member says in its heartbeat."""
+        held = self._given.get(source, set())
+        says = {
+            **dict.fromkeys(beat.stuck, NodeLiveliness.STUCK),
+            **dict.fromkeys(beat.silent, NodeLiveliness.SILENT),
+        }
+        if not held and not says:
+            return []
+        self._given[source] = set(says)
+        events: list[GraphEvent] = []
+        for about in (*says, *(each for each in sorted(held) if each not in says)):
+            liveliness = says.get(about, NodeLiveliness.ALIVE)
+            events += self.hold(about, source, liveliness, "", again=about in held)
+        return events
+
+    def end(self, source: str) -> list[GraphEvent]:
+        """Take back all that a member said of others."""
+        events: list[GraphEvent] = []
+        for about in sorted(self._given.pop(source, ())):
+            events += self.hold(about, source, NodeLiveliness.ALIVE, "")
+        return events
+
+
+def liveliness_event(sender: Sender) -> GraphEvent:
+    """Return the event that tells how alive a member is now."""
+    return GraphEvent(
+        kind=EventKind(sender.liveliness.value),
+        node=sender.node,
+        incarnation=sender.incarnation,
+        reason=sender.reason,
+    )
+
 
 _HERE = ""
 _BEATS = "heartbeats"

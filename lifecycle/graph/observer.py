@@ -18,7 +18,7 @@ from typing import Protocol
 from lifecycle.errors import MiddlewareError
 from lifecycle.graph.parameters import Clients as ParameterClients
 from lifecycle.graph.parameters import ParameterReadings
-from lifecycle.graph.waiting import set_within
+from lifecycle.graph.scheduler import set_within
 from lifecycle.plan.model import Plan
 from lifecycle.verify.noise import NO_NAMES, DeclaredNames, tolerating_pattern
 from lifecycle.verify.observation import (

@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection, Mapping
 from typing import Protocol
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.graph.waiting import set_within
+from lifecycle.graph.scheduler import set_within
 from lifecycle.verify.observation import NodeParameters, ParameterReport
 
 _logger = logging.getLogger(__name__)
@@ -218,7 +218,7 @@ class _Node:
             self._clients.report_parameters(self._name, self.names, timeout_s=limit_s)
         )
         try:
-            # Not wait_for, see waiting.py.
+            # Not wait_for, see set_within.
             await asyncio.wait({asking}, timeout=limit_s)
             if asking.done():
                 return asking.result()

@@ -30,7 +30,8 @@ from lifecycle.graph.messages import (
     encode,
     new_incarnation,
 )
-from lifecycle.graph.transport import GraphTransport, Remove
+from lifecycle.graph.scheduler import Remove
+from lifecycle.graph.transport import GraphTransport
 
 _logger = logging.getLogger(__name__)
 

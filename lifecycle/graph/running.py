@@ -9,9 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterator
 
-from lifecycle.graph.event import NodeLiveliness
-from lifecycle.graph.links import Link
-from lifecycle.graph.view import NodeView
+from lifecycle.graph.model import Link, NodeLiveliness, NodeView
 from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedNode
 from lifecycle.verify.observation import EndpointReport
 from lifecycle.verify.verdict import Outcome

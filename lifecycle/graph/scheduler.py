@@ -1,9 +1,9 @@
-"""Time and threads for the upper layers of the graph interface: one place where everything runs.
+"""Time and threads for the graph interface: one place where everything runs.
 
-Owns: the Scheduler Protocol and its three kinds. Whatever a layer does, and every callback that it
+Owns: the Scheduler Protocol and its three kinds, many deadlines of equal length with one timer, and
+a wait for an event that loses no cancellation. Whatever a layer does, and every callback that it
 calls, runs in its scheduler, one after another and never two at once; so a subscriber needs no lock
-against another subscriber. Nothing polls: a scheduler sleeps until it is given something or until
-something is due. Pure.
+against another. A scheduler sleeps until it is given something or something is due. Pure.
 """
 
 from __future__ import annotations
@@ -16,15 +16,16 @@ import logging
 import threading
 import time
 import typing
-from collections import deque
+from collections import OrderedDict, deque
 from collections.abc import Callable
 from typing import Protocol
-
-from lifecycle.graph.transport import Remove
 
 _logger = logging.getLogger(__name__)
 
 Work = Callable[[], None]
+
+Remove = Callable[[], None]
+"""Takes a callback away again; a second call does nothing."""
 
 
 class Scheduler(Protocol):
@@ -227,3 +228,64 @@ def _logged(work: Work) -> None:
         work()
     except Exception:
         _logger.exception("cannot handle a graph event")
+
+
+class Deadlines:
+    """Calls `passed` with each name that was not touched for `after_s`; then it is dropped.
+
+    To be used in the scheduler only.
+    """
+
+    def __init__(self, scheduler: Scheduler, after_s: float, passed: Callable[[str], None]) -> None:
+        self._scheduler = scheduler
+        self._after_s = after_s
+        self._passed = passed
+        self._touched_s: OrderedDict[str, float] = OrderedDict()
+        self._cancel: Remove | None = None
+
+    def touch(self, name: str) -> None:
+        """Begin the deadline of `name` anew."""
+        self._touched_s[name] = self._scheduler.now_s()
+        self._touched_s.move_to_end(name)
+        self._arm()
+
+    def drop(self, name: str) -> None:
+        """Forget `name`; the timer finds out by itself."""
+        self._touched_s.pop(name, None)
+
+    def close(self) -> None:
+        """Forget all."""
+        self._touched_s.clear()
+        if self._cancel is not None:
+            self._cancel()
+
+    def _arm(self) -> None:
+        if self._cancel is None and self._touched_s:
+            first_s = next(iter(self._touched_s.values()))
+            self._cancel = self._scheduler.call_at(first_s + self._after_s, self._check)
+
+    def _check(self) -> None:
+        self._cancel = None
+        now_s = self._scheduler.now_s()
+        while self._touched_s:
+            name, touched_s = next(iter(self._touched_s.items()))
+            if touched_s + self._after_s > now_s:
+                break
+            del self._touched_s[name]
+            self._passed(name)
+        self._arm()
+
+
+async def set_within(event: asyncio.Event, timeout_s: float | None) -> bool:
+    """Wait until `event` is set; False if it was not within `timeout_s` (None: no limit).
+
+    asyncio.wait_for of Python 3.10 and 3.11 returns normally when it is cancelled in the moment in
+    which what it waits for comes true (python/cpython#86296): a task that waits in a loop then
+    outlives its cancellation, and whoever waits for its end waits for ever.
+    """
+    waiting = asyncio.ensure_future(event.wait())
+    try:
+        done, _ = await asyncio.wait({waiting}, timeout=timeout_s)
+    finally:
+        waiting.cancel()
+    return bool(done)

@@ -1,8 +1,8 @@
-"""Layer 3 of the graph interface: the state of the graph; its queries are in queries.py.
+"""Layer 3 of the graph interface: the state of the graph, and what may be asked of it.
 
 Owns: what is known of every node, kept true by events, and re-read from a node only when the
 checksum that it announces is not the one that is held, or when messages of it were lost. One change
-costs work in proportion to the node that changed.
+costs work in proportion to the node that changed, a query in proportion to its answer.
 
 Threads: the state changes in the scheduler of its events, and subscribers are called there. Every
 public method may be called from any thread, and what it returns does not change afterwards.
@@ -10,22 +10,287 @@ public method may be called from any thread, and what it returns does not change
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import logging
+import threading
 import typing
 from collections.abc import Callable
 
-from lifecycle.graph.endpoints import EndpointChange
-from lifecycle.graph.event import EventKind, GraphEvent, Member
 from lifecycle.graph.events import GraphEvents
-from lifecycle.graph.messages import Heartbeat, Joined
-from lifecycle.graph.queries import GraphQueries
-from lifecycle.graph.record import Record
-from lifecycle.graph.transport import Remove
-from lifecycle.graph.view import GraphChange, NodeView, change
-from lifecycle.verify.observation import NodeConfiguration
+from lifecycle.graph.messages import (
+    ConfigurationChanged,
+    GraphMessage,
+    Heartbeat,
+    Joined,
+    StateChanged,
+)
+from lifecycle.graph.model import (
+    End,
+    EndpointChange,
+    EventKind,
+    GraphChange,
+    GraphEvent,
+    Link,
+    Member,
+    NodeLiveliness,
+    NodeView,
+    Owned,
+    altered,
+    change,
+    kept,
+    link,
+    match_ends,
+)
+from lifecycle.graph.running import Running, up_and_running
+from lifecycle.graph.scheduler import Remove
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.plan.model import Plan
+from lifecycle.verify.observation import ConnectionReport, NodeConfiguration
 
 _logger = logging.getLogger(__name__)
+
+_LIVELINESS = {
+    EventKind.SILENT: NodeLiveliness.SILENT,
+    EventKind.STUCK: NodeLiveliness.STUCK,
+    EventKind.ALIVE: NodeLiveliness.ALIVE,
+}
+
+
+class Record:
+    """One instance of one node."""
+
+    def __init__(self, member: Member) -> None:
+        self.view = NodeView(
+            name=member.node,
+            incarnation=member.incarnation,
+            liveliness=member.liveliness,
+            reason=member.reason,
+            state=member.state,
+            connected=member.connected,
+        )
+        self.reading: object | None = None
+        """Token of the reading that is under way."""
+        self._announced = member.checksum
+        self._doubtful = member.checksum is None
+        self._again = False
+        self._meanwhile: list[GraphMessage] = []
+
+    @property
+    def must_read(self) -> bool:
+        """Whether what is held is not what the node announced, or may not be."""
+        if self.reading is not None:
+            return False
+        if self._doubtful:
+            return True
+        held = self.view.configuration
+        return bool(self._announced) and (held is None or held.checksum != self._announced)
+
+    def doubt(self) -> None:
+        """Have the configuration read again whatever its checksum."""
+        if self.reading is None:
+            self._doubtful = True
+        else:
+            self._again = True
+
+    def begin(self) -> object:
+        """Begin to read; return the token of this reading."""
+        self._doubtful = self._again = False
+        self._meanwhile = []
+        self.reading = object()
+        return self.reading
+
+    def failed(self) -> None:
+        """End a reading without an answer; the next heartbeat gives occasion to try again."""
+        self.reading = None
+        self._doubtful = True
+        self._meanwhile = []
+
+    def take(self, configuration: NodeConfiguration) -> None:
+        """Hold a configuration that was read or given, and what has been told since it was asked.
+
+        The node may have changed between its answer and a message that came before the answer: the
+        checksum that was announced meanwhile, if it is another one, has it read once more.
+        """
+        meanwhile, self._meanwhile = self._meanwhile, []
+        again, self._again = self._again, False
+        self.reading = None
+        self.view = dataclasses.replace(
+            self.view,
+            configuration=kept(configuration),
+            state=configuration.state,
+            connected=configuration.connected,
+        )
+        announced = False
+        for message in meanwhile:
+            announced |= isinstance(message, ConfigurationChanged | Heartbeat | Joined)
+            self._alter(message)
+        if not announced:
+            self._announced = configuration.checksum
+        self._doubtful = again
+
+    def apply(self, event: GraphEvent) -> None:
+        """Let an event of this node take effect."""
+        if event.kind in _LIVELINESS:
+            self.view = dataclasses.replace(
+                self.view, liveliness=_LIVELINESS[event.kind], reason=event.reason
+            )
+        elif event.kind is EventKind.GAP:
+            self.doubt()
+        elif event.message is not None:
+            if event.incarnation != self.view.incarnation:
+                # Discovery had shown it already; now it speaks for itself.
+                self.view = dataclasses.replace(self.view, incarnation=event.incarnation)
+                self.doubt()
+            message = event.message
+            if isinstance(message, ConfigurationChanged | Heartbeat | Joined):
+                self._announced = message.checksum
+            if self.reading is not None:
+                self._meanwhile.append(message)
+            self._alter(message)
+
+    def _alter(self, message: GraphMessage) -> None:
+        view, configuration = self.view, self.view.configuration
+        if isinstance(message, StateChanged | Heartbeat | Joined):
+            if (view.state, view.connected) == (message.state, message.connected):
+                return
+            if configuration is not None:
+                configuration = dataclasses.replace(
+                    configuration, state=message.state, connected=message.connected
+                )
+            self.view = dataclasses.replace(
+                view,
+                configuration=configuration,
+                state=message.state,
+                connected=message.connected,
+            )
+        elif configuration is not None:
+            changed = altered(configuration, message)
+            if changed != configuration:
+                self.view = dataclasses.replace(view, configuration=changed)
+
+
+class GraphQueries:
+    """The queries of one graph; `GraphState` is one that follows events.
+
+    Args:
+        events: layer 2; it has the index of endpoints.
+    """
+
+    def __init__(self, events: GraphEvents) -> None:
+        self.events = events
+        self._lock = threading.RLock()
+        self._records: dict[str, Record] = {}
+
+    def nodes(self) -> tuple[NodeView, ...]:
+        """Return every node of the graph, silent ones included, by name."""
+        with self._lock:
+            views = [each.view for each in self._records.values()]
+        return tuple(sorted(views, key=lambda each: each.name))
+
+    def node(self, name: str) -> NodeView | None:
+        """Return what is known of a node (fully qualified); None if it is not in the graph."""
+        with self._lock:
+            record = self._records.get(name)
+            return None if record is None else record.view
+
+    def connections_of(self, node: str) -> tuple[ConnectionReport, ...]:
+        """Return the connections of a node; none if it is not known."""
+        view = self.node(node)
+        return () if view is None else view.connections
+
+    def publishers_of(self, topic: str) -> tuple[End, ...]:
+        """Return who publishes a topic (fully qualified), aliases included."""
+        return self.endpoints(EndpointKind.PUBLISHER, topic)
+
+    def subscriptions_of(self, topic: str) -> tuple[End, ...]:
+        """Return who subscribes to a topic."""
+        return self.endpoints(EndpointKind.SUBSCRIPTION, topic)
+
+    def servers_of(self, service: str) -> tuple[End, ...]:
+        """Return who offers a service."""
+        return self.endpoints(EndpointKind.SERVICE_SERVER, service)
+
+    def clients_of(self, service: str) -> tuple[End, ...]:
+        """Return who uses a service."""
+        return self.endpoints(EndpointKind.SERVICE_CLIENT, service)
+
+    def endpoints(self, kind: EndpointKind, name: str) -> tuple[End, ...]:
+        """Return the endpoints of a kind and name (fully qualified), by node name."""
+        with self.events.lock:
+            owned = self.events.endpoints.named(kind, name)
+        return self._ends(owned)
+
+    def topics(self) -> tuple[str, ...]:
+        """Return every topic that somebody publishes or subscribes to, sorted."""
+        with self.events.lock:
+            names = {
+                *self.events.endpoints.names(EndpointKind.PUBLISHER),
+                *self.events.endpoints.names(EndpointKind.SUBSCRIPTION),
+            }
+        return tuple(sorted(names))
+
+    def connected(self, topic: str, publisher: str, subscription: str) -> tuple[Link, ...]:
+        """Return how two nodes are connected by a topic.
+
+        Args:
+            topic: fully qualified.
+            publisher: fully qualified name of the publishing node.
+            subscription: of the subscribing node.
+
+        Returns:
+            One link for each pair of their endpoints, usually one; none if either has no endpoint.
+        """
+        return self._links(
+            topic,
+            lambda end: end.node.name == publisher,
+            lambda end: end.node.name == subscription,
+        )
+
+    def flows(self, topic: str | None = None) -> tuple[Link, ...]:
+        """Return every publisher → subscription pair, connected or not, of one topic or of all."""
+        topics = self.topics() if topic is None else (topic,)
+        return tuple(each for name in topics for each in self._links(name, _any, _any))
+
+    def is_up_and_running(self, plan: Plan) -> Running:
+        """Tell whether every node of `plan` is there, active, mapped and connected.
+
+        Three-valued, with what is missing. It proves less than the gate does: undeclared nodes,
+        uniqueness and QoS are `lifecycle.verify`'s.
+        """
+        return up_and_running(plan, self.node, self.connected)
+
+    def _links(
+        self, topic: str, publishes: Callable[[End], bool], subscribes: Callable[[End], bool]
+    ) -> tuple[Link, ...]:
+        publishers, subscriptions = self.publishers_of(topic), self.subscriptions_of(topic)
+        publishing, subscribing = match_ends(publishers), match_ends(subscriptions)
+        return tuple(
+            link(
+                topic,
+                publisher,
+                subscription,
+                publishers=publishing,
+                subscriptions=subscribing,
+            )
+            for publisher in publishers
+            if publishes(publisher)
+            for subscription in subscriptions
+            if subscribes(subscription)
+        )
+
+    def _ends(self, owned: tuple[Owned, ...]) -> tuple[End, ...]:
+        found: list[End] = []
+        for each in owned:
+            view = self.node(each.node)
+            if view is not None:
+                found.append(End(node=view, endpoint=each.endpoint))
+        return tuple(sorted(found, key=lambda each: each.node.name))
+
+
+def _any(_: End) -> bool:
+    return True
+
 
 Fetch = Callable[[str, Callable[[NodeConfiguration | None], None]], None]
 """Reads the configuration of a node (fully qualified) and calls back once, from any thread, at once

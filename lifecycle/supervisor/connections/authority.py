@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Protocol
 
 from lifecycle.errors import BringUpError
-from lifecycle.graph.waiting import set_within
+from lifecycle.graph import set_within
 from lifecycle.manifest.model import Authority as AuthorityKind
 from lifecycle.manifest.model import Condition, DataLayerSource
 from lifecycle.node.host.control import Operation

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.export.captured import CapturedParameter, CapturedSystem, capture
-from lifecycle.graph.waiting import set_within
+from lifecycle.graph import set_within
 from lifecycle.manifest.model import DiscoveryRange
 from lifecycle.verify.noise import known_node
 from lifecycle.verify.observation import (

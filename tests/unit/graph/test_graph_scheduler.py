@@ -9,7 +9,7 @@ import threading
 import pytest
 
 from lifecycle.graph import LoopScheduler, ManualScheduler, ThreadScheduler, every
-from lifecycle.graph.deadlines import Deadlines
+from lifecycle.graph.scheduler import Deadlines
 
 LIMIT_S = 5.0
 

@@ -24,7 +24,7 @@ from lifecycle.graph import (
     NodeView,
     encode,
 )
-from lifecycle.graph.links import link, match_ends
+from lifecycle.graph.model import link, match_ends
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import QosProfile, Reliability
 from lifecycle.network.nfe import InternetProtocol, NetworkFlowEndpoint, TransportProtocol

@@ -5,8 +5,8 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 
+from lifecycle.graph import set_within
 from lifecycle.graph.observer import Observer
-from lifecycle.graph.waiting import set_within
 from lifecycle.verify.observation import ObservedNode
 from tests.unit.graph.test_observer import FakeClients, FakeGraph, configuration, plan
 from tests.unit.supervisor.fakes import run

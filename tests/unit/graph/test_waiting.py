@@ -6,7 +6,7 @@ import asyncio
 
 import pytest
 
-from lifecycle.graph.waiting import set_within
+from lifecycle.graph import set_within
 
 
 def test_an_event_that_is_set_ends_the_wait_and_one_that_is_not_ends_with_the_time() -> None:
