@@ -1,8 +1,9 @@
-"""The graph interface: what runs, told by its participants, and what an observer sees of it.
+"""The graph interface: what runs, who is connected to whom, and what has just changed.
 
 Owns: graph messages and how they travel, the events made of them, and the state with its queries
-(docs/graph_interface.md); and observations for the supervisor and `lifecycle verify`. Must not use
-ctypes or private rclpy names; those live in middleware/. Names that need rclpy load on first use.
+(docs/graph_interface.md), of which the supervisor and `lifecycle verify` judge an observation. Must
+not use ctypes or private rclpy names; those live in middleware/. Names that need rclpy load on
+first use.
 """
 
 from __future__ import annotations
@@ -42,9 +43,7 @@ from lifecycle.graph.model import (
     NodeLiveliness,
     NodeView,
 )
-from lifecycle.graph.observer import Observer
 from lifecycle.graph.reporter import HEARTBEAT_PERIOD_S, Every, GraphReporter
-from lifecycle.graph.running import Running
 from lifecycle.graph.scheduler import (
     LoopScheduler,
     ManualScheduler,
@@ -59,7 +58,7 @@ from lifecycle.graph.transport import GraphTransport, InMemoryNetwork, InMemoryT
 
 if TYPE_CHECKING:
     from lifecycle.graph.dds import GRAPH_QOS, DdsTransport, steady_timer
-    from lifecycle.graph.facade import Graph
+    from lifecycle.graph.graph import Graph
 
 __all__ = [
     "FORGET_AFTER_S",
@@ -99,9 +98,7 @@ __all__ = [
     "Member",
     "NodeLiveliness",
     "NodeView",
-    "Observer",
     "Remove",
-    "Running",
     "Scheduler",
     "SilentNotice",
     "StateChanged",
@@ -118,7 +115,7 @@ __all__ = [
 _HOME = {
     "GRAPH_QOS": "dds",
     "DdsTransport": "dds",
-    "Graph": "facade",
+    "Graph": "graph",
     "steady_timer": "dds",
 }
 

@@ -18,7 +18,7 @@ import typing
 from collections.abc import Callable, Iterable, Iterator
 
 from lifecycle.graph.membership import Membership, endpoint_event
-from lifecycle.graph.messages import GraphMessageError, decode
+from lifecycle.graph.messages import GraphMessage, GraphMessageError, decode
 from lifecycle.graph.model import (
     EndpointChange,
     EndpointIndex,
@@ -121,7 +121,7 @@ class GraphEvents:
     """The events of one graph.
 
     Args:
-        transport: where messages come from; it is not closed by `close`.
+        transport: where messages come from; it is not closed by `close`. None: from nowhere.
         scheduler: where everything runs.
         silent_after_s: a node that sent messages and then none for so long is silent; > 0.
         hold_s: so long a message waits for those before it, >= 0.
@@ -130,7 +130,7 @@ class GraphEvents:
 
     def __init__(
         self,
-        transport: GraphTransport,
+        transport: GraphTransport | None,
         scheduler: Scheduler,
         *,
         silent_after_s: float = SILENT_AFTER_S,
@@ -152,9 +152,12 @@ class GraphEvents:
             hold_s=hold_s,
             forget_after_s=forget_after_s,
         )
-        self._stop = transport.receive(
-            lambda data: scheduler.post(functools.partial(self._arrived, data))
-        )
+        self._message_callbacks: tuple[Callable[[GraphMessage], None], ...] = ()
+        self._stop: Remove | None = None
+        if transport is not None:
+            self._stop = transport.receive(
+                lambda data: scheduler.post(functools.partial(self._arrived, data))
+            )
 
     # -- subscribing
 
@@ -177,6 +180,10 @@ class GraphEvents:
         """
         wanted = (kinds,) if isinstance(kinds, EventKind) else tuple(kinds)
         return self._subscribers.add([(kind, node) for kind in wanted], callback)
+
+    def on_message(self, callback: Callable[[GraphMessage], None]) -> None:
+        """Have `callback` called in the scheduler with each message, before it is put in order."""
+        self._message_callbacks += (callback,)
 
     def on_publisher(
         self,
@@ -306,7 +313,8 @@ class GraphEvents:
     def close(self) -> None:
         """Stop listening. What was begun may still be told; again is harmless."""
         self._membership.closed = True
-        self._stop()
+        if self._stop is not None:
+            self._stop()
         self.scheduler.post(self._membership.end)
 
     # -- what happens in the scheduler
@@ -318,8 +326,10 @@ class GraphEvents:
             message = decode(data)
         except GraphMessageError as error:
             self._malformed += 1
-            _logger.debug("%s", error)
+            _logger.info("passed over: %s", error)
             return
+        for callback in self._message_callbacks:
+            callback(message)
         self._membership.hear(message)
 
     def _report(self, node: str, liveliness: NodeLiveliness, reason: str) -> None:

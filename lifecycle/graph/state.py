@@ -15,7 +15,7 @@ import functools
 import logging
 import threading
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from lifecycle.graph.events import GraphEvents
 from lifecycle.graph.messages import (
@@ -42,11 +42,16 @@ from lifecycle.graph.model import (
     link,
     match_ends,
 )
-from lifecycle.graph.running import Running, up_and_running
 from lifecycle.graph.scheduler import Remove
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.plan.model import Plan
-from lifecycle.verify.observation import ConnectionReport, NodeConfiguration
+from lifecycle.verify.observation import (
+    ConnectionReport,
+    NodeConfiguration,
+    NodeParameters,
+    Observation,
+    ObservedEndpoint,
+    ObservedNode,
+)
 
 _logger = logging.getLogger(__name__)
 
@@ -170,17 +175,60 @@ class Record:
                 self.view = dataclasses.replace(view, configuration=changed)
 
 
-class GraphQueries:
-    """The queries of one graph; `GraphState` is one that follows events.
+Answer = tuple[str | None, NodeConfiguration | None]
+"""State and configuration of a node that was asked for them; None where it did not say."""
 
-    Args:
-        events: layer 2; it has the index of endpoints.
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Look:
+    """What was there at one moment, as `lifecycle.graph.observer` saw it.
+
+    Attributes:
+        nodes: of the graph, without their states.
+        endpoints: of the graph.
+        answers: of the nodes that were asked, by full name.
+        parameters: of nodes that do not report them.
     """
 
-    def __init__(self, events: GraphEvents) -> None:
+    nodes: tuple[ObservedNode, ...] = ()
+    endpoints: tuple[ObservedEndpoint, ...] = ()
+    answers: Mapping[str, Answer] = dataclasses.field(default_factory=dict)
+    parameters: tuple[NodeParameters, ...] = ()
+
+
+Fetch = Callable[[str, Callable[[NodeConfiguration | None], None]], None]
+"""Reads the configuration of a node (fully qualified) and calls back once, from any thread, at once
+or later; with None if it could not be read."""
+
+_ENDPOINT_KINDS = frozenset(
+    {EventKind.ENDPOINT_ADDED, EventKind.ENDPOINT_REMOVED, EventKind.ENDPOINT_CHANGED}
+)
+
+
+@typing.final
+class GraphState:
+    """The state of one graph.
+
+    Args:
+        events: layer 2; the state learns of the members that they know already. It may be shared.
+        fetch: how configurations are read.
+    """
+
+    def __init__(self, events: GraphEvents, fetch: Fetch) -> None:
         self.events = events
         self._lock = threading.RLock()
         self._records: dict[str, Record] = {}
+        self._given: Mapping[str, NodeConfiguration] = {}
+        self._look = Look()
+        self._fetch = fetch
+        self._callbacks: tuple[Callable[[GraphChange], None], ...] = ()
+        self._unread: set[str] = set()
+        self._reads = 0
+        self._stop: tuple[Remove, ...] = ()
+        self._closed = False
+        events.scheduler.post(self._begin)
+
+    # -- queries
 
     def nodes(self) -> tuple[NodeView, ...]:
         """Return every node of the graph, silent ones included, by name."""
@@ -252,74 +300,6 @@ class GraphQueries:
         topics = self.topics() if topic is None else (topic,)
         return tuple(each for name in topics for each in self._links(name, _any, _any))
 
-    def is_up_and_running(self, plan: Plan) -> Running:
-        """Tell whether every node of `plan` is there, active, mapped and connected.
-
-        Three-valued, with what is missing. It proves less than the gate does: undeclared nodes,
-        uniqueness and QoS are `lifecycle.verify`'s.
-        """
-        return up_and_running(plan, self.node, self.connected)
-
-    def _links(
-        self, topic: str, publishes: Callable[[End], bool], subscribes: Callable[[End], bool]
-    ) -> tuple[Link, ...]:
-        publishers, subscriptions = self.publishers_of(topic), self.subscriptions_of(topic)
-        publishing, subscribing = match_ends(publishers), match_ends(subscriptions)
-        return tuple(
-            link(
-                topic,
-                publisher,
-                subscription,
-                publishers=publishing,
-                subscriptions=subscribing,
-            )
-            for publisher in publishers
-            if publishes(publisher)
-            for subscription in subscriptions
-            if subscribes(subscription)
-        )
-
-    def _ends(self, owned: tuple[Owned, ...]) -> tuple[End, ...]:
-        found: list[End] = []
-        for each in owned:
-            view = self.node(each.node)
-            if view is not None:
-                found.append(End(node=view, endpoint=each.endpoint))
-        return tuple(sorted(found, key=lambda each: each.node.name))
-
-
-def _any(_: End) -> bool:
-    return True
-
-
-Fetch = Callable[[str, Callable[[NodeConfiguration | None], None]], None]
-"""Reads the configuration of a node (fully qualified) and calls back once, from any thread, at once
-or later; with None if it could not be read."""
-
-_ENDPOINT_KINDS = frozenset(
-    {EventKind.ENDPOINT_ADDED, EventKind.ENDPOINT_REMOVED, EventKind.ENDPOINT_CHANGED}
-)
-
-
-@typing.final
-class GraphState(GraphQueries):
-    """The state of one graph.
-
-    Args:
-        events: layer 2; the state learns of the members that they know already. It may be shared.
-        fetch: how configurations are read.
-    """
-
-    def __init__(self, events: GraphEvents, fetch: Fetch) -> None:
-        super().__init__(events)
-        self._fetch = fetch
-        self._callbacks: tuple[Callable[[GraphChange], None], ...] = ()
-        self._unread: set[str] = set()
-        self._reads = 0
-        self._stop: tuple[Remove, ...] = ()
-        self._closed = False
-        events.scheduler.post(self._begin)
-
     # -- changes
 
     @property
@@ -341,10 +321,25 @@ class GraphState(GraphQueries):
     def put_configuration(self, configuration: NodeConfiguration) -> None:
         """Give what was learnt of a node in another way, over a control channel say.
 
-        A node that sends no messages becomes a member by it.
+        A node that sends no messages becomes a member by it. For `observation` it is what the node
+        says of itself until a newer one is put, the node leaves the graph or it is dropped.
         """
-        self.events.report_seen(configuration.name)
+        name = configuration.name
+        with self._lock:
+            self._given = {**self._given, name: configuration}
+        self.events.report_seen(name)
         self.events.scheduler.post(functools.partial(self._put, configuration))
+
+    def drop_configuration(self, node: str, reason: str = "its process ended") -> None:
+        """Forget what was given of a node (fully qualified) that is not there any more."""
+        with self._lock:
+            self._given = {name: each for name, each in self._given.items() if name != node}
+        self.events.report_gone(node, reason)
+
+    @property
+    def given(self) -> Mapping[str, NodeConfiguration]:
+        """The configurations that were put, by full node name."""
+        return self._given
 
     def reread(self, node: str) -> None:
         """Have a node's configuration read again, whatever its checksum."""
@@ -373,6 +368,30 @@ class GraphState(GraphQueries):
         self._closed = True
         for stop in self._stop:
             stop()
+
+    # -- what is judged
+
+    def put_look(self, look: Look) -> None:
+        """Give what discovery and the nodes that were asked say now."""
+        self._look = look
+        for _, configuration in look.answers.values():
+            if configuration is not None:
+                self.events.scheduler.post(functools.partial(self._put, configuration))
+
+    def observation(self) -> Observation:
+        """Return what `lifecycle.verify` judges: the last look, and what is given of nodes now."""
+        look, given = self._look, self._given
+        asked = {name: configuration for name, (_, configuration) in look.answers.items()}
+        configurations = {**given, **asked}
+        return Observation(
+            nodes=tuple(
+                dataclasses.replace(each, state=_state(each.full_name, look.answers, given))
+                for each in look.nodes
+            ),
+            endpoints=look.endpoints,
+            configurations=tuple(each for each in configurations.values() if each is not None),
+            parameters=look.parameters,
+        )
 
     # -- what happens in the scheduler
 
@@ -465,6 +484,45 @@ class GraphState(GraphQueries):
     def _call(self, what: GraphChange) -> None:
         for callback in self._callbacks:
             _logged(callback, what)
+
+    def _links(
+        self, topic: str, publishes: Callable[[End], bool], subscribes: Callable[[End], bool]
+    ) -> tuple[Link, ...]:
+        publishers, subscriptions = self.publishers_of(topic), self.subscriptions_of(topic)
+        publishing, subscribing = match_ends(publishers), match_ends(subscriptions)
+        return tuple(
+            link(
+                topic,
+                publisher,
+                subscription,
+                publishers=publishing,
+                subscriptions=subscribing,
+            )
+            for publisher in publishers
+            if publishes(publisher)
+            for subscription in subscriptions
+            if subscribes(subscription)
+        )
+
+    def _ends(self, owned: tuple[Owned, ...]) -> tuple[End, ...]:
+        found: list[End] = []
+        for each in owned:
+            view = self.node(each.node)
+            if view is not None:
+                found.append(End(node=view, endpoint=each.endpoint))
+        return tuple(sorted(found, key=lambda each: each.node.name))
+
+
+def _any(_: End) -> bool:
+    return True
+
+
+def _state(
+    name: str, answers: Mapping[str, Answer], given: Mapping[str, NodeConfiguration]
+) -> str | None:
+    if name in given:
+        return given[name].state
+    return answers[name][0] if name in answers else None
 
 
 def _logged(callback: Callable[[GraphChange], None], what: GraphChange) -> None:

@@ -1,8 +1,9 @@
 """Calling ROS services from asyncio.
 
-Owns: one executor thread on the observer's node, the bridge from rclpy's futures to asyncio's, and
-the rule for requests that stay unanswered. rmw_fastrtps drops a reply when the client's reader is
-not matched yet, so a request that may be repeated is repeated until its deadline.
+Owns: one executor thread on the observer's node where that is its own, the bridge from rclpy's
+futures to asyncio's, and the rule for requests that stay unanswered. rmw_fastrtps drops a reply
+when the client's reader is not matched yet, so a request that may be repeated is repeated until its
+deadline.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import contextlib
 from collections.abc import Awaitable, Callable
 from typing import Any
 
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.client import Client
 from rclpy.task import Future
 
@@ -52,12 +54,19 @@ class ServiceCalls:
     """Calls services on the observer's node; the participant is the observer's.
 
     Must be used from one asyncio loop; `destroy` it before the observer.
+
+    Attributes:
+        group: reentrant, for all that is made on the node: on a node of somebody else's, replies
+            must come while one of its callbacks waits.
     """
 
     def __init__(self, observer: GraphObserver) -> None:
         self._observer = observer
         self._clients: dict[tuple[str, type[Any]], Client] = {}
-        self._spinner = Spinner(observer.node, thread="service-calls")
+        self.group = ReentrantCallbackGroup()
+        self._spinner: Spinner | None = None
+        if observer.owns_node:
+            self._spinner = Spinner(observer.node, thread="service-calls")
 
     async def call(
         self,
@@ -125,13 +134,14 @@ class ServiceCalls:
 
     def destroy(self) -> None:
         """Stop the thread and drop the clients; again is harmless."""
-        self._spinner.stop()
+        if self._spinner is not None:
+            self._spinner.stop()
         self.forget("")
 
     def _client(self, service: str, type_: type[Any]) -> Client:
         client = self._clients.get((service, type_))
         if client is None:
-            client = self._observer.node.create_client(type_, service)
+            client = self._observer.node.create_client(type_, service, callback_group=self.group)
             self._clients[service, type_] = client
         return client
 
