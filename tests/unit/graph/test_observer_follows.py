@@ -103,9 +103,7 @@ def test_a_node_that_reports_nothing_is_what_discovery_shows_of_it() -> None:
     in_world(main)
 
 
-def test_a_node_of_ours_without_messages_is_read_again_when_what_is_beside_it_changes() -> (
-    None
-):
+def test_a_node_of_ours_without_messages_is_read_again_when_what_is_beside_it_changes() -> None:
     async def main(world: World) -> None:
         world.graph.nodes = (ObservedNode(full_name="/it"),)
         world.graph.offered = {"/it/get_configuration"}
