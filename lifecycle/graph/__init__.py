@@ -53,7 +53,7 @@ from lifecycle.graph.scheduler import (
     every,
     set_within,
 )
-from lifecycle.graph.state import Fetch, GraphState
+from lifecycle.graph.state import Fetch, GraphState, Look
 from lifecycle.graph.transport import GraphTransport, InMemoryNetwork, InMemoryTransport
 
 if TYPE_CHECKING:
@@ -91,6 +91,7 @@ __all__ = [
     "Joined",
     "Left",
     "Link",
+    "Look",
     "LoopScheduler",
     "ManualScheduler",
     "MappingEstablished",

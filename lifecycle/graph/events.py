@@ -48,7 +48,7 @@ class Subscribers:
         self._lock = threading.Lock()
         self._callbacks: dict[tuple[EventKind, About], tuple[tuple[object, Callback], ...]] = {}
         self._outbox: list[GraphEvent] = []
-        self._telling = False
+        self._notifying = False
 
     def add(self, wanted: Iterable[tuple[EventKind, About]], callback: Callback) -> Remove:
         """Have `callback` called with what is wanted; return what takes it away."""
@@ -71,15 +71,15 @@ class Subscribers:
 
         return remove
 
-    def tell(self, events: Iterable[GraphEvent]) -> None:
-        """Tell each event to all who asked for it, before the next event.
+    def notify(self, events: Iterable[GraphEvent]) -> None:
+        """Notify all who asked for an event of it, before the next event.
 
-        What a callback makes happen meanwhile is told after that.
+        What a callback makes happen meanwhile follows after that.
         """
         self._outbox += events
-        if self._telling:
+        if self._notifying:
             return
-        self._telling = True
+        self._notifying = True
         try:
             while self._outbox:
                 event = self._outbox.pop(0)
@@ -87,7 +87,7 @@ class Subscribers:
                     for _, callback in self._callbacks.get(place, ()):
                         call(callback, event)
         finally:
-            self._telling = False
+            self._notifying = False
 
 
 def call(callback: Callback, event: GraphEvent) -> None:
@@ -113,7 +113,7 @@ HOLD_S = 0.2
 """What a reliable transport still delivers comes within so long."""
 
 FORGET_AFTER_S = 600.0
-"""A node of which nothing was heard for so long has left."""
+"""A node that sent nothing for so long has left."""
 
 
 @typing.final
@@ -147,7 +147,7 @@ class GraphEvents:
             scheduler,
             self.endpoints,
             self.lock,
-            self._subscribers.tell,
+            self._subscribers.notify,
             silent_after_s=silent_after_s,
             hold_s=hold_s,
             forget_after_s=forget_after_s,
@@ -224,7 +224,7 @@ class GraphEvents:
         removes: list[Remove] = []
 
         def begin() -> None:
-            # In one turn of the scheduler, so that none is told twice and none is left out.
+            # In one turn of the scheduler, so that none comes twice and none is left out.
             if removes:
                 return
             with self.lock:
@@ -263,12 +263,12 @@ class GraphEvents:
         """Tell whether `node` is part of the graph now and sends messages."""
         return self._membership.reports(node)
 
-    # -- doors for what is noticed otherwise
+    # -- what is noticed otherwise
 
     def report_silent(self, node: str, reason: str = "") -> None:
-        """Take it that nothing is heard of `node`, until it is heard or `report_alive`.
+        """Take `node` for silent, until a message of it comes or `report_alive`.
 
-        The door for whoever notices sooner than by missing heartbeats: DDS liveliness, a pidfd. A
+        For what notices sooner than by missing heartbeats: DDS liveliness, a pidfd. A
         node that is not a member is passed over.
         """
         self._report(node, NodeLiveliness.SILENT, reason)
@@ -293,13 +293,13 @@ class GraphEvents:
         self.scheduler.post(functools.partial(self._membership.vanished, node, reason))
 
     def configuration_read(self, node: str, endpoints: Iterable[EndpointReport]) -> EndpointChange:
-        """Take what a node's configuration says of its endpoints; subscribers hear what is new.
+        """Take what a node's configuration says of its endpoints, and notify of what is new.
 
         To be called in the scheduler. A node that is not a member has no endpoints.
         """
         with self.lock:
             change = self.endpoints.update(node, endpoints if self._membership.has(node) else ())
-        self._subscribers.tell(
+        self._subscribers.notify(
             endpoint_event(kind, node, each)
             for kind, changed in (
                 (EventKind.ENDPOINT_REMOVED, change.removed),
@@ -311,7 +311,7 @@ class GraphEvents:
         return change
 
     def close(self) -> None:
-        """Stop listening. What was begun may still be told; again is harmless."""
+        """Stop listening. What was begun may still follow; again is harmless."""
         self._membership.closed = True
         if self._stop is not None:
             self._stop()
@@ -330,7 +330,7 @@ class GraphEvents:
             return
         for callback in self._message_callbacks:
             callback(message)
-        self._membership.hear(message)
+        self._membership.take(message)
 
     def _report(self, node: str, liveliness: NodeLiveliness, reason: str) -> None:
         self.scheduler.post(functools.partial(self._membership.report, node, liveliness, reason))

@@ -37,7 +37,7 @@ class Sequencer:
     """Orders the messages of one incarnation.
 
     Args:
-        first: the first message that was heard, whatever its number: what came before is unknown.
+        first: the first message that came, whatever its number: what was before is unknown.
     """
 
     def __init__(self, first: GraphMessage) -> None:
@@ -146,8 +146,8 @@ class Sender:
     def is_next(self, message: GraphMessage) -> bool:
         """Tell whether a message of another instance, or of one that left, begins the next one.
 
-        The later incarnation wins. An earlier one only comes forth when the later is not heard any
-        more: then the wall clock was set back between the two.
+        The later incarnation wins. An earlier one is taken only when the later has fallen
+        silent: then the wall clock was set back between the two.
         """
         if isinstance(message, Left):
             self.departed.append(message.incarnation)
@@ -159,7 +159,7 @@ class Sender:
         return self.liveliness is NodeLiveliness.SILENT
 
     def learn(self, message: GraphMessage) -> None:
-        """Keep what a message, in its turn, tells of state and checksum."""
+        """Keep what a message, in its turn, says of state and checksum."""
         if isinstance(message, Joined | Heartbeat | StateChanged):
             self._state, self._connected = message.state, message.connected
         if isinstance(message, Joined | Heartbeat | ConfigurationChanged):
@@ -171,10 +171,10 @@ class Sender:
         """Hold what `source` says of us; ALIVE takes it back. Return whether our state changed.
 
         Args:
-            source: who says so.
+            source: the node that says so.
             liveliness: what it says.
             reason: for people.
-            again: it has said so before: then it counts only if we were not heard meanwhile.
+            again: it has said so before: then it counts only if no message of ours came meanwhile.
         """
         before = self.liveliness
         if again and source in self._overruled and liveliness is NodeLiveliness.SILENT:
@@ -187,8 +187,8 @@ class Sender:
             self._troubles[source] = (liveliness, reason or (text if held is liveliness else ""))
         return self.liveliness is not before
 
-    def heard(self) -> bool:
-        """Be not silent, whoever says so: we heard of it. Return whether that is a change."""
+    def received(self) -> bool:
+        """Be silent no more, whatever others say: a message came. Return whether it was."""
         before = self.liveliness
         if before is not NodeLiveliness.SILENT:
             return False
@@ -204,7 +204,7 @@ class Sender:
 
     @property
     def liveliness(self) -> NodeLiveliness:
-        """The worst that anybody says of it."""
+        """The worst that is said of it."""
         if not self._troubles:
             return NodeLiveliness.ALIVE
         held = {liveliness for liveliness, _ in self._troubles.values()}
@@ -297,7 +297,7 @@ class Notices:
 
 
 def liveliness_event(sender: Sender) -> GraphEvent:
-    """Return the event that tells how alive a member is now."""
+    """Return the event of how alive a member is now."""
     return GraphEvent(
         kind=EventKind(sender.liveliness.value),
         node=sender.node,
@@ -318,8 +318,8 @@ class Membership:
     Args:
         scheduler: where everything runs.
         endpoints: of all members; those of one that leaves go with it.
-        lock: held while members or endpoints change, and not while events are told.
-        tell: given what happens, in order.
+        lock: held while members or endpoints change, and not while subscribers are notified.
+        notify: given what happens, in order.
         silent_after_s: a node that sent messages and then none for so long is silent; > 0.
         hold_s: so long a message waits for those before it, >= 0.
         forget_after_s: a silent node counts as gone after so long, > silent_after_s.
@@ -334,7 +334,7 @@ class Membership:
         scheduler: Scheduler,
         endpoints: EndpointIndex,
         lock: threading.RLock,
-        tell: Callable[[Iterable[GraphEvent]], None],
+        notify: Callable[[Iterable[GraphEvent]], None],
         *,
         silent_after_s: float,
         hold_s: float,
@@ -343,7 +343,7 @@ class Membership:
         self._scheduler = scheduler
         self._endpoints = endpoints
         self._lock = lock
-        self._tell = tell
+        self._notify = notify
         self._hold_s = hold_s
         self._silent_after_s = silent_after_s
         self._senders: dict[str, Sender] = {}
@@ -370,17 +370,17 @@ class Membership:
             sender = self._senders.get(node)
             return sender is not None and sender.present and bool(sender.incarnation)
 
-    def hear(self, message: GraphMessage) -> None:
+    def take(self, message: GraphMessage) -> None:
         """Take a message that arrived."""
         with self._lock:
             events = self._take(message)
-        self._tell(events)
+        self._notify(events)
 
     def report(self, node: str, liveliness: NodeLiveliness, reason: str) -> None:
-        """Take it from whoever observes here, and sends no messages, how alive a member is."""
+        """Take what was noticed here, without a message, of how alive a member is."""
         with self._lock:
             events = self._notices.hold(node, _HERE, liveliness, reason)
-        self._tell(events)
+        self._notify(events)
 
     def seen(self, node: str) -> None:
         """Take in a node that sends no messages: discovery shows it."""
@@ -390,7 +390,7 @@ class Membership:
                 return
             sender.begin()
             self._gone.drop(node)
-        self._tell([_event(EventKind.JOINED, sender)])
+        self._notify([_event(EventKind.JOINED, sender)])
 
     def vanished(self, node: str, reason: str) -> None:
         """Take out a node that sends no messages; one that sends some is passed over."""
@@ -399,7 +399,7 @@ class Membership:
             if sender is None or not sender.present or sender.incarnation:
                 return
             events = self._end_of(sender, reason)
-        self._tell(events)
+        self._notify(events)
 
     def end(self) -> None:
         """Wait for nothing any more."""
@@ -428,11 +428,11 @@ class Membership:
             return events
         self._beats.touch(sender.node)
         self._gone.drop(sender.node)
-        if sender.heard():
+        if sender.received():
             events.append(liveliness_event(sender))
         for each in ready:
-            # JOINED was told already, whatever the first message was.
-            events += self._apply(sender, each, told=first and isinstance(each, Joined))
+            # JOINED was an event already, whatever the first message was.
+            events += self._apply(sender, each, joined=first and isinstance(each, Joined))
         return [*events, *self._wait_for_missing(sender)]
 
     def _begin(self, sender: Sender, message: GraphMessage) -> tuple[bool, list[GraphEvent]]:
@@ -444,12 +444,12 @@ class Membership:
         sender.begin(message.incarnation, message)
         return True, [*events, _event(EventKind.JOINED, sender, message)]
 
-    def _apply(self, sender: Sender, message: GraphMessage, *, told: bool) -> list[GraphEvent]:
+    def _apply(self, sender: Sender, message: GraphMessage, *, joined: bool) -> list[GraphEvent]:
         """Let one message, in its turn, take effect."""
         if isinstance(message, Left):
             return self._end_of(sender, message.reason, message)
         sender.learn(message)
-        if told:
+        if joined:
             return []
         if isinstance(message, SilentNotice | StuckNotice | AliveNotice):
             return self._notices.take(sender.node, message)
@@ -473,7 +473,7 @@ class Membership:
     def _waited(self, sender: Sender) -> None:
         with self._lock:
             events = self._give_up(sender)
-        self._tell(events)
+        self._notify(events)
 
     def _give_up(self, sender: Sender) -> list[GraphEvent]:
         sender.cancel_wait()
@@ -481,7 +481,7 @@ class Membership:
         missing = sender.order.last + 1
         events: list[GraphEvent] = []
         for each in sender.order.give_up():
-            events += self._apply(sender, each, told=False)
+            events += self._apply(sender, each, joined=False)
         if sender.present:
             # Last: who reads the node now needs nothing of the above on top of the answer.
             events.append(_event(EventKind.GAP, sender, reason=f"message {missing} was lost"))
@@ -502,14 +502,14 @@ class Membership:
         self._gone.touch(sender.node)
         return events
 
-    # -- what happens when nothing is heard
+    # -- what happens when no message comes
 
     def _fell_silent(self, node: str) -> None:
         with self._lock:
             self._gone.touch(node)
             reason = f"no message for {self._silent_after_s:g} s"
             events = self._notices.hold(node, _BEATS, NodeLiveliness.SILENT, reason)
-        self._tell(events)
+        self._notify(events)
 
     def _forget(self, node: str) -> None:
         """Drop a node that left or fell silent long ago."""
@@ -518,7 +518,7 @@ class Membership:
             events = self._end_of(sender, "not heard any more") if sender.present else []
             self._gone.drop(node)
             del self._senders[node]
-        self._tell(events)
+        self._notify(events)
 
 
 def _event(

@@ -46,7 +46,7 @@ class EventKind(enum.Enum):
     CONNECTION_LOST = "connection_lost"
     MAPPING_ESTABLISHED = "mapping_established"
     MAPPING_LOST = "mapping_lost"
-    SILENT = "silent"  # nothing is heard of the node
+    SILENT = "silent"  # no message of the node comes any more
     STUCK = "stuck"  # the node is there and does not do its work
     ALIVE = "alive"  # neither of the two any more
     GAP = "gap"  # messages of the node were lost: read its configuration again
@@ -70,7 +70,7 @@ class GraphEvent:
     Attributes:
         node: fully qualified name of the node that it happened to.
         incarnation: of that node; empty if it sends no graph messages.
-        message: what told it; None if discovery, silence or a configuration did.
+        message: that said so; None if discovery, silence or a configuration did.
         reason: for people; empty if there is none.
         endpoint: for the three ENDPOINT kinds; as it is now, or was.
     """
@@ -85,7 +85,7 @@ class GraphEvent:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Member:
-    """A node that is part of the graph, as far as its messages tell.
+    """A node that is part of the graph, as far as its messages say.
 
     Attributes:
         incarnation: empty if it sends no graph messages: then discovery has shown it.

@@ -42,7 +42,7 @@ class Clients(Protocol):
     """Nodes' parameter services, see lifecycle.middleware.NodeClients."""
 
     def serves_parameters(self, node: str) -> bool | None:
-        """Tell whether a node has them; None while discovery may not show them yet."""
+        """Return whether a node has them; None while discovery may not show them yet."""
 
     async def report_parameters(
         self, node: str, names: Collection[str], *, timeout_s: float

@@ -70,7 +70,7 @@ def every(scheduler: Scheduler) -> Callable[[float, Work], Remove]:
 
 @typing.final
 class ManualScheduler:
-    """Time that moves only when it is told to: for tests and simulations. One thread.
+    """Time that moves only by `advance`: for tests and simulations. One thread.
 
     What is posted runs at once, unless something runs already: then after that.
     """
@@ -202,7 +202,7 @@ class ThreadScheduler:
         return entry.clear
 
     def close(self) -> None:
-        """End the thread; waits for what runs now, unless that is who calls."""
+        """End the thread; waits for what runs now, unless it is called there."""
         with contextlib.suppress(RuntimeError):  # it is closed already
             self.loop.call_soon_threadsafe(self.loop.stop)
         if self._thread is not threading.current_thread():
@@ -278,7 +278,7 @@ async def set_within(event: asyncio.Event, timeout_s: float | None) -> bool:
 
     asyncio.wait_for of Python 3.10 and 3.11 returns normally when it is cancelled in the moment in
     which what it waits for comes true (python/cpython#86296): a task that waits in a loop then
-    outlives its cancellation, and whoever waits for its end waits for ever.
+    outlives its cancellation, and who waits for its end waits for ever.
     """
     waiting = asyncio.ensure_future(event.wait())
     try:

@@ -112,7 +112,7 @@ class Record:
         self._meanwhile = []
 
     def take(self, configuration: NodeConfiguration) -> None:
-        """Hold a configuration that was read or given, and what has been told since it was asked.
+        """Hold a configuration that was read or given, and what messages said since it was asked.
 
         The node may have changed between its answer and a message that came before the answer: the
         checksum that was announced meanwhile, if it is another one, has it read once more.
@@ -144,7 +144,7 @@ class Record:
             self.doubt()
         elif event.message is not None:
             if event.incarnation != self.view.incarnation:
-                # Discovery had shown it already; now it speaks for itself.
+                # Discovery had shown it already; now it reports itself.
                 self.view = dataclasses.replace(self.view, incarnation=event.incarnation)
                 self.doubt()
             message = event.message
@@ -270,7 +270,7 @@ class GraphState:
         return self._ends(owned)
 
     def topics(self) -> tuple[str, ...]:
-        """Return every topic that somebody publishes or subscribes to, sorted."""
+        """Return every topic that is published or subscribed to, sorted."""
         with self.events.lock:
             names = {
                 *self.events.endpoints.names(EndpointKind.PUBLISHER),
@@ -416,14 +416,14 @@ class GraphState:
         before = record.view
         with self._lock:
             record.apply(event)
-        self._tell(before, record)
+        self._publish(before, record)
         self._read_if_needed(record)
 
     def _join(self, member: Member) -> None:
         record = Record(member)
         with self._lock:
             self._records[member.node] = record
-        self._tell(None, record)
+        self._publish(None, record)
         self._read_if_needed(record)
 
     def _leave(self, node: str) -> None:
@@ -468,10 +468,10 @@ class GraphState:
         before = record.view
         with self._lock:
             record.take(configuration)
-        self._tell(before, record)
+        self._publish(before, record)
         self._read_if_needed(record)
 
-    def _tell(self, before: NodeView | None, record: Record) -> None:
+    def _publish(self, before: NodeView | None, record: Record) -> None:
         after = record.view
         if after is before:
             return

@@ -17,14 +17,14 @@ from lifecycle.graph.scheduler import Remove, Scheduler
 
 
 class GraphTransport(Protocol):
-    """Carries messages to everybody in the graph.
+    """Carries messages to all in the graph.
 
     Nothing is promised about delivery: a message may be lost, doubled, late or out of order, and a
-    sender may receive its own. Whoever is on top (`GraphEvents`) copes with that.
+    sender may receive its own. `GraphEvents` on top copes with that.
     """
 
     def send(self, message: bytes) -> None:
-        """Send one message to everybody who receives; any thread, never waits for a receiver.
+        """Send one message to all who receive; any thread, never waits for a receiver.
 
         Raises:
             LifecycleError: it could not be handed over.
@@ -34,7 +34,7 @@ class GraphTransport(Protocol):
         """Have `callback` called with each message from now on, in a thread of the transport."""
 
     def on_peer(self, callback: Callable[[], None]) -> Remove:
-        """Have `callback` called when somebody can hear us who could not before.
+        """Have `callback` called when a receiver is reached that was not before.
 
         The moment to say again who we are: after a late joiner came, or a partition healed.
         """
@@ -45,7 +45,7 @@ class GraphTransport(Protocol):
 
 @typing.final
 class InMemoryNetwork:
-    """Carries messages between its transports, as badly as it is told to.
+    """Carries messages between its transports, as badly as is asked.
 
     Args:
         scheduler: whose time passes while messages are under way.
@@ -78,7 +78,7 @@ class InMemoryNetwork:
         return InMemoryTransport(self)
 
     def partition(self, *groups: Iterable[InMemoryTransport]) -> None:
-        """Part the network: only transports of one group hear each other.
+        """Part the network: only transports of one group reach each other.
 
         Transports that no group names form one more group. What is under way still arrives.
         """
@@ -87,7 +87,7 @@ class InMemoryNetwork:
         }
 
     def heal(self) -> None:
-        """End every partition, and tell those who hear somebody again (`on_peer`)."""
+        """End every partition, and notify those who reach a receiver again (`on_peer`)."""
         parted, self._islands = self._islands, {}
         if parted:
             for transport in tuple(self._transports):
@@ -109,7 +109,7 @@ class InMemoryNetwork:
         self._transports[transport] = None
 
     def listen(self, receiver: InMemoryTransport) -> None:
-        """Let a transport receive, and tell all others on its island that it hears them."""
+        """Let a transport receive, and notify all others on its island (`on_peer`)."""
         self._receivers[receiver] = None
         island = self._islands.get(receiver, 0)
         for transport in tuple(self._transports):
@@ -143,7 +143,7 @@ class InMemoryTransport:
         network.enter(self)
 
     def send(self, message: bytes) -> None:
-        """Send to everybody on the same island, ourselves included."""
+        """Send to all on the same island, ourselves included."""
         if not self._closed:
             self._network.carry(self, message)
 
@@ -156,7 +156,7 @@ class InMemoryTransport:
         return remove
 
     def on_peer(self, callback: Callable[[], None]) -> Remove:
-        """Have `callback` called when somebody begins to receive, or a partition healed."""
+        """Have `callback` called when a receiver begins, or a partition healed."""
         return _keep(self._peer_callbacks, callback)
 
     def close(self) -> None:
@@ -165,13 +165,13 @@ class InMemoryTransport:
         self._network.leave(self)
 
     def arrive(self, message: bytes) -> None:
-        """Hand a message to who receives here; called by the network."""
+        """Pass a message to who receives here; called by the network."""
         if not self._closed:
             for callback in tuple(self._callbacks.values()):
                 callback(message)
 
     def peer_came(self) -> None:
-        """Tell that somebody hears us; called by the network."""
+        """Notify that a receiver is reached; called by the network."""
         if not self._closed:
             for callback in tuple(self._peer_callbacks.values()):
                 callback()

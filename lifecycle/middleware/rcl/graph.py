@@ -25,8 +25,7 @@ from lifecycle.middleware.discovery.dead_participants import (
 )
 from lifecycle.middleware.discovery.probe_targets import knock_for
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
-from lifecycle.middleware.rcl.graph_changes import on_graph_change
-from lifecycle.middleware.rcl.graph_guard import GraphGuard
+from lifecycle.middleware.rcl.graph_changes import GraphGuard, on_graph_change
 from lifecycle.middleware.rcl.graph_queries import endpoints_of, endpoints_of_node, topic_endpoints
 from lifecycle.middleware.rcl.hidden_node import quiet_node
 from lifecycle.middleware.rcl.stale_node_filter import StaleNodeFilter
@@ -44,13 +43,13 @@ from lifecycle.verify.noise import (
 from lifecycle.verify.observation import ObservedEndpoint, ObservedNode
 
 ANSWER_S = 0.15
-"""Who hears a knock on this host or the next one answers within so long."""
+"""A participant that a probe reaches, on this host or the next one, answers within so long."""
 
 PATIENCE_S = 3.5
 """What Fast DDS lost on the way it sends again every 3 s."""
 
 _UNASKED_S = 1.5
-"""Within so long everybody is seen where nobody can be asked, over shared memory or TCP.
+"""Within so long all are seen where none can be asked, over shared memory or TCP.
 
 They announce themselves each 0.5 s, and TCP may lose the first of it (measured: up to 1.2 s).
 """
@@ -59,7 +58,7 @@ _UNCOUNTED_S = 0.6
 """Within so long who is asked is seen, if its answer may not come to us (measured: up to 0.3 s)."""
 
 _TOLD_S = 2.5
-"""Within so long a discovery server has told of everybody (measured: up to 1.6 s)."""
+"""Within so long a discovery server has announced all (measured: up to 1.6 s)."""
 
 _AGREED_S = 5.0
 """A server that listens agrees within 0.1 s, on a machine with both processors busy within 1 s."""
@@ -134,7 +133,7 @@ class GraphObserver:
 
     @classmethod
     def on(cls, node: Node) -> GraphObserver:
-        """Look through a node that somebody else spins, and destroys after this.
+        """Look through a node that others spin, and destroy after this.
 
         How its participant is connected is not known here, so that nobody can be asked to announce
         itself: for the first 3.5 s a look may miss who is there (`settling_s`).
@@ -254,7 +253,7 @@ class GraphObserver:
             while not (used := is_used(address, port)):
                 if used is False or time.monotonic() > deadline:
                     return False
-                time.sleep(_LOOK_S)  # the kernel tells nobody
+                time.sleep(_LOOK_S)  # the kernel gives no event
         return True
 
     def participants_of(
@@ -282,9 +281,9 @@ class GraphObserver:
         )
 
     def remove_participants(self, prefixes: Iterable[str], pids: Iterable[int]) -> None:
-        """Have everybody forget participants whose process is known to be dead.
+        """Have all participants forget participants whose process is known to be dead.
 
-        Others are told over UDP only, see `discovery/dead_participants.py`; here they do
+        Others learn of it over UDP only, see `discovery/dead_participants.py`; here they do
         not count any more, whatever discovery shows until their lease has run out.
 
         Args:
@@ -344,10 +343,10 @@ class GraphObserver:
     def _services_of_others(
         self, names: DeclaredNames, untold: Collection[str]
     ) -> Iterator[ObservedEndpoint]:
-        """Yield who offers or asks for declared services and is a node of which rcl does not tell.
+        """Yield who offers or asks for declared services and is a node that rcl does not show.
 
         A node that is about to be known has them too; a plain DDS program never is one, and no rcl
-        tells of a node whose name it would not give.
+        shows a node whose name it would not give.
         """
         services = [
             *names.of_kind(EndpointKind.SERVICE_SERVER),
@@ -399,7 +398,7 @@ class GraphObserver:
             yield dataclasses.replace(endpoint, address=known.get(prefix, ""))
 
     def _services(self, full_name: str) -> tuple[ObservedEndpoint, ...] | None:
-        """Return the service endpoints of a node; None if rcl does not tell them."""
+        """Return the service endpoints of a node; None if rcl does not show them."""
         found: list[ObservedEndpoint] = []
         for kind in (EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT):
             listed = endpoints_of_node(self.node, kind, full_name)

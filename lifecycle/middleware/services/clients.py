@@ -204,7 +204,7 @@ class NodeClients:
     def serves_parameters(self, node: str) -> bool | None:
         """Tell whether `node` has parameter services; None while discovery may not show them yet.
 
-        Client libraries make them before the type description service, and discovery tells of one
+        Client libraries make them before the type description service, and discovery shows one
         participant's services in order: where it shows the latter alone, there are none.
         """
         offered = self._observer.services_of(node)

@@ -26,7 +26,7 @@ _BURST_S = 0.05
 
 
 class ObserverParticipant:
-    """What a supervisor sees and reaches of one domain. `destroy` it, or use it in a `with`."""
+    """What a supervisor observes and reaches of one domain. `destroy` it, or use it in a `with`."""
 
     def __init__(self, graph: Graph) -> None:
         self._graph = graph
@@ -80,8 +80,8 @@ class ObserverParticipant:
         """Return the driver of a managed node that is not hosted by us."""
         return ServiceDriver(self._graph.clients, node)
 
-    def hand(self, node: str) -> ServiceHand:
-        """Return the hand on any node that has a node interface, by full name."""
+    def node_interface(self, node: str) -> ServiceHand:
+        """Return what drives the node interface of any node that has one, by full name."""
         return ServiceHand(self._graph.clients, node)
 
     async def observe(self, plan: Plan) -> Observation:
@@ -112,26 +112,26 @@ class ObserverParticipant:
         return self._graph.discovery.participants_of(pid, nodes=nodes, reported=reported)
 
     def remove_participants(self, prefixes: Iterable[str], pids: Iterable[int]) -> None:
-        """Have everybody forget participants whose process is dead."""
+        """Have all participants forget those whose process is dead."""
         self._graph.discovery.remove_participants(prefixes, pids)
 
-    def machine_voice(self, system: str, machine: str) -> AlivePublisher:
-        """Be heard as the supervisor of a machine."""
+    def announce_machine(self, system: str, machine: str) -> AlivePublisher:
+        """Announce ourselves as the supervisor of a machine, by DDS liveliness."""
         from lifecycle.middleware.discovery.liveliness import AlivePublisher, machine_topic
 
         return AlivePublisher(self._node, machine_topic(system, machine))
 
-    def machine_ear(self, system: str, machine: str, to: Listener) -> AliveSubscription:
-        """Hear the supervisor of a machine."""
+    def watch_machine(self, system: str, machine: str, to: Listener) -> AliveSubscription:
+        """Watch the liveliness of the supervisor of a machine."""
         from lifecycle.middleware.discovery.liveliness import machine_topic
 
-        return self._ear(machine_topic(system, machine), to)
+        return self._watch(machine_topic(system, machine), to)
 
-    def node_ear(self, node: str, to: Listener) -> AliveSubscription:
-        """Hear a node that somebody runs by itself."""
+    def watch_node(self, node: str, to: Listener) -> AliveSubscription:
+        """Watch the liveliness of a node that is attached."""
         from lifecycle.middleware.discovery.liveliness import node_topic
 
-        return self._ear(node_topic(node), to)
+        return self._watch(node_topic(node), to)
 
     def plan_notices(self, on_notice: Callable[[str], None]) -> PlanNotices:
         """Take part in the exchange of plans."""
@@ -140,7 +140,7 @@ class ObserverParticipant:
         return PlanNotices(self._node, on_notice)
 
     def call_out(self, addresses: Iterable[str]) -> None:
-        """Make everybody announce themselves, as far as the system's discovery allows."""
+        """Make all participants announce themselves, as far as the system's discovery allows."""
         from lifecycle.middleware.discovery.rediscovery import call_out
 
         call_out(self._graph.discovery.domain_id, self._graph.discovery.urls, addresses, os.environ)
@@ -152,12 +152,12 @@ class ObserverParticipant:
         send_again_soon()
 
     def tell_names(self) -> None:
-        """Tell the graph anew that we are here."""
+        """Announce our node to the graph anew."""
         from lifecycle.middleware.discovery.rediscovery import tell_names
 
         tell_names([self._node])
 
-    def _ear(self, topic: str, to: Listener) -> AliveSubscription:
+    def _watch(self, topic: str, to: Listener) -> AliveSubscription:
         from lifecycle.middleware.discovery.liveliness import AliveSubscription
 
         return AliveSubscription(
@@ -165,7 +165,7 @@ class ObserverParticipant:
         )
 
     def prepare_to_leave(self) -> None:
-        """Let go of connections that nobody answers: whatever is sent would wait for their ends."""
+        """Let go of connections that do not answer: all that is sent would wait for their ends."""
         from lifecycle.middleware.discovery.dead_connections import give_up_dead_connections
 
         give_up_dead_connections()

@@ -281,7 +281,7 @@ def test_a_program_asks_whether_the_system_is_up_and_running(
     with Graph.open(fresh_domain) as graph:
         nothing = graph.verdict(plan)
         assert nothing.verdict is Outcome.VIOLATED
-        assert {"graph.missing-node"} == {each.rule for each in nothing.findings}
+        assert "graph.missing-node" in {each.rule for each in nothing.findings}
         with up(manifest, runtime=tmp_path) as run:
             run.until("system", reached="active")
             running = graph.verdict(plan)
