@@ -219,6 +219,11 @@ class Observer:
                 parameters=self._parameters.latest,
             )
         )
+        if not self._follows:
+            # Else readings bring it, which put messages that come meanwhile on top of the answer.
+            for configuration in asked.values():
+                if configuration is not None:
+                    self.state.learn(configuration)
         return self.state.observation()
 
     async def wait_change(self) -> None:

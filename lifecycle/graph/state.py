@@ -374,9 +374,10 @@ class GraphState:
     def put_look(self, look: Look) -> None:
         """Give what discovery and the nodes that were asked say now."""
         self._look = look
-        for _, configuration in look.answers.values():
-            if configuration is not None:
-                self.events.scheduler.post(functools.partial(self._put, configuration))
+
+    def learn(self, configuration: NodeConfiguration) -> None:
+        """Show what a member answered, where no reading of this state would bring it."""
+        self.events.scheduler.post(functools.partial(self._put, configuration))
 
     def observation(self) -> Observation:
         """Return what `lifecycle.verify` judges: the last look, and what is given of nodes now."""

@@ -9,6 +9,8 @@ import asyncio
 import dataclasses
 from collections.abc import Awaitable, Callable
 
+import pytest
+
 from lifecycle.graph import (
     GraphEvents,
     GraphReporter,
@@ -33,12 +35,12 @@ SHOWN = ObservedEndpoint(
 
 
 class World:
-    def __init__(self) -> None:
+    def __init__(self, *, follows: bool = True) -> None:
         self.graph, self.clients = FakeGraph(), FakeClients()
         self.scheduler = LoopScheduler()
         self.network = InMemoryNetwork(self.scheduler)
         events = GraphEvents(self.network.transport(), self.scheduler)
-        self.observer = Observer(self.graph, self.clients, events, follows=True)
+        self.observer = Observer(self.graph, self.clients, events, follows=follows)
         self.state = self.observer.state
 
     async def settle(self) -> None:
@@ -48,9 +50,9 @@ class World:
         return self.state.topics()
 
 
-def in_world(main: Callable[[World], Awaitable[None]]) -> None:
+def in_world(main: Callable[[World], Awaitable[None]], *, follows: bool = True) -> None:
     async def made() -> None:
-        world = World()
+        world = World(follows=follows)
         await main(world)
         world.observer.close()
 
@@ -134,7 +136,8 @@ def test_the_state_of_a_foreign_managed_node_is_followed() -> None:
     in_world(main)
 
 
-def test_what_is_judged_is_a_snapshot_of_the_state_that_programs_ask() -> None:
+@pytest.mark.parametrize("follows", [True, False])
+def test_what_is_judged_is_a_snapshot_of_the_state_that_programs_ask(*, follows: bool) -> None:
     async def main(world: World) -> None:
         world.graph.nodes = (
             ObservedNode(full_name="/put", managed=True),
@@ -142,11 +145,12 @@ def test_what_is_judged_is_a_snapshot_of_the_state_that_programs_ask() -> None:
         )
         world.clients.states["/it"] = "inactive"
         world.clients.configurations["/it"] = ITS_OWN
+        world.graph.offered = {"/it/get_configuration"}
         put = configuration("/put", "active")
         world.state.put_configuration(put)
         seen = await world.observer.observe(plan("put", "it", "absent"))
         assert seen == world.state.observation()
-        await asyncio.sleep(0)
+        await world.settle()
         views = {each.name: each.configuration for each in world.state.nodes()}
         assert views == {each.name: each for each in seen.configurations}
         verdict = verify(plan("put", "it", "absent"), seen, stage=Stage.ACTIVE)
@@ -155,7 +159,7 @@ def test_what_is_judged_is_a_snapshot_of_the_state_that_programs_ask() -> None:
             ("state.wrong-state", "/it"),
         }
 
-    in_world(main)
+    in_world(main, follows=follows)
 
 
 def test_what_was_put_of_a_node_whose_process_ended_is_judged_no_more() -> None:
