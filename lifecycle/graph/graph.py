@@ -163,7 +163,7 @@ class Graph:
         return asyncio.run_coroutine_threadsafe(self.observe(plan), self.scheduler.loop).result()
 
     def verdict(self, plan: Plan, *, stage: Stage = Stage.ACTIVE) -> Verdict:
-        """Return whether what runs is what `plan` says, as `lifecycle verify` judges it.
+        """Return whether what runs now is what `plan` says, by the rules of `lifecycle verify`.
 
         Args:
             plan: of a manifest, `lifecycle.plan.build_plan`.
