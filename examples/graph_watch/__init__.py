@@ -1,1 +1,1 @@
-"""A program that reacts to a new publisher of a topic, by the graph interface."""
+"""Programs that follow a graph: one reacts to a new publisher, one asks whether a system runs."""

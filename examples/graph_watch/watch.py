@@ -2,7 +2,7 @@
 
     python -m examples.graph_watch.watch /chatter
 
-It has no node of its own and polls nothing: the graph calls back. Ctrl-C ends it.
+It has no node of its own and sleeps in between: the graph calls back. Ctrl-C ends it.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
-"""The graph interface: what runs, told by its participants, and what an observer sees of it.
+"""The graph interface: what runs, who is connected to whom, and what has just changed.
 
 Owns: graph messages and how they travel, the events made of them, and the state with its queries
-(docs/graph_interface.md); and observations for the supervisor and `lifecycle verify`. Must not use
-ctypes or private rclpy names; those live in middleware/. Names that need rclpy load on first use.
+(docs/graph_interface.md), of which the supervisor and `lifecycle verify` judge an observation. Must
+not use ctypes or private rclpy names; those live in middleware/. Names that need rclpy load on
+first use.
 """
 
 from __future__ import annotations
@@ -10,11 +11,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
-from lifecycle.graph.endpoints import EndpointChange
-from lifecycle.graph.event import EventKind, GraphEvent, Member, NodeLiveliness
 from lifecycle.graph.events import FORGET_AFTER_S, SILENT_AFTER_S, GraphEvents
-from lifecycle.graph.links import End, Link
-from lifecycle.graph.memory import InMemoryNetwork, InMemoryTransport
 from lifecycle.graph.messages import (
     AliveNotice,
     ConfigurationChanged,
@@ -35,23 +32,33 @@ from lifecycle.graph.messages import (
     encode,
     new_incarnation,
 )
-from lifecycle.graph.observer import Observer
+from lifecycle.graph.model import (
+    End,
+    EndpointChange,
+    EventKind,
+    GraphChange,
+    GraphEvent,
+    Link,
+    Member,
+    NodeLiveliness,
+    NodeView,
+)
 from lifecycle.graph.reporter import HEARTBEAT_PERIOD_S, Every, GraphReporter
-from lifecycle.graph.running import Running
 from lifecycle.graph.scheduler import (
     LoopScheduler,
     ManualScheduler,
+    Remove,
     Scheduler,
     ThreadScheduler,
     every,
+    set_within,
 )
-from lifecycle.graph.state import Fetch, GraphState
-from lifecycle.graph.transport import GraphTransport, Remove
-from lifecycle.graph.view import GraphChange, NodeView
+from lifecycle.graph.state import Fetch, GraphState, Look
+from lifecycle.graph.transport import GraphTransport, InMemoryNetwork, InMemoryTransport
 
 if TYPE_CHECKING:
     from lifecycle.graph.dds import GRAPH_QOS, DdsTransport, steady_timer
-    from lifecycle.graph.facade import Graph
+    from lifecycle.graph.graph import Graph
 
 __all__ = [
     "FORGET_AFTER_S",
@@ -84,6 +91,7 @@ __all__ = [
     "Joined",
     "Left",
     "Link",
+    "Look",
     "LoopScheduler",
     "ManualScheduler",
     "MappingEstablished",
@@ -91,9 +99,7 @@ __all__ = [
     "Member",
     "NodeLiveliness",
     "NodeView",
-    "Observer",
     "Remove",
-    "Running",
     "Scheduler",
     "SilentNotice",
     "StateChanged",
@@ -103,13 +109,14 @@ __all__ = [
     "encode",
     "every",
     "new_incarnation",
+    "set_within",
     "steady_timer",
 ]
 
 _HOME = {
     "GRAPH_QOS": "dds",
     "DdsTransport": "dds",
-    "Graph": "facade",
+    "Graph": "graph",
     "steady_timer": "dds",
 }
 

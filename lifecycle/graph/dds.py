@@ -23,7 +23,7 @@ from rclpy.subscription import Subscription
 from std_msgs.msg import String
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.graph.transport import Remove
+from lifecycle.graph.scheduler import Remove
 from lifecycle.verify.noise import GRAPH_TOPIC
 
 _logger = logging.getLogger(__name__)
@@ -34,7 +34,7 @@ GRAPH_QOS = QoSProfile(
     reliability=QoSReliabilityPolicy.RELIABLE,
     durability=QoSDurabilityPolicy.VOLATILE,
 )
-"""A late joiner is told again (`on_peer`) rather than given history: what was is of no use."""
+"""For a late joiner all is sent again (`on_peer`) rather than kept: what was is of no use."""
 
 
 @typing.final
@@ -42,12 +42,12 @@ class DdsTransport:
     """Sends and receives on `/lifecycle/graph` with a node's own participant.
 
     The subscription is made by the first `receive` and the publisher by the first `send` or
-    `on_peer`: who only reports does not listen, who only listens does not announce a publisher.
+    `on_peer`: a reporter has no subscription, and a reader no publisher.
     Callbacks run in the executor that spins the node. `close` it before the node is destroyed.
 
     Args:
         node: any rclpy node that is spun.
-        qos: must fit everybody else's; for participants that add liveliness to the same policies.
+        qos: must fit that of all others; for participants that add liveliness to the same policies.
         callback_group: of the subscription and the events; by default one of its own.
     """
 
@@ -137,7 +137,7 @@ class DdsTransport:
             callback(data)
 
     def _matched(self, info: Any) -> None:
-        # Several matches may come as one event; that somebody left is none of our business.
+        # Several matches may come as one event; that a peer left does not matter here.
         before, self._readers = self._readers, info.current_count
         if info.current_count > before or info.current_count_change > 0:
             for callback in tuple(self._peer_callbacks.values()):

@@ -1,8 +1,9 @@
-"""Layer 2 of the graph interface: what happens in the graph, told to subscribers.
+"""Layer 2 of the graph interface: what happens in the graph, and who is notified of it.
 
-Owns: who is told of what; membership.py says what happened. Duplicates are dropped, messages that
-come too early wait, and what stays missing becomes a GAP: read that node again. A node of which
-nothing is heard is SILENT, and ALIVE again afterwards.
+Owns: who is a member of the graph: joining, leaving and restarting; and the subscribers by what
+they ask for. Duplicates are dropped, messages that come too early wait, and what stays missing
+becomes a GAP: read that node again. A node that sends nothing any more is SILENT, and ALIVE again
+afterwards. What is held of each member is membership.py's.
 
 Threads: everything runs in the scheduler. Subscribers are called there, one after another, each
 event to all of them before the next; so they must be quick, and may call any method here. Every
@@ -15,19 +16,106 @@ import functools
 import logging
 import threading
 import typing
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 
-from lifecycle.graph.endpoints import EndpointChange, EndpointIndex
-from lifecycle.graph.event import EventKind, GraphEvent, Member, NodeLiveliness
-from lifecycle.graph.membership import Membership, endpoint_event
-from lifecycle.graph.messages import GraphMessageError, decode
-from lifecycle.graph.scheduler import Scheduler
-from lifecycle.graph.subscribers import Subscribers, call
-from lifecycle.graph.transport import GraphTransport, Remove
+from lifecycle.graph.membership import Notices, Sender, liveliness_event
+from lifecycle.graph.messages import (
+    AliveNotice,
+    GraphMessage,
+    GraphMessageError,
+    Heartbeat,
+    Joined,
+    Left,
+    SilentNotice,
+    StuckNotice,
+    decode,
+)
+from lifecycle.graph.model import (
+    EndpointChange,
+    EndpointIndex,
+    EventKind,
+    GraphEvent,
+    Member,
+    NodeLiveliness,
+    names_of,
+)
+from lifecycle.graph.scheduler import Deadlines, Remove, Scheduler
+from lifecycle.graph.transport import GraphTransport
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.verify.observation import EndpointReport
 
 _logger = logging.getLogger(__name__)
+
+About = str | tuple[EndpointKind, str] | None
+"""A node, an endpoint's kind and name, or anything."""
+
+Callback = Callable[[GraphEvent], None]
+
+
+class Subscribers:
+    """Callbacks of one graph. `add` from any thread; the rest from the scheduler."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._callbacks: dict[tuple[EventKind, About], tuple[tuple[object, Callback], ...]] = {}
+        self._outbox: list[GraphEvent] = []
+        self._notifying = False
+
+    def add(self, wanted: Iterable[tuple[EventKind, About]], callback: Callback) -> Remove:
+        """Have `callback` called with what is wanted; return what takes it away."""
+        token = object()
+        places = tuple(wanted)
+        with self._lock:
+            for place in places:
+                self._callbacks[place] = (*self._callbacks.get(place, ()), (token, callback))
+
+        def remove() -> None:
+            with self._lock:
+                for place in places:
+                    left = tuple(
+                        each for each in self._callbacks.get(place, ()) if each[0] is not token
+                    )
+                    if left:
+                        self._callbacks[place] = left
+                    else:
+                        self._callbacks.pop(place, None)
+
+        return remove
+
+    def notify(self, events: Iterable[GraphEvent]) -> None:
+        """Notify all who asked for an event of it, before the next event.
+
+        What a callback makes happen meanwhile follows after that.
+        """
+        self._outbox += events
+        if self._notifying:
+            return
+        self._notifying = True
+        try:
+            while self._outbox:
+                event = self._outbox.pop(0)
+                for place in _places(event):
+                    for _, callback in self._callbacks.get(place, ()):
+                        call(callback, event)
+        finally:
+            self._notifying = False
+
+
+def call(callback: Callback, event: GraphEvent) -> None:
+    """Call back; an exception is logged, and ends nothing."""
+    try:
+        callback(event)
+    except Exception:
+        _logger.exception("cannot handle %s of %s", event.kind.value, event.node)
+
+
+def _places(event: GraphEvent) -> Iterator[tuple[EventKind, About]]:
+    yield event.kind, None
+    yield event.kind, event.node
+    if event.endpoint is not None:
+        for name in names_of(event.endpoint):
+            yield event.kind, (event.endpoint.kind, name)
+
 
 SILENT_AFTER_S = 7.0
 """Three heartbeats and a half: one or two may be lost without an alarm."""
@@ -36,7 +124,11 @@ HOLD_S = 0.2
 """What a reliable transport still delivers comes within so long."""
 
 FORGET_AFTER_S = 600.0
-"""A node of which nothing was heard for so long has left."""
+"""A node that sent nothing for so long has left."""
+
+
+_HERE = ""
+_BEATS = "heartbeats"
 
 
 @typing.final
@@ -44,16 +136,21 @@ class GraphEvents:
     """The events of one graph.
 
     Args:
-        transport: where messages come from; it is not closed by `close`.
+        transport: where messages come from; it is not closed by `close`. None: from nowhere.
         scheduler: where everything runs.
         silent_after_s: a node that sent messages and then none for so long is silent; > 0.
         hold_s: so long a message waits for those before it, >= 0.
         forget_after_s: a silent node counts as gone after so long, > silent_after_s.
+
+    Attributes:
+        endpoints: who has which endpoint, as configurations were read; hold `lock` to look.
+        lock: held while members or endpoints change, and not while subscribers are notified.
+        ignored: how many messages were malformed, or of an instance that is not the current one.
     """
 
     def __init__(
         self,
-        transport: GraphTransport,
+        transport: GraphTransport | None,
         scheduler: Scheduler,
         *,
         silent_after_s: float = SILENT_AFTER_S,
@@ -62,22 +159,22 @@ class GraphEvents:
     ) -> None:
         self.scheduler = scheduler
         self.endpoints = EndpointIndex()
-        """Who has which endpoint, as configurations were read; hold `lock` to look."""
         self.lock = threading.RLock()
-        self._malformed = 0
+        self.ignored = 0
+        self._closed = False
+        self._hold_s = hold_s
+        self._silent_after_s = silent_after_s
         self._subscribers = Subscribers()
-        self._membership = Membership(
-            scheduler,
-            self.endpoints,
-            self.lock,
-            self._subscribers.tell,
-            silent_after_s=silent_after_s,
-            hold_s=hold_s,
-            forget_after_s=forget_after_s,
-        )
-        self._stop = transport.receive(
-            lambda data: scheduler.post(functools.partial(self._arrived, data))
-        )
+        self._senders: dict[str, Sender] = {}
+        self._notices = Notices(self._senders)
+        self._beats = Deadlines(scheduler, silent_after_s, self._fell_silent)
+        self._gone = Deadlines(scheduler, forget_after_s, self._forget)
+        self._message_callbacks: tuple[Callable[[GraphMessage], None], ...] = ()
+        self._stop: Remove | None = None
+        if transport is not None:
+            self._stop = transport.receive(
+                lambda data: scheduler.post(functools.partial(self._arrived, data))
+            )
 
     # -- subscribing
 
@@ -100,6 +197,10 @@ class GraphEvents:
         """
         wanted = (kinds,) if isinstance(kinds, EventKind) else tuple(kinds)
         return self._subscribers.add([(kind, node) for kind in wanted], callback)
+
+    def on_message(self, callback: Callable[[GraphMessage], None]) -> None:
+        """Have `callback` called in the scheduler with each message, before it is put in order."""
+        self._message_callbacks += (callback,)
 
     def on_publisher(
         self,
@@ -140,7 +241,7 @@ class GraphEvents:
         removes: list[Remove] = []
 
         def begin() -> None:
-            # In one turn of the scheduler, so that none is told twice and none is left out.
+            # In one turn of the scheduler, so that none comes twice and none is left out.
             if removes:
                 return
             with self.lock:
@@ -166,25 +267,23 @@ class GraphEvents:
         self.scheduler.post(begin)
         return remove
 
-    @property
-    def ignored(self) -> int:
-        """How many messages were malformed, or of an instance that is not the current one."""
-        return self._malformed + self._membership.ignored
-
     def members(self) -> tuple[Member, ...]:
         """Return who is part of the graph now, silent ones included."""
-        return self._membership.members()
+        with self.lock:
+            return tuple(each.member for each in self._senders.values() if each.present)
 
     def reports(self, node: str) -> bool:
-        """Tell whether `node` is part of the graph now and sends messages."""
-        return self._membership.reports(node)
+        """Tell whether a node is part of the graph now and sends messages."""
+        with self.lock:
+            sender = self._senders.get(node)
+            return sender is not None and sender.present and bool(sender.incarnation)
 
-    # -- doors for what is noticed otherwise
+    # -- what is noticed otherwise
 
     def report_silent(self, node: str, reason: str = "") -> None:
-        """Take it that nothing is heard of `node`, until it is heard or `report_alive`.
+        """Take `node` for silent, until a message of it comes or `report_alive`.
 
-        The door for whoever notices sooner than by missing heartbeats: DDS liveliness, a pidfd. A
+        For what notices sooner than by missing heartbeats: DDS liveliness, a pidfd. A
         node that is not a member is passed over.
         """
         self._report(node, NodeLiveliness.SILENT, reason)
@@ -199,23 +298,23 @@ class GraphEvents:
 
     def report_seen(self, node: str) -> None:
         """Take it that `node` is there although it sends no messages: discovery shows it."""
-        self.scheduler.post(functools.partial(self._membership.seen, node))
+        self.scheduler.post(functools.partial(self._seen, node))
 
     def report_gone(self, node: str, reason: str = "") -> None:
         """Take back `report_seen`.
 
         A node that sends messages is passed over: Fast DDS forgets the names of nodes that live.
         """
-        self.scheduler.post(functools.partial(self._membership.vanished, node, reason))
+        self.scheduler.post(functools.partial(self._vanished, node, reason))
 
     def configuration_read(self, node: str, endpoints: Iterable[EndpointReport]) -> EndpointChange:
-        """Take what a node's configuration says of its endpoints; subscribers hear what is new.
+        """Take what a node's configuration says of its endpoints, and notify of what is new.
 
         To be called in the scheduler. A node that is not a member has no endpoints.
         """
         with self.lock:
-            change = self.endpoints.update(node, endpoints if self._membership.has(node) else ())
-        self._subscribers.tell(
+            change = self.endpoints.update(node, endpoints if self._has(node) else ())
+        self._subscribers.notify(
             endpoint_event(kind, node, each)
             for kind, changed in (
                 (EventKind.ENDPOINT_REMOVED, change.removed),
@@ -227,23 +326,199 @@ class GraphEvents:
         return change
 
     def close(self) -> None:
-        """Stop listening. What was begun may still be told; again is harmless."""
-        self._membership.closed = True
-        self._stop()
-        self.scheduler.post(self._membership.end)
+        """Stop listening. What was begun may still follow; again is harmless."""
+        self._closed = True
+        if self._stop is not None:
+            self._stop()
+        self.scheduler.post(self._end)
 
     # -- what happens in the scheduler
 
     def _arrived(self, data: bytes) -> None:
-        if self._membership.closed:
+        if self._closed:
             return
         try:
             message = decode(data)
         except GraphMessageError as error:
-            self._malformed += 1
-            _logger.debug("%s", error)
+            self.ignored += 1
+            _logger.info("passed over: %s", error)
             return
-        self._membership.hear(message)
+        for callback in self._message_callbacks:
+            callback(message)
+        self._message(message)
 
     def _report(self, node: str, liveliness: NodeLiveliness, reason: str) -> None:
-        self.scheduler.post(functools.partial(self._membership.report, node, liveliness, reason))
+        self.scheduler.post(functools.partial(self._noticed, node, liveliness, reason))
+
+    def _message(self, message: GraphMessage) -> None:
+        """Take a message that arrived."""
+        with self.lock:
+            events = self._take(message)
+        self._subscribers.notify(events)
+
+    def _noticed(self, node: str, liveliness: NodeLiveliness, reason: str) -> None:
+        """Take what was noticed here, without a message, of how alive a member is."""
+        with self.lock:
+            events = self._notices.hold(node, _HERE, liveliness, reason)
+        self._subscribers.notify(events)
+
+    def _seen(self, node: str) -> None:
+        """Take in a node that sends no messages: discovery shows it."""
+        with self.lock:
+            sender = self._senders.setdefault(node, Sender(node))
+            if sender.present or self._closed:
+                return
+            sender.begin()
+            self._gone.drop(node)
+        self._subscribers.notify([_event(EventKind.JOINED, sender)])
+
+    def _vanished(self, node: str, reason: str) -> None:
+        """Take out a node that sends no messages; one that sends some is passed over."""
+        with self.lock:
+            sender = self._senders.get(node)
+            if sender is None or not sender.present or sender.incarnation:
+                return
+            events = self._end_of(sender, reason)
+        self._subscribers.notify(events)
+
+    def _end(self) -> None:
+        """Wait for nothing any more."""
+        self._beats.close()
+        self._gone.close()
+        for sender in self._senders.values():
+            sender.cancel_wait()
+
+    def _has(self, node: str) -> bool:
+        """Tell whether a node is part of the graph now."""
+        with self.lock:
+            sender = self._senders.get(node)
+            return sender is not None and sender.present
+
+    # -- messages, in their order
+
+    def _take(self, message: GraphMessage) -> list[GraphEvent]:
+        sender = self._senders.get(message.node)
+        if sender is None:
+            sender = self._senders[message.node] = Sender(message.node)
+            self._gone.touch(sender.node)  # it may begin with its farewell
+        events: list[GraphEvent] = []
+        first = message.incarnation != sender.incarnation or not sender.present
+        if first:
+            if not sender.is_next(message):
+                self.ignored += 1
+                return []
+            first, events = self._begin(sender, message)
+        assert sender.order is not None
+        ready = sender.order.take(message)
+        if ready is None:
+            return events
+        self._beats.touch(sender.node)
+        self._gone.drop(sender.node)
+        if sender.received():
+            events.append(liveliness_event(sender))
+        for each in ready:
+            # JOINED was an event already, whatever the first message was.
+            events += self._apply(sender, each, joined=first and isinstance(each, Joined))
+        return [*events, *self._wait_for_missing(sender)]
+
+    def _begin(self, sender: Sender, message: GraphMessage) -> tuple[bool, list[GraphEvent]]:
+        """Take a node's first message; return whether it joined by it, and what happened."""
+        if sender.present and not sender.incarnation:
+            sender.adopt(message.incarnation, message)
+            return False, []
+        events = self._end_of(sender, "restarted") if sender.present else []
+        sender.begin(message.incarnation, message)
+        return True, [*events, _event(EventKind.JOINED, sender, message)]
+
+    def _apply(self, sender: Sender, message: GraphMessage, *, joined: bool) -> list[GraphEvent]:
+        """Let one message, in its turn, take effect."""
+        if isinstance(message, Left):
+            return self._end_of(sender, message.reason, message)
+        sender.learn(message)
+        if joined:
+            return []
+        if isinstance(message, SilentNotice | StuckNotice | AliveNotice):
+            return self._notices.take(sender.node, message)
+        events = self._notices.renew(sender.node, message) if isinstance(message, Heartbeat) else []
+        kind = EventKind.HEARTBEAT if isinstance(message, Joined) else EventKind(message.kind.value)
+        return [*events, _event(kind, sender, message)]
+
+    def _wait_for_missing(self, sender: Sender) -> list[GraphEvent]:
+        if not sender.present or sender.order is None:
+            return []
+        if not sender.order.is_waiting:
+            sender.cancel_wait()
+        elif sender.order.is_full:
+            return self._give_up(sender)
+        elif sender.stop_waiting is None:
+            sender.stop_waiting = self.scheduler.call_at(
+                self.scheduler.now_s() + self._hold_s, functools.partial(self._waited, sender)
+            )
+        return []
+
+    def _waited(self, sender: Sender) -> None:
+        with self.lock:
+            events = self._give_up(sender)
+        self._subscribers.notify(events)
+
+    def _give_up(self, sender: Sender) -> list[GraphEvent]:
+        sender.cancel_wait()
+        assert sender.order is not None
+        missing = sender.order.last + 1
+        events: list[GraphEvent] = []
+        for each in sender.order.give_up():
+            events += self._apply(sender, each, joined=False)
+        if sender.present:
+            # Last: who reads the node now needs nothing of the above on top of the answer.
+            events.append(_event(EventKind.GAP, sender, reason=f"message {missing} was lost"))
+        return events
+
+    def _end_of(
+        self, sender: Sender, reason: str, message: GraphMessage | None = None
+    ) -> list[GraphEvent]:
+        """Take a member out, with its endpoints and with what it noticed of others."""
+        events = self._notices.end(sender.node)
+        events += (
+            endpoint_event(EventKind.ENDPOINT_REMOVED, sender.node, each)
+            for each in self.endpoints.update(sender.node, ()).removed
+        )
+        events.append(_event(EventKind.LEFT, sender, message, reason))
+        sender.end(for_good=message is not None)
+        self._beats.drop(sender.node)
+        self._gone.touch(sender.node)
+        return events
+
+    # -- what happens when no message comes
+
+    def _fell_silent(self, node: str) -> None:
+        with self.lock:
+            self._gone.touch(node)
+            reason = f"no message for {self._silent_after_s:g} s"
+            events = self._notices.hold(node, _BEATS, NodeLiveliness.SILENT, reason)
+        self._subscribers.notify(events)
+
+    def _forget(self, node: str) -> None:
+        """Drop a node that left or fell silent long ago."""
+        with self.lock:
+            sender = self._senders[node]
+            events = self._end_of(sender, "not heard any more") if sender.present else []
+            self._gone.drop(node)
+            del self._senders[node]
+        self._subscribers.notify(events)
+
+
+def _event(
+    kind: EventKind, sender: Sender, message: GraphMessage | None = None, reason: str = ""
+) -> GraphEvent:
+    return GraphEvent(
+        kind=kind,
+        node=sender.node,
+        incarnation=sender.incarnation,
+        message=message,
+        reason=reason,
+    )
+
+
+def endpoint_event(kind: EventKind, node: str, endpoint: EndpointReport) -> GraphEvent:
+    """Return the event of an endpoint that came, went or changed."""
+    return GraphEvent(kind=kind, node=node, endpoint=endpoint)

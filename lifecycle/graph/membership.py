@@ -1,260 +1,302 @@
-"""Who is a member of the graph, and what each message of it means.
+"""What is held of one member of the graph, and what members report of each other.
 
-Owns: joining, leaving and restarting; the order in which the messages of a node count, and how long
-a missing one is waited for; and what follows when nothing is heard. Events come out of it; who is
-told of them is events.py's to say.
+Owns: the order in which the messages of a node count, what is a duplicate and what is missing;
+which of two instances is the current one; its state and its troubles; and which members report
+others as silent or stuck, until they take it back. Pure; not thread-safe.
 """
 
 from __future__ import annotations
 
-import functools
-import threading
-from collections.abc import Callable, Iterable
+from collections import deque
+from collections.abc import Mapping
 
-from lifecycle.graph.deadlines import Deadlines
-from lifecycle.graph.endpoints import EndpointIndex
-from lifecycle.graph.event import EventKind, GraphEvent, Member, NodeLiveliness
 from lifecycle.graph.messages import (
     AliveNotice,
+    ConfigurationChanged,
     GraphMessage,
     Heartbeat,
     Joined,
     Left,
     SilentNotice,
+    StateChanged,
     StuckNotice,
 )
-from lifecycle.graph.notices import Notices, liveliness_event
-from lifecycle.graph.scheduler import Scheduler
-from lifecycle.graph.sender import Sender
-from lifecycle.verify.observation import EndpointReport
+from lifecycle.graph.model import EventKind, GraphEvent, Member, NodeLiveliness
+from lifecycle.graph.scheduler import Remove
 
-_HERE = ""
-_BEATS = "heartbeats"
+WINDOW = 64
+"""So many messages that came too early are held; then what is missing counts as lost. The depth of
+the graph topic's QoS: what a writer no longer has, it cannot send again."""
 
 
-class Membership:
-    """The members of one graph.
-
-    `members`, `has` and `reports` may be called from any thread; the rest in the scheduler.
+class Sequencer:
+    """Orders the messages of one incarnation.
 
     Args:
-        scheduler: where everything runs.
-        endpoints: of all members; those of one that leaves go with it.
-        lock: held while members or endpoints change, and not while events are told.
-        tell: given what happens, in order.
-        silent_after_s: a node that sent messages and then none for so long is silent; > 0.
-        hold_s: so long a message waits for those before it, >= 0.
-        forget_after_s: a silent node counts as gone after so long, > silent_after_s.
-
-    Attributes:
-        ignored: how many messages were of an instance that is not the current one.
-        closed: nobody is taken in any more.
+        first: the first message that came, whatever its number: what was before is unknown.
     """
 
-    def __init__(
-        self,
-        scheduler: Scheduler,
-        endpoints: EndpointIndex,
-        lock: threading.RLock,
-        tell: Callable[[Iterable[GraphEvent]], None],
-        *,
-        silent_after_s: float,
-        hold_s: float,
-        forget_after_s: float,
-    ) -> None:
-        self._scheduler = scheduler
-        self._endpoints = endpoints
-        self._lock = lock
-        self._tell = tell
-        self._hold_s = hold_s
-        self._silent_after_s = silent_after_s
-        self._senders: dict[str, Sender] = {}
-        self._notices = Notices(self._senders)
-        self._beats = Deadlines(scheduler, silent_after_s, self._fell_silent)
-        self._gone = Deadlines(scheduler, forget_after_s, self._forget)
-        self.ignored = 0
-        self.closed = False
+    def __init__(self, first: GraphMessage) -> None:
+        beats = isinstance(first, Heartbeat)
+        self.last = first.sequence if beats else first.sequence - 1
+        """Number of the last message that was handed on."""
+        self._held: dict[int, GraphMessage] = {}
+        self._beat: Heartbeat | None = None
 
-    def members(self) -> tuple[Member, ...]:
-        """Return who is part of the graph now, silent ones included."""
-        with self._lock:
-            return tuple(each.member for each in self._senders.values() if each.present)
+    @property
+    def is_waiting(self) -> bool:
+        """Whether something is missing before what has come."""
+        return bool(self._held) or self._beat is not None
 
-    def has(self, node: str) -> bool:
-        """Tell whether a node is part of the graph now."""
-        with self._lock:
-            sender = self._senders.get(node)
-            return sender is not None and sender.present
+    @property
+    def is_full(self) -> bool:
+        """Whether too much is held to wait any longer."""
+        return len(self._held) >= WINDOW
 
-    def reports(self, node: str) -> bool:
-        """Tell whether a node is part of the graph now and sends messages."""
-        with self._lock:
-            sender = self._senders.get(node)
-            return sender is not None and sender.present and bool(sender.incarnation)
+    def take(self, message: GraphMessage) -> tuple[GraphMessage, ...] | None:
+        """Return what may be handed on now, in order; None if the message says nothing new.
 
-    def hear(self, message: GraphMessage) -> None:
-        """Take a message that arrived."""
-        with self._lock:
-            events = self._take(message)
-        self._tell(events)
+        A heartbeat older than what was handed on says nothing; one that is ahead waits.
+        """
+        if isinstance(message, Heartbeat):
+            if message.sequence < self.last:
+                return None
+            if message.sequence == self.last:
+                return (message,)
+            if self._beat is None or message.sequence >= self._beat.sequence:
+                self._beat = message
+            return ()
+        if message.sequence <= self.last or message.sequence in self._held:
+            return None
+        self._held[message.sequence] = message
+        return self._ready()
 
-    def report(self, node: str, liveliness: NodeLiveliness, reason: str) -> None:
-        """Take it from whoever observes here, and sends no messages, how alive a member is."""
-        with self._lock:
-            events = self._notices.hold(node, _HERE, liveliness, reason)
-        self._tell(events)
+    def give_up(self) -> tuple[GraphMessage, ...]:
+        """Count what is missing as lost, and return all that was held, in order."""
+        found: list[GraphMessage] = []
+        while self._held:
+            self.last = min(self._held) - 1
+            found += self._ready()
+        if self._beat is not None:
+            found.append(self._beat)
+            self.last, self._beat = self._beat.sequence, None
+        return tuple(found)
 
-    def seen(self, node: str) -> None:
-        """Take in a node that sends no messages: discovery shows it."""
-        with self._lock:
-            sender = self._senders.setdefault(node, Sender(node))
-            if sender.present or self.closed:
-                return
-            sender.begin()
-            self._gone.drop(node)
-        self._tell([_event(EventKind.JOINED, sender)])
+    def _ready(self) -> tuple[GraphMessage, ...]:
+        found: list[GraphMessage] = []
+        while (message := self._held.pop(self.last + 1, None)) is not None:
+            found.append(message)
+            self.last += 1
+        if self._beat is not None and self._beat.sequence <= self.last:
+            if self._beat.sequence == self.last:
+                found.append(self._beat)
+            self._beat = None
+        return tuple(found)
 
-    def vanished(self, node: str, reason: str) -> None:
-        """Take out a node that sends no messages; one that sends some is passed over."""
-        with self._lock:
-            sender = self._senders.get(node)
-            if sender is None or not sender.present or sender.incarnation:
-                return
-            events = self._end_of(sender, reason)
-        self._tell(events)
 
-    def end(self) -> None:
-        """Wait for nothing any more."""
-        self._beats.close()
-        self._gone.close()
-        for sender in self._senders.values():
-            sender.cancel_wait()
+_REMEMBERED = 8
+"""Incarnations that left and whose late messages must not bring them back."""
 
-    # -- messages, in their order
 
-    def _take(self, message: GraphMessage) -> list[GraphEvent]:
-        sender = self._senders.get(message.node)
-        if sender is None:
-            sender = self._senders[message.node] = Sender(message.node)
-            self._gone.touch(sender.node)  # it may begin with its farewell
-        events: list[GraphEvent] = []
-        first = message.incarnation != sender.incarnation or not sender.present
-        if first:
-            if not sender.is_next(message):
-                self.ignored += 1
-                return []
-            first, events = self._begin(sender, message)
-        assert sender.order is not None
-        ready = sender.order.take(message)
-        if ready is None:
-            return events
-        self._beats.touch(sender.node)
-        self._gone.drop(sender.node)
-        if sender.heard():
-            events.append(liveliness_event(sender))
-        for each in ready:
-            # JOINED was told already, whatever the first message was.
-            events += self._apply(sender, each, told=first and isinstance(each, Joined))
-        return [*events, *self._wait_for_missing(sender)]
+class Sender:
+    """One member of the graph, or one that was."""
 
-    def _begin(self, sender: Sender, message: GraphMessage) -> tuple[bool, list[GraphEvent]]:
-        """Take a node's first message; return whether it joined by it, and what happened."""
-        if sender.present and not sender.incarnation:
-            sender.adopt(message.incarnation, message)
-            return False, []
-        events = self._end_of(sender, "restarted") if sender.present else []
-        sender.begin(message.incarnation, message)
-        return True, [*events, _event(EventKind.JOINED, sender, message)]
+    def __init__(self, node: str) -> None:
+        self.node = node
+        self.incarnation = ""
+        self.present = False
+        """It joined and did not leave."""
+        self.order: Sequencer | None = None
+        """None while it has sent nothing."""
+        self.stop_waiting: Remove | None = None
+        """Cancels the wait for a missing message; None if there is none."""
+        self.departed: deque[str] = deque(maxlen=_REMEMBERED)
+        self._state: str | None = None
+        self._connected: bool | None = None
+        self._checksum: str | None = None
+        self._troubles: dict[str, tuple[NodeLiveliness, str]] = {}
+        self._overruled: set[str] = set()
 
-    def _apply(self, sender: Sender, message: GraphMessage, *, told: bool) -> list[GraphEvent]:
-        """Let one message, in its turn, take effect."""
+    def begin(self, incarnation: str = "", first: GraphMessage | None = None) -> None:
+        """Be another instance from now on, or the first one; without a message, as discovered."""
+        self.cancel_wait()
+        self.incarnation = incarnation
+        self.present = True
+        self.order = None if first is None else Sequencer(first)
+        self._state = self._connected = self._checksum = None
+        self._troubles, self._overruled = {}, set()
+
+    def adopt(self, incarnation: str, first: GraphMessage) -> None:
+        """Send messages from now on, having been seen by discovery only."""
+        self.incarnation = incarnation
+        self.order = Sequencer(first)
+
+    def end(self, *, for_good: bool) -> None:
+        """Be no member any more. `for_good`: this incarnation said so, and does not come back."""
+        self.cancel_wait()
+        self.present = False
+        self._troubles, self._overruled = {}, set()
+        if for_good and self.incarnation:
+            self.departed.append(self.incarnation)
+
+    def is_next(self, message: GraphMessage) -> bool:
+        """Tell whether a message of another instance, or of one that left, begins the next one.
+
+        The later incarnation wins. An earlier one is taken only when the later has fallen
+        silent: then the wall clock was set back between the two.
+        """
         if isinstance(message, Left):
-            return self._end_of(sender, message.reason, message)
-        sender.learn(message)
-        if told:
-            return []
-        if isinstance(message, SilentNotice | StuckNotice | AliveNotice):
-            return self._notices.take(sender.node, message)
-        events = self._notices.renew(sender.node, message) if isinstance(message, Heartbeat) else []
-        kind = EventKind.HEARTBEAT if isinstance(message, Joined) else EventKind(message.kind.value)
-        return [*events, _event(kind, sender, message)]
+            self.departed.append(message.incarnation)
+            return False
+        if message.incarnation in self.departed:
+            return False
+        if not self.present or message.incarnation > self.incarnation:
+            return True
+        return self.liveliness is NodeLiveliness.SILENT
 
-    def _wait_for_missing(self, sender: Sender) -> list[GraphEvent]:
-        if not sender.present or sender.order is None:
-            return []
-        if not sender.order.is_waiting:
-            sender.cancel_wait()
-        elif sender.order.is_full:
-            return self._give_up(sender)
-        elif sender.stop_waiting is None:
-            sender.stop_waiting = self._scheduler.call_at(
-                self._scheduler.now_s() + self._hold_s, functools.partial(self._waited, sender)
-            )
-        return []
+    def learn(self, message: GraphMessage) -> None:
+        """Keep what a message, in its turn, says of state and checksum."""
+        if isinstance(message, Joined | Heartbeat | StateChanged):
+            self._state, self._connected = message.state, message.connected
+        if isinstance(message, Joined | Heartbeat | ConfigurationChanged):
+            self._checksum = message.checksum
 
-    def _waited(self, sender: Sender) -> None:
-        with self._lock:
-            events = self._give_up(sender)
-        self._tell(events)
+    def trouble(
+        self, source: str, liveliness: NodeLiveliness, reason: str, *, again: bool = False
+    ) -> bool:
+        """Hold what `source` says of us; ALIVE takes it back. Return whether our state changed.
 
-    def _give_up(self, sender: Sender) -> list[GraphEvent]:
-        sender.cancel_wait()
-        assert sender.order is not None
-        missing = sender.order.last + 1
-        events: list[GraphEvent] = []
-        for each in sender.order.give_up():
-            events += self._apply(sender, each, told=False)
-        if sender.present:
-            # Last: who reads the node now needs nothing of the above on top of the answer.
-            events.append(_event(EventKind.GAP, sender, reason=f"message {missing} was lost"))
-        return events
+        Args:
+            source: the node that says so.
+            liveliness: what it says.
+            reason: for people.
+            again: it has said so before: then it counts only if no message of ours came meanwhile.
+        """
+        before = self.liveliness
+        if again and source in self._overruled and liveliness is NodeLiveliness.SILENT:
+            return False
+        self._overruled.discard(source)
+        if liveliness is NodeLiveliness.ALIVE:
+            self._troubles.pop(source, None)
+        else:
+            held, text = self._troubles.get(source, (None, ""))
+            self._troubles[source] = (liveliness, reason or (text if held is liveliness else ""))
+        return self.liveliness is not before
 
-    def _end_of(
-        self, sender: Sender, reason: str, message: GraphMessage | None = None
-    ) -> list[GraphEvent]:
-        """Take a member out, with its endpoints and with what it noticed of others."""
-        events = self._notices.end(sender.node)
-        events += (
-            endpoint_event(EventKind.ENDPOINT_REMOVED, sender.node, each)
-            for each in self._endpoints.update(sender.node, ()).removed
+    def received(self) -> bool:
+        """Be silent no more, whatever others say: a message came. Return whether it was."""
+        before = self.liveliness
+        if before is not NodeLiveliness.SILENT:
+            return False
+        silent = {
+            source
+            for source, (liveliness, _) in self._troubles.items()
+            if liveliness is NodeLiveliness.SILENT
+        }
+        self._overruled |= silent
+        for source in silent:
+            del self._troubles[source]
+        return True
+
+    @property
+    def liveliness(self) -> NodeLiveliness:
+        """The worst that is said of it."""
+        if not self._troubles:
+            return NodeLiveliness.ALIVE
+        held = {liveliness for liveliness, _ in self._troubles.values()}
+        return NodeLiveliness.SILENT if NodeLiveliness.SILENT in held else NodeLiveliness.STUCK
+
+    @property
+    def reason(self) -> str:
+        """Why it is not alive; empty if it is."""
+        worst = self.liveliness
+        reasons = (text for held, text in self._troubles.values() if held is worst and text)
+        return ", ".join(dict.fromkeys(reasons))
+
+    @property
+    def member(self) -> Member:
+        """What is known of it."""
+        return Member(
+            node=self.node,
+            incarnation=self.incarnation,
+            state=self._state,
+            connected=self._connected,
+            checksum=self._checksum,
+            liveliness=self.liveliness,
+            reason=self.reason,
         )
-        events.append(_event(EventKind.LEFT, sender, message, reason))
-        sender.end(for_good=message is not None)
-        self._beats.drop(sender.node)
-        self._gone.touch(sender.node)
+
+    def cancel_wait(self) -> None:
+        """Wait for no missing message any more."""
+        if self.stop_waiting is not None:
+            self.stop_waiting()
+            self.stop_waiting = None
+
+
+class Notices:
+    """The troubles of the members of one graph.
+
+    Args:
+        senders: every member by name, as they are now.
+    """
+
+    def __init__(self, senders: Mapping[str, Sender]) -> None:
+        self._senders = senders
+        self._given: dict[str, set[str]] = {}
+        """Sender of notices → whom they are about."""
+
+    def hold(
+        self,
+        node: str,
+        source: str,
+        liveliness: NodeLiveliness,
+        reason: str,
+        *,
+        again: bool = False,
+    ) -> list[GraphEvent]:
+        """Hold what `source` says of `node`, as `Sender.trouble`; return what that changes."""
+        sender = self._senders.get(node)
+        if sender is None or not sender.present:
+            return []
+        changed = sender.trouble(source, liveliness, reason, again=again)
+        return [liveliness_event(sender)] if changed else []
+
+    def take(
+        self, source: str, message: SilentNotice | StuckNotice | AliveNotice
+    ) -> list[GraphEvent]:
+        """Take a notice that a member gives of another."""
+        self._given.setdefault(source, set()).add(message.about)
+        return self.hold(message.about, source, NodeLiveliness(message.kind.value), message.reason)
+
+    def renew(self, source: str, beat: Heartbeat) -> list[GraphEvent]:
+        """Hold exactly what a member says in its heartbeat."""
+        held = self._given.get(source, set())
+        says = {
+            **dict.fromkeys(beat.stuck, NodeLiveliness.STUCK),
+            **dict.fromkeys(beat.silent, NodeLiveliness.SILENT),
+        }
+        if not held and not says:
+            return []
+        self._given[source] = set(says)
+        events: list[GraphEvent] = []
+        for about in (*says, *(each for each in sorted(held) if each not in says)):
+            liveliness = says.get(about, NodeLiveliness.ALIVE)
+            events += self.hold(about, source, liveliness, "", again=about in held)
         return events
 
-    # -- what happens when nothing is heard
-
-    def _fell_silent(self, node: str) -> None:
-        with self._lock:
-            self._gone.touch(node)
-            reason = f"no message for {self._silent_after_s:g} s"
-            events = self._notices.hold(node, _BEATS, NodeLiveliness.SILENT, reason)
-        self._tell(events)
-
-    def _forget(self, node: str) -> None:
-        """Drop a node that left or fell silent long ago."""
-        with self._lock:
-            sender = self._senders[node]
-            events = self._end_of(sender, "not heard any more") if sender.present else []
-            self._gone.drop(node)
-            del self._senders[node]
-        self._tell(events)
+    def end(self, source: str) -> list[GraphEvent]:
+        """Take back all that a member said of others."""
+        events: list[GraphEvent] = []
+        for about in sorted(self._given.pop(source, ())):
+            events += self.hold(about, source, NodeLiveliness.ALIVE, "")
+        return events
 
 
-def _event(
-    kind: EventKind, sender: Sender, message: GraphMessage | None = None, reason: str = ""
-) -> GraphEvent:
+def liveliness_event(sender: Sender) -> GraphEvent:
+    """Return the event of how alive a member is now."""
     return GraphEvent(
-        kind=kind,
+        kind=EventKind(sender.liveliness.value),
         node=sender.node,
         incarnation=sender.incarnation,
-        message=message,
-        reason=reason,
+        reason=sender.reason,
     )
-
-
-def endpoint_event(kind: EventKind, node: str, endpoint: EndpointReport) -> GraphEvent:
-    """Return the event of an endpoint that came, went or changed."""
-    return GraphEvent(kind=kind, node=node, endpoint=endpoint)

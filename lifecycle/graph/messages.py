@@ -1,4 +1,4 @@
-"""Graph messages: what participants of the graph tell all others.
+"""Graph messages: what participants of the graph send to all others.
 
 Owns: the message types, their JSON (schema: schemas/graph_message.v1.schema.json) and which of two
 incarnations is the later one. How messages travel is `transport`'s. Pure.
@@ -32,7 +32,7 @@ class GraphMessageError(LifecycleError):
 
 
 class GraphKind(enum.Enum):
-    """What a message tells."""
+    """What a message says."""
 
     JOINED = "joined"
     LEFT = "left"
@@ -194,7 +194,7 @@ class MappingLost(GraphMessage):
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class SilentNotice(GraphMessage):
-    """The sender noticed that nothing is heard of node `about` any more."""
+    """The sender noticed that node `about` is silent."""
 
     kind: ClassVar[GraphKind] = GraphKind.SILENT
 
@@ -245,8 +245,8 @@ def new_incarnation() -> str:
     """Return a text that no other node instance has, and that compares greater than earlier ones.
 
     It begins with the wall clock's time. Where that was set back between two starts of a node, the
-    new incarnation compares as the earlier one; readers take it all the same once they no longer
-    hear the other.
+    new incarnation compares as the earlier one; readers take it all the same once the other is
+    silent.
     """
     return f"{time.time_ns():020d}-{secrets.token_hex(_RANDOM_BYTES)}"
 

@@ -1,8 +1,8 @@
-"""One observation out of three sources: discovery, the nodes' services, the control channel.
+"""The graph's state brought up to date out of discovery, nodes' services and parameters.
 
-Owns: what is asked of whom, the configurations that were delivered out of band, and when a change
-is worth another look. Event driven: it only looks when asked to and only wakes when something
-happened.
+Owns: what is asked of which node, and when; which of discovery's nodes are members of the graph,
+and what counts as the configuration of one that serves none; when a change is worth another look.
+It looks when it is asked to, and when something happened.
 """
 
 from __future__ import annotations
@@ -10,18 +10,30 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import dataclasses
+import functools
 import logging
 import typing
 from collections.abc import Callable, Collection, Iterable
 from typing import Protocol
 
 from lifecycle.errors import MiddlewareError
+from lifecycle.graph.events import GraphEvents
+from lifecycle.graph.messages import GraphMessage, Heartbeat
 from lifecycle.graph.parameters import Clients as ParameterClients
 from lifecycle.graph.parameters import ParameterReadings
-from lifecycle.graph.waiting import set_within
+from lifecycle.graph.scheduler import Remove, set_within
+from lifecycle.graph.state import Answer, GraphState, Look
 from lifecycle.plan.model import Plan
-from lifecycle.verify.noise import NO_NAMES, DeclaredNames, tolerating_pattern
+from lifecycle.verify.noise import (
+    NO_NAMES,
+    DeclaredNames,
+    is_noise_node,
+    known_node,
+    tolerating_pattern,
+)
 from lifecycle.verify.observation import (
+    EndpointReport,
+    Identity,
     NodeConfiguration,
     Observation,
     ObservedEndpoint,
@@ -29,12 +41,22 @@ from lifecycle.verify.observation import (
 )
 
 _logger = logging.getLogger(__name__)
+
+QUIET_S = 0.02
+BURST_S = 0.1
+
 _ASK_S = 1.0
 """A node that answers at all answers within milliseconds."""
 
+_READ_S = 3.0
+"""Nobody waits for a reading, and a node that has just begun may still be on its way."""
 
-class Graph(Protocol):
-    """Discovery, see lifecycle.middleware.GraphObserver."""
+_TOGETHER_S = 0.05
+"""Changes of discovery come in bursts; who follows them looks once for all within so long."""
+
+
+class Discovery(Protocol):
+    """What discovery shows, see lifecycle.middleware.GraphObserver."""
 
     def snapshot(
         self, *, declared: Collection[str] = (), names: DeclaredNames = NO_NAMES
@@ -42,9 +64,12 @@ class Graph(Protocol):
         """Return the nodes and endpoints that discovery shows now."""
 
     def settling_s(self) -> float:
-        """Return for how long the last snapshot may miss somebody who is there; 0 if it cannot."""
+        """Return for how long the last snapshot may miss who is there; 0 if it cannot."""
 
-    def on_change(self, callback: Callable[[], None]) -> Callable[[], None]:
+    def offers(self, node: str, service: str) -> bool:
+        """Tell whether discovery shows a service on a node."""
+
+    def on_change(self, callback: Callable[[], None]) -> Remove:
         """Call `callback` from any thread after each change; return what takes it away."""
 
     def destroy(self) -> None:
@@ -57,8 +82,10 @@ class Clients(ParameterClients, Protocol):
     async def get_state(self, node: str, *, timeout_s: float) -> str:
         """Return the label of the node's state."""
 
-    async def get_configuration(self, node: str, *, timeout_s: float) -> NodeConfiguration | None:
-        """Return the node's configuration; None where it has no such interface."""
+    async def get_configuration(
+        self, node: str, *, timeout_s: float, expected: bool
+    ) -> NodeConfiguration | None:
+        """Return the node's configuration; None where it is shown to have no such interface."""
 
     def on_transition(self, node: str, callback: Callable[[], None]) -> None:
         """Call `callback` from any thread after each transition of the node, until `forget`."""
@@ -70,71 +97,88 @@ class Clients(ParameterClients, Protocol):
         """Drop everything."""
 
 
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class _Shown:
+    """A node that sends no messages, as discovery shows it.
+
+    Attributes:
+        serves: it has the node configuration interface.
+        beside: what its hidden participants have: it knows what they mean.
+    """
+
+    managed: bool
+    serves: bool
+    endpoints: tuple[ObservedEndpoint, ...]
+    beside: tuple[tuple[str, tuple[ObservedEndpoint, ...]], ...]
+
+
 @typing.final
 class Observer:
-    """The eyes of a supervisor and of `lifecycle verify`.
-
-    Use `Observer.open`, before starting what is to be observed; methods from one asyncio loop.
+    """Brings the state of one graph up to date.
 
     Args:
-        graph: discovery.
-        clients: services of nodes that do not report over a control channel.
+        discovery: what is there.
+        clients: services of nodes.
+        events: layer 2; `state` is kept on it, and its scheduler is where everything runs.
         quiet_s: a burst of changes is over when nothing changed for so long, ≥ 0.
         burst_s: a burst is cut off after so long, ≥ quiet_s.
-        guests: also ask nodes that are not planned, as far as they have our node interface.
+        guests: `observe` also asks nodes that are not planned, as far as they have our node
+            interface.
+        follows: read every node whenever it changes, as programs want it that ask the state;
+            else nodes are asked by `observe` only, as who judges wants it.
+
+    Attributes:
+        state: layer 3.
+        changes: changes so far, each counted at once: before its burst has passed (`wait_change`).
     """
 
     def __init__(
         self,
-        graph: Graph,
+        discovery: Discovery,
         clients: Clients,
+        events: GraphEvents,
         *,
-        quiet_s: float = 0.02,
-        burst_s: float = 0.1,
+        quiet_s: float = QUIET_S,
+        burst_s: float = BURST_S,
         guests: bool = False,
+        follows: bool = False,
     ) -> None:
-        self._graph = graph
+        self.state = GraphState(events, self._read)
+        self.changes = 0
+        self._discovery = discovery
         self._clients = clients
+        self._events = events
         self._quiet_s = quiet_s
         self._burst_s = burst_s
         self._guests = guests
-        self._configurations: dict[str, NodeConfiguration] = {}
+        self._follows = follows
         self._seen: frozenset[str] = frozenset()
         self._asked: set[str] = set()
         self._checksums: dict[str, str] = {}
+        self._shown: dict[str, _Shown] = {}
+        self._readings: set[asyncio.Task[None]] = set()
         self._parameters = ParameterReadings(clients, self._wake)
         self._changed = asyncio.Event()
         self._changed.set()  # nothing was looked at yet
-        self._count = 0
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._remove = graph.on_change(self._wake)
+        self._due: Remove | None = None
+        self._closed = False
+        events.on_message(self._message_came)
+        self._remove = discovery.on_change(self._discovery_changed)
+        if follows:
+            events.scheduler.post(self._follow)
 
-    @classmethod
-    def open(cls, domain_id: int, *, quiet_s: float = 0.02, burst_s: float = 0.1) -> Observer:
-        """Make an observer with a participant of its own in `domain_id` (0–232).
-
-        Raises:
-            MiddlewareError: no participant could be made.
-        """
-        from lifecycle.middleware import GraphObserver, NodeClients
-
-        graph = GraphObserver(domain_id)
-        return cls(graph, NodeClients(graph), quiet_s=quiet_s, burst_s=burst_s)
-
-    @property
-    def changes(self) -> int:
-        """Changes so far, each counted at once: before its burst has passed (`wait_change`)."""
-        return self._count
+    # -- one observation
 
     async def observe(self, plan: Plan) -> Observation:
-        """Return what is there now.
+        """Return what is there now, as the state has it then.
 
-        Waits until everybody who was there before us is seen, which takes a moment after `open`:
-        an observation that misses a participant would prove nothing about undeclared nodes.
+        Waits until everybody who was there before us is seen, which takes a moment at first: an
+        observation that misses a participant would prove nothing about undeclared nodes.
 
-        Planned nodes whose configuration was not put here are asked for their state and their
-        configuration; what they do not answer within a second stays unknown. Those that report no
-        parameters, and of which some are planned, are asked for these (graph/parameters.py).
+        Planned nodes whose configuration was not put into the state are asked for their state and
+        their configuration; what they do not answer within a second stays unknown. Those that
+        report no parameters, and of which some are planned, are asked for these (parameters.py).
 
         Raises:
             MiddlewareError: the graph can no longer be watched.
@@ -144,25 +188,81 @@ class Observer:
         names = DeclaredNames.of(plan)
         while True:
             self._changed.clear()
-            nodes, endpoints = self._graph.snapshot(declared=planned, names=names)
-            settling_s = self._graph.settling_s()
+            nodes, endpoints = self._discovery.snapshot(declared=planned, names=names)
+            settling_s = self._discovery.settling_s()
             if settling_s <= 0:
                 break
             await set_within(self._changed, settling_s)
-        self._forget_the_gone(node.full_name for node in nodes)
-        present = {node.full_name for node in nodes} - set(self._configurations)
+        self._show(nodes, endpoints)
+        given = self.state.given
         judged = {
             node.full_name: frozenset(each.name for each in node.expected_parameters)
             for node in plan.nodes
-            if node.expected_parameters and node.full_name in present
+            if node.expected_parameters and node.full_name in self._seen - given.keys()
         }
         self._parameters.listen(judged)
+        answers = await self._ask_all(plan, nodes, planned, given)
+        asked = {name: configuration for name, (_, configuration) in answers.items()}
+        self._checksums = {name: each.checksum for name, each in asked.items() if each is not None}
+        reporting = {
+            name
+            for name, each in {**self.state.given, **asked}.items()
+            if each is not None and each.parameters is not None
+        }
+        if await self._parameters.follow(sorted(judged.keys() - reporting), reporting=reporting):
+            return await self.observe(plan)  # each node is waited for once
+        self.state.put_look(
+            Look(
+                nodes=nodes,
+                endpoints=endpoints,
+                answers=answers,
+                parameters=self._parameters.latest,
+            )
+        )
+        if not self._follows:
+            # Else readings bring it, which put messages that come meanwhile on top of the answer.
+            for configuration in asked.values():
+                if configuration is not None:
+                    self.state.learn(configuration)
+        return self.state.observation()
+
+    async def wait_change(self) -> None:
+        """Wait until a burst of changes has passed, if any came since this or `observe` was called.
+
+        Discovery, a transition or a parameter of a node that is asked, or a message of one that
+        changed makes a change; a configuration that is put into the state makes none.
+        """
+        loop = self._bind()
+        await self._changed.wait()
+        end = loop.time() + self._burst_s
+        while (left_s := end - loop.time()) > 0:
+            self._changed.clear()
+            if not await set_within(self._changed, min(self._quiet_s, left_s)):
+                break
+        self._changed.clear()
+
+    def close(self) -> None:
+        """Look no more; again is harmless."""
+        self._closed = True
+        self._remove()
+        self.state.close()
+        if self._due is not None:
+            self._due()
+        self._parameters.close()
+
+    async def _ask_all(
+        self,
+        plan: Plan,
+        nodes: Iterable[ObservedNode],
+        planned: Collection[str],
+        given: Collection[str],
+    ) -> dict[str, Answer]:
         answers = dict(
             await asyncio.gather(
                 *(
                     self._ask(node)
                     for node in nodes
-                    if node.full_name in planned and node.full_name not in self._configurations
+                    if node.full_name in planned and node.full_name not in given
                 )
             )
         )
@@ -178,92 +278,26 @@ class Observer:
                     )
                 )
             )
-        told = {name: configuration for name, (_, configuration) in answers.items()}
-        self._checksums = {name: each.checksum for name, each in told.items() if each is not None}
-        configurations = {**self._configurations, **told}
-        reporting = {name for name, each in configurations.items() if _reports_parameters(each)}
-        if await self._parameters.follow(sorted(judged.keys() - reporting), reporting=reporting):
-            return await self.observe(plan)  # each node is waited for once
-        return Observation(
-            nodes=tuple(
-                dataclasses.replace(
-                    node, state=_state(node.full_name, answers, self._configurations)
-                )
-                for node in nodes
-            ),
-            endpoints=endpoints,
-            configurations=tuple(each for each in configurations.values() if each is not None),
-            parameters=self._parameters.latest,
-        )
+        return answers
 
-    def hear(self, node: str, checksum: str = "") -> None:
-        """Take word, from any thread, that a node has changed: it is worth another look.
-
-        Args:
-            node: fully qualified; one whose configuration is put here tells us by itself.
-            checksum: of its configuration, from a heartbeat: it has changed only if that is new.
-        """
-        if node in self._configurations or (checksum and self._checksums.get(node) == checksum):
-            return
-        self._wake()
-
-    async def wait_change(self) -> None:
-        """Wait until a burst of changes has passed, if any came since this or `observe` was called.
-
-        Discovery, or a transition of a node that is asked, makes a change; a configuration that
-        is put here makes none.
-        """
-        loop = self._bind()
-        await self._changed.wait()
-        end = loop.time() + self._burst_s
-        while (left_s := end - loop.time()) > 0:
-            self._changed.clear()
-            if not await set_within(self._changed, min(self._quiet_s, left_s)):
-                break
-        self._changed.clear()
-
-    def put_configuration(self, configuration: NodeConfiguration) -> None:
-        """Give what a node reported over its control channel; it is not asked again.
-
-        It stands until a newer one is put, the node leaves the graph or it is dropped.
-        """
-        self._configurations[configuration.name] = configuration
-
-    def drop_configuration(self, node: str) -> None:
-        """Forget what `node` (fully qualified) reported, because its process ended."""
-        self._configurations.pop(node, None)
-
-    def destroy(self) -> None:
-        """Leave the graph."""
-        self._remove()
-        self._parameters.close()
-        self._clients.destroy()
-        self._graph.destroy()
-
-    def __enter__(self) -> Observer:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.destroy()
-
-    async def _ask(self, node: ObservedNode) -> tuple[str, _Answer]:
+    async def _ask(self, node: ObservedNode) -> tuple[str, Answer]:
         name = node.full_name
         self._asked.add(name)
         if not node.managed:
             return name, (None, await self._ask_configuration(name))
-        self._clients.on_transition(name, self._wake)
+        self._follow_transitions(name)
         state, configuration = await asyncio.gather(
             self._ask_state(name), self._ask_configuration(name)
         )
         return name, (state, configuration)
 
-    async def _ask_guest(self, node: ObservedNode) -> tuple[str, _Answer]:
+    async def _ask_guest(self, node: ObservedNode) -> tuple[str, Answer]:
         name = node.full_name
         configuration = await self._ask_configuration(name)
         if configuration is None:
             return name, (None, None)
         self._asked.add(name)
-        self._clients.on_transition(name, self._wake)
+        self._follow_transitions(name)
         return name, (configuration.state, configuration)
 
     async def _ask_state(self, name: str) -> str | None:
@@ -273,52 +307,168 @@ class Observer:
             _logger.info("state of %s unknown: %s", name, error)
             return None
 
-    async def _ask_configuration(self, name: str) -> NodeConfiguration | None:
+    async def _ask_configuration(
+        self, name: str, *, timeout_s: float = _ASK_S, expected: bool = False
+    ) -> NodeConfiguration | None:
         try:
-            return await self._clients.get_configuration(name, timeout_s=_ASK_S)
+            return await self._clients.get_configuration(
+                name, timeout_s=timeout_s, expected=expected
+            )
         except MiddlewareError as error:
             _logger.info("configuration of %s unknown: %s", name, error)
             return None
 
-    def _forget_the_gone(self, names: Iterable[str]) -> None:
-        """Drop what is held for nodes that were in the graph and are not any more."""
-        present = frozenset(names)
-        for name in self._seen - present:
-            self._configurations.pop(name, None)
-            self._parameters.forget(name)
-            if name in self._asked:
-                self._asked.discard(name)
-                self._clients.forget(name)
+    def _follow_transitions(self, name: str) -> None:
+        self._clients.on_transition(name, functools.partial(self._moved, name))
+
+    # -- what happened, from any thread
+
+    def _discovery_changed(self) -> None:
+        self._wake()
+        if self._follows:
+            self._events.scheduler.post(self._follow_soon)
+
+    def _moved(self, name: str) -> None:
+        self._wake()
+        if self._follows:
+            self.state.reread(name)
+
+    def _wake(self) -> None:
+        # Before the first use there is no loop, and nobody who waits.
+        if self._loop is not None:
+            with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
+                self._loop.call_soon_threadsafe(self._note)
+
+    # -- what happens in the scheduler
+
+    def _note(self) -> None:
+        self.changes += 1
+        self._changed.set()
+
+    def _message_came(self, message: GraphMessage) -> None:
+        """Take it as a change, unless it says of a node only what is known of it.
+
+        A node whose configuration is put into the state reports its changes that way; a heartbeat
+        is one if its checksum is new.
+        """
+        name = message.node
+        checksum = message.checksum if isinstance(message, Heartbeat) else ""
+        known = checksum and self._checksums.get(name) == checksum
+        if self._loop is not None and not known and name not in self.state.given:
+            self._note()
+
+    def _follow_soon(self) -> None:
+        if self._due is None and not self._closed:
+            scheduler = self._events.scheduler
+            self._due = scheduler.call_at(scheduler.now_s() + _TOGETHER_S, self._follow)
+            self.state.retry()
+
+    def _follow(self) -> None:
+        """Compare who is there with who was."""
+        self._due = None
+        if not self._closed:
+            self._show(*self._discovery.snapshot())
+
+    def _show(self, nodes: Collection[ObservedNode], endpoints: Iterable[ObservedEndpoint]) -> None:
+        """Have nodes join that discovery shows, and forget those that it shows no more."""
+        present = frozenset(node.full_name for node in nodes)
+        reporting = {each.node for each in self._events.members() if each.incarnation}
+        for name in sorted(self._seen - present):
+            self._forget(name)
+        for name in sorted(present - self._seen - reporting):
+            if _counts(name):
+                self._events.report_seen(name)
         self._seen = present
+        by_node: dict[str, list[ObservedEndpoint]] = {}
+        for endpoint in endpoints:
+            by_node.setdefault(endpoint.node, []).append(endpoint)
+        hidden = sorted(name for name in present if name.rpartition("/")[2].startswith("_"))
+        given = self.state.given
+        for node in nodes:
+            name = node.full_name
+            if name in reporting or name in given or not _counts(name):
+                self._shown.pop(name, None)
+                continue
+            space, _, base = name.rpartition("/")
+            own = f"{space}/_{base}_"
+            shown = _Shown(
+                managed=bool(node.managed),
+                serves=self._follows and self._discovery.offers(name, f"{name}/get_configuration"),
+                endpoints=tuple(by_node.get(name, ())),
+                beside=tuple(
+                    (each, tuple(by_node.get(each, ()))) for each in hidden if each.startswith(own)
+                ),
+            )
+            if self._shown.get(name) != shown:
+                self._shown[name] = shown
+                self.state.reread(name)
+
+    def _forget(self, name: str) -> None:
+        """Drop what is held for a node that was in the graph and is not any more."""
+        self._shown.pop(name, None)
+        self._parameters.forget(name)
+        self.state.drop_configuration(name, "discovery does not show it any more")
+        if name in self._asked:
+            self._asked.discard(name)
+            self._clients.forget(name)
+
+    # -- configurations for the state
+
+    def _read(self, name: str, done: Callable[[NodeConfiguration | None], None]) -> None:
+        """Give the configuration of a node: its own if it serves one, else what is seen of it."""
+        if not self._follows:
+            done(self.state.given.get(name) or self._seen_configuration(name, ""))
+        elif not self._closed:
+            reading = asyncio.ensure_future(self._answer(name, done))
+            self._readings.add(reading)
+            reading.add_done_callback(self._readings.discard)
+
+    async def _answer(self, name: str, done: Callable[[NodeConfiguration | None], None]) -> None:
+        # Who sends messages serves one, even if the next look has yet to show it.
+        reports = self._events.reports(name)
+        shown = self._shown.get(name)
+        self._asked.add(name)
+        if shown is not None and shown.managed:
+            self._follow_transitions(name)
+        configuration = None
+        if reports or shown is None or shown.serves:
+            configuration = await self._ask_configuration(
+                name, timeout_s=_READ_S, expected=reports or shown is not None
+            )
+        elif shown.managed:
+            configuration = self._seen_configuration(name, await self._ask_state(name) or "")
+        else:
+            configuration = self._seen_configuration(name, "")
+        done(configuration or self.state.given.get(name))
+
+    def _seen_configuration(self, name: str, state: str) -> NodeConfiguration | None:
+        shown = self._shown.get(name)
+        if shown is None:
+            return None
+        return NodeConfiguration(
+            identity=Identity(machine_id="", process_id=0, node_id=""),
+            name=name,
+            state=state,
+            connected=True,
+            rmw="",
+            transports=(),
+            serializations=(),
+            paradigms=(),
+            endpoints=tuple(
+                EndpointReport(
+                    kind=each.kind, name="", resolved=each.name, type=each.type, mapped=True
+                )
+                for each in shown.endpoints
+            ),
+        )
 
     def _bind(self) -> asyncio.AbstractEventLoop:
         if self._loop is None:
             self._loop = asyncio.get_running_loop()
         return self._loop
 
-    def _wake(self) -> None:
-        # Any thread. Before the first use there is no loop, and nobody who waits.
-        if self._loop is not None:
-            with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
-                self._loop.call_soon_threadsafe(self._note)
 
-    def _note(self) -> None:
-        self._count += 1
-        self._changed.set()
-
-
-def _reports_parameters(configuration: NodeConfiguration | None) -> bool:
-    return configuration is not None and configuration.parameters is not None
-
-
-_Answer = tuple[str | None, NodeConfiguration | None]
-
-
-def _state(
-    name: str,
-    answers: dict[str, _Answer],
-    put: dict[str, NodeConfiguration],
-) -> str | None:
-    if name in put:
-        return put[name].state
-    return answers[name][0] if name in answers else None
+def _counts(name: str) -> bool:
+    """Tell whether a node is part of a system: no tool's, no hidden one, and its name is known."""
+    hidden = name.rpartition("/")[2].startswith("_")
+    return bool(known_node(name)) and not hidden and not is_noise_node(name)

@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection, Mapping
 from typing import Protocol
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.graph.waiting import set_within
+from lifecycle.graph.scheduler import set_within
 from lifecycle.verify.observation import NodeParameters, ParameterReport
 
 _logger = logging.getLogger(__name__)
@@ -42,7 +42,7 @@ class Clients(Protocol):
     """Nodes' parameter services, see lifecycle.middleware.NodeClients."""
 
     def serves_parameters(self, node: str) -> bool | None:
-        """Tell whether a node has them; None while discovery may not show them yet."""
+        """Return whether a node has them; None while discovery may not show them yet."""
 
     async def report_parameters(
         self, node: str, names: Collection[str], *, timeout_s: float
@@ -218,7 +218,7 @@ class _Node:
             self._clients.report_parameters(self._name, self.names, timeout_s=limit_s)
         )
         try:
-            # Not wait_for, see waiting.py.
+            # Not wait_for, see set_within.
             await asyncio.wait({asking}, timeout=limit_s)
             if asking.done():
                 return asking.result()

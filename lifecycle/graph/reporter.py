@@ -1,4 +1,4 @@
-"""The sending side of one node: what it tells the graph about itself.
+"""The sending side of one node: what it reports of itself to the graph.
 
 Owns: a node's incarnation, its sequence numbers, and what its heartbeats repeat. Imports no ROS:
 the transport and the timer are given.
@@ -30,12 +30,13 @@ from lifecycle.graph.messages import (
     encode,
     new_incarnation,
 )
-from lifecycle.graph.transport import GraphTransport, Remove
+from lifecycle.graph.scheduler import Remove
+from lifecycle.graph.transport import GraphTransport
 
 _logger = logging.getLogger(__name__)
 
 HEARTBEAT_PERIOD_S = 2.0
-"""Heartbeats repair what was lost; whoever must notice a death sooner has other means."""
+"""Heartbeats repair what was lost; what must notice a death sooner has other means."""
 
 
 class Every(Protocol):
@@ -47,7 +48,7 @@ class Every(Protocol):
 
 @typing.final
 class GraphReporter:
-    """Tells the graph what becomes of one node instance. Every method: any thread.
+    """Reports to the graph what becomes of one node instance. Every method: any thread.
 
     Before `joined` and after `left` nothing is sent, but states and checksums are kept. A message
     that the transport does not take is logged, never raised: a node works without the graph.
@@ -108,46 +109,46 @@ class GraphReporter:
                     self._transport.on_peer(self.announce),
                     self._every(self._period_s, self.announce),
                 )
-            self._tell(Joined, state=state, connected=connected, checksum=checksum)
+            self._report(Joined, state=state, connected=connected, checksum=checksum)
 
     def left(self, reason: str = "") -> None:
         """Say farewell and stop the heartbeats; again is harmless."""
         with self._lock:
-            self._tell(Left, reason=reason)
+            self._report(Left, reason=reason)
             self._left = True
             for stop in self._stop:
                 stop()
             self._stop = ()
 
     def state_changed(self, state: str, *, connected: bool) -> None:
-        """Tell the lifecycle state and whether the data layer is made; nothing if both are told."""
+        """Report the state and whether the data layer is made; nothing if both are known."""
         with self._lock:
             if (state, connected) == (self._state, self._connected):
                 return
             self._state, self._connected = state, connected
-            self._tell(StateChanged, state=state, connected=connected)
+            self._report(StateChanged, state=state, connected=connected)
 
     def configuration_changed(self, checksum: str) -> None:
-        """Tell that the node configuration is to be read again; nothing if the checksum is told."""
+        """Report that the configuration is to be read again; nothing if the checksum is known."""
         with self._lock:
             if checksum == self._checksum:
                 return
             self._checksum = checksum
-            self._tell(ConfigurationChanged, checksum=checksum)
+            self._report(ConfigurationChanged, checksum=checksum)
 
     def connection_established(self, connection: str, urls: Sequence[str] = ()) -> None:
-        """Tell that a connection works; `connection` is empty for the node's own participant."""
-        self._tell(ConnectionEstablished, connection=connection, urls=tuple(urls))
+        """Report that a connection works; `connection` is empty for the node's own participant."""
+        self._report(ConnectionEstablished, connection=connection, urls=tuple(urls))
 
     def connection_lost(self, connection: str, urls: Sequence[str] = (), error: str = "") -> None:
-        """Tell that a connection was unmade (no error) or that it no longer works."""
-        self._tell(ConnectionLost, connection=connection, urls=tuple(urls), error=error)
+        """Report that a connection was unmade (no error) or that it no longer works."""
+        self._report(ConnectionLost, connection=connection, urls=tuple(urls), error=error)
 
     def mapping_established(
         self, endpoint: str, connection: str = "", *, matched: int | None = None
     ) -> None:
-        """Tell that an endpoint (`publishers/video`) is on a connection, or matched a peer more."""
-        self._tell(MappingEstablished, endpoint=endpoint, connection=connection, matched=matched)
+        """Report that an endpoint (`publishers/video`) is on a connection, or matched one more."""
+        self._report(MappingEstablished, endpoint=endpoint, connection=connection, matched=matched)
 
     def mapping_lost(
         self,
@@ -157,7 +158,7 @@ class GraphReporter:
         matched: int | None = None,
         error: str = "",
     ) -> None:
-        """Tell that an endpoint was taken off a connection, or lost a matched peer.
+        """Report that an endpoint was taken off a connection, or lost a matched peer.
 
         Args:
             endpoint: `publishers/video`.
@@ -165,23 +166,23 @@ class GraphReporter:
             matched: None if it was taken off; else how many peers it has left.
             error: why; empty if that was asked for.
         """
-        self._tell(
+        self._report(
             MappingLost, endpoint=endpoint, connection=connection, matched=matched, error=error
         )
 
     def silent(self, about: str, reason: str = "") -> None:
-        """Tell everybody that nothing is heard of another node (fully qualified) any more.
+        """Report to all that another node (fully qualified) is silent.
 
         The heartbeats repeat it until `alive`.
         """
         self._notice(SilentNotice, about, reason)
 
     def stuck(self, about: str, reason: str = "") -> None:
-        """Tell everybody that another node is there and does not do its work."""
+        """Report to all that another node is there and does not do its work."""
         self._notice(StuckNotice, about, reason)
 
     def alive(self, about: str, reason: str = "") -> None:
-        """Take back what `silent` or `stuck` told of another node."""
+        """Take back what `silent` or `stuck` reported of another node."""
         self._notice(AliveNotice, about, reason)
 
     def announce(self) -> None:
@@ -212,12 +213,12 @@ class GraphReporter:
                 self._notices.pop(about, None)
             else:
                 self._notices[about] = type_
-            self._tell(type_, about=about, reason=reason)
+            self._report(type_, about=about, reason=reason)
 
     def _noticed(self, type_: type[GraphMessage]) -> tuple[str, ...]:
         return tuple(about for about, kind in self._notices.items() if kind is type_)
 
-    def _tell(self, type_: type[GraphMessage], **fields: Any) -> None:
+    def _report(self, type_: type[GraphMessage], **fields: Any) -> None:
         # Under the lock until it is sent: what leaves first has the lower number.
         with self._lock:
             if not self.is_member:

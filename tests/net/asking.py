@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import sys
 
-from lifecycle.graph.waiting import set_within
+from lifecycle.graph import set_within
 from lifecycle.middleware import GraphObserver, NodeClients
 from lifecycle.plan.model import ParticipantConnections
 

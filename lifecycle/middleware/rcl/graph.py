@@ -13,6 +13,9 @@ import time
 import typing
 from collections.abc import Callable, Collection, Iterable, Iterator
 
+import rclpy
+from rclpy.node import Node
+
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.middleware.discovery.dead_peers import (
     PROCESS_DIGITS,
@@ -23,7 +26,7 @@ from lifecycle.middleware.discovery.dead_peers import (
 )
 from lifecycle.middleware.discovery.probe import knock_for
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
-from lifecycle.middleware.rcl.graph_guard import GraphGuard
+from lifecycle.middleware.rcl.graph_changes import GraphGuard, on_graph_change
 from lifecycle.middleware.rcl.graph_queries import endpoints_of, endpoints_of_node, topic_endpoints
 from lifecycle.middleware.rcl.hidden_node import quiet_node
 from lifecycle.middleware.rcl.stale_node_filter import StaleNodeFilter
@@ -41,13 +44,13 @@ from lifecycle.verify.noise import (
 from lifecycle.verify.observation import ObservedEndpoint, ObservedNode
 
 ANSWER_S = 0.15
-"""Who hears a knock on this host or the next one answers within so long."""
+"""A participant that a probe reaches, on this host or the next one, answers within so long."""
 
 PATIENCE_S = 3.5
 """What Fast DDS lost on the way it sends again every 3 s."""
 
 _UNASKED_S = 1.5
-"""Within so long everybody is seen where nobody can be asked, over shared memory or TCP.
+"""Within so long all are seen where none can be asked, over shared memory or TCP.
 
 They announce themselves each 0.5 s, and TCP may lose the first of it (measured: up to 1.2 s).
 """
@@ -56,7 +59,7 @@ _UNCOUNTED_S = 0.6
 """Within so long who is asked is seen, if its answer may not come to us (measured: up to 0.3 s)."""
 
 _TOLD_S = 2.5
-"""Within so long a discovery server has told of everybody (measured: up to 1.6 s)."""
+"""Within so long a discovery server has announced all (measured: up to 1.6 s)."""
 
 _AGREED_S = 5.0
 """A server that listens agrees within 0.1 s, on a machine with both processors busy within 1 s."""
@@ -71,44 +74,75 @@ Snapshot = tuple[tuple[ObservedNode, ...], tuple[ObservedEndpoint, ...]]
 
 @typing.final
 class GraphObserver:
-    """A hidden node that sees the whole graph of one domain.
+    """What discovery shows of the graph of one domain, to a hidden node of its own.
 
     Make it before starting what it is to see: a participant that is there already is found at
     once. `destroy` it, or use it in a `with`. Every method may be called from any thread.
+    `GraphObserver.on` looks through a node that is there already.
 
     Args:
         domain_id: 0–232.
         connections: how it is connected; as a client of a discovery server it is a super client,
-            which is told of everything.
+            to which everything is announced.
+        node: looked through instead of a hidden one, see `on`.
 
     Attributes:
         urls: of its connections; none where the RMW chooses.
+        owns_node: the node is its own, and nobody else spins or destroys it.
 
     Raises:
         ConnectionUrlError: a URL that is none.
         MiddlewareError: no participant could be made.
     """
 
-    def __init__(self, domain_id: int, connections: ParticipantConnections | None = None) -> None:
+    def __init__(
+        self,
+        domain_id: int,
+        connections: ParticipantConnections | None = None,
+        *,
+        node: Node | None = None,
+    ) -> None:
         self.domain_id = domain_id
         settings = ParticipantSettings.of(
             connections or ParticipantConnections(), super_client=True
         )
-        self._context, self.node = quiet_node(
-            f"_lifecycle_observer_{os.getpid()}", "/", domain_id, settings=settings
-        )
-        self._name = self.node.get_fully_qualified_name()
         self.urls = settings.urls
-        self._stale_node_filter = StaleNodeFilter(self.node)
+        self.owns_node = node is None
         self._lock = threading.Lock()
         self._callbacks: tuple[Callable[[], None], ...] = ()
         self._destroyed = False
         self._known: frozenset[str] = frozenset()
-        self._guard = GraphGuard(self.node, self._changed)
-        self._knocks = knock_for(domain_id, settings.urls, os.environ)
         self._asked_for: set[str] = set()
-        self._limit_s = _TOLD_S if any(url.server for url in settings.urls) else _UNASKED_S
+        self._context: rclpy.Context | None = None
+        self._guard: GraphGuard | None = None
+        if node is None:
+            self._context, node = quiet_node(
+                f"_lifecycle_observer_{os.getpid()}", "/", domain_id, settings=settings
+            )
+            self._guard = GraphGuard(node, self._changed)
+            self._unwatch = self._guard.stop
+            self._knocks = knock_for(domain_id, settings.urls, os.environ)
+            self._limit_s = _TOLD_S if any(url.server for url in settings.urls) else _UNASKED_S
+        else:
+            self._unwatch = on_graph_change(node, self._changed)
+            self._knocks = ()
+            self._limit_s = PATIENCE_S
+        self.node = node
+        self._name = self.node.get_fully_qualified_name()
+        self._stale_node_filter = StaleNodeFilter(self.node)
         self._made_s = time.monotonic()
+
+    @classmethod
+    def on(cls, node: Node) -> GraphObserver:
+        """Look through a node that others spin, and destroy after this.
+
+        How its participant is connected is not known here, so that nobody can be asked to announce
+        itself: for the first 3.5 s a look may miss who is there (`settling_s`).
+
+        Raises:
+            MiddlewareError: rcl's graph guard condition could not be waited on.
+        """
+        return cls(node.context.get_domain_id(), node=node)
 
     def on_change(self, callback: Callable[[], None]) -> Callable[[], None]:
         """Have `callback` called in the guard's thread after each change of the graph.
@@ -133,8 +167,8 @@ class GraphObserver:
     ) -> Snapshot:
         """Return the nodes and the endpoints that discovery shows now, in a stable order.
 
-        All but ourselves. The housekeeping of client libraries is left out. Services are known by
-        their nodes, so those of nobody known are looked for by name.
+        All but its own node. The housekeeping of client libraries is left out. Services are known
+        by their nodes, so those of nobody known are looked for by name.
 
         Args:
             declared: fully qualified names of nodes that are looked for.
@@ -144,11 +178,11 @@ class GraphObserver:
         Raises:
             MiddlewareError: the graph is no longer watched; the message says why.
         """
-        if self._guard.failure is not None:
+        if self._guard is not None and self._guard.failure is not None:
             raise self._guard.failure
         self._known = frozenset()
         counts = self._stale_node_filter.count()
-        ourselves = {} if counts[self._name] > 1 else {self._name}
+        ourselves = {self._name} if self.owns_node and counts[self._name] == 1 else ()
         endpoints = [
             each for each in self._topic_endpoints(declared, names) if each.node not in ourselves
         ]
@@ -220,7 +254,7 @@ class GraphObserver:
             while not (used := is_used(address, port)):
                 if used is False or time.monotonic() > deadline:
                     return False
-                time.sleep(_LOOK_S)  # the kernel tells nobody
+                time.sleep(_LOOK_S)  # the kernel gives no event
         return True
 
     def participants_of(
@@ -248,9 +282,9 @@ class GraphObserver:
         )
 
     def remove_participants(self, prefixes: Iterable[str], pids: Iterable[int]) -> None:
-        """Have everybody forget participants whose process is known to be dead.
+        """Have all participants forget participants whose process is known to be dead.
 
-        Others are told over UDP only, see `discovery/dead_participants.py`; here they do
+        Others learn of it over UDP only, see `discovery/dead_participants.py`; here they do
         not count any more, whatever discovery shows until their lease has run out.
 
         Args:
@@ -268,11 +302,12 @@ class GraphObserver:
         self._destroyed = True
         for knock in self._knocks:
             knock.close()
-        self._guard.stop()
-        give_up_dead_connections()
-        self.node.destroy_node()
-        self._context.try_shutdown()
-        self._context.destroy()
+        self._unwatch()
+        if self._context is not None:
+            give_up_dead_connections()
+            self.node.destroy_node()
+            self._context.try_shutdown()
+            self._context.destroy()
 
     def __enter__(self) -> GraphObserver:
         return self
@@ -309,10 +344,10 @@ class GraphObserver:
     def _services_of_others(
         self, names: DeclaredNames, untold: Collection[str]
     ) -> Iterator[ObservedEndpoint]:
-        """Yield who offers or asks for declared services and is a node of which rcl does not tell.
+        """Yield who offers or asks for declared services and is a node that rcl does not show.
 
         A node that is about to be known has them too; a plain DDS program never is one, and no rcl
-        tells of a node whose name it would not give.
+        shows a node whose name it would not give.
         """
         services = [
             *names.of_kind(EndpointKind.SERVICE_SERVER),
@@ -364,7 +399,7 @@ class GraphObserver:
             yield dataclasses.replace(endpoint, address=known.get(prefix, ""))
 
     def _services(self, full_name: str) -> tuple[ObservedEndpoint, ...] | None:
-        """Return the service endpoints of a node; None if rcl does not tell them."""
+        """Return the service endpoints of a node; None if rcl does not show them."""
         found: list[ObservedEndpoint] = []
         for kind in (EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT):
             listed = endpoints_of_node(self.node, kind, full_name)

@@ -1,4 +1,4 @@
-r"""What rclpy's graph queries tell, of any name that a DDS participant may choose.
+r"""What rclpy's graph queries return, of any name that a DDS participant may choose.
 
 Owns: the questions of who is in the graph, asked of rcl and rmw as C has them. rclpy's own raise
 as soon as one name is outside ROS's alphabet: a topic that cannot be expanded (ValueError), a name

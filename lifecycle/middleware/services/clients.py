@@ -147,9 +147,14 @@ class NodeClients:
             reply.cancel()
 
     async def get_configuration(
-        self, node: str, *, timeout_s: float = TIMEOUT_S
+        self, node: str, *, timeout_s: float = TIMEOUT_S, expected: bool = False
     ) -> NodeConfiguration | None:
         """Read the node configuration interface of `node`.
+
+        Args:
+            node: fully qualified name.
+            timeout_s: seconds, > 0.
+            expected: the node has one, so that it is waited for if discovery does not show it yet.
 
         Returns:
             None where discovery shows no such interface on the node.
@@ -159,7 +164,7 @@ class NodeClients:
             MiddlewareError: the node could not give it, or it is not what the schema says.
         """
         service = f"{node}/get_configuration"
-        if not self._observer.offers(node, service):
+        if not expected and not self._observer.offers(node, service):
             return None
         response = await self._calls.call(
             service, Trigger, Trigger.Request(), timeout_s=timeout_s, repeat=True
@@ -199,7 +204,7 @@ class NodeClients:
     def serves_parameters(self, node: str) -> bool | None:
         """Tell whether `node` has parameter services; None while discovery may not show them yet.
 
-        Client libraries make them before the type description service, and discovery tells of one
+        Client libraries make them before the type description service, and discovery shows one
         participant's services in order: where it shows the latter alone, there are none.
         """
         offered = self._observer.services_of(node)
@@ -210,7 +215,7 @@ class NodeClients:
     def on_parameters(self, callback: Callable[[str, frozenset[str]], None]) -> None:
         """Have `callback` called in the executor thread with each change of any node's parameters.
 
-        It is given the node's full name and the names of the parameters. Once: whoever asks again
+        It is given the node's full name and the names of the parameters. Once: asking again
         changes nothing.
         """
         if self._parameter_events is None:
@@ -224,7 +229,11 @@ class NodeClients:
                 callback(event.node, frozenset(each.name for each in changed))
 
             self._parameter_events = self._observer.node.create_subscription(
-                ParameterEvent, "/parameter_events", arrived, qos_profile_parameter_events
+                ParameterEvent,
+                "/parameter_events",
+                arrived,
+                qos_profile_parameter_events,
+                callback_group=self._calls.group,
             )
 
     async def connect_to(
@@ -242,41 +251,41 @@ class NodeClients:
             ServiceUnansweredError: no such service, or no answer; all of these.
             MiddlewareError: the node refused, with its reason; all of these.
         """
-        await self._tell(node, "connect_to", name, tuple(urls), timeout_s)
+        await self._set(node, "connect_to", name, tuple(urls), timeout_s)
 
     async def map_to(
         self, node: str, endpoint: str, connection: str, *, timeout_s: float = TIMEOUT_S
     ) -> None:
         """Have a node carry an endpoint, `publishers/video`, by a connection; "" is its own."""
-        await self._tell(node, "map_to", endpoint, connection, timeout_s)
+        await self._set(node, "map_to", endpoint, connection, timeout_s)
 
     async def disconnect(self, node: str, connection: str, *, timeout_s: float = TIMEOUT_S) -> None:
         """Have a node unmake a connection."""
-        await self._tell(node, "disconnect", connection, "", timeout_s)
+        await self._set(node, "disconnect", connection, "", timeout_s)
 
     async def remap(
         self, node: str, endpoint: str, name: str, *, timeout_s: float = TIMEOUT_S
     ) -> None:
         """Have a node give an endpoint another topic or service name."""
-        await self._tell(node, "remap", endpoint, name, timeout_s)
+        await self._set(node, "remap", endpoint, name, timeout_s)
 
     async def alias(
         self, node: str, endpoint: str, names: Sequence[str], *, timeout_s: float = TIMEOUT_S
     ) -> None:
         """Have a node give an endpoint these further names, and no others."""
-        await self._tell(node, "alias", endpoint, tuple(names), timeout_s)
+        await self._set(node, "alias", endpoint, tuple(names), timeout_s)
 
-    async def _tell(
+    async def _set(
         self, node: str, operation: str, name: str, value: str | tuple[str, ...], timeout_s: float
     ) -> None:
         """Call one of the services that take a name and a value, and say why if it is refused."""
         if isinstance(value, str):
-            told = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=value)
+            given = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=value)
         else:
-            told = ParameterValue(
+            given = ParameterValue(
                 type=ParameterType.PARAMETER_STRING_ARRAY, string_array_value=list(value)
             )
-        request = SetParameters.Request(parameters=[Parameter(name=name, value=told)])
+        request = SetParameters.Request(parameters=[Parameter(name=name, value=given)])
         # Each of them makes the same state again when it arrives twice.
         response = await self._calls.call(
             f"{node}/{operation}", SetParameters, request, timeout_s=timeout_s, repeat=True
@@ -292,13 +301,17 @@ class NodeClients:
             )
 
     def on_transition(self, node: str, callback: Callable[[], None]) -> None:
-        """Have `callback` called in the executor thread when `node` tells of a transition.
+        """Have `callback` called in the executor thread after each transition of `node`.
 
         One callback per node, until `forget`; asking again for the same node changes nothing.
         """
         if node not in self._transitions:
             self._transitions[node] = self._observer.node.create_subscription(
-                TransitionEvent, f"{node}/transition_event", lambda _: callback(), _EVENT_DEPTH
+                TransitionEvent,
+                f"{node}/transition_event",
+                lambda _: callback(),
+                _EVENT_DEPTH,
+                callback_group=self._calls.group,
             )
 
     def forget(self, node: str) -> None:

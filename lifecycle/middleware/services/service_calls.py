@@ -1,29 +1,36 @@
 """Calling ROS services from asyncio.
 
-Owns: one executor thread on the observer's node, the bridge from rclpy's futures to asyncio's, and
-the rule for requests that stay unanswered. rmw_fastrtps drops a reply when the client's reader is
-not matched yet, so a request that may be repeated is repeated until its deadline.
+Owns: one executor thread on the observer's node where that is its own, the bridge from rclpy's
+futures to asyncio's, and the rule for requests that stay unanswered. rmw_fastrtps drops a reply
+when the client's reader is not matched yet, so a request that may be repeated is repeated until its
+deadline.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
+import threading
 from collections.abc import Awaitable, Callable
 from typing import Any
 
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.client import Client
+from rclpy.executors import ExternalShutdownException, ShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
 from rclpy.task import Future
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.rcl.graph import GraphObserver
-from lifecycle.middleware.rcl.hidden_node import Spinner
+
+_logger = logging.getLogger(__name__)
 
 _FIRST_ATTEMPT_S = 0.1
 """So long a server of rmw_fastrtps waits for the client's reader before it drops its reply."""
 _LONGEST_ATTEMPT_S = 2.0
 _MATCH_CHECK_S = 0.02
-"""Discovery tells of a service a moment before the client is matched with it, and only once."""
+"""Discovery shows a service a moment before the client is matched with it, and only once."""
 _UNMATCHED_S = 0.5
 """So long a service that is in the graph may keep its client unmatched before it is asked anyway.
 
@@ -52,12 +59,19 @@ class ServiceCalls:
     """Calls services on the observer's node; the participant is the observer's.
 
     Must be used from one asyncio loop; `destroy` it before the observer.
+
+    Attributes:
+        group: reentrant, for all that is made on the node: on a node that others spin, replies
+            must come while one of its callbacks waits.
     """
 
     def __init__(self, observer: GraphObserver) -> None:
         self._observer = observer
         self._clients: dict[tuple[str, type[Any]], Client] = {}
-        self._spinner = Spinner(observer.node, thread="service-calls")
+        self.group = ReentrantCallbackGroup()
+        self._spinner: _Spinner | None = None
+        if observer.owns_node:
+            self._spinner = _Spinner(observer.node, thread="service-calls")
 
     async def call(
         self,
@@ -125,13 +139,14 @@ class ServiceCalls:
 
     def destroy(self) -> None:
         """Stop the thread and drop the clients; again is harmless."""
-        self._spinner.stop()
+        if self._spinner is not None:
+            self._spinner.stop()
         self.forget("")
 
     def _client(self, service: str, type_: type[Any]) -> Client:
         client = self._clients.get((service, type_))
         if client is None:
-            client = self._observer.node.create_client(type_, service)
+            client = self._observer.node.create_client(type_, service, callback_group=self.group)
             self._clients[service, type_] = client
         return client
 
@@ -176,6 +191,33 @@ class ServiceCalls:
         finally:
             remove()
         return True
+
+
+class _Spinner:
+    """Spins one node in a thread, from now until `stop` or the end of its context.
+
+    Args:
+        node: an observer's own.
+        thread: its name.
+    """
+
+    def __init__(self, node: Node, *, thread: str) -> None:
+        # Never EventsExecutor: on Jazzy's wheels it spins at full load and loses every call.
+        self._executor = SingleThreadedExecutor(context=node.context)
+        self._executor.add_node(node)
+        self._thread = threading.Thread(target=self._spin, name=thread, daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the thread; again is harmless."""
+        self._executor.shutdown()
+        self._thread.join()
+
+    def _spin(self) -> None:
+        try:
+            self._executor.spin()
+        except (ExternalShutdownException, ShutdownException):
+            _logger.debug("the context was shut down")
 
 
 def _deliver(answer: asyncio.Future[Any], pending: Future) -> None:

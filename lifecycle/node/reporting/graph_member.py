@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from rclpy.node import Node
 
-from lifecycle.graph.dds import DdsTransport, steady_timer
-from lifecycle.graph.reporter import GraphReporter
+from lifecycle.graph import DdsTransport, GraphReporter, steady_timer
 from lifecycle.node.connections.connection_status import ConnectionEvent, ConnectionEventKind
 
 if TYPE_CHECKING:

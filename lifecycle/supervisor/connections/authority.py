@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Protocol
 
 from lifecycle.errors import BringUpError
-from lifecycle.graph.waiting import set_within
+from lifecycle.graph import set_within
 from lifecycle.manifest.model import Authority as AuthorityKind
 from lifecycle.manifest.model import Condition, DataLayerSource
 from lifecycle.node.host.control import Operation
@@ -86,8 +86,8 @@ CALM_S = 10.0
 class Reaching(Protocol):
     """How nodes that are not ours are reached, see eyes.ObserverParticipant."""
 
-    def hand(self, node: str) -> Hand:
-        """Return the hand on any node that has a node interface, by full name."""
+    def node_interface(self, node: str) -> Hand:
+        """Return what drives the node interface of any node that has one, by full name."""
 
 
 def authority_of(system: System, emit: Emitter, reaching: Reaching) -> Authority | None:
@@ -97,7 +97,7 @@ def authority_of(system: System, emit: Emitter, reaching: Reaching) -> Authority
         return None
     dynamic = layer.source is DataLayerSource.DYNAMIC
     source = NegotiatedSource(system.plan) if dynamic else PlannedSource(system.plan)
-    return Authority(system, source, emit, hand_of=reaching.hand)
+    return Authority(system, source, emit, hand_of=reaching.node_interface)
 
 
 class Source(Protocol):

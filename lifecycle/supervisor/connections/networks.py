@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from lifecycle.errors import LifecycleError
-from lifecycle.graph.waiting import set_within
+from lifecycle.graph import set_within
 from lifecycle.plan.model import Plan
 from lifecycle.run_directory import LEDGER_NAME, RunDirectory
 from lifecycle.supervisor.run.events import Emitter, Event, Notice, VerdictChanged

@@ -28,7 +28,7 @@ TRIES = 5
 
 
 class Seeing(Protocol):
-    """Sees the graph, see lifecycle.graph.Observer."""
+    """Sees the graph, see lifecycle.graph.Graph."""
 
     async def observe(self, plan: Plan) -> Observation:
         """Return what the graph holds now, the states of planned nodes included."""

@@ -12,7 +12,7 @@ import dataclasses
 from collections.abc import Callable, Collection, Iterator
 from typing import Protocol
 
-from lifecycle.graph.waiting import set_within
+from lifecycle.graph import set_within
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.connections import discovery_server

@@ -49,14 +49,14 @@ class Voice(Protocol):
 class Air(Protocol):
     """What carries voices, see eyes.ObserverParticipant."""
 
-    def machine_voice(self, system: str, machine: str) -> Voice:
-        """Be heard as the supervisor of a machine."""
+    def announce_machine(self, system: str, machine: str) -> Voice:
+        """Announce ourselves as the supervisor of a machine."""
 
-    def machine_ear(self, system: str, machine: str, to: Listener) -> Ear:
-        """Hear the supervisor of a machine; callbacks come from any thread."""
+    def watch_machine(self, system: str, machine: str, to: Listener) -> Ear:
+        """Watch the supervisor of a machine; callbacks come from any thread."""
 
-    def node_ear(self, node: str, to: Listener) -> Ear:
-        """Hear a node that somebody runs by itself."""
+    def watch_node(self, node: str, to: Listener) -> Ear:
+        """Watch a node that is attached."""
 
     def call_out(self, addresses: Iterable[str]) -> None:
         """Make everybody announce themselves; a few datagrams."""
@@ -129,14 +129,14 @@ class PeerSupervisors:
                 what = f"the supervisor of machine {machine!r}"
                 self._machines.append(_PeerSupervisor(what, machine, tuple(nodes)))
                 listener = self._listener(self._machines[-1])
-                self._ears.append(self._air.machine_ear(plan.system, machine, listener))
+                self._ears.append(self._air.watch_machine(plan.system, machine, listener))
         self._attached = self._attached_nodes()
         for name in self._attached:
             listener = self._listener(_PeerSupervisor(repr(name), "", (name,)))
-            self._ears.append(self._air.node_ear(name, listener))
+            self._ears.append(self._air.watch_node(name, listener))
         if remote:
             own = dict.fromkeys(node.planned.machine for node in self._system.nodes.values())
-            self._voices = [self._air.machine_voice(plan.system, each) for each in own if each]
+            self._voices = [self._air.announce_machine(plan.system, each) for each in own if each]
             self._system.liveliness.listen(self._tell)
 
     def renew(self) -> None:

@@ -1,12 +1,11 @@
-"""The supervisor's participant: its eyes on the graph and its hands on nodes that are not ours.
+"""The supervisor's participant: it observes the graph and drives nodes that are not ours.
 
-Owns: making and destroying them in the right order; rclpy is imported here, late, and nowhere else
-in this room.
+Owns: one `lifecycle.graph.Graph` and what else is on its participant; rclpy is imported here, late,
+and nowhere else in this room.
 """
 
 from __future__ import annotations
 
-import logging
 import os
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING
@@ -17,27 +16,21 @@ from lifecycle.supervisor.nodes.driver import NodeDriver, ServiceDriver, Service
 from lifecycle.verify.observation import NodeConfiguration, Observation
 
 if TYPE_CHECKING:
-    from lifecycle.graph import DdsTransport, Observer
+    from lifecycle.graph import Graph
     from lifecycle.middleware.discovery.liveliness import AlivePublisher, AliveSubscription
     from lifecycle.middleware.discovery.plan_notices import PlanNotices
-    from lifecycle.middleware.rcl.graph import GraphObserver
-    from lifecycle.middleware.services.clients import NodeClients
-
-_logger = logging.getLogger(__name__)
 
 _QUIET_S = 0.005
 _BURST_S = 0.05
-"""Shorter than an observer's own: bring-up is a race, and a look costs a few milliseconds."""
+"""Shorter than a graph's own: bring-up is a race, and a look costs a few milliseconds."""
 
 
 class ObserverParticipant:
-    """What a supervisor sees and reaches of one domain. `destroy` it, or use it in a `with`."""
+    """What a supervisor observes and reaches of one domain. `destroy` it, or use it in a `with`."""
 
-    def __init__(self, observer: Observer, clients: NodeClients, graph: GraphObserver) -> None:
-        self._observer = observer
-        self._clients = clients
+    def __init__(self, graph: Graph) -> None:
         self._graph = graph
-        self._transport: DdsTransport | None = None
+        self._node = graph.discovery.node
 
     @classmethod
     def open(
@@ -54,21 +47,23 @@ class ObserverParticipant:
             domain_id: 0–232.
             connections: how it is connected; by default as the RMW likes.
             guests: also read the configurations of nodes that are not planned.
-            events: listen to what nodes tell the graph, and look again at those that changed.
+            events: receive graph messages, and look again at nodes that changed.
 
         Raises:
             MiddlewareError: it cannot be made.
         """
-        from lifecycle.graph import Observer
-        from lifecycle.middleware import GraphObserver, NodeClients
+        from lifecycle.graph import Graph
 
-        graph = GraphObserver(domain_id, connections)
-        clients = NodeClients(graph)
-        observer = Observer(graph, clients, quiet_s=_QUIET_S, burst_s=_BURST_S, guests=guests)
-        observer_participant = cls(observer, clients, graph)
-        if events:
-            observer_participant._listen()
-        return observer_participant
+        return cls(
+            Graph.in_loop(
+                domain_id,
+                connections,
+                messages=events,
+                guests=guests,
+                quiet_s=_QUIET_S,
+                burst_s=_BURST_S,
+            )
+        )
 
     @property
     def rmw(self) -> str:
@@ -79,76 +74,76 @@ class ObserverParticipant:
 
     def reaches_servers(self) -> bool:
         """Wait, bounded, until a TCP discovery server can be asked; False if it never will be."""
-        return self._graph.reaches_servers()
+        return self._graph.discovery.reaches_servers()
 
     def driver(self, node: PlannedNode) -> NodeDriver:
         """Return the driver of a managed node that is not hosted by us."""
-        return ServiceDriver(self._clients, node)
+        return ServiceDriver(self._graph.clients, node)
 
-    def hand(self, node: str) -> ServiceHand:
-        """Return the hand on any node that has a node interface, by full name."""
-        return ServiceHand(self._clients, node)
+    def node_interface(self, node: str) -> ServiceHand:
+        """Return what drives the node interface of any node that has one, by full name."""
+        return ServiceHand(self._graph.clients, node)
 
     async def observe(self, plan: Plan) -> Observation:
         """Return what is there now."""
-        return await self._observer.observe(plan)
+        return await self._graph.observe(plan)
 
     @property
     def changes(self) -> int:
         """Changes so far, before their bursts have passed."""
-        return self._observer.changes
+        return self._graph.changes
 
     async def wait_change(self) -> None:
         """Wait until something changed."""
-        await self._observer.wait_change()
+        await self._graph.wait_change()
 
     def put_configuration(self, configuration: NodeConfiguration) -> None:
         """Give what a node reported over its control channel."""
-        self._observer.put_configuration(configuration)
+        self._graph.state.put_configuration(configuration)
 
     def drop_configuration(self, node: str) -> None:
         """Forget what a node reported whose process ended."""
-        self._observer.drop_configuration(node)
+        self._graph.state.drop_configuration(node)
 
     def participants_of(
         self, pid: int, *, nodes: Iterable[str], reported: Iterable[str]
     ) -> frozenset[str]:
         """Return the GUID prefixes of the participants that discovery shows of a process."""
-        return self._graph.participants_of(pid, nodes=nodes, reported=reported)
+        return self._graph.discovery.participants_of(pid, nodes=nodes, reported=reported)
 
     def remove_participants(self, prefixes: Iterable[str], pids: Iterable[int]) -> None:
-        """Have everybody forget participants whose process is dead."""
-        self._graph.remove_participants(prefixes, pids)
+        """Have all participants forget those whose process is dead."""
+        self._graph.discovery.remove_participants(prefixes, pids)
 
-    def machine_voice(self, system: str, machine: str) -> AlivePublisher:
-        """Be heard as the supervisor of a machine."""
+    def announce_machine(self, system: str, machine: str) -> AlivePublisher:
+        """Announce ourselves as the supervisor of a machine, by DDS liveliness."""
         from lifecycle.middleware.discovery.liveliness import AlivePublisher, machine_topic
 
-        return AlivePublisher(self._graph.node, machine_topic(system, machine))
+        return AlivePublisher(self._node, machine_topic(system, machine))
 
-    def machine_ear(self, system: str, machine: str, to: Listener) -> AliveSubscription:
-        """Hear the supervisor of a machine."""
+    def watch_machine(self, system: str, machine: str, to: Listener) -> AliveSubscription:
+        """Watch the liveliness of the supervisor of a machine."""
         from lifecycle.middleware.discovery.liveliness import machine_topic
 
-        return self._ear(machine_topic(system, machine), to)
+        return self._watch(machine_topic(system, machine), to)
 
-    def node_ear(self, node: str, to: Listener) -> AliveSubscription:
-        """Hear a node that somebody runs by itself."""
+    def watch_node(self, node: str, to: Listener) -> AliveSubscription:
+        """Watch the liveliness of a node that is attached."""
         from lifecycle.middleware.discovery.liveliness import node_topic
 
-        return self._ear(node_topic(node), to)
+        return self._watch(node_topic(node), to)
 
     def plan_notices(self, on_notice: Callable[[str], None]) -> PlanNotices:
         """Take part in the exchange of plans."""
         from lifecycle.middleware.discovery.plan_notices import PlanNotices
 
-        return PlanNotices(self._graph.node, on_notice)
+        return PlanNotices(self._node, on_notice)
 
     def call_out(self, addresses: Iterable[str]) -> None:
-        """Make everybody announce themselves, as far as the system's discovery allows."""
+        """Make all participants announce themselves, as far as the system's discovery allows."""
         from lifecycle.middleware.discovery.rediscovery import call_out
 
-        call_out(self._graph.domain_id, self._graph.urls, addresses, os.environ)
+        call_out(self._graph.discovery.domain_id, self._graph.discovery.urls, addresses, os.environ)
 
     def send_again_soon(self) -> None:
         """Have what waits for a link to come back be sent soon when it does."""
@@ -157,45 +152,27 @@ class ObserverParticipant:
         send_again_soon()
 
     def tell_names(self) -> None:
-        """Tell the graph anew that we are here."""
+        """Announce our node to the graph anew."""
         from lifecycle.middleware.discovery.rediscovery import tell_names
 
-        tell_names([self._graph.node])
+        tell_names([self._node])
 
-    def _ear(self, topic: str, to: Listener) -> AliveSubscription:
+    def _watch(self, topic: str, to: Listener) -> AliveSubscription:
         from lifecycle.middleware.discovery.liveliness import AliveSubscription
 
         return AliveSubscription(
-            self._graph.node, topic, on_heard=to.heard, on_left=to.left, on_told=to.told
+            self._node, topic, on_heard=to.heard, on_left=to.left, on_told=to.told
         )
 
-    def _listen(self) -> None:
-        """Take what nodes tell the graph as a reason to look again."""
-        from lifecycle.graph import DdsTransport, GraphMessageError, Heartbeat, decode
-
-        def arrived(data: bytes) -> None:
-            try:
-                message = decode(data)
-            except GraphMessageError as error:
-                _logger.info("passed over: %s", error)
-                return
-            checksum = message.checksum if isinstance(message, Heartbeat) else ""
-            self._observer.hear(message.node, checksum)
-
-        self._transport = DdsTransport(self._graph.node)
-        self._transport.receive(arrived)
-
     def prepare_to_leave(self) -> None:
-        """Let go of connections that nobody answers: whatever is sent would wait for their ends."""
+        """Let go of connections that do not answer: all that is sent would wait for their ends."""
         from lifecycle.middleware.discovery.dead_peers import give_up_dead_connections
 
         give_up_dead_connections()
 
     def destroy(self) -> None:
         """Leave the graph."""
-        if self._transport is not None:
-            self._transport.close()
-        self._observer.destroy()
+        self._graph.close()
 
     def __enter__(self) -> ObserverParticipant:  # noqa: PYI034 - typing.Self is not in Python 3.10
         return self

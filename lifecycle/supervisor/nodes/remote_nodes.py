@@ -23,7 +23,7 @@ its announcer may not be matched yet."""
 
 
 class Seeing(Protocol):
-    """The eyes of a supervisor, see lifecycle.graph.Observer."""
+    """The eyes of a supervisor, see lifecycle.graph.Graph."""
 
     async def observe(self, plan: Plan) -> Observation:
         """Return what the graph holds now, nodes' own reports included."""

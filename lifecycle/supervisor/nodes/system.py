@@ -41,7 +41,7 @@ _REFRESH_S = 1.0
 
 
 class GraphObserver(Protocol):
-    """The eyes of a supervisor, see lifecycle.graph.Observer."""
+    """The eyes of a supervisor, see lifecycle.graph.Graph."""
 
     async def observe(self, plan: Plan) -> Observation:
         """Return what the graph holds now, with the configurations put here and read there."""

@@ -18,7 +18,7 @@ from collections.abc import Callable, Mapping
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import BringUpError
-from lifecycle.graph.waiting import set_within
+from lifecycle.graph import set_within
 from lifecycle.supervisor.processes.fork_server_protocol import (
     LARGEST_MESSAGE,
     MSG_CMSG_CLOEXEC,

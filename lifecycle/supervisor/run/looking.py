@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import dataclasses
 import logging
 import os
 from collections.abc import Awaitable, Callable, Collection, Iterator, Mapping
@@ -18,7 +17,8 @@ from typing import TYPE_CHECKING, TypeVar
 from lifecycle.errors import MiddlewareError
 from lifecycle.export.captured import CapturedParameter, CapturedSystem, capture
 from lifecycle.export.picture import Picture, Supervised, build_picture
-from lifecycle.graph.waiting import set_within
+from lifecycle.graph import Look as GraphLook
+from lifecycle.graph import set_within
 from lifecycle.manifest.model import DiscoveryRange
 from lifecycle.plan.model import Plan
 from lifecycle.run_directory import is_held, run_name, runtime_root
@@ -38,6 +38,7 @@ from lifecycle.verify.observation import (
 )
 
 if TYPE_CHECKING:
+    from lifecycle.graph import Graph
     from lifecycle.middleware import GraphObserver, NodeClients
 
 
@@ -150,16 +151,12 @@ def capture_running(
     Raises:
         MiddlewareError: no participant can be made.
     """
-    from lifecycle.middleware import GraphObserver, NodeClients
+    from lifecycle.graph import Graph
 
     os.environ["ROS_DOMAIN_ID"] = str(domain_id)
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = discovery_range.name
-    with GraphObserver(domain_id) as graph:
-        clients = NodeClients(graph)
-        try:
-            observation, parameters, unsettled = asyncio.run(_look(graph, clients, wait_s))
-        finally:
-            clients.destroy()
+    with Graph.in_loop(domain_id) as graph:
+        observation, parameters, unsettled = asyncio.run(_look(graph, wait_s))
     return capture(
         observation,
         parameters,
@@ -174,31 +171,35 @@ def capture_running(
 _Parameters = dict[str, "tuple[CapturedParameter, ...] | None"]
 
 
-async def _look(
-    graph: GraphObserver, clients: NodeClients, wait_s: float
-) -> tuple[Observation, _Parameters, str]:
-    (nodes, endpoints), unsettled = await _settled(graph, wait_s)
+async def _look(graph: Graph, wait_s: float) -> tuple[Observation, _Parameters, str]:
+    (nodes, endpoints), unsettled = await _settled(graph.discovery, wait_s)
     serving = {
         node.full_name
         for node in nodes
-        if graph.offers(node.full_name, f"{node.full_name}/list_parameters")
+        if graph.discovery.offers(node.full_name, f"{node.full_name}/list_parameters")
     }
     answers = await asyncio.gather(
-        *(_ask(clients, node, parameters=node.full_name in serving) for node in nodes)
+        *(_ask(graph.clients, node, parameters=node.full_name in serving) for node in nodes)
     )
-    observation = Observation(
-        nodes=tuple(node for node, _, _ in answers),
-        endpoints=endpoints,
-        configurations=tuple(each for _, each, _ in answers if each is not None),
+    names = [node.full_name for node in nodes]
+    graph.state.put_look(
+        GraphLook(
+            nodes=nodes,
+            endpoints=endpoints,
+            answers={
+                name: (state, configuration)
+                for name, (state, configuration, _) in zip(names, answers, strict=True)
+            },
+        )
     )
-    told = {
-        node.full_name: parameters for node, _, parameters in answers if node.full_name in serving
+    parameters = {
+        name: each for name, (_, _, each) in zip(names, answers, strict=True) if name in serving
     }
-    return observation, told, unsettled
+    return graph.state.observation(), parameters, unsettled
 
 
 async def _settled(graph: GraphObserver, wait_s: float) -> tuple[Snapshot, str]:
-    """Wait until the graph stands still; return it, and what it still lacked in the end."""
+    """Wait until the graph changes no more; return it, and what it still lacked in the end."""
     loop = asyncio.get_running_loop()
     deadline = loop.time() + wait_s
     changed = asyncio.Event()
@@ -225,7 +226,7 @@ async def _settled(graph: GraphObserver, wait_s: float) -> tuple[Snapshot, str]:
 
 
 def _pending(snapshot: Snapshot, *, settling_s: float) -> Collection[str]:
-    """Say what discovery still has to tell."""
+    """Say what discovery still has to show."""
     _, endpoints = snapshot
     pending = dict.fromkeys(
         f"nobody tells whose {each.name} is" for each in endpoints if not known_node(each.node)
@@ -237,15 +238,14 @@ def _pending(snapshot: Snapshot, *, settling_s: float) -> Collection[str]:
 
 async def _ask(
     clients: NodeClients, node: ObservedNode, *, parameters: bool
-) -> tuple[ObservedNode, NodeConfiguration | None, tuple[CapturedParameter, ...] | None]:
+) -> tuple[str | None, NodeConfiguration | None, tuple[CapturedParameter, ...] | None]:
     """Ask a node for its state, its configuration and its parameters, all at once."""
     name = node.full_name
-    state, configuration, told = await asyncio.gather(
+    return await asyncio.gather(
         _or_none(clients.get_state(name, timeout_s=_ASK_S)) if node.managed else _nothing(),
         _or_none(clients.get_configuration(name, timeout_s=_ASK_S)),
         _or_none(clients.get_parameters(name, timeout_s=_ASK_S)) if parameters else _nothing(),
     )
-    return dataclasses.replace(node, state=state), configuration, told
 
 
 async def _or_none(asked: Awaitable[T]) -> T | None:

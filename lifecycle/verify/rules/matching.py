@@ -1,4 +1,6 @@
-"""Rules about declared pairs that do not match. Pure.
+"""When a publisher and a subscription count as matched, and the rules about declared pairs. Pure.
+
+Owns: `match` and `obstacle`, by which the rules here and `lifecycle.graph`'s links judge a pair.
 
 Judged pair by pair: each end that reports names the peers that it is matched with, and both must
 name each other. Where an end's RMW only counts its peers, the count must be that of all endpoints
@@ -10,10 +12,12 @@ partition, which nobody announces upward; that is not enough for a declared link
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import Certainty, QosProfile, incompatibilities
+from lifecycle.verify.observation import EndpointReport
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.verdict import Finding, Outcome
 from lifecycle.verify.view import UNKNOWN_QOS, Actual, FlowView, Seen, View, actual_qos
@@ -43,17 +47,74 @@ UNMATCHED_FLOW = Rule(
 RULES = (UNMATCHED_LINK, UNMATCHED_FLOW)
 
 
-_Answer = tuple[Outcome, str]
+Match = tuple[Outcome, str]
 """What is known of a pair, and why it is not ok."""
 
-_OK: _Answer = (Outcome.OK, "")
+_OK: Match = (Outcome.OK, "")
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class MatchEnd:
+    """A publisher or a subscription, with all that is known of it.
+
+    Attributes:
+        qos: as announced or reported, `UNKNOWN_QOS` where nobody says.
+        gid: hex; empty where it is not known.
+        report: what its node says; None if it says nothing.
+        expected: it is one that the system has for good, so that whoever can match it must; a
+            tool's may be matched or not.
+    """
+
+    kind: EndpointKind
+    type: str
+    qos: QosProfile
+    gid: str
+    report: EndpointReport | None
+    expected: bool
+
+
+def obstacle(publisher: MatchEnd, subscription: MatchEnd) -> str:
+    """Return why two ends cannot match at all (DDS 1.4 §2.2.2.5, §2.2.3); empty if they can."""
+    if publisher.type != subscription.type:
+        return f"the types differ, {publisher.type} and {subscription.type}"
+    if not _compatible(publisher.qos, subscription.qos):
+        return "the QoS is incompatible"
+    return ""
+
+
+def match(
+    publisher: MatchEnd,
+    subscription: MatchEnd,
+    publishers: Sequence[MatchEnd],
+    subscriptions: Sequence[MatchEnd],
+) -> Match | None:
+    """Judge whether two ends that can match are matched, by what both say of each other.
+
+    Args:
+        publisher: one end.
+        subscription: the other end.
+        publishers: every publisher of the topic in the graph, tools' included.
+        subscriptions: likewise.
+
+    Returns:
+        None if neither end reports its matches.
+    """
+    answers = [
+        answer
+        for answer in (
+            _of_one_end(publisher, subscription, subscriptions),
+            _of_one_end(subscription, publisher, publishers),
+        )
+        if answer is not None
+    ]
+    return _worst(answers) if answers else None
 
 
 def check(view: View) -> Iterator[Finding]:
     """Judge every planned flow."""
-    topics: dict[tuple[str, EndpointKind], list[Seen]] = {}
+    topics: dict[tuple[str, EndpointKind], list[MatchEnd]] = {}
     for seen in (*view.seen, *view.seen_of_tools):
-        topics.setdefault((seen.name, seen.kind), []).append(seen)
+        topics.setdefault((seen.name, seen.kind), []).append(_end_of_graph(seen))
     for flow in view.flows:
         cause = _cause(flow)
         if cause and not flow.planned.linked:
@@ -89,19 +150,17 @@ def _cause(flow: FlowView) -> str:
             return f"the {word} is missing"
     for publisher in flow.publishers:
         for subscription in flow.subscriptions:
-            if _type(publisher) != _type(subscription):
-                return f"the types differ, {_type(publisher)} and {_type(subscription)}"
-            if not _compatible(_qos(publisher), _qos(subscription)):
-                return "the QoS is incompatible"
+            if cause := obstacle(_end(publisher), _end(subscription)):
+                return cause
     return ""
 
 
-def _judge(flow: FlowView, topics: Mapping[tuple[str, EndpointKind], Sequence[Seen]]) -> _Answer:
+def _judge(flow: FlowView, topics: Mapping[tuple[str, EndpointKind], Sequence[MatchEnd]]) -> Match:
     """Return the worst that is known of any of the flow's pairs, whose ends are all seen."""
     answers = [
-        _pair(
-            publisher,
-            subscription,
+        match(
+            _end(publisher),
+            _end(subscription),
             topics[flow.planned.topic, EndpointKind.PUBLISHER],
             topics[flow.planned.topic, EndpointKind.SUBSCRIPTION],
         )
@@ -113,25 +172,7 @@ def _judge(flow: FlowView, topics: Mapping[tuple[str, EndpointKind], Sequence[Se
     return _worst(each for each in answers if each is not None)
 
 
-def _pair(
-    publisher: Actual,
-    subscription: Actual,
-    publishers: Sequence[Seen],
-    subscriptions: Sequence[Seen],
-) -> _Answer | None:
-    """Return what the two ends say of each other; None if neither reports its matches."""
-    told = [
-        answer
-        for answer in (
-            _of_one_end(publisher, subscription, subscriptions),
-            _of_one_end(subscription, publisher, publishers),
-        )
-        if answer is not None
-    ]
-    return _worst(told) if told else None
-
-
-def _worst(answers: Iterable[_Answer]) -> _Answer:
+def _worst(answers: Iterable[Match]) -> Match:
     """Return the worst outcome with every reason for it."""
     found = list(answers)
     outcome = Outcome.worst(each for each, _ in found)
@@ -139,16 +180,15 @@ def _worst(answers: Iterable[_Answer]) -> _Answer:
     return outcome, ", ".join(reasons)
 
 
-def _of_one_end(end: Actual, other: Actual, others: Sequence[Seen]) -> _Answer | None:
+def _of_one_end(end: MatchEnd, other: MatchEnd, others: Sequence[MatchEnd]) -> Match | None:
     """Return what one end says of the other; None if it does not report its matches."""
     report = end.report
     if report is None or report.matched is None:
         return None
-    word = f"the {end.planned.kind.noun}"
-    gid = _gid(other)
-    if report.peers is None or not gid:
+    word = f"the {end.kind.noun}"
+    if report.peers is None or not other.gid:
         return _by_count(word, report.matched, end, others)
-    if gid in report.peers:
+    if other.gid in report.peers:
         return _OK
     unknown = report.matched - len(report.peers)
     if unknown > 0:
@@ -161,34 +201,20 @@ def _of_one_end(end: Actual, other: Actual, others: Sequence[Seen]) -> _Answer |
     return Outcome.VIOLATED, f"{word} matched {report.matched} others, not this one"
 
 
-def _by_count(word: str, matched: int, end: Actual, others: Sequence[Seen]) -> _Answer:
+def _by_count(word: str, matched: int, end: MatchEnd, others: Sequence[MatchEnd]) -> Match:
     """Conclude from a number alone: it proves the pair only if it is that of all who can match."""
-    publishes = end.planned.kind is EndpointKind.PUBLISHER
-    own = _qos(end)
+    publishes = end.kind is EndpointKind.PUBLISHER
     possible = [
         other
         for other in others
-        if other.type == _type(end)
-        and (
-            _compatible(own, other.qos or UNKNOWN_QOS)
-            if publishes
-            else _compatible(other.qos or UNKNOWN_QOS, own)
-        )
+        if not (obstacle(end, other) if publishes else obstacle(other, end))
     ]
     reason = f"{word} matched {matched} of {len(possible)}"
     if matched == len(possible):
         return _OK
-    if matched < len(possible) and (
-        matched == 0 or all(each.planned is not None for each in possible)
-    ):
+    if matched < len(possible) and (matched == 0 or all(each.expected for each in possible)):
         return Outcome.VIOLATED, reason
     return Outcome.UNVERIFIABLE, f"{reason}, and does not tell which"
-
-
-def _gid(end: Actual) -> str:
-    """Return the GID of an end: as discovery shows it, else as its node says; empty if unknown."""
-    shown = end.observed.gid if end.observed is not None else ""
-    return shown or (end.report.gid if end.report is not None else "")
 
 
 def _compatible(offered: QosProfile, requested: QosProfile) -> bool:
@@ -198,14 +224,25 @@ def _compatible(offered: QosProfile, requested: QosProfile) -> bool:
     )
 
 
-def _type(end: Actual) -> str:
-    return end.observed.type if end.observed else end.planned.type
+def _end(actual: Actual) -> MatchEnd:
+    """Return a declared end: as discovery shows it, else as its node says."""
+    shown, report = actual.observed, actual.report
+    return MatchEnd(
+        kind=actual.planned.kind,
+        type=shown.type if shown else actual.planned.type,
+        qos=actual_qos(shown.qos if shown else None, report.qos if report else None) or UNKNOWN_QOS,
+        gid=(shown.gid if shown else "") or (report.gid if report else ""),
+        report=report,
+        expected=True,
+    )
 
 
-def _qos(end: Actual) -> QosProfile:
-    return (
-        actual_qos(
-            end.observed.qos if end.observed else None, end.report.qos if end.report else None
-        )
-        or UNKNOWN_QOS
+def _end_of_graph(seen: Seen) -> MatchEnd:
+    return MatchEnd(
+        kind=seen.kind,
+        type=seen.type,
+        qos=seen.qos or UNKNOWN_QOS,
+        gid="",
+        report=seen.report,
+        expected=seen.planned is not None,
     )

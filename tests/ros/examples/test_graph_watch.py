@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -48,3 +49,21 @@ def test_a_new_publisher_of_the_topic_is_greeted_and_seen_off(
         limit.cancel()
         watch.kill()
         watch.communicate()
+
+
+def test_a_program_says_what_of_a_system_does_not_run(fresh_domain: int) -> None:
+    asked = subprocess.run(
+        [
+            *(sys.executable, "-m", "examples.graph_watch.is_running"),
+            "manifests/first_node.lifecycle.yaml",
+        ],
+        cwd=ROOT,
+        env={**os.environ, "ROS_DOMAIN_ID": str(fresh_domain)},
+        capture_output=True,
+        text=True,
+        timeout=LIMIT_S,
+        check=False,
+    )
+    said = asked.stdout.splitlines()
+    assert (asked.returncode, without_fast_dds(asked.stderr)) == (1, [])
+    assert said[0] == f"cannot find node /talker in domain {fresh_domain}", said

@@ -29,8 +29,12 @@ from lifecycle.graph import (
     GraphState,
     NodeLiveliness,
 )
+from lifecycle.manifest import load
 from lifecycle.manifest.model import EndpointKind
+from lifecycle.plan import build_plan
+from lifecycle.verify import Outcome
 from lifecycle.verify.observation import EndpointReport, Identity, NodeConfiguration
+from tests.ros.supervisor.running import pair, up
 
 LIMIT_S = 30.0
 
@@ -267,3 +271,21 @@ def test_a_graph_on_a_users_node_needs_no_participant_of_its_own(
     finally:
         executor.shutdown()
         thread.join()
+
+
+def test_a_program_asks_whether_the_system_is_up_and_running(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    manifest = pair(tmp_path, fresh_domain)
+    plan = build_plan(load(manifest).manifest)
+    with Graph.open(fresh_domain) as graph:
+        nothing = graph.verdict(plan)
+        assert nothing.verdict is Outcome.VIOLATED
+        assert "graph.missing-node" in {each.rule for each in nothing.findings}
+        with up(manifest, runtime=tmp_path) as run:
+            run.until("system", reached="active")
+            running = graph.verdict(plan)
+            assert (running.verdict, running.findings) == (Outcome.OK, ())
+            assert graph.state.observation().configurations
+            with Graph.open(fresh_domain) as late:
+                assert late.verdict(plan) == running

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from lifecycle.graph import Observer
+from lifecycle.graph import Graph
 from lifecycle.middleware.rcl.graph import PATIENCE_S
 from tests.stalls import Stalls, assert_in_time, noted_stalls
 
@@ -58,7 +58,7 @@ def stranger(fresh_domain: int) -> Iterator[int]:
 async def first_look(domain_id: int, stalls: Stalls) -> tuple[bool, float]:
     """Return whether the noise was seen, and the seconds it took beside those the machine took."""
     begun = time.monotonic()
-    with Observer.open(domain_id) as observer:
+    with Graph.in_loop(domain_id) as observer:
         observation = await observer.observe(NOTHING)  # type: ignore[arg-type]
     seen = any(endpoint.name == "/noise" for endpoint in observation.endpoints)
     return seen, stalls.taken(begun, time.monotonic())

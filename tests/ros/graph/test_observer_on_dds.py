@@ -13,7 +13,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from std_msgs.msg import String
 
-from lifecycle.graph import Observer
+from lifecycle.graph import Graph
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import (
     DiscoveryRange,
@@ -69,8 +69,8 @@ def plan(domain_id: int, *names: str) -> Plan:
 
 
 @pytest.fixture
-def observer(domain_id: int) -> Iterator[Observer]:
-    with Observer.open(domain_id) as observer:
+def observer(domain_id: int) -> Iterator[Graph]:
+    with Graph.in_loop(domain_id) as observer:
         yield observer
 
 
@@ -92,7 +92,7 @@ def states(observation: Observation) -> dict[str, str | None]:
 
 
 async def observed(
-    observer: Observer, plan: Plan, holds: Callable[[Observation], bool]
+    observer: Graph, plan: Plan, holds: Callable[[Observation], bool]
 ) -> Observation:
     """Look after each change until it holds, as a supervisor does; no polling."""
 
@@ -110,7 +110,7 @@ async def observed(
 
 
 def test_a_managed_nodes_state_is_seen_and_a_transition_wakes(
-    observer: Observer,
+    observer: Graph,
     managed: ManagedNode,
     domain_id: int,
     wait_until: Callable[..., None],
@@ -143,7 +143,7 @@ def test_a_burst_of_changes_wakes_a_few_times_only(
 
     async def follow() -> None:
         # Longer than a busy machine tears one burst apart.
-        with Observer.open(domain_id, quiet_s=0.3, burst_s=BOUND_S) as observer:
+        with Graph.in_loop(domain_id, quiet_s=0.3, burst_s=BOUND_S) as observer:
             await observer.observe(system)
             node = make_node("n")
             for number in range(publishers):

@@ -25,7 +25,7 @@ from lifecycle.graph import (
     StuckNotice,
     encode,
 )
-from lifecycle.graph.sequencer import WINDOW
+from lifecycle.graph.membership import WINDOW
 
 
 class Stage:

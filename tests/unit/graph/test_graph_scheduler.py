@@ -1,4 +1,4 @@
-"""Everything in one place, one after another, and nothing polls."""
+"""Everything in one place, one after another, and a wait that loses no cancellation."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import threading
 
 import pytest
 
-from lifecycle.graph import LoopScheduler, ManualScheduler, ThreadScheduler, every
-from lifecycle.graph.deadlines import Deadlines
+from lifecycle.graph import LoopScheduler, ManualScheduler, ThreadScheduler, every, set_within
+from lifecycle.graph.scheduler import Deadlines
 
 LIMIT_S = 5.0
 
@@ -121,3 +121,57 @@ def test_many_deadlines_take_one_timer_and_few_wake_ups() -> None:
         deadlines.drop(name)
     scheduler.manual.advance(100.0)
     assert passed == [("/n0", 25.0)]
+
+
+def test_an_event_that_is_set_ends_the_wait_and_one_that_is_not_ends_with_the_time() -> None:
+    async def main() -> tuple[bool, bool, bool]:
+        event, never = asyncio.Event(), asyncio.Event()
+        asyncio.get_running_loop().call_soon(event.set)
+        return (
+            await set_within(event, None),
+            await set_within(event, 0.0),
+            await set_within(never, 0.0),
+        )
+
+    assert asyncio.run(main()) == (True, True, False)
+
+
+@pytest.mark.parametrize("turns", range(5))
+def test_a_cancellation_in_the_moment_of_the_event_is_not_lost(turns: int) -> None:
+    async def forever(event: asyncio.Event) -> None:
+        while True:
+            await set_within(event, 1000.0)
+            event.clear()
+
+    async def main() -> bool:
+        event = asyncio.Event()
+        task = asyncio.ensure_future(forever(event))
+        await asyncio.sleep(0)
+        await asyncio.sleep(0)
+        event.set()
+        for _ in range(turns):
+            await asyncio.sleep(0)
+        task.cancel()
+        await asyncio.wait({task}, timeout=1.0)
+        return task.cancelled()
+
+    assert asyncio.run(main())
+
+
+def test_what_is_posted_before_there_is_a_loop_waits_for_it() -> None:
+    scheduler, ran = LoopScheduler(), []
+    scheduler.post(lambda: ran.append("early"))
+
+    async def use() -> None:
+        scheduler.post(lambda: ran.append("late"))
+        await asyncio.sleep(0)
+
+    asyncio.run(use())
+    assert ran == ["early", "late"]
+
+
+def test_a_thread_that_ends_cancels_the_coroutines_that_run_in_it() -> None:
+    scheduler = ThreadScheduler("test")
+    waiting = asyncio.run_coroutine_threadsafe(asyncio.sleep(3600), scheduler.loop)
+    scheduler.close()
+    assert waiting.cancelled()

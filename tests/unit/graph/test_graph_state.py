@@ -24,7 +24,7 @@ from lifecycle.graph import (
     NodeView,
     encode,
 )
-from lifecycle.graph.links import link
+from lifecycle.graph.model import link, match_ends
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import QosProfile, Reliability
 from lifecycle.network.nfe import InternetProtocol, NetworkFlowEndpoint, TransportProtocol
@@ -314,15 +314,14 @@ def end(
 
 
 def judged(
-    publisher: dict[str, Any], subscription: dict[str, Any], *, publishers: int = 1
+    publisher: dict[str, Any], subscription: dict[str, Any], *others: End
 ) -> tuple[Outcome, str, str]:
-    found = link(
-        "/t",
-        end("/a", PUBLISHER, **publisher),
-        end("/b", SUBSCRIPTION, **subscription),
-        publishers=publishers,
-        subscriptions=1,
-    )
+    one, other = end("/a", PUBLISHER, **publisher), end("/b", SUBSCRIPTION, **subscription)
+    ends = {
+        "publishers": match_ends((one, *others)),
+        "subscriptions": match_ends((other,)),
+    }
+    found = link("/t", one, other, **ends)
     return found.connected, found.reason, found.transport
 
 
@@ -330,9 +329,15 @@ def judged(
     ("publisher", "subscription", "outcome", "reason"),
     [
         ({"matched": 1}, {}, Outcome.OK, ""),
-        ({"matched": 0}, {"matched": 1}, Outcome.OK, ""),
-        ({}, {}, Outcome.UNVERIFIABLE, "neither end tells its matches"),
-        ({"matched": 0}, {}, Outcome.VIOLATED, "they have not matched"),
+        ({"matched": 0}, {"matched": 1}, Outcome.VIOLATED, "the publisher matched 0 of 1"),
+        ({}, {}, Outcome.UNVERIFIABLE, "neither end reports whom it is matched with"),
+        ({"matched": 0}, {}, Outcome.VIOLATED, "the publisher matched 0 of 1"),
+        (
+            {"matched": 2},
+            {},
+            Outcome.UNVERIFIABLE,
+            "the publisher matched 2 of 1, and does not tell which",
+        ),
         ({"mapped": False}, {}, Outcome.VIOLATED, "/a has not mapped it onto a connection"),
         ({}, {"error": "no route"}, Outcome.VIOLATED, "/b: no route"),
         ({}, {"liveliness": NodeLiveliness.SILENT}, Outcome.VIOLATED, "/b is silent"),
@@ -357,9 +362,15 @@ def test_two_ends_are_connected_as_far_as_they_tell(
     assert judged(publisher, subscription)[:2] == (outcome, reason)
 
 
-def test_a_count_that_may_be_of_another_peer_proves_nothing() -> None:
-    outcome, reason, _ = judged({}, {"matched": 1}, publishers=2)
-    assert (outcome, reason) == (Outcome.UNVERIFIABLE, "matched 1 of 2, nobody tells which")
+def test_a_count_is_that_of_all_who_can_match_as_the_verification_has_it() -> None:
+    more = end("/c", PUBLISHER)
+    outcome, reason, _ = judged({}, {"matched": 1}, more)
+    assert (outcome, reason) == (Outcome.VIOLATED, "the subscription matched 1 of 2")
+    assert judged({}, {"matched": 2}, more)[0] is Outcome.OK
+    silent = end("/c", PUBLISHER, liveliness=NodeLiveliness.SILENT)
+    assert judged({}, {"matched": 1}, silent)[0] is Outcome.OK
+    other = end("/c", PUBLISHER, type="std_msgs/msg/Empty")
+    assert judged({}, {"matched": 1}, other)[0] is Outcome.OK
 
 
 @pytest.mark.parametrize(("peers", "outcome"), [(("0b",), Outcome.OK), (("77",), Outcome.VIOLATED)])
@@ -372,12 +383,14 @@ def test_an_end_that_names_its_peers_proves_the_pair_and_no_other(
 
 
 def test_a_link_says_by_which_flow_and_connections() -> None:
+    publisher = end("/a", PUBLISHER, connection="net", matched=1)
+    subscription = end("/b", SUBSCRIPTION)
     found = link(
         "/t",
-        end("/a", PUBLISHER, connection="net", matched=1),
-        end("/b", SUBSCRIPTION),
-        publishers=1,
-        subscriptions=1,
+        publisher,
+        subscription,
+        publishers=match_ends([publisher]),
+        subscriptions=match_ends([subscription]),
     )
     assert (found.transport, found.connections) == ("udpv4", ("net", ""))
     assert [(each.destination_address, each.destination_port) for each in found.flows] == [

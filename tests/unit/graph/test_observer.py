@@ -6,11 +6,12 @@ import asyncio
 import dataclasses
 import logging
 from collections.abc import Awaitable, Callable, Collection
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import pytest
 
 from lifecycle.errors import MiddlewareError
+from lifecycle.graph import GraphEvents, ManualScheduler
 from lifecycle.graph.observer import Observer
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import (
@@ -49,6 +50,7 @@ class FakeGraph:
         self.callbacks: list[Callable[[], None]] = []
         self.destroyed = False
         self.arriving: list[tuple[ObservedNode, ...]] = []
+        self.offered: set[str] = set()
 
     def snapshot(
         self, *, declared: Collection[str] = (), names: DeclaredNames = NO_NAMES
@@ -60,6 +62,9 @@ class FakeGraph:
 
     def settling_s(self) -> float:
         return 0.01 if self.arriving else 0.0
+
+    def offers(self, node: str, service: str) -> bool:
+        return service in self.offered
 
     def on_change(self, callback: Callable[[], None]) -> Callable[[], None]:
         self.callbacks.append(callback)
@@ -91,7 +96,9 @@ class FakeClients:
             raise MiddlewareError(f"cannot call service '{node}/get_state': it is hung")
         return self.states[node]
 
-    async def get_configuration(self, node: str, *, timeout_s: float) -> NodeConfiguration | None:
+    async def get_configuration(
+        self, node: str, *, timeout_s: float, expected: bool
+    ) -> NodeConfiguration | None:
         return self.configurations.get(node)
 
     def on_transition(self, node: str, callback: Callable[[], None]) -> None:
@@ -180,9 +187,14 @@ def clients() -> FakeClients:
     return FakeClients()
 
 
+def observing(graph: FakeGraph, clients: FakeClients, **options: Any) -> Observer:
+    """An observer whose state changes at once."""
+    return Observer(graph, clients, GraphEvents(None, ManualScheduler()), **options)
+
+
 @pytest.fixture
 def observer(graph: FakeGraph, clients: FakeClients) -> Observer:
-    return Observer(graph, clients, quiet_s=0.01, burst_s=0.05)
+    return observing(graph, clients, quiet_s=0.01, burst_s=0.05)
 
 
 def run(awaitable: Awaitable[T]) -> T:
@@ -230,7 +242,7 @@ def test_what_was_put_is_believed_and_not_asked_for(
 ) -> None:
     graph.nodes = managed("/a")
     clients.states = {"/a": "unconfigured"}
-    observer.put_configuration(configuration("/a", "active"))
+    observer.state.put_configuration(configuration("/a", "active"))
     observation = run(observer.observe(plan("a")))
     assert observation.nodes == (ObservedNode(full_name="/a", managed=True, state="active"),)
     assert observation.configurations == (configuration("/a", "active"),)
@@ -240,7 +252,7 @@ def test_what_was_put_is_believed_and_not_asked_for(
 def test_what_was_put_stands_before_discovery_shows_the_node_and_goes_with_it(
     observer: Observer, graph: FakeGraph
 ) -> None:
-    observer.put_configuration(configuration("/a"))
+    observer.state.put_configuration(configuration("/a"))
     assert run(observer.observe(plan("a"))).configurations == (configuration("/a"),)
     graph.nodes = managed("/a")
     assert run(observer.observe(plan("a"))).configurations == (configuration("/a"),)
@@ -249,11 +261,11 @@ def test_what_was_put_stands_before_discovery_shows_the_node_and_goes_with_it(
 
 
 def test_a_newer_configuration_replaces_an_older_and_can_be_dropped(observer: Observer) -> None:
-    observer.put_configuration(configuration("/a", "inactive"))
-    observer.put_configuration(configuration("/a", "active"))
+    observer.state.put_configuration(configuration("/a", "inactive"))
+    observer.state.put_configuration(configuration("/a", "active"))
     assert run(observer.observe(plan("a"))).configurations == (configuration("/a", "active"),)
-    observer.drop_configuration("/a")
-    observer.drop_configuration("/a")
+    observer.state.drop_configuration("/a")
+    observer.state.drop_configuration("/a")
     assert run(observer.observe(plan("a"))).configurations == ()
 
 
@@ -345,10 +357,11 @@ def test_a_change_after_the_loop_was_closed_is_nobodys_concern(
     graph.change()
 
 
-def test_leaving_takes_everything_along(graph: FakeGraph, clients: FakeClients) -> None:
-    with Observer(graph, clients):
-        assert len(graph.callbacks) == 1
-    assert (graph.callbacks, graph.destroyed, clients.destroyed) == ([], True, True)
+def test_who_has_left_is_called_back_no_more(graph: FakeGraph, clients: FakeClients) -> None:
+    observer = observing(graph, clients)
+    assert len(graph.callbacks) == 1
+    observer.close()
+    assert graph.callbacks == []
 
 
 def test_an_observation_does_not_share_what_the_graph_keeps(
@@ -363,7 +376,7 @@ def test_an_observation_does_not_share_what_the_graph_keeps(
 def test_an_observation_waits_for_who_answered_and_is_not_seen_yet() -> None:
     graph = FakeGraph()
     graph.arriving = [(), (), (ObservedNode(full_name="/stranger"),)]
-    observer = Observer(graph, FakeClients())
+    observer = observing(graph, FakeClients())
     observation = asyncio.run(observer.observe(plan()))
     assert [node.full_name for node in observation.nodes] == ["/stranger"]
 
@@ -382,7 +395,7 @@ def test_only_nodes_that_report_no_parameters_are_asked_for_those_that_are_plann
     observer: Observer, graph: FakeGraph, clients: FakeClients
 ) -> None:
     graph.nodes = managed("/foreign", "/ours", "/asked", "/unplanned")
-    observer.put_configuration(dataclasses.replace(configuration("/ours"), parameters=()))
+    observer.state.put_configuration(dataclasses.replace(configuration("/ours"), parameters=()))
     clients.configurations["/asked"] = dataclasses.replace(configuration("/asked"), parameters=())
     named = with_parameter(plan("foreign", "ours", "asked", "gone"), "foreign", "ours", "asked")
     seen = run(observer.observe(named))
@@ -396,7 +409,7 @@ def test_without_a_planned_parameter_of_others_nobody_listens_for_changes(
     observer: Observer, graph: FakeGraph, clients: FakeClients
 ) -> None:
     graph.nodes = managed("/foreign", "/ours")
-    observer.put_configuration(dataclasses.replace(configuration("/ours"), parameters=()))
+    observer.state.put_configuration(dataclasses.replace(configuration("/ours"), parameters=()))
     seen = run(observer.observe(with_parameter(plan("foreign", "ours"), "ours")))
     assert (seen.parameters, clients.read, clients.listening) == ((), [], False)
 

@@ -5,10 +5,19 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 
+from lifecycle.graph import (
+    GraphEvents,
+    GraphMessage,
+    Heartbeat,
+    InMemoryNetwork,
+    ManualScheduler,
+    StateChanged,
+    encode,
+    set_within,
+)
 from lifecycle.graph.observer import Observer
-from lifecycle.graph.waiting import set_within
 from lifecycle.verify.observation import ObservedNode
-from tests.unit.graph.test_observer import FakeClients, FakeGraph, configuration, plan
+from tests.unit.graph.test_observer import FakeClients, FakeGraph, configuration, observing, plan
 from tests.unit.supervisor.fakes import run
 
 
@@ -23,7 +32,7 @@ def world(*, guests: bool) -> tuple[FakeGraph, FakeClients, Observer]:
         "/guest": dataclasses.replace(configuration("/guest"), checksum="1"),
         "/plain": configuration("/plain"),
     }
-    return graph, clients, Observer(graph, clients, guests=guests)
+    return graph, clients, observing(graph, clients, guests=guests)
 
 
 def test_a_guest_is_read_and_followed_and_nobody_else_is() -> None:
@@ -51,7 +60,7 @@ def test_without_guests_only_planned_nodes_are_read() -> None:
     run(main())
 
 
-def test_word_of_a_change_is_worth_a_look_and_a_heartbeat_only_with_a_new_checksum() -> None:
+def test_a_message_is_worth_a_look_and_a_heartbeat_only_with_a_new_checksum() -> None:
     async def woken(observer: Observer) -> bool:
         waiting = asyncio.Event()
         change = asyncio.ensure_future(observer.wait_change())
@@ -62,16 +71,24 @@ def test_word_of_a_change_is_worth_a_look_and_a_heartbeat_only_with_a_new_checks
             change.cancel()
 
     async def main() -> None:
-        _, _, observer = world(guests=True)
+        graph, clients, _ = world(guests=True)
+        network = InMemoryNetwork(scheduler := ManualScheduler())
+        events = GraphEvents(network.transport(), scheduler)
+        observer = Observer(graph, clients, events, guests=True)
+        sender = network.transport()
+
+        def send(type_: type[GraphMessage], node: str, **fields: str) -> None:
+            sender.send(encode(type_(node=node, incarnation="1", sequence=1, **fields)))
+
         await observer.observe(plan())
-        observer.hear("/guest", "1")
+        send(Heartbeat, "/guest", checksum="1")
         assert not await woken(observer)
-        observer.hear("/guest", "2")
+        send(Heartbeat, "/guest", checksum="2")
         assert await woken(observer)
-        observer.hear("/guest")
+        send(StateChanged, "/guest", state="active")
         assert await woken(observer)
-        observer.put_configuration(configuration("/hosted"))
-        observer.hear("/hosted")
+        observer.state.put_configuration(configuration("/hosted"))
+        send(StateChanged, "/hosted", state="active")
         assert not await woken(observer)
 
     run(main())

@@ -198,13 +198,13 @@ class FakeAir:
         self.done: list[str] = []
         self.destroyed = 0
 
-    def machine_voice(self, system: str, machine: str) -> FakeVoice:
+    def announce_machine(self, system: str, machine: str) -> FakeVoice:
         return self.voices.setdefault(f"{system}/{machine}", FakeVoice())
 
-    def machine_ear(self, system: str, machine: str, to: Listener) -> FakeEar:
+    def watch_machine(self, system: str, machine: str, to: Listener) -> FakeEar:
         return self.ears.setdefault(f"{system}/{machine}", FakeEar(to, self))
 
-    def node_ear(self, node: str, to: Listener) -> FakeEar:
+    def watch_node(self, node: str, to: Listener) -> FakeEar:
         return self.ears.setdefault(node, FakeEar(to, self))
 
     def call_out(self, addresses: Iterable[str]) -> None:

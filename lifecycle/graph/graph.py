@@ -1,0 +1,228 @@
+"""The graph on real DDS: the three layers of the graph interface put together.
+
+Owns: `Graph`, for programs that follow a ROS graph and for the supervisor that judges one. Both
+have the same state: fed by graph messages, by the configurations that nodes serve or that are put
+there, and by discovery. It sleeps until one of them has something new.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import threading
+import typing
+from collections.abc import Callable
+
+from rclpy.node import Node
+
+from lifecycle.graph.dds import DdsTransport
+from lifecycle.graph.events import SILENT_AFTER_S, GraphEvents
+from lifecycle.graph.observer import BURST_S, QUIET_S, Observer
+from lifecycle.graph.scheduler import LoopScheduler, ThreadScheduler
+from lifecycle.graph.state import GraphState
+from lifecycle.graph.transport import GraphTransport
+from lifecycle.middleware import GraphObserver, NodeClients
+from lifecycle.plan.model import ParticipantConnections, Plan
+from lifecycle.verify import Observation, Stage, Verdict, verify
+
+
+@typing.final
+class Graph:
+    """A ROS graph as it is now, and what happens in it.
+
+    Use `open` in a program that has no node, `on` in one that has. Callbacks come in a thread of
+    the graph's own, one after another; they must be quick. In a program that is one asyncio loop,
+    and judges the graph rather than following it, use `in_loop`. `close` it, or use it in a `with`.
+
+    Attributes:
+        transport: layer 1, for who wants to send.
+        events: layer 2.
+        state: layer 3.
+        discovery: what discovery shows.
+        clients: of nodes' services; to be used in the graph's loop.
+    """
+
+    def __init__(
+        self,
+        discovery: GraphObserver,
+        scheduler: LoopScheduler | ThreadScheduler,
+        *,
+        messages: bool = True,
+        silent_after_s: float = SILENT_AFTER_S,
+        quiet_s: float = QUIET_S,
+        burst_s: float = BURST_S,
+        guests: bool = False,
+    ) -> None:
+        """Put the layers together; with a thread of its own the graph also follows every node."""
+        self.scheduler = scheduler
+        self.transport: GraphTransport = DdsTransport(discovery.node)
+        self.discovery = discovery
+        self.clients = NodeClients(discovery)
+        self.events = GraphEvents(
+            self.transport if messages else None, scheduler, silent_after_s=silent_after_s
+        )
+        self._observer = Observer(
+            discovery,
+            self.clients,
+            self.events,
+            quiet_s=quiet_s,
+            burst_s=burst_s,
+            guests=guests,
+            follows=isinstance(scheduler, ThreadScheduler),
+        )
+        self.state = self._observer.state
+        self._closed = False
+
+    @classmethod
+    def open(
+        cls,
+        domain_id: int | None = None,
+        *,
+        connections: ParticipantConnections | None = None,
+        silent_after_s: float = SILENT_AFTER_S,
+    ) -> Graph:
+        """Follow the graph of a domain with a participant of its own.
+
+        Args:
+            domain_id: 0–232; None: ROS_DOMAIN_ID, else 0.
+            connections: how the participant is connected; None leaves it to the RMW.
+            silent_after_s: see `GraphEvents`.
+
+        Raises:
+            MiddlewareError: no participant could be made.
+        """
+        if domain_id is None:
+            domain_id = int(os.environ.get("ROS_DOMAIN_ID") or 0)
+        discovery = GraphObserver(domain_id, connections)
+        return cls(discovery, ThreadScheduler(), silent_after_s=silent_after_s)
+
+    @classmethod
+    def on(cls, node: Node, *, silent_after_s: float = SILENT_AFTER_S) -> Graph:
+        """Follow the graph with a node that is there and that an executor spins.
+
+        Nothing is spun here: messages and answers come while the node's executor runs. Close the
+        graph before the node is destroyed.
+
+        Args:
+            node: any rclpy node, a LifecycleNode for instance.
+            silent_after_s: see `GraphEvents`.
+
+        Raises:
+            MiddlewareError: rcl's graph guard condition could not be waited on.
+        """
+        return cls(GraphObserver.on(node), ThreadScheduler(), silent_after_s=silent_after_s)
+
+    @classmethod
+    def in_loop(
+        cls,
+        domain_id: int,
+        connections: ParticipantConnections | None = None,
+        *,
+        messages: bool = False,
+        guests: bool = False,
+        quiet_s: float = QUIET_S,
+        burst_s: float = BURST_S,
+    ) -> Graph:
+        """Look at the graph of a domain with a participant of its own, as a supervisor does.
+
+        Make it before starting what is to be observed. All runs in the asyncio loop in which the
+        graph is first used; nodes are asked when `observe` is called, and then only.
+
+        Args:
+            domain_id: 0–232.
+            connections: how the participant is connected; None leaves it to the RMW.
+            messages: receive what nodes say of themselves; a change is worth another look.
+            guests: also ask nodes that are not planned, as far as they have our node interface.
+            quiet_s: a burst of changes is over when nothing changed for so long, ≥ 0.
+            burst_s: a burst is cut off after so long, ≥ quiet_s.
+
+        Raises:
+            MiddlewareError: no participant could be made.
+        """
+        return cls(
+            GraphObserver(domain_id, connections),
+            LoopScheduler(),
+            messages=messages,
+            quiet_s=quiet_s,
+            burst_s=burst_s,
+            guests=guests,
+        )
+
+    # -- judging
+
+    def observation(self, plan: Plan) -> Observation:
+        """Return what there is of `plan` now and what there is besides, for `lifecycle.verify`.
+
+        Planned nodes are asked anew for their state and their configuration, which takes up to a
+        second for each that does not answer, all at once. Just after the graph was made it waits
+        until discovery is complete, up to 3.5 s. Not to be called in a callback, nor with
+        `in_loop`: there, `observe`.
+        """
+        if isinstance(self.scheduler, LoopScheduler):
+            raise TypeError("cannot wait for an observation in its own loop; await observe(plan)")
+        return asyncio.run_coroutine_threadsafe(self.observe(plan), self.scheduler.loop).result()
+
+    def verdict(self, plan: Plan, *, stage: Stage = Stage.ACTIVE) -> Verdict:
+        """Return whether what runs now is what `plan` says, by the rules of `lifecycle verify`.
+
+        Args:
+            plan: of a manifest, `lifecycle.plan.build_plan`.
+            stage: ACTIVE, or CONNECTED before anything is activated.
+        """
+        return verify(plan, self.observation(plan), stage=stage)
+
+    async def observe(self, plan: Plan) -> Observation:
+        """Return what `observation` returns; in the graph's loop.
+
+        Raises:
+            MiddlewareError: the graph can no longer be watched.
+        """
+        return await self._observer.observe(plan)
+
+    @property
+    def changes(self) -> int:
+        """Changes so far, each counted at once: before its burst has passed (`wait_change`)."""
+        return self._observer.changes
+
+    async def wait_change(self) -> None:
+        """Wait until a burst of changes has passed, if any came since the last observation."""
+        await self._observer.wait_change()
+
+    # -- following
+
+    def wait_for(self, holds: Callable[[GraphState], object], *, timeout_s: float) -> bool:
+        """Wait until something holds of the state; False if it did not within `timeout_s`.
+
+        It is looked at after each change, never in between. Not to be called in a callback.
+        """
+        found = threading.Event()
+
+        def look(*_: object) -> None:
+            if not found.is_set() and holds(self.state):
+                found.set()
+
+        remove = self.state.on_change(look)
+        try:
+            self.scheduler.post(look)
+            return found.wait(timeout_s)
+        finally:
+            remove()
+
+    def close(self) -> None:
+        """Leave the graph; again is harmless. Nothing is called back after it."""
+        if self._closed:
+            return
+        self._closed = True
+        self.events.close()
+        if isinstance(self.scheduler, ThreadScheduler):
+            self.scheduler.close()
+        self._observer.close()
+        self.transport.close()
+        self.clients.destroy()
+        self.discovery.destroy()
+
+    def __enter__(self) -> Graph:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
