@@ -25,7 +25,7 @@ from lifecycle.network.five_qi import five_qi_of
 from lifecycle.network.five_qi_dscp import dscp_mapping
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.network.transport_priority import TransportPriorityMapping
-from tests.unit.plan.samples import at, link, manifest, need, node, publisher, subscription
+from tests.builders import at, link, manifest, need, node, publisher, subscription
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
 STRICTLY = UniqueRequirement.STRICTLY_REQUIRED

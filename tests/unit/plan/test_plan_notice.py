@@ -21,7 +21,7 @@ from lifecycle.plan.notice import (
     encode,
     notice_of,
 )
-from tests.unit.supervisor.fakes import HERE, plan_of, planned_node
+from tests.builders import HERE, plan_of, planned_node
 
 
 def plan(system: str = "robot", *names: str) -> Plan:

@@ -23,7 +23,7 @@ from lifecycle.plan import PlanError, owner_of, participants_cost
 from lifecycle.plan.command import command_line, parameter_text
 from lifecycle.plan.levels import dependency_levels
 from lifecycle.plan.processes import planned_processes
-from tests.unit.plan.samples import link, need, node, planned, publisher, subscription
+from tests.builders import link, need, node, planned, publisher, subscription
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
 STRICTLY = UniqueRequirement.STRICTLY_REQUIRED

@@ -26,7 +26,7 @@ from lifecycle.plan import build_plan
 from lifecycle.plan.connections.demand import demand
 from lifecycle.plan.render.table import table
 from lifecycle.plan.render.text import render_text, spell_qos
-from tests.unit.plan.samples import at, need, node, planned, publisher, subscription, teleop
+from tests.builders import at, need, node, planned, publisher, subscription, teleop
 
 TELEOP = """\
 system robot: 2 nodes, 2 processes, 3 flows; domain 7, discovery range system_default

@@ -13,7 +13,7 @@ from lifecycle.supervisor.connections.desired_state import steps, wired
 from lifecycle.supervisor.connections.negotiation import NegotiatedSource
 from lifecycle.supervisor.connections.renegotiation import Expectation
 from lifecycle.verify.observation import NodeConfiguration, Observation
-from tests.unit.plan.samples import at
+from tests.builders import at
 from tests.unit.supervisor.fakes import rewired
 from tests.unit.supervisor.test_supervisor_negotiation import (
     LISTENER,
