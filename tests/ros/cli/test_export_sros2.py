@@ -7,6 +7,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
 from rclpy.node import Node
 
 from lifecycle.export.sros2 import documents
@@ -14,6 +15,8 @@ from lifecycle.manifest import load
 from lifecycle.plan import build_plan
 from tests.ros.supervisor.running import up
 from tests.ros.supervisor.test_systems_of_actions import acting
+
+pytestmark = pytest.mark.thorough
 
 
 def made_by(watcher: Node, name: str, namespace: str) -> tuple[set[str], set[str]]:

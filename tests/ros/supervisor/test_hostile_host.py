@@ -20,6 +20,8 @@ from lifecycle.middleware import segments_of
 from lifecycle.run_directory import RUN_VARIABLE
 from tests.ros.supervisor.running import ROOT, Up, command, environment, marked, pair
 
+pytestmark = pytest.mark.thorough
+
 OPEN = {"policy/undeclared_nodes": "open"}
 
 # Root of a user namespace of its own where this user may not make PID namespaces.
