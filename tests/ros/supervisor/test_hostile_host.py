@@ -43,6 +43,7 @@ def in_shared_memory(names: frozenset[str]) -> set[str]:
     return {name for name in names if Path("/dev/shm", name).exists()}
 
 
+@pytest.mark.alone  # what others leave in /dev/shm would be removed, and said
 def test_the_shared_memory_of_another_pid_namespace_is_left_alone(
     tmp_path: Path, domain_id: int, make_node: Callable[..., Node]
 ) -> None:

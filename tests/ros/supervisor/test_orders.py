@@ -325,6 +325,7 @@ def test_a_node_of_somebody_else_is_not_restarted(
         assert refused.stderr == "cannot restart '/intruder': somebody else runs it\n"
 
 
+@pytest.mark.thorough
 def test_a_changed_manifest_is_neither_restarted_nor_resumed_in_silence(
     tmp_path: Path, fresh_domain: int
 ) -> None:
@@ -387,6 +388,7 @@ def line_of(manifest: Path, start: str) -> int:
     return next(number for number, line in enumerate(lines, 1) if line.startswith(start))
 
 
+@pytest.mark.thorough
 def test_a_node_is_not_reloaded_alone_where_others_would_notice(
     tmp_path: Path, fresh_domain: int
 ) -> None:
@@ -414,6 +416,7 @@ def test_a_node_is_not_reloaded_alone_where_others_would_notice(
         assert phases(tmp_path)[0] == "active"
 
 
+@pytest.mark.thorough
 def test_a_manifest_that_moves_the_supervisor_itself_is_not_reloaded(
     tmp_path: Path, fresh_domain: int
 ) -> None:
@@ -435,6 +438,7 @@ def test_a_manifest_that_moves_the_supervisor_itself_is_not_reloaded(
         assert phases(tmp_path)[0] == "active"
 
 
+@pytest.mark.thorough
 def test_a_reloaded_system_has_the_nodes_of_the_new_manifest(
     tmp_path: Path, fresh_domain: int
 ) -> None:
@@ -468,6 +472,7 @@ def test_a_reloaded_system_has_the_nodes_of_the_new_manifest(
         run.assert_nothing_left()
 
 
+@pytest.mark.thorough
 def test_a_reloaded_system_that_is_not_as_declared_is_held(
     tmp_path: Path, fresh_domain: int, make_intruder: Intruders
 ) -> None:
@@ -511,6 +516,7 @@ def test_what_a_running_supervisor_cannot_take_is_refused_with_the_reason(
     )
 
 
+@pytest.mark.thorough
 def test_a_parameter_file_that_changed_is_not_taken_in_silence(
     tmp_path: Path, fresh_domain: int
 ) -> None:
