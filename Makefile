@@ -4,12 +4,20 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
-.PHONY: demo test check check-static bench hostile mutate docs clean help
+# How many tests run at once; most of them wait. Each has a domain of its own, tests/ros/conftest.py.
+WORKERS ?= 3
+PYTEST  := $(BIN)/python -m pytest
+
+# Tests start hundreds of programs: where nothing may be compiled ahead, each compiles the whole package again.
+export PYTHONDONTWRITEBYTECODE :=
+
+.PHONY: demo test test-thorough check check-static soak bench hostile mutate docs clean help
 
 help:
 	@echo "make demo    bring up a small robot from its manifest, verified, then shut it down"
-	@echo "make test    set up and run the tests that need no privilege"
+	@echo "make test    set up and run the tests, real DDS included; no privilege needed; five minutes"
 	@echo "make check   everything CI runs: lint, types, import contracts, all tests"
+	@echo "make soak    the faults and the gate twenty times in a row; an hour"
 	@echo "make bench   run the benchmarks and print their ratios"
 	@echo "make hostile attack everything that reads what others wrote, and list what was not handled"
 	@echo "make mutate  change what judges, one small change at a time, and list what no test notices"
@@ -24,10 +32,14 @@ $(STAMP): pyproject.toml
 demo: $(STAMP)
 	$(BIN)/lifecycle up manifests/teleop.lifecycle.yaml --stop-after 5
 
-# Side by side what minds no company; one after the other what is about time and silence.
 test: $(STAMP)
-	$(BIN)/python -m pytest -n 2 tests/unit tests/ros/faults
-	$(BIN)/python -m pytest tests/ros tests/net --ignore=tests/ros/faults
+	$(PYTEST) -n $(WORKERS) --dist worksteal tests/unit
+	$(PYTEST) -n $(WORKERS) --dist worksteal -m "not thorough and not alone" tests/ros
+
+# What `test` leaves out: first side by side as well, then one after the other.
+test-thorough: $(STAMP)
+	$(PYTEST) -n $(WORKERS) --dist worksteal -m "thorough and not alone" tests/ros tests/net
+	$(PYTEST) -m alone tests/ros tests/net
 
 check-static: $(STAMP)
 	$(BIN)/ruff check .
@@ -35,7 +47,15 @@ check-static: $(STAMP)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-check: check-static test
+check: check-static test test-thorough
+
+# What holds must hold each time: the faults and the gate, TIMES over and without a second try, then bring-ups on a busy machine.
+TIMES ?= 20
+soak: $(STAMP)
+	for each in $$(seq $(TIMES)); do \
+	  $(PYTEST) -n $(WORKERS) --dist worksteal -p no:rerunfailures tests/ros/faults tests/ros/supervisor/test_gate_holds.py || exit 1; \
+	done
+	$(BIN)/python benchmarks/soak_bring_up.py --times $(TIMES)
 
 bench: $(STAMP)
 	@for each in benchmarks/*.py; do echo "== $$each"; $(BIN)/python $$each || exit 1; done

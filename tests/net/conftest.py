@@ -19,12 +19,16 @@ def hosts() -> Iterator[Hosts]:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark everything below tests/net, give it a second try, and skip it where no host can be."""
+    """Mark everything below tests/net, give it a second try, and skip it where no host can be.
+
+    All of it is `thorough`: most machines cannot run it.
+    """
     here = Path(__file__).parent
     mine = [item for item in items if here in item.path.parents]
     reason = lacking() if mine else ""
     for item in mine:
         item.add_marker(pytest.mark.net)
+        item.add_marker(pytest.mark.thorough)
         item.add_marker(SECOND_TRY)
         if reason:
             item.add_marker(pytest.mark.skip(reason=reason))

@@ -21,6 +21,8 @@ from tests.ros.supervisor.running import Up
 from tests.stalls import TRIES, Stalls, assert_in_time, noted_stalls
 from tests.unit.middleware.test_retransmission import KNOWN
 
+pytestmark = pytest.mark.alone
+
 NODES = "benchmarks.liveliness_nodes"
 WITHIN_S = 1.0
 """What is promised."""

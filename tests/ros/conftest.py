@@ -80,6 +80,13 @@ def fresh_domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
         yield domain
 
 
+@pytest.fixture(scope="module")
+def shared_domain() -> Iterator[int]:
+    """A domain for the tests of one module that look at one running system."""
+    with _claimed_domain() as domain:
+        yield domain
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _shared_memory() -> Iterator[set[str]]:
     """Fail the run if a segment that it made is left and unused at its end."""

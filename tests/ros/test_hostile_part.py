@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.thorough
+
 ROOT = Path(__file__).parents[2]
 EVERY = {"files": 15, "servers": 16, "control": 5, "parsers": 10}
 """Which of a class's attacks are tried here: each so manieth."""

@@ -28,7 +28,7 @@ from lifecycle.supervisor.control import server
 from lifecycle.supervisor.control.client import find_run, running
 from lifecycle.supervisor.control.server import Ask, ControlServer, Question, ask, follow
 from lifecycle.supervisor.control.status import SystemStatus
-from tests.unit.supervisor.fakes import plan_of, planned_node
+from tests.builders import plan_of, planned_node
 
 STATUS = SystemStatus(
     system="robot",

@@ -12,6 +12,8 @@ from lifecycle.errors import ExitCode
 from lifecycle.manifest import load
 from tests.ros.supervisor.running import BOUND_S, ENOUGH, pair, up, verb
 
+pytestmark = pytest.mark.thorough
+
 _SETTLES = ("--wait", str(BOUND_S / 2))
 """It ends once nothing changes any more, which takes a busy machine longer."""
 

@@ -19,12 +19,15 @@ from tests.ros.supervisor.running import (
     BOUND_S,
     ENOUGH,
     ROOT,
+    Up,
     command,
     environment,
     pair,
     up,
     verb,
 )
+
+pytestmark = pytest.mark.thorough
 
 
 def picture(*words: str, runtime: Path) -> dict[str, Any]:
@@ -47,53 +50,58 @@ def states(drawn: dict[str, Any]) -> dict[str, tuple[str, str]]:
 ACTIVE = ("present", "active")
 
 
-def test_a_supervised_system_is_drawn_with_its_processes_and_flows(
-    tmp_path: Path, fresh_domain: int
-) -> None:
-    manifest = pair(tmp_path, fresh_domain)
-    with up(manifest, runtime=tmp_path) as run:
+@pytest.fixture(scope="module")
+def active(tmp_path_factory: pytest.TempPathFactory, shared_domain: int) -> Iterator[Up]:
+    """An active pair to look at."""
+    directory = tmp_path_factory.mktemp("active")
+    with up(pair(directory, shared_domain), runtime=directory) as run:
         run.until("system", reached="active")
-        for target in ("pair", str(manifest)):
-            drawn = picture(target, runtime=tmp_path)
-            assert (drawn["phase"], drawn["verdict"]) == ("active", "ok")
-            assert states(drawn) == {"/listener": ACTIVE, "/talker": ACTIVE}
-        pids = {
-            node["name"]: node["pid"]
-            for process in drawn["machines"][0]["processes"]
-            for node in process["nodes"]
-        }
-        assert pids == {f"/{key}": run.pid_of(key) for key in ("listener", "talker")}
-        flow = drawn["flows"][0]
-        assert (flow["topic"], flow["names"], flow["presence"], flow["outcome"]) == (
-            "/chatter",
-            ["/talker", "/listener"],
-            "present",
-            "ok",
-        )
-        assert flow["tuples"][0].startswith("udp ")
+        yield run
+        run.signal(signal.SIGTERM)
+        assert run.finish() == ExitCode.OK
+
+
+def test_a_supervised_system_is_drawn_with_its_processes_and_flows(active: Up) -> None:
+    runtime, manifest = active.runtime, active.manifest
+    for target in ("pair", str(manifest)):
+        drawn = picture(target, runtime=runtime)
+        assert (drawn["phase"], drawn["verdict"]) == ("active", "ok")
+        assert states(drawn) == {"/listener": ACTIVE, "/talker": ACTIVE}
+    pids = {
+        node["name"]: node["pid"]
+        for process in drawn["machines"][0]["processes"]
+        for node in process["nodes"]
+    }
+    assert pids == {f"/{key}": active.pid_of(key) for key in ("listener", "talker")}
+    flow = drawn["flows"][0]
+    assert (flow["topic"], flow["names"], flow["presence"], flow["outcome"]) == (
+        "/chatter",
+        ["/talker", "/listener"],
+        "present",
+        "ok",
+    )
+    assert flow["tuples"][0].startswith("udp ")
 
 
 def test_without_a_supervisor_what_runs_is_looked_at_from_outside(
-    tmp_path: Path, fresh_domain: int
+    tmp_path: Path, active: Up, shared_domain: int
 ) -> None:
-    manifest = pair(tmp_path, fresh_domain)
-    empty = verb("graph", str(manifest), "--timeout", "0", runtime=tmp_path)
+    seen = picture(str(active.manifest), *ENOUGH, runtime=tmp_path)
+    assert (seen["phase"], seen["verdict"]) == ("", "ok")
+    assert states(seen) == {"/listener": ACTIVE, "/talker": ACTIVE}
+
+    other = pair(tmp_path, shared_domain, edit={"nodes/third": _THIRD})
+    seen = picture(str(other), "--timeout", "0", runtime=tmp_path)
+    assert states(seen)["/third"] == ("missing", "not there")
+
+
+def test_where_nothing_runs_what_is_declared_is_missing(tmp_path: Path, fresh_domain: int) -> None:
+    empty = verb("graph", str(pair(tmp_path, fresh_domain)), "--timeout", "0", runtime=tmp_path)
     assert empty.returncode == ExitCode.OK
     assert "  ∅ /talker    not there  declared, but missing ⚠2\n" in empty.stdout
     assert empty.stderr == (
         f"no node in the graph; looked in ROS domain {fresh_domain}, discovery range localhost\n"
     )
-    remote_nodes = tmp_path / "elsewhere"
-    remote_nodes.mkdir()
-    with up(manifest, runtime=tmp_path) as run:
-        run.until("system", reached="active")
-        seen = picture(str(manifest), *ENOUGH, runtime=remote_nodes)
-        assert (seen["phase"], seen["verdict"]) == ("", "ok")
-        assert states(seen) == {"/listener": ACTIVE, "/talker": ACTIVE}
-
-        other = pair(remote_nodes, fresh_domain, edit={"nodes/third": _THIRD})
-        seen = picture(str(other), "--timeout", "0", runtime=remote_nodes)
-        assert states(seen)["/third"] == ("missing", "not there")
 
 
 _THIRD = {"run": {"attach": True}, "managed": False}

@@ -60,6 +60,7 @@ def run_up(fault: Fault, directory: Path) -> UpRun:
     environment = {
         **os.environ,
         "ROS_LOG_DIR": str(directory / "log"),
+        "XDG_RUNTIME_DIR": str(directory),
         "FAULT_SHARED_MEMORY_ONLY": str(Path(__file__).with_name("shared_memory_only.xml")),
         "FAULT_FOREIGN_PARTITION": str(Path(__file__).with_name("foreign_partition.xml")),
     }

@@ -19,7 +19,7 @@ from lifecycle.errors import ExitCode
 from tests.ros.faults.running import ROOT
 from tests.ros.faults.system import BARE_DDS, healthy
 
-pytestmark = pytest.mark.ros
+pytestmark = [pytest.mark.ros, pytest.mark.thorough]
 
 LIMIT_S = 60.0
 STRING = b":std_msgs::msg::dds_::String_"

@@ -16,7 +16,7 @@ from lifecycle.graph import Graph
 from lifecycle.middleware.rcl.graph import PATIENCE_S
 from tests.stalls import Stalls, assert_in_time, noted_stalls
 
-pytestmark = pytest.mark.ros
+pytestmark = [pytest.mark.ros, pytest.mark.alone]
 
 STRANGER = """
 import os, signal

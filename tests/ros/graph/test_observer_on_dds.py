@@ -14,58 +14,19 @@ from rclpy.node import Node
 from std_msgs.msg import String
 
 from lifecycle.graph import Graph
-from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import (
-    DiscoveryRange,
-    EndpointPolicy,
-    Policy,
-    Run,
     RunKind,
-    Timeouts,
 )
-from lifecycle.plan.model import Plan, PlannedNode
+from lifecycle.plan.model import Plan
 from lifecycle.verify.observation import Observation
+from tests.builders import plan_of, planned_node
 
 BOUND_S = 30.0
-AT = Position(file="m.yaml", line=1, column=1)
-
-
-def planned(name: str) -> PlannedNode:
-    return PlannedNode(
-        key=name,
-        name=name,
-        namespace="/",
-        machine="",
-        process=name,
-        managed=True,
-        run=Run(kind=RunKind.ATTACH),
-        endpoints=(),
-        declared_parameters=(),
-        parameters=(),
-        parameter_files=(),
-        remap=(),
-        participants=(),
-        after=(),
-        timeouts=Timeouts(),
-        endpoint_policy=EndpointPolicy.DECLARED,
-        log_level="",
-        at=AT,
-    )
 
 
 def plan(domain_id: int, *names: str) -> Plan:
-    return Plan(
-        system="test",
-        manifest_path="m.yaml",
-        domain_id=domain_id,
-        discovery_range=DiscoveryRange.LOCALHOST,
-        policy=Policy(),
-        machines=(),
-        processes=(),
-        nodes=tuple(planned(name) for name in names),
-        flows=(),
-        levels=(),
-    )
+    nodes = (planned_node(name, kind=RunKind.ATTACH) for name in names)
+    return plan_of(*nodes, domain_id=domain_id)
 
 
 @pytest.fixture

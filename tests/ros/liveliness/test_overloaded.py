@@ -9,10 +9,13 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
 import yaml
 
 from tests.ros.liveliness.nodes import WORKS_S
 from tests.ros.supervisor.running import up
+
+pytestmark = pytest.mark.alone
 
 SILENT_S = 0.8
 """`timeouts.silent_s` where a manifest does not say."""

@@ -19,6 +19,8 @@ from lifecycle.middleware.discovery.rediscovery import tell_names
 from tests.ros.supervisor.running import ROOT, Event, Up, environment, up, verb
 from tests.stalls import Stalls, assert_in_time, noted_stalls
 
+pytestmark = pytest.mark.alone
+
 NODES = "benchmarks.liveliness_nodes"
 WITHIN_S = 1.0
 """What is promised."""

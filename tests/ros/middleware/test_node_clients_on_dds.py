@@ -21,7 +21,7 @@ from std_srvs.srv import Trigger
 from lifecycle.codec import to_json
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware import GraphObserver, NodeClients, ServiceUnansweredError
-from lifecycle.verify.observation import Identity, NodeConfiguration
+from tests.builders import configuration
 
 T = TypeVar("T")
 Serve = Callable[..., None]
@@ -29,17 +29,7 @@ WaitUntil = Callable[..., None]
 
 BOUND_S = 30.0
 UNREADABLE = "cannot read the configuration of '/n': Object missing required field `identity`"
-CONFIGURATION = NodeConfiguration(
-    identity=Identity(machine_id="m", process_id=1, node_id="/n@01"),
-    name="/n",
-    state="inactive",
-    connected=True,
-    rmw="rmw_fastrtps_cpp",
-    transports=("udpv4",),
-    serializations=("cdr",),
-    paradigms=("publish_subscribe",),
-    endpoints=(),
-)
+CONFIGURATION = configuration("/n")
 
 
 @pytest.fixture

@@ -6,13 +6,13 @@ from typing import Any
 
 from action_msgs.msg import GoalStatus
 from lifecycle_driver import Driver
-from planning import endpoint
 from rclpy.task import Future
 from std_msgs.msg import String
 from test_msgs.action import Fibonacci
 
 from lifecycle import GoalInterruptedError, LifecycleNode, on_action
 from lifecycle.manifest.model import EndpointKind
+from tests.builders import planned_endpoint
 
 TYPE = "test_msgs/action/Fibonacci"
 SUCCEEDED = GoalStatus.STATUS_SUCCEEDED
@@ -21,11 +21,11 @@ ABORTED = GoalStatus.STATUS_ABORTED
 
 
 def server(name: str = "count", **changes: Any) -> Any:
-    return endpoint(EndpointKind.ACTION_SERVER, name, TYPE, **changes)
+    return planned_endpoint(EndpointKind.ACTION_SERVER, name, TYPE, **changes)
 
 
 def client(name: str = "count", **changes: Any) -> Any:
-    return endpoint(EndpointKind.ACTION_CLIENT, name, TYPE, **changes)
+    return planned_endpoint(EndpointKind.ACTION_CLIENT, name, TYPE, **changes)
 
 
 class Counting(LifecycleNode):

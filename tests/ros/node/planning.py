@@ -11,36 +11,28 @@ import rclpy
 
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.manifest.qos import QosProfile
 from lifecycle.node.author.node import LifecycleNode
 from lifecycle.node.author.spec import Construction, Mode, constructing, plan_without_manifest
 from lifecycle.plan.model import PlannedEndpoint, PlannedNode
+from tests.builders import STRING, planned_endpoint
 
 AT = Position(file="test.lifecycle.yaml", line=7, column=5, path="nodes.it")
-_TOPICS = {EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION}
 
 
-def endpoint(kind: EndpointKind, name: str, type_: str, **changes: Any) -> PlannedEndpoint:
-    """Return a planned endpoint in the root namespace."""
-    qos = QosProfile() if kind in _TOPICS else None
-    values = {"qos": qos, "resolved": f"/{name.lstrip('/')}", "at": AT, **changes}
-    return PlannedEndpoint(kind=kind, name=name, type=type_, **values)
+def publisher(name: str, type_: str = STRING, **changes: Any) -> PlannedEndpoint:
+    return planned_endpoint(EndpointKind.PUBLISHER, name, type_, **changes)
 
 
-def publisher(name: str, type_: str = "std_msgs/msg/String", **changes: Any) -> PlannedEndpoint:
-    return endpoint(EndpointKind.PUBLISHER, name, type_, **changes)
-
-
-def subscription(name: str, type_: str = "std_msgs/msg/String", **changes: Any) -> PlannedEndpoint:
-    return endpoint(EndpointKind.SUBSCRIPTION, name, type_, **changes)
+def subscription(name: str, type_: str = STRING, **changes: Any) -> PlannedEndpoint:
+    return planned_endpoint(EndpointKind.SUBSCRIPTION, name, type_, **changes)
 
 
 def server(name: str, type_: str = "std_srvs/srv/Trigger") -> PlannedEndpoint:
-    return endpoint(EndpointKind.SERVICE_SERVER, name, type_)
+    return planned_endpoint(EndpointKind.SERVICE_SERVER, name, type_)
 
 
 def client(name: str, type_: str = "std_srvs/srv/Trigger") -> PlannedEndpoint:
-    return endpoint(EndpointKind.SERVICE_CLIENT, name, type_)
+    return planned_endpoint(EndpointKind.SERVICE_CLIENT, name, type_)
 
 
 def planned(name: str, *endpoints: PlannedEndpoint, **changes: Any) -> PlannedNode:

@@ -560,7 +560,7 @@ def test_a_planned_connection_that_cannot_be_made_fails_connect_and_leaves_none(
 
 
 _ALONE = """
-from planning import planned, publisher
+from tests.ros.node.planning import planned, publisher
 from lifecycle import LifecycleNode
 from lifecycle.node import run
 from lifecycle.plan.model import ParticipantConnections, PlannedParticipant
@@ -592,7 +592,7 @@ run(It, lifecycle="auto", spec=spec, say=lambda line: None)
 def test_a_node_in_a_terminal_is_connected_as_its_plan_says(fresh_domain: int) -> None:
     with subprocess.Popen(
         [sys.executable, "-c", _ALONE],
-        cwd=Path(__file__).parent,
+        cwd=Path(__file__).parents[3],
         stdout=subprocess.PIPE,
         text=True,
     ) as process:

@@ -131,7 +131,7 @@ def test_a_plain_node_gets_its_transports_too(start: Start, fresh_domain: int) -
 
 _ALONE = """
 import sys
-from planning import planned
+from tests.ros.node.planning import planned
 from lifecycle import LifecycleNode
 from lifecycle.middleware import has_shared_memory
 from lifecycle.node import run
@@ -150,7 +150,7 @@ def test_a_node_in_a_terminal_has_the_transports_of_its_plan(
 ) -> None:
     with subprocess.Popen(
         [sys.executable, "-c", _ALONE, *transports],
-        cwd=Path(__file__).parent,
+        cwd=Path(__file__).parents[3],
         stdout=subprocess.PIPE,
         text=True,
     ) as process:

@@ -87,6 +87,8 @@ class Up:
         variables: set in its environment.
 
     Attributes:
+        manifest: what it brings up.
+        runtime: directory of its runs and logs.
         events: everything it printed so far.
         segments: shared memory that its processes were seen to use.
     """
@@ -100,6 +102,8 @@ class Up:
         variables: Mapping[str, str] | None = None,
     ) -> None:
         self.mark = uuid.uuid4().hex
+        self.manifest = manifest
+        self.runtime = runtime
         self.events: list[Event] = []
         self.segments: set[str] = set()
         self._lines: queue.Queue[str] = queue.Queue()

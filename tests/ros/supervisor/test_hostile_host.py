@@ -20,6 +20,8 @@ from lifecycle.middleware import segments_of
 from lifecycle.run_directory import RUN_VARIABLE
 from tests.ros.supervisor.running import ROOT, Up, command, environment, marked, pair
 
+pytestmark = pytest.mark.thorough
+
 OPEN = {"policy/undeclared_nodes": "open"}
 
 # Root of a user namespace of its own where this user may not make PID namespaces.
@@ -41,6 +43,7 @@ def in_shared_memory(names: frozenset[str]) -> set[str]:
     return {name for name in names if Path("/dev/shm", name).exists()}
 
 
+@pytest.mark.alone  # what others leave in /dev/shm would be removed, and said
 def test_the_shared_memory_of_another_pid_namespace_is_left_alone(
     tmp_path: Path, domain_id: int, make_node: Callable[..., Node]
 ) -> None:

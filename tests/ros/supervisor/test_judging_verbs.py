@@ -14,6 +14,8 @@ import pytest
 from lifecycle.errors import ExitCode
 from tests.ros.supervisor.running import ENOUGH, pair, up, verb
 
+pytestmark = pytest.mark.thorough
+
 
 def test_a_running_system_is_judged_from_outside(tmp_path: Path, fresh_domain: int) -> None:
     manifest = pair(tmp_path, fresh_domain)

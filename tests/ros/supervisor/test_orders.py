@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import json
-import socket
+import signal
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -16,9 +16,12 @@ import yaml
 from rclpy.node import Node
 
 from lifecycle.errors import ExitCode
+from tests.ros.middleware.free_ports import free_ports
 from tests.ros.supervisor.running import BOUND_S, ENOUGH, Up, pair, up, verb
 
 Intruders = Callable[[int], Callable[[], None]]
+_PORTS = 20
+"""More than a planner gives out to two nodes from `first_port` on."""
 
 
 def requests(run: Up, since: int) -> list[tuple[str, str]]:
@@ -254,7 +257,19 @@ def test_a_node_that_dies_while_it_restarts_ends_the_run(tmp_path: Path, fresh_d
         run.assert_nothing_left()
 
 
-def test_orders_that_name_nothing_are_refused(tmp_path: Path, fresh_domain: int) -> None:
+@pytest.fixture(scope="module")
+def active(tmp_path_factory: pytest.TempPathFactory, shared_domain: int) -> Iterator[Up]:
+    """An active pair for tests that change nothing of it."""
+    directory = tmp_path_factory.mktemp("active")
+    with up(pair(directory, shared_domain), runtime=directory) as run:
+        run.until("system", reached="active")
+        yield run
+        assert phases(directory) == ("active", {"/talker": "active", "/listener": "active"})
+        run.signal(signal.SIGTERM)
+        assert run.finish() == ExitCode.OK
+
+
+def test_orders_that_name_nothing_are_refused(active: Up, shared_domain: int) -> None:
     refusals = {
         ("restart", "pair", "talkre"): (
             "cannot restart 'talkre': this supervisor runs no such node; "
@@ -264,15 +279,24 @@ def test_orders_that_name_nothing_are_refused(tmp_path: Path, fresh_domain: int)
             "cannot restart talker, listener at once; name one node, or none\n"
         ),
         ("pause", "pear"): (
-            f"cannot find a running system 'pear'; running: pair@{fresh_domain}; "
+            f"cannot find a running system 'pear'; running: pair@{shared_domain}; "
             "start it: lifecycle up MANIFEST\n"
         ),
     }
-    with up(pair(tmp_path, fresh_domain), runtime=tmp_path) as run:
-        run.until("system", reached="active")
-        for words, said in refusals.items():
-            refused = verb(*words, runtime=tmp_path)
-            assert (refused.returncode, refused.stderr) == (ExitCode.USAGE, said)
+    for words, said in refusals.items():
+        refused = verb(*words, runtime=active.runtime)
+        assert (refused.returncode, refused.stderr) == (ExitCode.USAGE, said)
+
+
+def test_a_second_up_of_the_same_system_is_refused(active: Up, shared_domain: int) -> None:
+    manifest = pair(active.runtime, shared_domain)
+    second = verb("up", str(manifest), runtime=active.runtime)
+    assert second.returncode == ExitCode.USAGE
+    assert second.stderr == (
+        f"cannot bring up 'pair@{shared_domain}': another supervisor "
+        f"(pid {active.process.pid}) runs it already; "
+        f"end it first: lifecycle down pair@{shared_domain}\n"
+    )
 
 
 def test_a_system_on_its_way_up_takes_no_orders(tmp_path: Path, fresh_domain: int) -> None:
@@ -301,6 +325,7 @@ def test_a_node_of_somebody_else_is_not_restarted(
         assert refused.stderr == "cannot restart '/intruder': somebody else runs it\n"
 
 
+@pytest.mark.thorough
 def test_a_changed_manifest_is_neither_restarted_nor_resumed_in_silence(
     tmp_path: Path, fresh_domain: int
 ) -> None:
@@ -363,6 +388,7 @@ def line_of(manifest: Path, start: str) -> int:
     return next(number for number, line in enumerate(lines, 1) if line.startswith(start))
 
 
+@pytest.mark.thorough
 def test_a_node_is_not_reloaded_alone_where_others_would_notice(
     tmp_path: Path, fresh_domain: int
 ) -> None:
@@ -390,11 +416,11 @@ def test_a_node_is_not_reloaded_alone_where_others_would_notice(
         assert phases(tmp_path)[0] == "active"
 
 
+@pytest.mark.thorough
 def test_a_manifest_that_moves_the_supervisor_itself_is_not_reloaded(
     tmp_path: Path, fresh_domain: int
 ) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        first_port = 20000 + server.getsockname()[1] % 10000
+    first_port = free_ports(_PORTS)[0]
     how = {"discovery": {"domain_id": fresh_domain, "mode": "static", "first_port": first_port}}
     manifest = pair(tmp_path, fresh_domain, edit=how)
     with up(manifest, runtime=tmp_path) as run:
@@ -412,6 +438,7 @@ def test_a_manifest_that_moves_the_supervisor_itself_is_not_reloaded(
         assert phases(tmp_path)[0] == "active"
 
 
+@pytest.mark.thorough
 def test_a_reloaded_system_has_the_nodes_of_the_new_manifest(
     tmp_path: Path, fresh_domain: int
 ) -> None:
@@ -445,6 +472,7 @@ def test_a_reloaded_system_has_the_nodes_of_the_new_manifest(
         run.assert_nothing_left()
 
 
+@pytest.mark.thorough
 def test_a_reloaded_system_that_is_not_as_declared_is_held(
     tmp_path: Path, fresh_domain: int, make_intruder: Intruders
 ) -> None:
@@ -466,33 +494,29 @@ def test_a_reloaded_system_that_is_not_as_declared_is_held(
 
 
 def test_what_a_running_supervisor_cannot_take_is_refused_with_the_reason(
-    tmp_path: Path, fresh_domain: int
+    active: Up, shared_domain: int
 ) -> None:
-    manifest = pair(tmp_path, fresh_domain)
+    directory, domain_id = active.runtime, shared_domain
     end = "; end it and start it anew: lifecycle down, then lifecycle up\n"
-    with up(manifest, runtime=tmp_path) as run:
-        run.until("system", reached="active")
-        pair(tmp_path, fresh_domain, edit={"discovery/range": "subnet"})
-        refused = verb("restart", str(manifest), "--reload", runtime=tmp_path)
-        assert refused.returncode == ExitCode.USAGE
-        assert refused.stderr == (
-            "cannot reload the manifest of 'pair' while it runs: a running supervisor cannot "
-            'change this:\ndiscovery.range: was "localhost", is "subnet"' + end
-        )
-        refused = verb("restart", "pair", "--reload", runtime=tmp_path)
-        assert refused.returncode == ExitCode.USAGE
-        assert refused.stderr == (
-            "cannot reload 'pair': it is no manifest; name the manifest's file\n"
-        )
-        pair(tmp_path, fresh_domain + 1)
-        refused = verb("restart", str(manifest), "--reload", runtime=tmp_path)
-        assert refused.returncode == ExitCode.USAGE
-        assert refused.stderr.startswith(
-            f"cannot find a running system 'pair@{fresh_domain + 1}'; running: pair@{fresh_domain}"
-        )
-        assert phases(tmp_path)[0] == "active"
+    manifest = pair(directory, domain_id, edit={"discovery/range": "subnet"})
+    refused = verb("restart", str(manifest), "--reload", runtime=directory)
+    assert refused.returncode == ExitCode.USAGE
+    assert refused.stderr == (
+        "cannot reload the manifest of 'pair' while it runs: a running supervisor cannot "
+        'change this:\ndiscovery.range: was "localhost", is "subnet"' + end
+    )
+    refused = verb("restart", "pair", "--reload", runtime=directory)
+    assert refused.returncode == ExitCode.USAGE
+    assert refused.stderr == ("cannot reload 'pair': it is no manifest; name the manifest's file\n")
+    pair(directory, domain_id + 1)
+    refused = verb("restart", str(manifest), "--reload", runtime=directory)
+    assert refused.returncode == ExitCode.USAGE
+    assert refused.stderr.startswith(
+        f"cannot find a running system 'pair@{domain_id + 1}'; running: pair@{domain_id}"
+    )
 
 
+@pytest.mark.thorough
 def test_a_parameter_file_that_changed_is_not_taken_in_silence(
     tmp_path: Path, fresh_domain: int
 ) -> None:

@@ -38,6 +38,8 @@ from tests.ros.supervisor.running import (
     verb,
 )
 
+pytestmark = pytest.mark.thorough
+
 _CHATTY = {"nodes/talker/run/python": "tests.ros.supervisor.systems:Chatty"}
 _ENDS_S = 15.0
 """A take-down takes a second or two, the last of the output more; a busy machine doubles it."""

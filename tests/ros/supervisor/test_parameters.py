@@ -17,6 +17,8 @@ from lifecycle.middleware import GraphObserver
 from lifecycle.middleware.services.service_calls import ServiceCalls
 from tests.ros.supervisor.running import BOUND_S, ENOUGH, ROOT, Up, pair, up, verb
 
+pytestmark = pytest.mark.thorough
+
 ARM = str(ROOT / "tests" / "ros" / "supervisor" / "with_parameters.py")
 DECLARED = {
     "gain": {"type": "double"},

@@ -6,10 +6,13 @@ import json
 from pathlib import Path
 from typing import Any
 
+import pytest
 import yaml
 
 from lifecycle.errors import ExitCode
 from tests.ros.supervisor.running import up, verb
+
+pytestmark = pytest.mark.thorough
 
 TYPE = "test_msgs/action/Fibonacci"
 HIDDEN = ("send_goal", "cancel_goal", "get_result", "feedback", "status")

@@ -7,9 +7,12 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import pytest
 import yaml
 
 from tests.ros.supervisor.running import ROOT, Event, up
+
+pytestmark = pytest.mark.thorough
 
 ASK = {"name": "ask", "type": "std_srvs/srv/Trigger"}
 SERVER = ROOT / "tests" / "ros" / "supervisor" / "answering.py"

@@ -7,10 +7,13 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import pytest
 import yaml
 
 from lifecycle.errors import ExitCode
 from tests.ros.supervisor.running import ENOUGH, ROOT, pair, up, verb
+
+pytestmark = pytest.mark.thorough
 
 _FOREIGN = str(ROOT / "tests" / "ros" / "faults" / "foreign.py")
 _NUMBERS = {"max_delay_ms": 0.0001, "rate_hz": 500, "loss": 1e-6, "max_message_size": 3}

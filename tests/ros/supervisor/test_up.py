@@ -395,21 +395,6 @@ def test_a_grandchild_that_escaped_into_its_own_session_is_ended_too(
         run.assert_nothing_left()
 
 
-def test_a_second_up_of_the_same_system_is_refused(tmp_path: Path, fresh_domain: int) -> None:
-    manifest = pair(tmp_path, fresh_domain)
-    with up(manifest, runtime=tmp_path) as run:
-        run.until("system", reached="active")
-        second = verb("up", str(manifest), runtime=tmp_path)
-        assert second.returncode == ExitCode.USAGE
-        assert second.stderr == (
-            f"cannot bring up 'pair@{fresh_domain}': another supervisor "
-            f"(pid {run.process.pid}) runs it already; "
-            f"end it first: lifecycle down pair@{fresh_domain}\n"
-        )
-        run.signal(signal.SIGTERM)
-        assert run.finish() == ExitCode.OK
-
-
 def test_status_and_down_talk_to_a_running_supervisor(tmp_path: Path, fresh_domain: int) -> None:
     manifest = pair(tmp_path, fresh_domain)
     with up(manifest, runtime=tmp_path) as run:
@@ -509,7 +494,10 @@ def test_a_run_that_hangs_on_leaving_the_graph_ends_with_its_verdict_and_report(
 
 
 _NOBODY = "54321"
-"""A user without any other process: limits of processes are counted per user."""
+"""A user without any other process."""
+
+_LIMITED = str(54400 + int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw")))
+"""Likewise, and each test process has another one: limits of processes are counted per user."""
 
 _READS_ALL = "+dac_read_search,+dac_override"
 """Capabilities to use this installation all the same; the limit holds without CAP_SYS_RESOURCE."""
@@ -521,7 +509,7 @@ def limited(*options: str) -> tuple[str, ...]:
         return ("prlimit", *options)
     if shutil.which("setpriv") is None:
         pytest.skip("root has no limit of processes, and setpriv is not installed")
-    user = ("setpriv", "--reuid", _NOBODY, "--clear-groups", "--inh-caps", _READS_ALL)
+    user = ("setpriv", "--reuid", _LIMITED, "--clear-groups", "--inh-caps", _READS_ALL)
     return (*user, "--ambient-caps", _READS_ALL, "prlimit", *options)
 
 
@@ -550,6 +538,7 @@ def test_without_room_for_its_threads_a_system_is_not_begun_and_says_so(
         run.close()
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("whom", ["supervisor", "all"])
 def test_at_the_limit_of_processes_a_system_is_taken_down_all_the_same(
     tmp_path: Path, fresh_domain: int, whom: str

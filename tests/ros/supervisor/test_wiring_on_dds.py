@@ -23,6 +23,8 @@ from lifecycle.supervisor.gate.verification_loop import SETTLED_S
 from tests.ros.middleware.free_ports import free_ports
 from tests.ros.supervisor.running import BOUND_S, ENOUGH, ROOT, Up, left_of, pair, up, verb
 
+pytestmark = pytest.mark.thorough
+
 _PORTS = 20
 """More than a planner gives out to two nodes from `first_port` on."""
 

@@ -23,7 +23,7 @@ from lifecycle.plan import build_plan
 from lifecycle.supervisor.run.options import UpResult
 from lifecycle.supervisor.run.signals import Ended
 from lifecycle.verify import Outcome, Stage, Verdict, verify
-from tests.unit.plan.samples import teleop
+from tests.builders import teleop
 from tests.unit.verify.edits import drop_node
 from tests.unit.verify.perfect import perfect
 

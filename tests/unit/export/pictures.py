@@ -11,7 +11,7 @@ from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan import Plan, build_plan
 from lifecycle.verify import Stage, verify
 from lifecycle.verify.observation import Observation, ObservedEndpoint, ObservedNode
-from tests.unit.plan.samples import (
+from tests.builders import (
     STRING,
     at,
     endpoint,

@@ -18,15 +18,13 @@ from lifecycle.plan import build_plan
 from lifecycle.verify import Outcome, Stage, verify
 from lifecycle.verify.observation import (
     ConnectionReport,
-    EndpointReport,
-    Identity,
-    NodeConfiguration,
     NodeParameters,
     Observation,
     ObservedEndpoint,
     ObservedNode,
     ParameterReport,
 )
+from tests.builders import configuration, reported
 
 PUBLISHER, SUBSCRIPTION = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
 SERVER, CLIENT = EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT
@@ -288,27 +286,19 @@ def test_nodes_of_ours_tell_depth_uniqueness_dscp_and_their_hidden_participants(
     tmp_path: Path,
 ) -> None:
     told = QosProfile(depth=3)
-    configuration = NodeConfiguration(
-        identity=Identity(machine_id="m1", process_id=42, node_id="/robot/camera@01"),
-        name="/robot/camera",
-        state="active",
-        connected=True,
-        rmw="rmw_fastrtps_cpp",
-        transports=("udpv4",),
-        serializations=("cdr",),
-        paradigms=("publish-subscribe",),
-        endpoints=(
-            EndpointReport(
-                kind=PUBLISHER,
-                name="video",
-                resolved="/robot/video",
-                type="std_msgs/msg/String",
-                qos=told,
-                unique=UniqueRequirement.STRICTLY_REQUIRED,
-                participant="_camera_flow_0",
-                dscp=46,
-            ),
+    camera = configuration(
+        "/robot/camera",
+        reported(
+            PUBLISHER,
+            "video",
+            resolved="/robot/video",
+            qos=told,
+            unique=UniqueRequirement.STRICTLY_REQUIRED,
+            participant="_camera_flow_0",
+            dscp=46,
         ),
+        process_id=42,
+        state="active",
         connections=(ConnectionReport(name="net", node_name="_camera_net"),),
     )
     system = captured(
@@ -318,7 +308,7 @@ def test_nodes_of_ours_tell_depth_uniqueness_dscp_and_their_hidden_participants(
                 *plain("/robot/_camera_flow_0", "/robot/_camera_net"),
             ),
             endpoints=(endpoint(PUBLISHER, "/robot/_camera_flow_0", "/robot/video"),),
-            configurations=(configuration,),
+            configurations=(camera,),
         ),
         parameters={"/robot/camera": ()},
     )

@@ -38,8 +38,8 @@ from lifecycle.plan import build_plan
 from lifecycle.verify import Outcome, Stage, verify
 from lifecycle.verify.observation import Observation, ObservedEndpoint, ObservedNode
 from lifecycle.verify.verdict import Finding
+from tests.builders import STRING, node, planned, publisher, subscription, teleop
 from tests.unit.export.pictures import PUBLISHER, article, drawn, large, small
-from tests.unit.plan.samples import STRING, node, planned, publisher, subscription, teleop
 from tests.unit.verify.perfect import perfect
 
 SCHEMA = json.loads(

@@ -28,8 +28,8 @@ from lifecycle.export.picture.views import LINE, computational, data_layer, plac
 from lifecycle.manifest import load
 from lifecycle.manifest.model import Condition, Endpoint, EndpointKind, UniqueHow
 from lifecycle.plan import Plan, build_plan
+from tests.builders import endpoint, link, node, planned, publisher, subscription
 from tests.unit.export.pictures import PUBLISHER, SUBSCRIPTION, TRIGGER, article
-from tests.unit.plan.samples import endpoint, link, node, planned, publisher, subscription
 
 CLIENT, SERVER = EndpointKind.SERVICE_CLIENT, EndpointKind.SERVICE_SERVER
 SVG = "{http://www.w3.org/2000/svg}"

@@ -13,20 +13,13 @@ import pytest
 from lifecycle.errors import MiddlewareError
 from lifecycle.graph import GraphEvents, ManualScheduler
 from lifecycle.graph.observer import Observer
-from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import (
-    DiscoveryRange,
     EndpointKind,
-    EndpointPolicy,
-    Policy,
-    Run,
     RunKind,
-    Timeouts,
 )
-from lifecycle.plan.model import ExpectedParameter, Plan, PlannedNode
+from lifecycle.plan.model import ExpectedParameter, Plan
 from lifecycle.verify.noise import NO_NAMES, DeclaredNames
 from lifecycle.verify.observation import (
-    Identity,
     NodeConfiguration,
     NodeParameters,
     Observation,
@@ -34,6 +27,7 @@ from lifecycle.verify.observation import (
     ObservedNode,
     ParameterReport,
 )
+from tests.builders import configuration, plan_of, planned_node
 from tests.unit.supervisor.fakes import run as run_jumping
 
 T = TypeVar("T")
@@ -126,55 +120,7 @@ class FakeClients:
 
 
 def plan(*names: str) -> Plan:
-    at = Position(file="m.yaml", line=1, column=1)
-    return Plan(
-        system="test",
-        manifest_path="m.yaml",
-        domain_id=0,
-        discovery_range=DiscoveryRange.LOCALHOST,
-        policy=Policy(),
-        machines=(),
-        processes=(),
-        nodes=tuple(
-            PlannedNode(
-                key=name,
-                name=name,
-                namespace="/",
-                machine="",
-                process=name,
-                managed=True,
-                run=Run(kind=RunKind.ATTACH),
-                endpoints=(),
-                declared_parameters=(),
-                parameters=(),
-                parameter_files=(),
-                remap=(),
-                participants=(),
-                after=(),
-                timeouts=Timeouts(),
-                endpoint_policy=EndpointPolicy.DECLARED,
-                log_level="",
-                at=at,
-            )
-            for name in names
-        ),
-        flows=(),
-        levels=(),
-    )
-
-
-def configuration(name: str, state: str = "inactive") -> NodeConfiguration:
-    return NodeConfiguration(
-        identity=Identity(machine_id="m", process_id=1, node_id=f"{name}@01"),
-        name=name,
-        state=state,
-        connected=True,
-        rmw="rmw_fastrtps_cpp",
-        transports=(),
-        serializations=(),
-        paradigms=(),
-        endpoints=(),
-    )
+    return plan_of(*(planned_node(name, kind=RunKind.ATTACH) for name in names))
 
 
 @pytest.fixture
@@ -230,11 +176,11 @@ def test_a_node_without_lifecycle_services_is_not_asked_for_its_state(
     observer: Observer, graph: FakeGraph, clients: FakeClients
 ) -> None:
     graph.nodes = (ObservedNode(full_name="/a", managed=False),)
-    clients.configurations = {"/a": configuration("/a", "active")}
+    clients.configurations = {"/a": configuration("/a", state="active")}
     observation = run(observer.observe(plan("a")))
     assert clients.asked == []
     assert observation.nodes == graph.nodes
-    assert observation.configurations == (configuration("/a", "active"),)
+    assert observation.configurations == (configuration("/a", state="active"),)
 
 
 def test_what_was_put_is_believed_and_not_asked_for(
@@ -242,10 +188,10 @@ def test_what_was_put_is_believed_and_not_asked_for(
 ) -> None:
     graph.nodes = managed("/a")
     clients.states = {"/a": "unconfigured"}
-    observer.state.put_configuration(configuration("/a", "active"))
+    observer.state.put_configuration(configuration("/a", state="active"))
     observation = run(observer.observe(plan("a")))
     assert observation.nodes == (ObservedNode(full_name="/a", managed=True, state="active"),)
-    assert observation.configurations == (configuration("/a", "active"),)
+    assert observation.configurations == (configuration("/a", state="active"),)
     assert clients.asked == []
 
 
@@ -261,9 +207,9 @@ def test_what_was_put_stands_before_discovery_shows_the_node_and_goes_with_it(
 
 
 def test_a_newer_configuration_replaces_an_older_and_can_be_dropped(observer: Observer) -> None:
-    observer.state.put_configuration(configuration("/a", "inactive"))
-    observer.state.put_configuration(configuration("/a", "active"))
-    assert run(observer.observe(plan("a"))).configurations == (configuration("/a", "active"),)
+    observer.state.put_configuration(configuration("/a"))
+    observer.state.put_configuration(configuration("/a", state="active"))
+    assert run(observer.observe(plan("a"))).configurations == (configuration("/a", state="active"),)
     observer.state.drop_configuration("/a")
     observer.state.drop_configuration("/a")
     assert run(observer.observe(plan("a"))).configurations == ()

@@ -22,7 +22,7 @@ from lifecycle.manifest.model import (
 from lifecycle.network.dscp import TransportPriorityMapping, code_points
 from lifecycle.network.five_qi import dscp_mapping, five_qi_of
 from lifecycle.network.nfe import UniqueRequirement
-from tests.unit.plan.samples import at, link, manifest, need, node, publisher, subscription
+from tests.builders import at, link, manifest, need, node, publisher, subscription
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
 STRICTLY = UniqueRequirement.STRICTLY_REQUIRED

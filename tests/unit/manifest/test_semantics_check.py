@@ -9,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lifecycle.manifest.checks import check
-from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import (
     After,
     Condition,
@@ -20,7 +19,6 @@ from lifecycle.manifest.model import (
     Interface,
     Link,
     Machine,
-    Manifest,
     Node,
     Run,
     RunKind,
@@ -28,6 +26,7 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.manifest.qos import PRESETS
 from lifecycle.network.nfe import UniqueRequirement
+from tests.builders import at, endpoint, manifest, node
 
 Findings = Callable[..., list[str]]
 
@@ -67,44 +66,23 @@ def test_findings_of_all_topics_come_together_in_the_documents_order(findings: F
 
 
 def test_ten_thousand_endpoints_are_checked_within_seconds() -> None:
-    at = Position(file="s", line=1, column=1)
-
-    def node(index: int) -> Node:
-        endpoints = tuple(
-            Endpoint(
-                kind=kind,
-                name=f"/topic_{(index + shift) % 100}_{number}",
-                type="std_msgs/msg/Empty",
-                qos=PRESETS["default"],
-                at=at,
-            )
+    def many(index: int) -> Node:
+        endpoints = (
+            endpoint(kind, f"/topic_{(index + shift) % 100}_{number}", "std_msgs/msg/Empty")
             for kind, shift in ((EndpointKind.PUBLISHER, 0), (EndpointKind.SUBSCRIPTION, 1))
             for number in range(50)
         )
-        return Node(
-            key=f"n{index}",
-            name=f"n{index}",
-            namespace="/",
-            machine="m",
-            run=Run(kind=RunKind.PYTHON, python="demo:N"),
-            interface=Interface(endpoints=endpoints),
-            remap=(("nothing", "something"), ("more", "less")),
-            at=at,
-        )
+        remap = (("nothing", "something"), ("more", "less"))
+        return node(f"n{index}", *endpoints, machine="m", remap=remap)
 
-    manifest = Manifest(
-        path="s",
-        system="s",
-        machines=(Machine(name="m", at=at),),
-        nodes=tuple(node(index) for index in range(100)),
-    )
+    system = manifest(*(many(index) for index in range(100)), machines=(Machine(name="m", at=AT),))
     start = time.process_time()
-    found = check(manifest)
+    found = check(system)
     assert {each.rule for each in found} == {"check.remap-unused"}
     assert time.process_time() - start < 10
 
 
-AT = Position(file="s", line=1, column=1)
+AT = at(1)
 texts = st.sampled_from(["a", "b", "/a", "~/a", "~", "{ns}/a", "1a", "", "a b", "/", "x" * 250])
 types_ = st.sampled_from(["std_msgs/msg/Empty", "std_msgs/msg/Nothing", "acme/msg/A", ""])
 endpoints = st.builds(
@@ -166,15 +144,13 @@ links = st.builds(
 def test_any_manifest_gets_findings_never_an_exception(
     some: list[Node], demands: list[Link], domain: int
 ) -> None:
-    manifest = Manifest(
-        path="s",
-        system="s",
+    system = manifest(
+        *some,
+        links=demands,
         machines=(Machine(name="m", at=AT),),
         discovery=Discovery(domain_id=domain),
-        nodes=tuple(some),
-        links=tuple(demands),
     )
-    found = check(manifest, environment={})
+    found = check(system, environment={})
     assert all(each.message.startswith("cannot ") for each in found)
     assert all(each.rule.startswith("check.") for each in found)
     assert len(set(found)) == len(found)

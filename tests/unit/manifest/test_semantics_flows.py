@@ -8,26 +8,21 @@ from collections.abc import Callable
 import pytest
 
 from lifecycle.manifest.checks import check
-from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import (
-    Endpoint,
     EndpointKind,
     FlowIdentification,
     FlowNeed,
-    Interface,
-    Link,
     Machine,
     Manifest,
     Network,
-    Node,
-    Run,
-    RunKind,
     UniqueHow,
 )
-from lifecycle.manifest.qos import PRESETS, QosProfile, Reliability
+from lifecycle.manifest.qos import QosProfile, Reliability
 from lifecycle.network.nfe import UniqueRequirement
+from tests.builders import FILE, at, link, manifest, node, publisher, subscription
 
 Findings = Callable[..., list[str]]
+EMPTY = "std_msgs/msg/Empty"
 
 PAIR = """
 nodes:
@@ -44,7 +39,7 @@ nodes:
 links:
   - {{topic: /video, from: camera, to: viewer, unique: {demand}}}
 """
-YES, SOME, FILE, NO = (
+YES, SOME, ANY, NO = (
     f"{{unique: {each}}}"
     for each in ("strictly_required", "optionally_required", "system_default", "not_required")
 )
@@ -54,7 +49,7 @@ YES, SOME, FILE, NO = (
     ("demand", "publisher", "subscription", "missing"),
     [
         ("strongly", YES, YES, []),
-        ("strongly", SOME, FILE, []),
+        ("strongly", SOME, ANY, []),
         ("strongly", YES, NO, ["subscription 'video' of 'viewer'"]),
         ("strongly", NO, YES, ["publisher 'video' of 'camera'"]),
         (
@@ -91,63 +86,32 @@ def test_a_link_demands_what_its_ends_must_ask_for(
 
 def streams(count: int, *, need: FlowNeed) -> Manifest:
     """Return `count` marked publishers, in as many nodes, each with a weakly unique link."""
-
-    def at(line: int) -> Position:
-        return Position(file="s", line=line, column=1)
-
-    def node(key: str, kind: EndpointKind, names: list[str], **fields: object) -> Node:
-        endpoints = tuple(
-            Endpoint(
-                kind=kind, name=name, type="std_msgs/msg/Empty", qos=PRESETS["default"], at=at(1)
-            )
-            for name in names
-        )
-        return Node(
-            key=key,
-            name=key,
-            namespace="/",
-            machine=key,
-            run=Run(kind=RunKind.PYTHON, python="demo:N"),
-            interface=Interface(endpoints=endpoints),
-            at=at(1),
-            **fields,  # type: ignore[arg-type]
-        )
-
+    names = [f"s{index}" for index in range(count)]
     sources = [
         node(
             f"n{index}",
-            EndpointKind.PUBLISHER,
-            [f"s{index}"],
-            flows=(dataclasses.replace(need, name=f"s{index}", dscp=index % 64, at=at(index + 1)),),
+            publisher(name, EMPTY),
+            needs=(dataclasses.replace(need, name=name, dscp=index % 64, at=at(index + 1)),),
+            machine=f"n{index}",
         )
-        for index in range(count)
+        for index, name in enumerate(names)
     ]
-    sink = node("sink", EndpointKind.SUBSCRIPTION, [f"s{index}" for index in range(count)])
-    links = tuple(
-        Link(
-            topic=f"/s{index}",
-            from_node=f"n{index}",
-            to_node="sink",
-            unique=UniqueHow.WEAKLY,
-            at=at(1),
-        )
-        for index in range(count)
-    )
-    return Manifest(
-        path="s",
-        system="s",
+    sink = node("sink", *(subscription(name, EMPTY) for name in names), machine="sink")
+    return manifest(
+        *sources,
+        sink,
+        links=(
+            link(f"/{name}", f"n{index}", "sink", unique=UniqueHow.WEAKLY)
+            for index, name in enumerate(names)
+        ),
         machines=tuple(
             Machine(name=each.key, address=f"10.0.0.{index}", at=at(1))
             for index, each in enumerate((*sources, sink), start=1)
         ),
-        nodes=(*sources, sink),
-        links=links,
     )
 
 
-MARKED = FlowNeed(
-    kind=EndpointKind.PUBLISHER, name="", dscp=0, at=Position(file="s", line=1, column=1)
-)
+MARKED = FlowNeed(kind=EndpointKind.PUBLISHER, name="", dscp=0, at=at(1))
 
 
 def test_sixty_four_publishers_can_be_told_apart_by_dscp_alone() -> None:
@@ -157,8 +121,8 @@ def test_sixty_four_publishers_can_be_told_apart_by_dscp_alone() -> None:
 def test_the_sixty_fifth_publisher_with_only_a_dscp_is_refused_by_name() -> None:
     assert [str(each) for each in check(streams(65, need=MARKED))] == [
         (
-            "s:65:1: cannot tell publisher '/s64' of 'n64' apart by its DSCP: it is number 65 of "
-            "65 that have nothing else, and a DSCP has 64 values; ask for 'unique: "
+            f"{FILE}:65:1: cannot tell publisher '/s64' of 'n64' apart by its DSCP: it is number "
+            "65 of 65 that have nothing else, and a DSCP has 64 values; ask for 'unique: "
             "strictly_required', or give each a DSCP of its own"
         )
     ]
@@ -170,9 +134,9 @@ def test_publishers_that_ask_to_be_unique_do_not_rely_on_their_dscp() -> None:
 
 
 def test_a_dscp_that_no_link_needs_as_identifier_may_be_shared() -> None:
-    manifest = streams(70, need=MARKED)
-    links = tuple(dataclasses.replace(link, unique=UniqueHow.NOT) for link in manifest.links)
-    assert check(dataclasses.replace(manifest, links=links)) == ()
+    made = streams(70, need=MARKED)
+    links = tuple(dataclasses.replace(link, unique=UniqueHow.NOT) for link in made.links)
+    assert check(dataclasses.replace(made, links=links)) == ()
 
 
 @pytest.mark.parametrize(
@@ -187,27 +151,27 @@ def test_a_dscp_that_no_link_needs_as_identifier_may_be_shared() -> None:
 def test_numbers_out_of_range_are_refused_even_from_a_program(
     field: str, value: int, message: str
 ) -> None:
-    manifest = streams(1, need=dataclasses.replace(MARKED, dscp=None))
-    source = manifest.nodes[0]
+    made = streams(1, need=dataclasses.replace(MARKED, dscp=None))
+    source = made.nodes[0]
     flows = (dataclasses.replace(source.flows[0], **{field: value}),)
-    nodes = (dataclasses.replace(source, flows=flows), *manifest.nodes[1:])
-    found = check(dataclasses.replace(manifest, nodes=nodes, links=()))
+    nodes = (dataclasses.replace(source, flows=flows), *made.nodes[1:])
+    found = check(dataclasses.replace(made, nodes=nodes, links=()))
     assert [each.message for each in found] == [message]
 
 
 def acknowledging(reliability: Reliability, **marks: int | None) -> Manifest:
     """A stream whose subscription is marked."""
-    manifest = streams(1, need=MARKED)
+    made = streams(1, need=MARKED)
     given = {"dscp": 48, **marks}
     need = dataclasses.replace(MARKED, kind=EndpointKind.SUBSCRIPTION, name="s0", **given)
-    sink = manifest.nodes[1]
+    sink = made.nodes[1]
     (endpoint,) = sink.interface.endpoints
     qos = dataclasses.replace(endpoint.qos or QosProfile(), reliability=reliability)
     interface = dataclasses.replace(
         sink.interface, endpoints=(dataclasses.replace(endpoint, qos=qos),)
     )
     sink = dataclasses.replace(sink, interface=interface, flows=(need,))
-    return dataclasses.replace(manifest, nodes=(manifest.nodes[0], sink))
+    return dataclasses.replace(made, nodes=(made.nodes[0], sink))
 
 
 def test_a_reliable_subscription_can_be_marked_as_it_acknowledges() -> None:
@@ -218,8 +182,8 @@ def test_a_best_effort_subscription_is_told_that_it_sends_nothing_to_mark() -> N
     (found,) = check(acknowledging(Reliability.BEST_EFFORT))
     assert found.severity.value == "warning"
     assert str(found) == (
-        "s:1:1: warning: cannot mark anything that subscription 's0' sends with a DSCP: it is "
-        "BEST_EFFORT and acknowledges nothing; make it RELIABLE, or mark the publishers of the "
+        f"{FILE}:1:1: warning: cannot mark anything that subscription 's0' sends with a DSCP: it "
+        "is BEST_EFFORT and acknowledges nothing; make it RELIABLE, or mark the publishers of the "
         "topic"
     )
 
@@ -233,8 +197,8 @@ def test_a_subscription_has_one_mark_too() -> None:
 
 def test_a_subscription_may_not_acknowledge_with_what_identifies_a_publisher() -> None:
     network = Network(flow_identification=FlowIdentification.DSCP)
-    manifest = acknowledging(Reliability.RELIABLE, dscp=MARKED.dscp)
-    found = check(dataclasses.replace(manifest, network=network))
+    made = acknowledging(Reliability.RELIABLE, dscp=MARKED.dscp)
+    found = check(dataclasses.replace(made, network=network))
     assert [each.rule for each in found if each.severity.value == "error"] == [
         "check.dscp-not-unique"
     ]
@@ -242,9 +206,9 @@ def test_a_subscription_may_not_acknowledge_with_what_identifies_a_publisher() -
 
 
 def test_the_mark_of_a_subscription_makes_no_flow_unique() -> None:
-    manifest = acknowledging(Reliability.RELIABLE)
-    source = dataclasses.replace(manifest.nodes[0], flows=())
-    found = check(dataclasses.replace(manifest, nodes=(source, manifest.nodes[1])))
+    made = acknowledging(Reliability.RELIABLE)
+    source = dataclasses.replace(made.nodes[0], flows=())
+    found = check(dataclasses.replace(made, nodes=(source, made.nodes[1])))
     assert [each.rule for each in found] == ["check.link-not-unique"]
 
 
@@ -253,8 +217,8 @@ def test_a_link_that_relies_on_a_dscp_counts_as_an_identifier_too() -> None:
     found = check(dataclasses.replace(streams(65, need=MARKED), network=network))
     assert [str(each) for each in found] == [
         (
-            "s:65:1: cannot give publisher '/s64' of 'n64' DF = DSCP 0 = TOS 0 (0x00): it "
-            "identifies '/s0' of 'n0' (s:1:1); give it another DSCP, or none: then it gets one "
-            "that nobody has"
+            f"{FILE}:65:1: cannot give publisher '/s64' of 'n64' DF = DSCP 0 = TOS 0 (0x00): it "
+            f"identifies '/s0' of 'n0' ({FILE}:10:9); give it another DSCP, or none: then it gets "
+            "one that nobody has"
         )
     ]

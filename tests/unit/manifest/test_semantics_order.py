@@ -9,34 +9,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lifecycle.manifest.checks import check
-from lifecycle.manifest.diagnostics import Position
-from lifecycle.manifest.model import After, Condition, Manifest, Node, Run, RunKind
+from lifecycle.manifest.model import Condition, Manifest
+from tests.builders import manifest, node
 
 Findings = Callable[..., list[str]]
 
 
 def system(edges: dict[str, list[str]]) -> Manifest:
-    at = Position(file="s", line=1, column=1)
-    nodes = tuple(
-        Node(
-            key=key,
-            name=key,
-            namespace="/",
-            machine="",
-            run=Run(kind=RunKind.PYTHON, python="demo:Node"),
-            after=tuple(
-                After(
-                    node=other,
-                    condition=Condition.STARTED,
-                    at=Position(file="s", line=line, column=index),
-                )
-                for index, other in enumerate(others)
-            ),
-            at=at,
+    return manifest(
+        *(
+            node(key, after=[(other, Condition.STARTED) for other in others])
+            for key, others in edges.items()
         )
-        for line, (key, others) in enumerate(edges.items(), start=1)
     )
-    return Manifest(path="s", system="s", nodes=nodes)
 
 
 def circles(edges: dict[str, list[str]]) -> list[str]:

@@ -11,9 +11,9 @@ from lifecycle.node.reporting.configuration import checksum
 from lifecycle.verify.observation import (
     ConnectionReport,
     EndpointReport,
-    Identity,
     NodeConfiguration,
 )
+from tests.builders import configuration
 
 VIDEO = EndpointReport(
     kind=EndpointKind.PUBLISHER,
@@ -31,18 +31,7 @@ NET = ConnectionReport(
     established=True,
     mappings=("publishers/video",),
 )
-CAMERA = NodeConfiguration(
-    identity=Identity(machine_id="m", process_id=1, node_id="/camera@1"),
-    name="/camera",
-    state="active",
-    connected=True,
-    rmw="rmw_fastrtps_cpp",
-    transports=("udpv4",),
-    serializations=("cdr",),
-    paradigms=("publish-subscribe",),
-    endpoints=(VIDEO,),
-    connections=(NET,),
-)
+CAMERA = configuration("/camera", VIDEO, state="active", connections=(NET,))
 
 
 def _with(

@@ -5,22 +5,14 @@ from __future__ import annotations
 import pytest
 
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.node.author.handlers import match, on_action, on_message, on_service, on_timer
-from lifecycle.plan.model import PlannedEndpoint
+from tests.builders import planned_endpoint
 
-AT = Position(file="robot.lifecycle.yaml", line=3, column=1)
-
-
-def endpoint(kind: EndpointKind, name: str) -> PlannedEndpoint:
-    return PlannedEndpoint(kind=kind, name=name, resolved=f"/{name}", type="", qos=None, at=AT)
-
-
-SCAN = endpoint(EndpointKind.SUBSCRIPTION, "scan")
-RESET = endpoint(EndpointKind.SERVICE_SERVER, "reset")
-DOCK = endpoint(EndpointKind.ACTION_SERVER, "dock")
-VIDEO = endpoint(EndpointKind.PUBLISHER, "video")
+SCAN = planned_endpoint(EndpointKind.SUBSCRIPTION, "scan")
+RESET = planned_endpoint(EndpointKind.SERVICE_SERVER, "reset")
+DOCK = planned_endpoint(EndpointKind.ACTION_SERVER, "dock")
+VIDEO = planned_endpoint(EndpointKind.PUBLISHER, "video")
 
 
 class Base:
@@ -56,8 +48,8 @@ def test_one_method_may_handle_two_subscriptions() -> None:
         @on_message("rear")
         def see(self, message: object) -> None: ...
 
-    front = endpoint(EndpointKind.SUBSCRIPTION, "front")
-    rear = endpoint(EndpointKind.SUBSCRIPTION, "rear")
+    front = planned_endpoint(EndpointKind.SUBSCRIPTION, "front")
+    rear = planned_endpoint(EndpointKind.SUBSCRIPTION, "rear")
     handlers = match(Both, [front, rear], node="/both")
     assert [handlers.method(front), handlers.method(rear)] == ["see", "see"]
 

@@ -18,7 +18,7 @@ from lifecycle.manifest.model import (
     RunKind,
 )
 from lifecycle.plan import Plan, PlanError, build_plan, terms_of
-from tests.unit.plan.samples import at, link, manifest, node, planned, publisher, subscription
+from tests.builders import at, link, manifest, node, planned, publisher, subscription
 
 TWO = (
     Machine(name="robot", address="10.77.0.1", at=at(2)),

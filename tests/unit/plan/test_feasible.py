@@ -24,7 +24,7 @@ from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan import PlanError, build_plan, check_plan
 from lifecycle.plan.connections.hosts import demand
 from lifecycle.plan.render import render_text
-from tests.unit.plan.samples import (
+from tests.builders import (
     at,
     endpoint,
     manifest,

@@ -14,7 +14,7 @@ from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest.model import Discovery, DiscoveryRange, EndpointKind, Run, RunKind
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan import Plan, build_plan, model
-from tests.unit.plan.samples import (
+from tests.builders import (
     endpoint,
     manifest,
     node,

@@ -21,7 +21,7 @@ from lifecycle.plan.comparison import (
     plan_checksum,
 )
 from lifecycle.plan.model import Plan
-from tests.unit.supervisor.fakes import HERE, plan_of, planned_node
+from tests.builders import HERE, plan_of, planned_node
 
 
 def plan(system: str = "robot", *names: str) -> Plan:

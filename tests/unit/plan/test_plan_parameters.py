@@ -20,7 +20,7 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.plan import Plan, build_plan
 from lifecycle.plan.parameters import portable
-from tests.unit.plan.samples import at, manifest, node
+from tests.builders import at, manifest, node
 
 SCHEMA = Path(__file__).parents[3] / "schemas" / "plan.v1.schema.json"
 NAMED = "/robot/camera: {ros__parameters: {rate: 2.0}}"

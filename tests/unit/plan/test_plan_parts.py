@@ -22,7 +22,7 @@ from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan import PlanError, owner_of, participants_cost
 from lifecycle.plan.build import dependency_levels, planned_processes
 from lifecycle.plan.command import command_line, parameter_text
-from tests.unit.plan.samples import link, need, node, planned, publisher, subscription
+from tests.builders import link, need, node, planned, publisher, subscription
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
 STRICTLY = UniqueRequirement.STRICTLY_REQUIRED

@@ -11,7 +11,7 @@ from lifecycle.middleware.discovery.probe import discovery_peers, peers_environm
 from lifecycle.middleware.fastdds.profiles import discovery_profile
 from lifecycle.plan.connections.contacts import reached_hosts
 from lifecycle.plan.model import Plan
-from tests.unit.supervisor.fakes import HERE, plan_of, planned_node
+from tests.builders import HERE, plan_of, planned_node
 
 ADDRESSES = {"left": "10.0.1.1", "right": "10.0.2.1", "idle": "10.0.3.1", "near": "127.0.0.1"}
 

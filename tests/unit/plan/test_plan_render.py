@@ -25,7 +25,7 @@ from lifecycle.manifest.qos import PRESETS, History, Liveliness, QosProfile
 from lifecycle.plan import build_plan
 from lifecycle.plan.connections.hosts import demand
 from lifecycle.plan.render import render_text, spell_qos, table
-from tests.unit.plan.samples import at, need, node, planned, publisher, subscription, teleop
+from tests.builders import at, need, node, planned, publisher, subscription, teleop
 
 TELEOP = """\
 system robot: 2 nodes, 2 processes, 3 flows; domain 7, discovery range system_default

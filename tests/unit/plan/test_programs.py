@@ -11,7 +11,7 @@ import pytest
 
 from lifecycle.manifest.model import EndpointKind, Run, RunKind
 from lifecycle.plan.programs import Resolution, resolve_programs
-from tests.unit.plan.samples import endpoint, manifest, node, publisher, subscription
+from tests.builders import endpoint, manifest, node, publisher, subscription
 
 TALKER = """
 from lifecycle import LifecycleNode, on_message, on_service, on_action, on_goal, on_timer

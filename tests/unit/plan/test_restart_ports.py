@@ -7,7 +7,7 @@ import pytest
 from lifecycle.manifest.model import Discovery, DiscoveryMode, FlowTransport
 from lifecycle.network.connection_url import parse
 from lifecycle.plan import Plan, PlanError, is_restarted_url, restarted
-from tests.unit.plan.samples import node, planned, publisher, subscription
+from tests.builders import node, planned, publisher, subscription
 
 HOST = "tcpv4://127.0.0.1"
 

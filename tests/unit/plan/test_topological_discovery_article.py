@@ -40,8 +40,19 @@ from lifecycle.plan import (
 )
 from lifecycle.supervisor.connections.desired_state import Wired, planned_instructions, steps
 from lifecycle.supervisor.connections.negotiation import NegotiatedSource, party_of
-from lifecycle.verify.observation import EndpointReport, Identity, NodeConfiguration
-from tests.unit.plan.samples import at, link, manifest, need, node, planned, publisher, subscription
+from lifecycle.verify.observation import Identity, NodeConfiguration
+from tests.builders import (
+    at,
+    configuration,
+    link,
+    manifest,
+    need,
+    node,
+    planned,
+    publisher,
+    reported,
+    subscription,
+)
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
 MACHINES = (
@@ -138,7 +149,7 @@ def test_the_negotiator_says_the_same_of_nodes_that_report_themselves():
     plan = example(ARTICLE)
     hosts = hosts_of(plan)
     parties = [
-        party_of(reported(plan, each.key), hosts.host(each.machine), planned=each)
+        party_of(configured(plan, each.key), hosts.host(each.machine), planned=each)
         for each in plan.nodes
     ]
     graph = negotiate(parties, wishes_of(plan.flows), terms_of(plan))
@@ -150,27 +161,25 @@ def media(graph: DataLayerGraph) -> dict[tuple[str, str, str], str]:
     return {(each.topic, each.publisher, each.subscription): each.medium for each in graph.flows}
 
 
-def reported(plan: Plan, key: str, **changes: object) -> NodeConfiguration:
+def configured(plan: Plan, key: str, **changes: object) -> NodeConfiguration:
     """What a node of the plan says of itself through its configuration interface."""
     node = plan.node(key)
-    made = NodeConfiguration(
-        identity=Identity(
-            machine_id=node.machine, process_id=sum(node.process.encode()), node_id=f"{key}@1"
-        ),
-        name=node.full_name,
-        state="inactive",
-        connected=False,
-        rmw="rmw_fastrtps_cpp",
-        transports=("shm", "tcpv4", "udpm", "udpv4", "udpv6"),
-        serializations=("cdr",),
-        paradigms=("publish-subscribe", "request-response"),
-        endpoints=tuple(
-            EndpointReport(kind=each.kind, name=each.name, resolved=each.resolved, type=each.type)
+    return configuration(
+        node.full_name,
+        *(
+            reported(each.kind, each.name, each.type, resolved=each.resolved)
             for each in node.endpoints
         ),
-        checksum="0",
+        **{
+            "identity": Identity(
+                machine_id=node.machine, process_id=sum(node.process.encode()), node_id=f"{key}@1"
+            ),
+            "connected": False,
+            "transports": ("shm", "tcpv4", "udpm", "udpv4", "udpv6"),
+            "checksum": "0",
+            **changes,
+        },
     )
-    return dataclasses.replace(made, **changes)  # type: ignore[arg-type]
 
 
 # --- Statically Configured Nodes: declarative instructions
@@ -297,7 +306,7 @@ def negotiated(plan: Plan, *configurations: NodeConfiguration) -> str:
 
 
 def hinting(plan: Plan, *, lossy: bool, size_bytes: int) -> NodeConfiguration:
-    configuration = reported(plan, "p")
+    configuration = configured(plan, "p")
     (endpoint,) = configuration.endpoints
     hinted = dataclasses.replace(endpoint, lossy=lossy, size_bytes=size_bytes)
     return dataclasses.replace(configuration, endpoints=(hinted,))
@@ -305,16 +314,16 @@ def hinting(plan: Plan, *, lossy: bool, size_bytes: int) -> NodeConfiguration:
 
 def test_a_node_hints_that_its_data_do_not_bear_unreliable_transport():
     plan = pair()
-    assert negotiated(plan, reported(plan, "p"), reported(plan, "s")) == "udpv4"
+    assert negotiated(plan, configured(plan, "p"), configured(plan, "s")) == "udpv4"
     hint = hinting(plan, lossy=False, size_bytes=60_000)
-    assert negotiated(plan, hint, reported(plan, "s")) == "tcpv4"
+    assert negotiated(plan, hint, configured(plan, "s")) == "tcpv4"
 
 
 @pytest.mark.parametrize("said", [{"lossy": True}, {"transport": FlowTransport.UDPV4}])
 def test_what_the_manifest_says_of_a_flow_overrides_the_nodes_hint(said: dict[str, object]):
     plan = pair(needs=[need(PUB, "t", **said)])
     hint = hinting(plan, lossy=False, size_bytes=60_000)
-    assert negotiated(plan, hint, reported(plan, "s")) == "udpv4"
+    assert negotiated(plan, hint, configured(plan, "s")) == "udpv4"
 
 
 def test_a_link_overrides_the_nodes_hint_for_one_pair():
@@ -326,13 +335,13 @@ def test_a_link_overrides_the_nodes_hint_for_one_pair():
     )
     plan = build_plan(system, environment={})
     hint = hinting(plan, lossy=False, size_bytes=60_000)
-    assert negotiated(plan, hint, reported(plan, "s")) == "udpv4"
+    assert negotiated(plan, hint, configured(plan, "s")) == "udpv4"
 
 
 def test_what_transports_do_you_support_is_answered_and_decides():
     plan = pair()
     hosts = hosts_of(plan)
-    one, other = reported(plan, "p"), reported(plan, "s", transports=("tcpv4",))
+    one, other = configured(plan, "p"), configured(plan, "s", transports=("tcpv4",))
     parties = [party_of(one, hosts.host("m1")), party_of(other, hosts.host("m2"))]
     assert [each.transports for each in parties] == [
         ("shm", "tcpv4", "udpm", "udpv4", "udpv6"),
@@ -354,7 +363,7 @@ def test_configurations_captured_statically_and_read_while_running_negotiate_the
     bare = {key: dataclasses.replace(plan.node(key), participants=()) for key in ("p", "s")}
     statically = [party_of_node(each, hosts, rmw=plan.rmw) for each in bare.values()]
     dynamically = [
-        party_of(reported(plan, key), hosts.host(each.machine), planned=each)
+        party_of(configured(plan, key), hosts.host(each.machine), planned=each)
         for key, each in bare.items()
     ]
     one, other = (negotiate(each, {}, terms_of(plan)) for each in (statically, dynamically))
@@ -399,7 +408,7 @@ def test_intelligent_multicast_is_a_group_with_ttl_0_here_and_tcp_to_other_machi
 def test_everybody_who_negotiates_from_the_same_configurations_comes_to_the_same_graph():
     """So no master is needed: each supervisor, or each node, may decide for itself."""
     plan = intelligent(authority=Authority.SUPERVISOR, source=DataLayerSource.DYNAMIC, events=True)
-    told = [reported(plan, each.key) for each in plan.nodes]
+    told = [configured(plan, each.key) for each in plan.nodes]
     outcomes = []
     for order in (told, told[::-1]):
         source = NegotiatedSource(plan)
@@ -432,10 +441,10 @@ def test_a_node_that_joins_is_negotiated_with_and_nothing_else_is_touched():
         policy=Policy(undeclared_nodes=EndpointPolicy.OPEN),
     )
     source = NegotiatedSource(plan)
-    known = {each.full_name: reported(plan, each.key) for each in plan.nodes}
+    known = {each.full_name: configured(plan, each.key) for each in plan.nodes}
     before = source.instructions(known)
     guest = dataclasses.replace(
-        reported(plan, "s"),
+        configured(plan, "s"),
         identity=Identity(machine_id="elsewhere", process_id=9, node_id="guest@1"),
         name="/guest",
     )

@@ -14,7 +14,7 @@ from lifecycle.network.dscp import TransportPriorityMapping
 from lifecycle.plan import PlanError, build_plan
 from lifecycle.plan.render import render_text
 from lifecycle.verify import Outcome, Stage, verify
-from tests.unit.plan.samples import at, manifest, need, node, publisher
+from tests.builders import at, manifest, need, node, publisher
 from tests.unit.verify.edits import change_report
 from tests.unit.verify.perfect import perfect
 

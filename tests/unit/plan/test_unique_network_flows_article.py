@@ -29,7 +29,7 @@ from lifecycle.network.nfe import (
 from lifecycle.plan import PlanError, build_plan
 from lifecycle.plan.render import render_text
 from lifecycle.verify import Outcome, Stage, verify
-from tests.unit.plan.samples import at, link, manifest, need, node, publisher, subscription
+from tests.builders import at, link, manifest, need, node, publisher, subscription
 from tests.unit.verify.edits import change_report
 from tests.unit.verify.perfect import perfect
 

@@ -1,6 +1,6 @@
 """A supervisor's world without processes, ROS or waiting.
 
-Owns: plans by hand, a spawner whose "processes" are coroutines that speak the control protocol, an
+Owns: a spawner whose "processes" are coroutines that speak the control protocol, an
 observer that sees what it is told, and a loop whose clock jumps over every wait.
 """
 
@@ -13,25 +13,14 @@ import os
 import selectors
 import signal
 import socket
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import Callable, Coroutine
 from pathlib import Path
 from typing import Any, TypeVar
 
 from lifecycle.codec import from_json, to_json
-from lifecycle.manifest.diagnostics import Position
-from lifecycle.manifest.model import (
-    After,
-    Condition,
-    DiscoveryRange,
-    EndpointKind,
-    EndpointPolicy,
-    Policy,
-    Run,
-    RunKind,
-    Timeouts,
-)
+from lifecycle.manifest.model import EndpointKind
 from lifecycle.node.host.control import Command, Event, HostSpec, Operation
-from lifecycle.plan.model import Plan, PlannedNode, PlannedProcess
+from lifecycle.plan.model import Plan, PlannedNode
 from lifecycle.supervisor.nodes.bring_up import BringUp
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.spawn import ProcessExit, SpawnRequest
@@ -39,15 +28,13 @@ from lifecycle.supervisor.run.events import Emitter
 from lifecycle.supervisor.run.events import Event as SupervisorEvent
 from lifecycle.verify.observation import (
     ConnectionReport,
-    EndpointReport,
-    Identity,
     NodeConfiguration,
     Observation,
 )
 from lifecycle.verify.verdict import Finding, Outcome, Verdict
+from tests.builders import configuration, reported
 
 T = TypeVar("T")
-HERE = Position(file="robot.lifecycle.yaml", line=1, column=1)
 
 
 class _JumpingSelector(selectors.DefaultSelector):
@@ -85,62 +72,6 @@ def run(main: Coroutine[Any, Any, T]) -> T:
         loop.close()
 
 
-def planned_node(
-    key: str,
-    *,
-    after: Mapping[str, Condition] = {},
-    process: str = "",
-    kind: RunKind = RunKind.PYTHON,
-    managed: bool = True,
-    timeouts: Timeouts = Timeouts(),  # noqa: B008 - frozen
-) -> PlannedNode:
-    """One node."""
-    return PlannedNode(
-        key=key,
-        name=key,
-        namespace="/",
-        machine="",
-        process=process or key,
-        managed=managed,
-        run=Run(kind=kind, python="m:C"),
-        endpoints=(),
-        declared_parameters=(),
-        parameters=(),
-        parameter_files=(),
-        remap=(),
-        participants=(),
-        after=tuple(After(node=node, condition=when, at=HERE) for node, when in after.items()),
-        timeouts=timeouts,
-        endpoint_policy=EndpointPolicy.DECLARED,
-        log_level="",
-        at=HERE,
-    )
-
-
-def plan_of(*nodes: PlannedNode) -> Plan:
-    """A plan of these nodes, one process each unless they name one."""
-    processes: dict[str, list[PlannedNode]] = {}
-    for node in nodes:
-        processes.setdefault(node.process, []).append(node)
-    return Plan(
-        system="robot",
-        manifest_path="robot.lifecycle.yaml",
-        domain_id=30,
-        discovery_range=DiscoveryRange.LOCALHOST,
-        policy=Policy(),
-        machines=(),
-        processes=tuple(
-            PlannedProcess(
-                name=name, machine="", run=group[0].run, nodes=tuple(node.key for node in group)
-            )
-            for name, group in processes.items()
-        ),
-        nodes=nodes,
-        flows=(),
-        levels=(),
-    )
-
-
 _STATES = {
     Operation.CONFIGURE: ("inactive", False),
     Operation.CONNECT: ("inactive", True),
@@ -154,24 +85,12 @@ _STATES = {
 
 def interface_of(node: str, *endpoints: str) -> NodeConfiguration:
     """What a configured node reports: endpoints as `publishers/video`, mapped nowhere."""
-    return NodeConfiguration(
-        identity=Identity(machine_id="here", process_id=1, node_id=f"{node}@01"),
-        name=node,
-        state="inactive",
+    kinds_and_names = (each.partition("/") for each in endpoints)
+    return configuration(
+        node,
+        *(reported(EndpointKind(kind), name) for kind, _, name in kinds_and_names),
         connected=False,
-        rmw="rmw_fastrtps_cpp",
         transports=("udpv4", "shm"),
-        serializations=("cdr",),
-        paradigms=("publish-subscribe",),
-        endpoints=tuple(
-            EndpointReport(
-                kind=EndpointKind(endpoint.partition("/")[0]),
-                name=endpoint.partition("/")[2],
-                resolved=f"/{endpoint.partition('/')[2]}",
-                type="std_msgs/msg/String",
-            )
-            for endpoint in endpoints
-        ),
         checksum="0",
     )
 

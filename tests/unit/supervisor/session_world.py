@@ -161,7 +161,7 @@ class FakeParticipant:
     def driver(self, node: PlannedNode) -> NodeDriver:
         return ServiceDriver(self.services, node)
 
-    def hand(self, node: str) -> ServiceHand:
+    def node_interface(self, node: str) -> ServiceHand:
         return ServiceHand(self.services, node)
 
     def participants_of(
@@ -173,13 +173,13 @@ class FakeParticipant:
     def remove_participants(self, prefixes: Iterable[str], pids: Iterable[int]) -> None:
         raise AssertionError(f"nothing is left in this graph: {prefixes} {pids}")
 
-    def machine_voice(self, system: str, machine: str) -> _Connection:
+    def announce_machine(self, system: str, machine: str) -> _Connection:
         raise AssertionError(f"{system} has no other machine than {machine}")
 
-    def machine_ear(self, system: str, machine: str, to: Listener) -> _Connection:
+    def watch_machine(self, system: str, machine: str, to: Listener) -> _Connection:
         raise AssertionError(f"{system} has no machine {machine}: {to}")
 
-    def node_ear(self, node: str, to: Listener) -> _Connection:
+    def watch_node(self, node: str, to: Listener) -> _Connection:
         del node, to
         return _Connection()
 

@@ -13,7 +13,8 @@ from lifecycle.supervisor.nodes.driver import LifecycleServices, ServiceDriver
 from lifecycle.supervisor.nodes.system import NodeRun
 from lifecycle.supervisor.run.events import Notice, Reach
 from lifecycle.verify.observation import Observation, ObservedNode
-from tests.unit.supervisor.fakes import World, plan_of, planned_node, run
+from tests.builders import plan_of, planned_node
+from tests.unit.supervisor.fakes import World, run
 from tests.unit.supervisor.test_supervisor_gate import ForeignNode
 
 

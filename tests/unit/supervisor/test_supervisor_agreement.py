@@ -22,7 +22,8 @@ from lifecycle.verify.observation import Observation, ObservedNode
 from lifecycle.verify.rules.matching import UNMATCHED_FLOW
 from lifecycle.verify.rules.nodes import MISSING_NODE, UNDECLARED_NODE
 from lifecycle.verify.verdict import Finding, Outcome, Verdict
-from tests.unit.supervisor.fakes import HERE, plan_of, planned_node, run
+from tests.builders import HERE, plan_of, planned_node
+from tests.unit.supervisor.fakes import run
 
 VIEWER = Observation(nodes=(ObservedNode(full_name="/viewer"),))
 NOBODY = Observation()

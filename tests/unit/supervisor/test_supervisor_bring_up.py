@@ -21,14 +21,8 @@ from lifecycle.supervisor.run.failure import StepFailedError, with_failure
 from lifecycle.supervisor.run.shutdown import TakeDown
 from lifecycle.verify.observation import Observation, ObservedNode
 from lifecycle.verify.verdict import NOT_JUDGED, Outcome, Stage, Verdict
-from tests.unit.supervisor.fakes import (
-    FakeGraph,
-    World,
-    plan_of,
-    planned_node,
-    run,
-    verdict_of,
-)
+from tests.builders import plan_of, planned_node
+from tests.unit.supervisor.fakes import FakeGraph, World, run, verdict_of
 
 LIMIT_S = 30.0
 

@@ -19,7 +19,8 @@ from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.spawn import ProcessExit, ProcessState
 from lifecycle.supervisor.run.failure import StepFailedError
 from lifecycle.supervisor.run.options import observer_connections, onlooker_connections
-from tests.unit.supervisor.fakes import FakeSpawner, World, plan_of, planned_node
+from tests.builders import plan_of, planned_node
+from tests.unit.supervisor.fakes import FakeSpawner, World
 
 PREFIX = "44.53.00.5f.45.50.52.4f.53.49.4d.41"
 

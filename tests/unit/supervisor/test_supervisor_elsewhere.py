@@ -13,28 +13,17 @@ from lifecycle.plan.model import Plan
 from lifecycle.supervisor.nodes.remote_nodes import RemoteNode, RemoteNodes
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.run.failure import ended
-from lifecycle.verify.observation import Identity, NodeConfiguration, Observation, ObservedNode
-from tests.unit.supervisor.fakes import World, plan_of, planned_node, run
+from lifecycle.verify.observation import Observation, ObservedNode
+from tests.builders import configuration, plan_of, planned_node
+from tests.unit.supervisor.fakes import World, run
 
 STARTED, CONFIGURED, CONNECTED, ACTIVE = Condition
 
 
-def _report(*, state: str, connected: bool) -> NodeConfiguration:
-    return NodeConfiguration(
-        identity=Identity(machine_id="b", process_id=1, node_id="/camera@01"),
-        name="/camera",
-        state=state,
-        connected=connected,
-        rmw="",
-        transports=(),
-        serializations=(),
-        paradigms=(),
-        endpoints=(),
-    )
-
-
 def _seen(state: str | None, *, connected: bool | None = None) -> Observation:
-    reports = () if connected is None else (_report(state=state or "", connected=connected),)
+    reports = ()
+    if connected is not None:
+        reports = (configuration("/camera", state=state or "", connected=connected),)
     return Observation(
         nodes=(ObservedNode(full_name="/camera", state=state),), configurations=reports
     )

@@ -13,7 +13,8 @@ from lifecycle.node.host.control import Operation
 from lifecycle.supervisor.gate.gate import Gate, Permit, VerificationError, behind_s
 from lifecycle.supervisor.nodes.driver import ServiceDriver
 from lifecycle.verify.verdict import Outcome, Verdict
-from tests.unit.supervisor.fakes import planned_node, verdict_of
+from tests.builders import planned_node
+from tests.unit.supervisor.fakes import verdict_of
 
 
 class ForeignNode:

@@ -37,15 +37,8 @@ from lifecycle.verify.observation import (
     ObservedNode,
 )
 from lifecycle.verify.verdict import Finding, Outcome, Stage, Verdict
-from tests.unit.supervisor.fakes import (
-    FakeGraph,
-    World,
-    interface_of,
-    plan_of,
-    planned_node,
-    run,
-    verdict_of,
-)
+from tests.builders import plan_of, planned_node
+from tests.unit.supervisor.fakes import FakeGraph, World, interface_of, run, verdict_of
 from tests.unit.supervisor.test_supervisor_negotiation import plan_of as negotiated_plan
 
 OK = verdict_of(Outcome.OK)

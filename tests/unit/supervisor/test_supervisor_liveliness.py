@@ -38,7 +38,8 @@ from lifecycle.supervisor.run.events import (
 )
 from lifecycle.verify.observation import Observation, ObservedNode
 from lifecycle.verify.verdict import Outcome
-from tests.unit.supervisor.fakes import HERE, World, plan_of, planned_node, run
+from tests.builders import HERE, plan_of, planned_node
+from tests.unit.supervisor.fakes import World, run
 
 
 class Ears:

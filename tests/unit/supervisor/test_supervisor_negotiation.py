@@ -16,8 +16,8 @@ from lifecycle.manifest.model import (
 from lifecycle.plan import Plan
 from lifecycle.supervisor.connections.desired_state import steps, wired
 from lifecycle.supervisor.connections.negotiation import NegotiatedSource
-from lifecycle.verify.observation import EndpointReport, Identity, NodeConfiguration
-from tests.unit.plan.samples import at, need, node, planned, publisher, subscription
+from lifecycle.verify.observation import EndpointReport, NodeConfiguration
+from tests.builders import at, configuration, need, node, planned, publisher, reported, subscription
 from tests.unit.supervisor.fakes import rewired
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
@@ -43,19 +43,12 @@ def plan_of(*, transport: FlowTransport = FlowTransport.ANY, is_open: bool = Tru
 def configured(
     name: str, *endpoints: tuple[EndpointKind, str], transports: tuple[str, ...] = ()
 ) -> NodeConfiguration:
-    return NodeConfiguration(
-        identity=Identity(machine_id="here", process_id=hash(name) % 1000, node_id=f"{name}@1"),
-        name=name,
-        state="inactive",
+    return configuration(
+        name,
+        *(reported(kind, each) for kind, each in endpoints),
+        process_id=sum(name.encode()),
         connected=False,
-        rmw="rmw_fastrtps_cpp",
         transports=transports or ("shm", "udpv4", "udpv6", "udpm", "tcpv4"),
-        serializations=("cdr",),
-        paradigms=("publish-subscribe", "request-response"),
-        endpoints=tuple(
-            EndpointReport(kind=kind, name=each, resolved=f"/{each}", type="std_msgs/msg/String")
-            for kind, each in endpoints
-        ),
         checksum="0",
     )
 

@@ -27,7 +27,8 @@ from lifecycle.supervisor.run.events import Reach
 from lifecycle.supervisor.run.shutdown import TakeDown
 from lifecycle.verify.observation import Observation
 from lifecycle.verify.verdict import Outcome
-from tests.unit.supervisor.fakes import World, plan_of, planned_node, run, verdict_of
+from tests.builders import plan_of, planned_node
+from tests.unit.supervisor.fakes import World, run, verdict_of
 from tests.unit.test_run_directory import STATUS
 
 PLAN = plan_of(

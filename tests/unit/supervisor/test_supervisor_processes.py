@@ -37,7 +37,7 @@ from lifecycle.supervisor.processes.orphans import end_run
 from lifecycle.supervisor.processes.process import COMMAND_ESCALATION, ManagedProcess
 from lifecycle.supervisor.processes.spawn import ProcessExit, ProcessState, change
 from lifecycle.supervisor.run.events import Emitter, LogLine
-from tests.unit.plan.samples import teleop
+from tests.builders import teleop
 
 PYTHON = sys.executable
 BOUND_S = 20.0

@@ -12,7 +12,7 @@ from lifecycle.plan import Plan
 from lifecycle.supervisor.connections.desired_state import steps, wired
 from lifecycle.supervisor.connections.negotiation import Expectation, NegotiatedSource
 from lifecycle.verify.observation import NodeConfiguration, Observation
-from tests.unit.plan.samples import at
+from tests.builders import at
 from tests.unit.supervisor.fakes import rewired
 from tests.unit.supervisor.test_supervisor_negotiation import (
     LISTENER,

@@ -25,7 +25,6 @@ from lifecycle.node.host.control import Operation
 from lifecycle.plan.model import (
     ParticipantConnections,
     Plan,
-    PlannedEndpoint,
     PlannedNode,
     PlannedParticipant,
 )
@@ -43,15 +42,8 @@ from lifecycle.supervisor.run.events import Notice, WiringChanged, WiringLost
 from lifecycle.supervisor.run.failure import StepFailedError
 from lifecycle.supervisor.run.shutdown import TakeDown
 from lifecycle.verify.observation import NodeConfiguration, Observation
-from tests.unit.supervisor.fakes import (
-    HERE,
-    World,
-    interface_of,
-    plan_of,
-    planned_node,
-    rewired,
-    run,
-)
+from tests.builders import plan_of, planned_endpoint, planned_node
+from tests.unit.supervisor.fakes import World, interface_of, rewired, run
 
 LIMIT_S = 30.0
 URL = "udpv4://127.0.0.1:7911"
@@ -62,15 +54,7 @@ CONNECT, MAP, DISCONNECT = Operation.CONNECT_TO, Operation.MAP_TO, Operation.DIS
 def wired_node(key: str, *, after: Mapping[str, Condition] = {}) -> PlannedNode:
     """A node whose publisher goes by `net` and whose subscription by its own participant."""
     endpoints = tuple(
-        PlannedEndpoint(
-            kind=kind,
-            name=name,
-            resolved=f"/{name}",
-            type="std_msgs/msg/String",
-            qos=None,
-            participant=participant,
-            at=HERE,
-        )
+        planned_endpoint(kind, name, participant=participant)
         for kind, name, participant in (
             (EndpointKind.PUBLISHER, "out", f"_{key}_net"),
             (EndpointKind.SUBSCRIPTION, "in", ""),

@@ -22,7 +22,7 @@ from lifecycle.verify import (
 )
 from lifecycle.verify.rules.definitions import differ
 from lifecycle.verify.rules.nodes import UNDECLARED_NODE
-from tests.unit.plan.samples import (
+from tests.builders import (
     endpoint,
     node,
     planned,

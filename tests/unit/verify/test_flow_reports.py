@@ -16,7 +16,7 @@ from lifecycle.plan import Plan, build_plan
 from lifecycle.verify import Finding, FlowReport, Outcome, Stage, verify
 from lifecycle.verify.judge import flow_reports
 from lifecycle.verify.layout import lay_out
-from tests.unit.plan.samples import at, node, planned, publisher, subscription, teleop
+from tests.builders import at, node, planned, publisher, subscription, teleop
 from tests.unit.verify.edits import (
     Edit,
     both,

@@ -8,8 +8,8 @@ import pytest
 
 from lifecycle.plan.model import PlannedParticipant
 from lifecycle.verify.hidden import Owners, is_hidden_node
-from lifecycle.verify.observation import ConnectionReport, Identity, NodeConfiguration
-from tests.unit.plan.samples import node, planned, publisher
+from lifecycle.verify.observation import ConnectionReport, NodeConfiguration
+from tests.builders import configuration, node, planned, publisher
 
 PLAN = planned(
     node("camera", publisher("video"), namespace="/robot"),
@@ -38,18 +38,8 @@ def test_a_connection_that_no_report_has_told_of_yet_is_known_by_its_name(
 
 def says(name: str, *hidden: str) -> NodeConfiguration:
     """The report of a node with connections on these hidden nodes."""
-    return NodeConfiguration(
-        identity=Identity(machine_id="m", process_id=1, node_id=name),
-        name=name,
-        state="active",
-        connected=True,
-        rmw="",
-        transports=(),
-        serializations=(),
-        paradigms=(),
-        endpoints=(),
-        connections=tuple(ConnectionReport(name="net", node_name=each) for each in hidden),
-    )
+    connections = tuple(ConnectionReport(name="net", node_name=each) for each in hidden)
+    return configuration(name, state="active", connections=connections)
 
 
 def test_a_hidden_node_is_whose_report_names_it_whatever_it_is_called() -> None:

@@ -9,7 +9,7 @@ from lifecycle.manifest.qos import QosProfile
 from lifecycle.plan import Plan
 from lifecycle.verify import Outcome, Stage, Verdict, verify
 from lifecycle.verify.verdict import OpenEndpoint, ToleratedNode
-from tests.unit.plan.samples import need, node, planned, publisher, subscription
+from tests.builders import need, node, planned, publisher, subscription
 from tests.unit.verify.edits import Edit, add_endpoint, add_node, both, change_report
 from tests.unit.verify.perfect import perfect
 

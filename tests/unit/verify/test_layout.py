@@ -21,7 +21,7 @@ from lifecycle.verify import (
 from lifecycle.verify.layout import lay_out
 from lifecycle.verify.observation import NodeParameters
 from lifecycle.verify.view import Actual, Seen, View
-from tests.unit.plan.samples import (
+from tests.builders import (
     at,
     endpoint,
     link,

@@ -10,7 +10,7 @@ from lifecycle.manifest.model import EndpointKind, Policy
 from lifecycle.plan import build_plan
 from lifecycle.verify import RULES, Finding, Outcome, Stage, Verdict, missing, not_ok, verify
 from lifecycle.verify.judge import taken_on_trust
-from tests.unit.plan.samples import teleop
+from tests.builders import teleop
 from tests.unit.verify.edits import (
     Edit,
     add_endpoint,

@@ -17,7 +17,7 @@ from lifecycle.verify import (
     without_noise,
 )
 from lifecycle.verify.noise import DeclaredNames, known_node, tolerating_pattern
-from tests.unit.plan.samples import endpoint, node, planned, publisher, subscription
+from tests.builders import endpoint, node, planned, publisher, subscription
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
 SERVER, CLIENT = EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT

@@ -14,9 +14,9 @@ from lifecycle.plan.connections.contacts import Contact
 from lifecycle.plan.model import ParticipantConnections, PlannedNode, PlannedParticipant
 from lifecycle.plan.negotiation.data_layer import RMW_DEFAULT, TRANSPORTS, Party, PartyEndpoint
 from lifecycle.supervisor.connections.negotiation import party_of
-from lifecycle.verify import EndpointReport, Identity, NodeConfiguration
+from lifecycle.verify import NodeConfiguration
 from lifecycle.verify.observation import ConnectionReport
-from tests.unit.plan.samples import need, node, planned, publisher, subscription
+from tests.builders import configuration, need, node, planned, publisher, reported, subscription
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
 STRING = "std_msgs/msg/String"
@@ -24,34 +24,15 @@ URL = "tcpv4://10.0.0.1:5100"
 STRICTLY, OPTIONALLY = UniqueRequirement.STRICTLY_REQUIRED, UniqueRequirement.OPTIONALLY_REQUIRED
 DEFAULT, NOT = UniqueRequirement.SYSTEM_DEFAULT, UniqueRequirement.NOT_REQUIRED
 
-VIDEO = EndpointReport(
-    kind=PUB,
-    name="video",
-    resolved="/video",
-    type=STRING,
-    qos=QosProfile(depth=3),
-    unique=STRICTLY,
-    lossy=True,
-    size_bytes=70_000,
+VIDEO = reported(
+    PUB, "video", qos=QosProfile(depth=3), unique=STRICTLY, lossy=True, size_bytes=70_000
 )
-CAMERA = NodeConfiguration(
-    identity=Identity(machine_id="m", process_id=42, node_id="/camera@01"),
-    name="/camera",
-    state="inactive",
-    connected=True,
-    rmw="rmw_fastrtps_cpp",
+CAMERA = configuration(
+    "/camera",
+    VIDEO,
+    reported(EndpointKind.SERVICE_SERVER, "reset", "std_srvs/srv/Trigger"),
+    process_id=42,
     transports=("udpv4", "tcpv4"),
-    serializations=("cdr",),
-    paradigms=("publish-subscribe",),
-    endpoints=(
-        VIDEO,
-        EndpointReport(
-            kind=EndpointKind.SERVICE_SERVER,
-            name="reset",
-            resolved="/reset",
-            type="std_srvs/srv/Trigger",
-        ),
-    ),
 )
 
 

@@ -10,7 +10,7 @@ from lifecycle.manifest.model import EndpointKind, EndpointPolicy, Policy, Run, 
 from lifecycle.manifest.qos import QosProfile, Reliability
 from lifecycle.plan import Plan
 from lifecycle.verify import Finding, Observation, Outcome, Stage, verify
-from tests.unit.plan.samples import BEST_EFFORT, link, node, planned, publisher, subscription
+from tests.builders import BEST_EFFORT, link, node, planned, publisher, subscription
 from tests.unit.verify.edits import (
     Edit,
     add_endpoint,

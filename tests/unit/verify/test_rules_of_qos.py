@@ -19,7 +19,7 @@ from lifecycle.manifest.qos import (
 )
 from lifecycle.plan import Plan
 from lifecycle.verify import Finding, Outcome, Stage, verify
-from tests.unit.plan.samples import node, planned, publisher, subscription
+from tests.builders import node, planned, publisher, subscription
 from tests.unit.verify.edits import (
     Edit,
     add_endpoint,

@@ -11,7 +11,7 @@ from lifecycle.verify import Identity, Stage
 from lifecycle.verify.layout import lay_out
 from lifecycle.verify.uniqueness import Uniqueness
 from lifecycle.verify.view import Actual
-from tests.unit.plan.samples import endpoint, node, planned, publisher, subscription
+from tests.builders import endpoint, node, planned, publisher, subscription
 from tests.unit.verify.edits import (
     Edit,
     both,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 from lifecycle.verify import Outcome, Stage, verify
-from tests.unit.plan.samples import node, planned, publisher, subscription
+from tests.builders import node, planned, publisher, subscription
 from tests.unit.verify.perfect import perfect
 
 PLAN = planned(node("one", publisher("a")), node("two", subscription("a")))

@@ -23,7 +23,7 @@ from lifecycle.plan.model import ParticipantConnections, PlannedParticipant
 from lifecycle.verify import Finding, Observation, Outcome, Stage, render_text, to_json, verify
 from lifecycle.verify.observation import ConnectionReport
 from lifecycle.verify.verdict import OpenEndpoint
-from tests.unit.plan.samples import at, link, node, planned, publisher, subscription
+from tests.builders import at, link, node, planned, publisher, subscription
 from tests.unit.verify.edits import (
     Edit,
     add_endpoint,

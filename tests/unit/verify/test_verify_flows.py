@@ -13,7 +13,7 @@ from lifecycle.network.nfe import (
 )
 from lifecycle.plan import Plan, build_plan
 from lifecycle.verify import Finding, FlowReport, Outcome, Stage, verify
-from tests.unit.plan.samples import at, link, need, node, planned, publisher, subscription, teleop
+from tests.builders import at, link, need, node, planned, publisher, subscription, teleop
 from tests.unit.verify.edits import (
     Edit,
     both,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from lifecycle.verify import Stage, verify
-from tests.unit.plan.samples import node, planned, publisher, subscription
+from tests.builders import node, planned, publisher, subscription
 from tests.unit.verify.edits import drop_node
 from tests.unit.verify.perfect import perfect
 

@@ -12,7 +12,7 @@ from lifecycle.plan.model import ExpectedParameter
 from lifecycle.verify import RULES, Finding, NodeConfiguration, Observation, Outcome, Stage, verify
 from lifecycle.verify.observation import LONGEST_VALUE, NodeParameters, ParameterReport
 from lifecycle.verify.rules.parameters import spell
-from tests.unit.plan.samples import at, node, planned
+from tests.builders import at, node, planned
 from tests.unit.verify.perfect import perfect
 from tests.unit.verify.told import told
 

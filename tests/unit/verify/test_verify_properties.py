@@ -14,7 +14,7 @@ from lifecycle.manifest.qos import PRESETS
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan import Plan
 from lifecycle.verify import Observation, Outcome, Stage, verify
-from tests.unit.plan.samples import endpoint, need, node, planned
+from tests.builders import endpoint, need, node, planned
 from tests.unit.verify.perfect import perfect
 
 TYPES = {

@@ -39,7 +39,7 @@ from lifecycle.verify import (
     verify,
 )
 from lifecycle.verify.verdict import OpenEndpoint, ToleratedNode
-from tests.unit.plan.samples import teleop
+from tests.builders import teleop
 from tests.unit.verify.edits import (
     Edit,
     add_node,

@@ -41,7 +41,7 @@ from lifecycle.verify import (
     verify,
 )
 from lifecycle.verify.rules.definitions import differ
-from tests.unit.plan.samples import (
+from tests.builders import (
     IMAGE,
     at,
     endpoint,

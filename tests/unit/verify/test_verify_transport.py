@@ -18,7 +18,7 @@ from lifecycle.plan.model import ParticipantConnections, PlannedParticipant
 from lifecycle.verify import Finding, Identity, Outcome, Stage, verify
 from lifecycle.verify.observation import ConnectionReport
 from lifecycle.verify.transport import carrier
-from tests.unit.plan.samples import at, link, need, node, planned, publisher, subscription
+from tests.builders import at, link, need, node, planned, publisher, subscription
 from tests.unit.verify.edits import (
     Edit,
     both,

@@ -26,7 +26,7 @@ from lifecycle.verify.view import (
     may_hide,
     only_shared_memory,
 )
-from tests.unit.plan.samples import at, need, node, planned, publisher, subscription
+from tests.builders import at, need, node, planned, publisher, subscription
 from tests.unit.verify.edits import (
     Edit,
     add_endpoint,

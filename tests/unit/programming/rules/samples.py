@@ -19,7 +19,7 @@ from lifecycle.network.nfe import (
 from lifecycle.plan import Plan
 from lifecycle.programming.rules.rules import FlowRule, LeftOut
 from lifecycle.verify.verdict import FlowReport, Outcome
-from tests.unit.plan.samples import at, need, node, planned, publisher, subscription
+from tests.builders import at, need, node, planned, publisher, subscription
 
 EXPECTED = Path(__file__).parent / "expected"
 

@@ -1,35 +1,48 @@
-"""Manifests made by hand, for tests that need no YAML."""
+"""Test data made by hand: what a manifest declares, what is planned of it, what a node reports.
+
+Owns: `node` and its parts, `manifest` and `planned` (what the planner makes of it); `planned_node`,
+`planned_endpoint` and `plan_of`, for tests of what runs plans, without the planner; `configuration`
+and `reported`, what a node says of itself. Needs neither YAML nor ROS.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import (
     After,
     Condition,
     Discovery,
+    DiscoveryRange,
     Endpoint,
     EndpointKind,
+    EndpointPolicy,
     FlowNeed,
     Interface,
     Link,
     Machine,
     Manifest,
     Node,
+    Policy,
     Run,
     RunKind,
+    Timeouts,
     UniqueHow,
 )
 from lifecycle.manifest.qos import QosProfile, Reliability
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan import Plan, build_plan
+from lifecycle.plan.model import PlannedEndpoint, PlannedNode, PlannedProcess
+from lifecycle.verify.observation import EndpointReport, Identity, NodeConfiguration
 
 FILE = "robot.lifecycle.yaml"
 IMAGE = "sensor_msgs/msg/CompressedImage"
 STRING = "std_msgs/msg/String"
 BEST_EFFORT = QosProfile(depth=1, reliability=Reliability.BEST_EFFORT)
+HERE = Position(file=FILE, line=1, column=1)
+_TOPICS = (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION)
 
 
 def at(line: int, column: int = 1) -> Position:
@@ -155,3 +168,92 @@ def teleop() -> Manifest:
         machines=machines,
         discovery=Discovery(domain_id=7),
     )
+
+
+def planned_endpoint(
+    kind: EndpointKind, name: str, type_: str = STRING, **changes: object
+) -> PlannedEndpoint:
+    """One endpoint as it must exist, in the root namespace; topics have the default QoS."""
+    qos = QosProfile() if kind in _TOPICS else None
+    values = {"qos": qos, "resolved": f"/{name.lstrip('/')}", "at": HERE, **changes}
+    return PlannedEndpoint(kind=kind, name=name, type=type_, **values)
+
+
+def planned_node(
+    key: str,
+    *,
+    after: Mapping[str, Condition] = {},
+    process: str = "",
+    kind: RunKind = RunKind.PYTHON,
+    managed: bool = True,
+    timeouts: Timeouts = Timeouts(),  # noqa: B008 - frozen
+) -> PlannedNode:
+    """One node without endpoints, in the root namespace; python by default."""
+    return PlannedNode(
+        key=key,
+        name=key,
+        namespace="/",
+        machine="",
+        process=process or key,
+        managed=managed,
+        run=Run(kind=kind, python="m:C"),
+        endpoints=(),
+        declared_parameters=(),
+        parameters=(),
+        parameter_files=(),
+        remap=(),
+        participants=(),
+        after=tuple(After(node=other, condition=when, at=HERE) for other, when in after.items()),
+        timeouts=timeouts,
+        endpoint_policy=EndpointPolicy.DECLARED,
+        log_level="",
+        at=HERE,
+    )
+
+
+def plan_of(*nodes: PlannedNode, domain_id: int = 30) -> Plan:
+    """A plan of these nodes, one process each unless they name one."""
+    processes: dict[str, list[PlannedNode]] = {}
+    for each in nodes:
+        processes.setdefault(each.process, []).append(each)
+    return Plan(
+        system="robot",
+        manifest_path=FILE,
+        domain_id=domain_id,
+        discovery_range=DiscoveryRange.LOCALHOST,
+        policy=Policy(),
+        machines=(),
+        processes=tuple(
+            PlannedProcess(
+                name=name, machine="", run=group[0].run, nodes=tuple(each.key for each in group)
+            )
+            for name, group in processes.items()
+        ),
+        nodes=nodes,
+        flows=(),
+        levels=(),
+    )
+
+
+def reported(kind: EndpointKind, name: str, type_: str = STRING, **rest: object) -> EndpointReport:
+    """What a node says of one endpoint in the root namespace, mapped nowhere."""
+    resolved = str(rest.pop("resolved", f"/{name}"))
+    return EndpointReport(kind=kind, name=name, resolved=resolved, type=type_, **rest)
+
+
+def configuration(
+    name: str, *endpoints: EndpointReport, process_id: int = 1, **changes: object
+) -> NodeConfiguration:
+    """What a connected node on machine "m" says of itself."""
+    made = NodeConfiguration(
+        identity=Identity(machine_id="m", process_id=process_id, node_id=f"{name}@{process_id}"),
+        name=name,
+        state="inactive",
+        connected=True,
+        rmw="rmw_fastrtps_cpp",
+        transports=("udpv4",),
+        serializations=("cdr",),
+        paradigms=("publish-subscribe",),
+        endpoints=endpoints,
+    )
+    return dataclasses.replace(made, **changes)
