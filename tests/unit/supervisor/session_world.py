@@ -116,6 +116,7 @@ class FakeParticipant:
         services: of the nodes in `others`.
         changes: so far.
         dropped: nodes whose reports were forgotten.
+        while_looking: done once, when the next look has seen everything and is not over yet.
     """
 
     def __init__(self, hosts: FakeForkServer) -> None:
@@ -125,6 +126,7 @@ class FakeParticipant:
         self.services = FakeServices(self, hosts.log)
         self.changes = 0
         self.dropped: list[str] = []
+        self.while_looking: Callable[[], None] | None = None
         self._hosts = hosts
         self._reports: dict[str, NodeConfiguration] = {}
         self._changed = asyncio.Event()
@@ -143,13 +145,17 @@ class FakeParticipant:
         del plan
         hosted = [name for names in self._hosts.nodes.values() for name in names]
         there = {name: "" for name in hosted if name not in self.unseen} | self.others
-        return Observation(
+        seen = Observation(
             nodes=tuple(
                 ObservedNode(full_name=name, state=None if name in self.mute else state or None)
                 for name, state in there.items()
             ),
             configurations=tuple(report for name, report in self._reports.items() if name in there),
         )
+        if (happens := self.while_looking) is not None:
+            self.while_looking = None
+            happens()
+        return seen
 
     def put_configuration(self, configuration: NodeConfiguration) -> None:
         self._reports[configuration.name] = configuration

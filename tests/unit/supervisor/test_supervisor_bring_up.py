@@ -293,26 +293,6 @@ def test_a_plain_command_is_only_started_and_whoever_stands_on_it_waits_for_its_
     run(main())
 
 
-def test_take_down_goes_in_reverse_order_and_undoes_only_what_was_done(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = _world(
-            tmp_path, planned_node("base"), planned_node("arm", after={"base": Condition.ACTIVE})
-        )
-        await world.bring_up.connect(LIMIT_S)
-        await world.bring_up.activate(Gate(strict=False).judge(verdict_of(Outcome.OK)), LIMIT_S)
-        before = len(world.log)
-        await _down(world)
-        steps = ["deactivate", "disconnect", "cleanup", "shutdown"]
-        assert world.log[before:] == [
-            *(f"/arm {step}" for step in steps),
-            *(f"/base {step}" for step in steps),
-        ]
-        states = {name: process.state for name, process in world.system.processes.items()}
-        assert states == {"base": ProcessState.EXITED, "arm": ProcessState.EXITED}
-
-    run(main())
-
-
 def test_a_node_is_undone_as_far_as_it_came(tmp_path: Path) -> None:
     async def main() -> None:
         world = _world(tmp_path, planned_node("a"), planned_node("b"))

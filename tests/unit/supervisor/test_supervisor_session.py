@@ -165,35 +165,6 @@ def test_a_system_is_brought_up_along_its_order_held_and_taken_down_in_reverse(
 
 
 @pytest.mark.parametrize(
-    ("condition", "reached", "held"),
-    [
-        (Condition.STARTED, "a start", "b start"),
-        (Condition.CONFIGURED, "/a configure", "/b configure"),
-        (Condition.CONNECTED, "/a connect", "/b connect"),
-        (Condition.ACTIVE, "/a activate", "/b activate"),
-    ],
-)
-def test_a_step_is_not_asked_for_before_what_it_comes_after_is_done(
-    tmp_path: Path, condition: Condition, reached: str, held: str
-) -> None:
-    async def main() -> None:
-        plan = plan_of(planned_node("b", after={"a": condition}), planned_node("a"))
-        world = SessionWorld(plan, tmp_path, stop_after_s=0.0)
-        world.hosts.takes_s[reached] = 5.0
-        began = asyncio.get_running_loop().time()
-
-        async def watch() -> None:
-            await world.story.until(held)
-            assert asyncio.get_running_loop().time() - began >= 5.0
-
-        await world.run(watch())
-        assert world.story.index(reached) < world.story.index(held)
-        assert world.report == "ended after it was active, exit code 0: done"
-
-    run(main())
-
-
-@pytest.mark.parametrize(
     ("until", "outline", "report"),
     [
         (
@@ -439,6 +410,26 @@ def test_what_changes_while_networks_are_programmed_keeps_the_gate_closed(tmp_pa
             "networks programmed (ok)",
             f"[verdict] connected violated {INTRUDED}",
             f"[stopping] at 3.5 s: {CHANGED}",
+            *BACK,
+            *over(4),
+        ]
+
+    run(main())
+
+
+def test_what_changes_while_it_is_looked_at_has_the_verdict_judged_again(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path)
+
+        def look() -> None:
+            world.graph.while_looking = world.intrude
+
+        world.story.in_the_moment["[system] connected"] = look
+        await world.run()
+        assert world.since("[system] connected")[1:] == [
+            *VERIFIED,
+            f"[verdict] connected violated {INTRUDED}",
+            f"[stopping] at 0.5 s: {CHANGED}",
             *BACK,
             *over(4),
         ]
