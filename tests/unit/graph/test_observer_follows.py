@@ -146,7 +146,7 @@ def test_what_is_judged_is_a_snapshot_of_the_state_that_programs_ask(*, follows:
         world.clients.states["/it"] = "inactive"
         world.clients.configurations["/it"] = ITS_OWN
         world.graph.offered = {"/it/get_configuration"}
-        put = configuration("/put", "active")
+        put = configuration("/put", state="active")
         world.state.put_configuration(put)
         seen = await world.observer.observe(plan("put", "it", "absent"))
         assert seen == world.state.observation()

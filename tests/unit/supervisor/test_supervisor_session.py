@@ -17,7 +17,8 @@ import pytest
 from lifecycle.manifest.model import Condition, RunKind, Timeouts
 from lifecycle.supervisor.control.server import Ask
 from lifecycle.supervisor.run.options import Until
-from tests.unit.supervisor.fakes import plan_of, planned_node, run
+from tests.builders import plan_of, planned_node
+from tests.unit.supervisor.fakes import run
 from tests.unit.supervisor.session_world import SessionWorld
 
 CHAIN = plan_of(planned_node("camera"), planned_node("viewer", after={"camera": Condition.ACTIVE}))
