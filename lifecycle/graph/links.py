@@ -12,9 +12,10 @@ import dataclasses
 from lifecycle.graph.event import NodeLiveliness
 from lifecycle.graph.view import NodeView
 from lifecycle.manifest.qos import Certainty, incompatibilities
+from lifecycle.network.medium import NETWORK_MEDIA
 from lifecycle.network.nfe import FlowTuple, flow_tuples
 from lifecycle.verify.observation import EndpointReport, Identity
-from lifecycle.verify.transport import NETWORK, NONE, carrier
+from lifecycle.verify.transport import NONE, carrier
 from lifecycle.verify.verdict import Outcome
 
 
@@ -35,7 +36,7 @@ class Link:
         connected: OK: data can go from one to the other; VIOLATED: they cannot; UNVERIFIABLE:
             nobody tells.
         reason: why it is not OK; empty if it is.
-        transport: what carries the data: "intraprocess", "shm", "udpv4", "udpv6", "tcpv4", "tcpv6";
+        transport: what carries the data: the word of a Medium;
             "none" if the two have nothing in common, "unknown" where nobody tells.
         flows: the network flows that the data can take; empty if no network carries them.
     """
@@ -76,7 +77,7 @@ def link(
         connected=connected,
         reason=reason,
         transport=transport,
-        flows=flow_tuples(source, destination) if transport in NETWORK else (),
+        flows=flow_tuples(source, destination) if transport in NETWORK_MEDIA else (),
     )
 
 

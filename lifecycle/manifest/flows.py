@@ -35,6 +35,7 @@ from lifecycle.network.dscp import (
     map_priority,
 )
 from lifecycle.network.five_qi import ClassIssue, check_class, five_qi_of, propose
+from lifecycle.network.medium import Medium
 from lifecycle.network.nfe import UniqueRequirement
 
 _OPERATOR_SPECIFIC = range(128, 255)  # TS 24.501 §9.11.4.12
@@ -232,7 +233,7 @@ class ResolvedNeed:
     max_delay_ms: float | None = None
     max_message_size: int | None = None
     max_datagram_bytes: int | None = None
-    transports: tuple[str, ...] = ()
+    transports: tuple[Medium, ...] = ()
     told_apart: bool = False
 
     @property
@@ -267,7 +268,7 @@ class ParticipantGroup:
     unique: bool
     dscp: int | None
     five_qi: int | None
-    transports: tuple[str, ...]
+    transports: tuple[Medium, ...]
     max_datagram_bytes: int | None
     non_blocking_send: bool
 
@@ -307,7 +308,7 @@ class FlowNeeds:
         for need in node.flows:
             yield self._resolved[node.key, need.kind, need.name]
 
-    def node_transports(self, node: Node) -> tuple[str, ...]:
+    def node_transports(self, node: Node) -> tuple[Medium, ...]:
         """Return all that a node's own participant may use; empty for any.
 
         Its subscriptions receive there; so if one must not get its data by shared memory, none of
@@ -405,8 +406,8 @@ class FlowNeeds:
             and discovery.transport is FlowTransport.ANY
         )
 
-    def _transports(self, node: Node) -> tuple[str, ...]:
-        return ("udpv6",) if ":" in self._addresses.get(node.machine, "") else ("udpv4",)
+    def _transports(self, node: Node) -> tuple[Medium, ...]:
+        return (Medium.UDPV6 if ":" in self._addresses.get(node.machine, "") else Medium.UDPV4,)
 
     def _with_datagrams(self, node_key: str, each: ResolvedNeed) -> ResolvedNeed:
         """Say how small datagrams must be; only a flow that a network knows can be harmed."""
@@ -424,7 +425,7 @@ class FlowNeeds:
 
 
 def _add_subscription(
-    found: dict[object, ParticipantGroup], each: ResolvedNeed, transports: tuple[str, ...]
+    found: dict[object, ParticipantGroup], each: ResolvedNeed, transports: tuple[Medium, ...]
 ) -> None:
     key = (EndpointKind.SUBSCRIPTION, each.dscp, transports)
     known = found.get(key)

@@ -18,7 +18,6 @@ from lifecycle.manifest.choices import (
     EndpointKind,
     EndpointPolicy,
     FlowIdentification,
-    FlowTransport,
     RunKind,
     UniqueHow,
 )
@@ -27,6 +26,7 @@ from lifecycle.manifest.qos import QosProfile
 from lifecycle.network.connection_url import ConnectionUrl
 from lifecycle.network.dscp import TransportPriorityMapping
 from lifecycle.network.five_qi import DscpMapping
+from lifecycle.network.medium import FlowTransport
 from lifecycle.network.nfe import UniqueRequirement
 
 ParameterValue = bool | int | float | str | tuple[bool | int | float | str, ...]

@@ -27,6 +27,7 @@ from lifecycle.network.address import (
     may_be_same,
     socket_text,
 )
+from lifecycle.network.medium import Medium
 
 
 class TransportProtocol(enum.Enum):
@@ -109,7 +110,7 @@ class NetworkFlowEndpoint:
     def describe(self) -> str:
         """Return it for people: `10.0.0.1:7411`, `[fd00::1]:7411`, or `shm`."""
         if self.transport_protocol is TransportProtocol.UNKNOWN:
-            return "shm"
+            return Medium.SHM
         return socket_text(self.internet_address, self.transport_port)
 
 

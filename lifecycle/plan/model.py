@@ -32,6 +32,7 @@ from lifecycle.manifest.model import (
     UniqueHow,
 )
 from lifecycle.manifest.qos import QosProfile
+from lifecycle.network.medium import Medium
 from lifecycle.network.nfe import UniqueRequirement
 
 
@@ -95,7 +96,7 @@ class PlannedParticipant:
             node's.
         dscp: 0–63 set on its sender sockets; None leaves them alone.
         reason: one phrase for people, "unique publisher video".
-        transports: all that it may use, "udpv4", "udpv6"; empty leaves it to the RMW.
+        transports: all that it may use, UDPV4, UDPV6; empty leaves it to the RMW.
         max_datagram_bytes: UDP payload above which RTPS splits messages itself, so that IP does
             not; None leaves it to the RMW.
         non_blocking_send: its sockets never wait; what finds a full buffer is lost.
@@ -108,7 +109,7 @@ class PlannedParticipant:
     name: str
     dscp: int | None
     reason: str
-    transports: tuple[str, ...] = ()
+    transports: tuple[Medium, ...] = ()
     max_datagram_bytes: int | None = None
     non_blocking_send: bool = False
     connection: str = ""
@@ -222,7 +223,7 @@ class PlannedNode:
         expected_parameters: what its parameters must be once it is configured: those declared and
             those given, see lifecycle.plan.parameters.
         unread_parameter_files: those whose values are not known here and so not expected.
-        transports: all that the node's own participant may use, "udpv4", "udpv6"; empty leaves it
+        transports: all that the node's own participant may use, UDPV4, UDPV6; empty leaves it
             to the RMW. Nodes of one process share a participant if these and `max_datagram_bytes`
             are equal.
         max_datagram_bytes: as in PlannedParticipant, for the node's own participant.
@@ -252,7 +253,7 @@ class PlannedNode:
     timeouts: Timeouts
     endpoint_policy: EndpointPolicy
     log_level: str
-    transports: tuple[str, ...] = ()
+    transports: tuple[Medium, ...] = ()
     max_datagram_bytes: int | None = None
     connections: ParticipantConnections = ParticipantConnections()
     authority: Authority = Authority.NODES
@@ -298,8 +299,8 @@ class PlannedFlow:
         unique: the strongest demand of a link on this pair.
         linked: a `links:` entry names this pair.
         transport: what a link says must carry it; ANY where none does.
-        medium: what will carry it, "intraprocess", "shm", "udpm", "udpv4", "udpv6" or "tcpv4";
-            empty if that is not known before the nodes' configurations are.
+        medium: the word of a Medium that will carry it; empty if that is not known before the
+            nodes' configurations are.
         medium_reason: one phrase for people, "same host", "links say so".
         quantities: numbers of its links that only a measurement could prove.
     """

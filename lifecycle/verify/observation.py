@@ -166,7 +166,7 @@ class NodeConfiguration:
         name: fully qualified node name.
         state: lifecycle_msgs/State label.
         connected: the data layer is made (nested state of inactive; True while active).
-        transports: what the node can be connected by, e.g. "udpv4", "shm".
+        transports: what the node can be connected by, words of media.
         serializations: wire formats, "cdr".
         paradigms: "publish-subscribe", "request-response".
         connections: every connection that exists or was asked for.

@@ -87,8 +87,8 @@ class FlowReport:
         five_qi: what is planned, 3GPP TS 23.501 Table 5.7.4-1; None if not asked for, or if several
             publishers differ.
         five_qi_reason: why it is this 5QI, or none, where the manifest says `auto`; else empty.
-        effective_transport: what carries it: "intraprocess", "shm", "udpv4", "udpv6", "tcpv4",
-            "tcpv6"; "unknown" where nobody tells, "none" where the ends have nothing in common.
+        effective_transport: the word of the Medium that carries it; "unknown" where nobody tells,
+            "none" where the ends have nothing in common.
         transport: "udp", "tcp", "shm or udp" …; what can carry it, as far as the NFEs tell.
         tuples: IP flows that the two ends' NFEs form, each with its 5-tuple and flow label; follows
             from source and destination. Where shared memory carries the flow, none of them does.
