@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import bisect
 import dataclasses
+from typing import Annotated
 
+from lifecycle.codec import DomainId, Positive, says
 from lifecycle.manifest.choices import (
     Authority,
     Condition,
@@ -22,7 +24,7 @@ from lifecycle.manifest.choices import (
     UniqueHow,
 )
 from lifecycle.manifest.diagnostics import Position, Severity
-from lifecycle.manifest.qos import QosProfile
+from lifecycle.manifest.qos import POLICIES, QosProfile
 from lifecycle.network.connection_url import ConnectionUrl
 from lifecycle.network.dscp import TransportPriorityMapping
 from lifecycle.network.five_qi import DscpMapping
@@ -97,7 +99,7 @@ class Endpoint:
     name: str
     type: str
     qos: QosProfile | None
-    qos_defaults: tuple[str, ...] = ()
+    qos_defaults: tuple[Annotated[str, says(enum=[*POLICIES])], ...] = ()
     at: Position
 
 
@@ -339,11 +341,11 @@ class Discovery:
         server_machine: runs the discovery server; empty for the first machine.
     """
 
-    domain_id: int | None = None
+    domain_id: DomainId | None = None
     mode: DiscoveryMode = DiscoveryMode.DYNAMIC
     range: DiscoveryRange = DiscoveryRange.SYSTEM_DEFAULT
     transport: FlowTransport = FlowTransport.ANY
-    first_port: int = 7910
+    first_port: Annotated[int, says(minimum=1024, maximum=65535)] = 7910
     server_machine: str = ""
     at: Position | None = None
 
@@ -381,7 +383,7 @@ class Network:
     flow_identification: FlowIdentification = FlowIdentification.PARTICIPANT
     transport_priority_mapping: TransportPriorityMapping | None = None
     five_qi_dscp: DscpMapping | None = None
-    max_datagram_bytes: int | None = None
+    max_datagram_bytes: Positive | None = None
     at: Position | None = None
 
 

@@ -19,6 +19,7 @@ import dataclasses
 import enum
 from collections.abc import Iterable, Sequence
 
+from lifecycle.codec import DscpValue, FlowLabel, PortOrNone
 from lifecycle.network.address import (
     canonical,
     is_loopback,
@@ -102,9 +103,9 @@ class NetworkFlowEndpoint:
 
     transport_protocol: TransportProtocol
     internet_protocol: InternetProtocol
-    transport_port: int
-    flow_label: int = 0
-    dscp: int = 0
+    transport_port: PortOrNone
+    flow_label: FlowLabel = 0
+    dscp: DscpValue = 0
     internet_address: str = ""
 
     def describe(self) -> str:
@@ -312,11 +313,11 @@ class FlowTuple:
     transport_protocol: TransportProtocol
     internet_protocol: InternetProtocol
     source_address: str
-    source_port: int
+    source_port: PortOrNone
     destination_address: str
-    destination_port: int
-    flow_label: int = 0
-    dscp: int = 0
+    destination_port: PortOrNone
+    flow_label: FlowLabel = 0
+    dscp: DscpValue = 0
 
     @property
     def source_is_known(self) -> bool:

@@ -7,8 +7,9 @@ Every name in it is fully qualified. JSON-able through `lifecycle.codec`. Pure.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Annotated, Any
 
+from lifecycle.codec import DomainId, DscpValue, Port, Positive, says
 from lifecycle.errors import ExitCode, LifecycleError
 from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.model import (
@@ -29,6 +30,8 @@ from lifecycle.manifest.model import (
     UniqueHow,
 )
 from lifecycle.network.medium import Medium
+
+_UdpUnicast = Annotated[Medium, says(enum=[Medium.UDPV4.value, Medium.UDPV6.value])]
 
 
 def declared(as_: type, by: object) -> dict[str, Any]:
@@ -60,7 +63,7 @@ class StaticEndpoint:
     topic: str
     type: str
     profile: str
-    user_id: int
+    user_id: Port
     reliable: bool = True
     transient_local: bool = False
 
@@ -115,10 +118,10 @@ class PlannedParticipant:
     """
 
     name: str
-    dscp: int | None
+    dscp: DscpValue | None
     reason: str
-    transports: tuple[Medium, ...] = ()
-    max_datagram_bytes: int | None = None
+    transports: tuple[_UdpUnicast, ...] = ()
+    max_datagram_bytes: Positive | None = None
     non_blocking_send: bool = False
     connection: str = ""
     connections: ParticipantConnections = ParticipantConnections()
@@ -145,14 +148,14 @@ class PlannedEndpoint(Endpoint, FlowTerms):
     """
 
     resolved: str
-    dscp: int | None = None
+    dscp: DscpValue | None = None
     enforce_dscp: bool = True
     dscp_reason: str = ""
     five_qi: int | None = None
     five_qi_reason: str = ""
     participant: str = ""
     max_delay_ms: float | None = None
-    max_message_size: int | None = None
+    max_message_size: Positive | None = None
     max_message_size_reason: str = ""
     type_hash: str = ""
 
@@ -171,7 +174,7 @@ class PlannedFile:
 
     place: str
     written: str
-    digest: str = ""
+    digest: Annotated[str, says(pattern="^([0-9a-f]{16})?$")] = ""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -225,8 +228,8 @@ class PlannedNode(NodeDeclaration):
     declared_parameters: tuple[ParameterDeclaration, ...]
     participants: tuple[PlannedParticipant, ...]
     endpoint_policy: EndpointPolicy
-    transports: tuple[Medium, ...] = ()
-    max_datagram_bytes: int | None = None
+    transports: tuple[_UdpUnicast, ...] = ()
+    max_datagram_bytes: Positive | None = None
     connections: ParticipantConnections = ParticipantConnections()
     authority: Authority = Authority.NODES
     events: bool = False
@@ -302,7 +305,7 @@ class PlannedServer:
 
     machine: str
     address: str
-    port: int
+    port: Port
     tcp: bool = True
     prefix: str
 
@@ -323,7 +326,7 @@ class Plan(SystemDeclaration):
     """
 
     manifest_path: str
-    domain_id: int
+    domain_id: DomainId
     discovery_range: DiscoveryRange
     processes: tuple[PlannedProcess, ...]
     nodes: tuple[PlannedNode, ...]
@@ -332,7 +335,7 @@ class Plan(SystemDeclaration):
     rmw: str = ""
     flow_identification: FlowIdentification = FlowIdentification.PARTICIPANT
     discovery_mode: DiscoveryMode = DiscoveryMode.DYNAMIC
-    max_datagram_bytes: int | None = None
+    max_datagram_bytes: Positive | None = None
     server: PlannedServer | None = None
     observers: tuple[tuple[str, ParticipantConnections], ...] = ()
 

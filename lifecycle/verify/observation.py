@@ -13,6 +13,7 @@ import re
 from collections.abc import Iterable
 
 from lifecycle import codec
+from lifecycle.codec import Count, DscpValue
 from lifecycle.manifest.model import EndpointKind, ParameterValue
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.network.nfe import NetworkFlowEndpoint, UniqueRequirement
@@ -39,7 +40,7 @@ class Identity:
     """
 
     machine_id: str
-    process_id: int
+    process_id: Count
     node_id: str
 
 
@@ -100,16 +101,16 @@ class EndpointReport:
     unique: UniqueRequirement = UniqueRequirement.NOT_REQUIRED
     nfes: tuple[NetworkFlowEndpoint, ...] | None = None
     participant: str = ""
-    matched: int | None = None
+    matched: Count | None = None
     peers: tuple[str, ...] | None = None
     server_matched: bool | None = None
-    dscp: int | None = None
+    dscp: DscpValue | None = None
     error: str = ""
     connection: str = ""
     mapped: bool = False
     aliases: tuple[str, ...] = ()
     lossy: bool | None = None
-    size_bytes: int | None = None
+    size_bytes: Count | None = None
     type_hash: str | None = None
 
 

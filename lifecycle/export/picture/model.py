@@ -10,6 +10,7 @@ import dataclasses
 import enum
 from collections.abc import Callable, Mapping
 
+from lifecycle.codec import DomainId, Positive
 from lifecycle.verify.verdict import Finding, FlowReport, Outcome, Verdict
 from lifecycle.verify.view import View
 
@@ -93,7 +94,7 @@ class PicturedNode:
     pid: int | None
     notes: tuple[str, ...]
     participants: tuple[PicturedParticipant, ...]
-    findings: tuple[int, ...]
+    findings: tuple[Positive, ...]
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,7 +120,7 @@ class PicturedEnd:
     node: str
     presence: Presence
     notes: tuple[str, ...]
-    findings: tuple[int, ...]
+    findings: tuple[Positive, ...]
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -201,14 +202,14 @@ class PicturedFlow:
     dscp: str
     unique: str
     demands: tuple[str, ...]
-    findings: tuple[int, ...]
+    findings: tuple[Positive, ...]
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class PicturedFinding:
     """One finding of the verdict; `number` is what elements call it by, from 1."""
 
-    number: int
+    number: Positive
     rule: str
     outcome: Outcome
     subject: str
@@ -227,7 +228,7 @@ class Picture:
     """
 
     system: str
-    domain_id: int
+    domain_id: DomainId
     phase: str
     verdict: Outcome | None
     machines: tuple[PicturedMachine, ...]
