@@ -11,7 +11,7 @@ PYTEST  := $(BIN)/python -m pytest
 # Tests start hundreds of programs: where nothing may be compiled ahead, each compiles the whole package again.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test test-thorough check check-static soak bench hostile mutate docs clean help
+.PHONY: demo test test-thorough check check-static soak bench hostile mutate docs schemas clean help
 
 help:
 	@echo "make demo    bring up a small robot from its manifest, verified, then shut it down"
@@ -21,6 +21,7 @@ help:
 	@echo "make bench   run the benchmarks and print their ratios"
 	@echo "make hostile attack everything that reads what others wrote, and list what was not handled"
 	@echo "make mutate  change what judges, one small change at a time, and list what no test notices"
+	@echo "make schemas write the JSON Schemas of results from their types, into schemas/"
 	@echo "make docs    build the documentation site, with the Python API, into build/site"
 
 $(STAMP): pyproject.toml
@@ -82,6 +83,9 @@ $(VENV)/.docs: $(STAMP)
 docs: $(VENV)/.docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict
 	@echo "read build/site/index.html"
+
+schemas: $(STAMP)
+	$(BIN)/python schemas/generate.py
 
 clean:
 	rm -rf mutants mutants.log $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,16 +1,33 @@
 """JSON in and out for the package's frozen dataclasses.
 
 Owns: the one way a dataclass becomes JSON (control channel, reports, files) and comes back typed.
-Enums travel as their values, tuples as arrays, None as null. Imports nothing of the package.
+Enums travel as their values, tuples as arrays, None as null. Owns also the ranges that the schemas
+of results say (`make schemas`); reading enforces none of them, for whoever reads says in words of
+its own what is out of range. Imports nothing of the package.
 """
 
 from __future__ import annotations
 
-from typing import TypeVar
+from typing import Annotated, TypeVar
 
 import msgspec
 
 T = TypeVar("T")
+
+
+def says(**keywords: object) -> msgspec.Meta:
+    """Return what a schema says of a value, for `Annotated`: `says(minimum=1)`."""
+    return msgspec.Meta(extra_json_schema=keywords)
+
+
+Count = Annotated[int, says(minimum=0)]
+Positive = Annotated[int, says(minimum=1)]
+DomainId = Annotated[int, says(minimum=0, maximum=232)]
+DscpValue = Annotated[int, says(minimum=0, maximum=63)]
+FlowLabel = Annotated[int, says(minimum=0, maximum=0xFFFFF)]
+Octet = Annotated[int, says(minimum=0, maximum=0xFF)]
+Port = Annotated[int, says(minimum=1, maximum=65535)]
+PortOrNone = Annotated[int, says(minimum=0, maximum=65535)]
 
 
 def to_json(value: object) -> bytes:

@@ -21,6 +21,7 @@ from lifecycle.graph.messages import (
     MappingLost,
 )
 from lifecycle.manifest.model import EndpointKind
+from lifecycle.network.medium import NETWORK_MEDIA
 from lifecycle.network.nfe import FlowTuple, flow_tuples
 from lifecycle.verify.observation import (
     ConnectionReport,
@@ -29,7 +30,7 @@ from lifecycle.verify.observation import (
     NodeConfiguration,
 )
 from lifecycle.verify.rules.matching import MatchEnd, match, obstacle
-from lifecycle.verify.transport import NETWORK, NONE, carrier
+from lifecycle.verify.transport import NONE, carrier
 from lifecycle.verify.verdict import Outcome
 from lifecycle.verify.view import UNKNOWN_QOS
 
@@ -429,7 +430,7 @@ def link(
         connected=connected,
         reason=reason,
         transport=transport,
-        flows=flow_tuples(source, destination) if transport in NETWORK else (),
+        flows=flow_tuples(source, destination) if transport in NETWORK_MEDIA else (),
     )
 
 

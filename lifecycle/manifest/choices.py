@@ -103,18 +103,6 @@ class UniqueHow(enum.Enum):
     STRONGLY = "strongly"
 
 
-class FlowTransport(enum.Enum):
-    """What may carry an endpoint's data."""
-
-    ANY = "any"  # the middleware chooses; Fast DDS prefers shared memory on one host
-    NETWORK = "network"  # an IP socket, never shared memory
-    SHM = "shm"
-    UDPV4 = "udpv4"
-    UDPV6 = "udpv6"
-    MULTICAST = "multicast"  # one datagram for all subscribers of a host, TTL 0
-    TCPV4 = "tcpv4"
-
-
 class FlowIdentification(enum.Enum):
     """How publishers that need a unique flow get one (*Unique Network Flows*)."""
 

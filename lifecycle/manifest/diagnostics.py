@@ -9,7 +9,9 @@ from __future__ import annotations
 import dataclasses
 import enum
 from collections.abc import Iterable
+from typing import Annotated
 
+from lifecycle.codec import Positive, says
 from lifecycle.errors import ExitCode, LifecycleError
 
 
@@ -32,8 +34,8 @@ class Position:
     """
 
     file: str
-    line: int
-    column: int
+    line: Positive
+    column: Positive
     path: str = ""
 
 
@@ -47,7 +49,7 @@ class Diagnostic:
         hint: the fix or the command that fixes it; may be empty.
     """
 
-    rule: str
+    rule: Annotated[str, says(pattern=r"^[a-z]+\.[a-z0-9.-]+$")]
     severity: Severity
     at: Position
     message: str

@@ -42,6 +42,7 @@ from lifecycle.network.dscp import (
     map_priority,
 )
 from lifecycle.network.five_qi import ClassIssue, check_class, five_qi_of, propose
+from lifecycle.network.medium import Medium
 from lifecycle.network.nfe import UniqueRequirement
 
 _OPERATOR_SPECIFIC = range(128, 255)  # TS 24.501 §9.11.4.12
@@ -239,7 +240,7 @@ class ResolvedNeed:
     max_delay_ms: float | None = None
     max_message_size: int | None = None
     max_datagram_bytes: int | None = None
-    transports: tuple[str, ...] = ()
+    transports: tuple[Medium, ...] = ()
     told_apart: bool = False
 
     @property
@@ -274,7 +275,7 @@ class ParticipantGroup:
     unique: bool
     dscp: int | None
     five_qi: int | None
-    transports: tuple[str, ...]
+    transports: tuple[Medium, ...]
     max_datagram_bytes: int | None
     non_blocking_send: bool
 
@@ -314,7 +315,7 @@ class FlowNeeds:
         for need in node.flows:
             yield self._resolved[node.key, need.kind, need.name]
 
-    def node_transports(self, node: Node) -> tuple[str, ...]:
+    def node_transports(self, node: Node) -> tuple[Medium, ...]:
         """Return all that a node's own participant may use; empty for any.
 
         Its subscriptions receive there; so if one must not get its data by shared memory, none of
@@ -412,8 +413,8 @@ class FlowNeeds:
             and discovery.transport is FlowTransport.ANY
         )
 
-    def _transports(self, node: Node) -> tuple[str, ...]:
-        return ("udpv6",) if ":" in self._addresses.get(node.machine, "") else ("udpv4",)
+    def _transports(self, node: Node) -> tuple[Medium, ...]:
+        return (Medium.UDPV6 if ":" in self._addresses.get(node.machine, "") else Medium.UDPV4,)
 
     def _with_datagrams(self, node_key: str, each: ResolvedNeed) -> ResolvedNeed:
         """Say how small datagrams must be; only a flow that a network knows can be harmed."""
@@ -431,7 +432,7 @@ class FlowNeeds:
 
 
 def _add_subscription(
-    found: dict[object, ParticipantGroup], each: ResolvedNeed, transports: tuple[str, ...]
+    found: dict[object, ParticipantGroup], each: ResolvedNeed, transports: tuple[Medium, ...]
 ) -> None:
     key = (EndpointKind.SUBSCRIPTION, each.dscp, transports)
     known = found.get(key)

@@ -17,7 +17,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from lifecycle.manifest.builders.cursor import Cursor
-from lifecycle.manifest.builders.system import Fragment, build_fragment
+from lifecycle.manifest.builders.system import build_manifest
 from lifecycle.manifest.checks import check, check_sound
 from lifecycle.manifest.checks.system import SEPARABLE, Partial
 from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, Severity
@@ -63,32 +63,17 @@ def load(
     variables = os.environ if environment is None else environment
     loading = _Loading(variables)
     origin = include.Origin.of(Path(path))
-    result = loading.read(origin, arguments, ())
+    manifest = loading.read(origin, arguments, ())
     found = loading.found
 
     def every() -> tuple[Diagnostic, ...]:
         quoted = _without_outside_text(found, os.fspath(path), variables)
         return _sorted(quoted, loading.files)
 
-    if result is None:
+    if manifest is None:
         raise ManifestError(every())
-    fragment, values = result
-    manifest = Manifest(
-        path=origin.shown,
-        system=fragment.system,
-        description=fragment.description,
-        arguments=values,
-        machines=fragment.machines,
-        discovery=fragment.discovery,
-        network=fragment.network,
-        data_layer=fragment.data_layer,
-        policy=fragment.policy,
-        nodes=fragment.nodes,
-        links=fragment.links,
-        positions=fragment.positions,
-    )
     if wrong := [each for each in found if each.severity is Severity.ERROR]:
-        part = partial(manifest, wrong, lost=fragment.lost, machines=loading.machines)
+        part = partial(manifest, wrong, lost=loading.lost, machines=loading.machines)
         found += check_sound(part, environment=variables)
         raise ManifestError(every())
     found += check(manifest, environment=variables)
@@ -213,15 +198,23 @@ SUFFIX = ".lifecycle.yaml"
 
 
 class _Loading:
-    """One run over a manifest and its includes."""
+    """One run over a manifest and its includes.
+
+    Attributes:
+        found: errors and warnings so far.
+        files: as they were read.
+        machines: names of all that are declared; None if not all are known.
+        lost: keys of nodes that are declared and could not be built; None if there may be any.
+    """
 
     def __init__(self, environment: Mapping[str, str]) -> None:
         self.found: list[Diagnostic] = []
         self.files: list[str] = []
         self.machines: frozenset[str] | None = frozenset()
+        self.lost: frozenset[str] | None = frozenset()
         self._environment = environment
         self._documents = 0
-        self._outermost: Fragment | None = None
+        self._outermost: Manifest | None = None
 
     def read(
         self,
@@ -229,7 +222,8 @@ class _Loading:
         given: Mapping[str, str],
         chain: tuple[include.Origin, ...],
         entry: Cursor | None = None,
-    ) -> tuple[Fragment, tuple[tuple[str, str], ...]] | None:
+        prefix: str = "",
+    ) -> Manifest | None:
         """Read one manifest and what it includes.
 
         Args:
@@ -237,10 +231,10 @@ class _Loading:
             given: argument values.
             chain: the manifests that include it, outermost first.
             entry: the include that names it.
+            prefix: what all its includes put before its keys.
 
         Returns:
-            What is declared, as far as it is sound, and argument values; None if the file cannot be
-            read at all.
+            What is declared, as far as it is sound; None if the file cannot be read at all.
         """
         flaws: list[Diagnostic] = []
         self.files.append(origin.shown)
@@ -258,51 +252,51 @@ class _Loading:
         self.found += [each for _, each in violations]
         unsound = [*substituted.broken, *(place for place, _ in violations)]
         root = Cursor.root(sound(document, unsound))
-        fragment = dataclasses.replace(
-            build_fragment(
-                root,
-                base=origin.path.parent,
-                environment=self._environment,
-                unsound=links(unsound),
-            ),
-            lost=lost(document, root.document),
+        manifest = build_manifest(
+            root,
+            path=origin.shown,
+            arguments=substituted.arguments,
+            base=origin.path.parent,
+            environment=self._environment,
+            unsound=links(unsound),
+            found=self.found,
         )
-        names = entries(document, "machines")
-        self.machines = None if names is None or self.machines is None else self.machines | names
-        self.found += fragment.diagnostics
-        self._check_outermost(root, fragment)
+        self.machines = _union(self.machines, entries(document, "machines"))
+        self.lost = _union(self.lost, lost(document, root.document), prefix)
+        self._check_outermost(root, manifest)
         for each in Cursor.root(document).items("include") if _is_list(document) else ():
             if not any(place[: len(each.place)] == each.place for place in unsound):
-                fragment = self._include(fragment, each, (*chain, origin))
+                manifest = self._include(manifest, each, (*chain, origin), prefix)
             else:
-                fragment = self._unread(fragment)
-        return fragment, substituted.arguments
+                self._unread()
+        return manifest
 
     def _include(
-        self, outer: Fragment, entry: Cursor, chain: tuple[include.Origin, ...]
-    ) -> Fragment:
+        self, outer: Manifest, entry: Cursor, chain: tuple[include.Origin, ...], prefix: str
+    ) -> Manifest:
         origin = include.locate(entry, chain, self.found)
         if origin is None:
-            return self._unread(outer)
+            self._unread()
+            return outer
         self._documents += 1
         if self._documents > include.MAX_DOCUMENTS:
             if self._documents == include.MAX_DOCUMENTS + 1:
                 message = f"cannot include more than {include.MAX_DOCUMENTS} manifests"
                 self.found.append(error("manifest.include", entry.at, message))
-            return self._unread(outer)
+            self._unread()
+            return outer
         given = {name: each.value.text for name, each in entry.entries("arguments")}
-        result = self.read(origin, given, chain, entry)
-        if result is None:
-            return self._unread(outer)
-        inner = include.move(
-            result[0], prefix=entry.text("prefix"), namespace=entry.text("namespace")
-        )
+        own = entry.text("prefix")
+        inner = self.read(origin, given, chain, entry, include.join_key(prefix, own))
+        if inner is None:
+            self._unread()
+            return outer
+        inner = include.move(inner, prefix=own, namespace=entry.text("namespace"))
         return include.join(outer, inner, entry.at, self.found)
 
-    def _unread(self, outer: Fragment) -> Fragment:
+    def _unread(self) -> None:
         """Note that a manifest is missing which may declare whatever is looked for."""
-        self.machines = None
-        return dataclasses.replace(outer, lost=None)
+        self.machines = self.lost = None
 
     def _check_suffix(self, document: Document) -> None:
         if not document.file.endswith(SUFFIX):
@@ -313,26 +307,29 @@ class _Loading:
             hint = f"rename it to {stem}{SUFFIX}"
             self.found.append(warning("manifest.suffix", at, message, hint))
 
-    def _check_outermost(self, root: Cursor, fragment: Fragment) -> None:
+    def _check_outermost(self, root: Cursor, manifest: Manifest) -> None:
         """Say so where a system-wide section of an included manifest does not come to hold."""
         if self._outermost is None:
-            self._outermost = fragment
+            self._outermost = manifest
             return
         outer = self._outermost
-        same = {
-            "discovery": dataclasses.replace(fragment.discovery, at=None)
-            == dataclasses.replace(outer.discovery, at=None),
-            "network": dataclasses.replace(fragment.network, at=None)
-            == dataclasses.replace(outer.network, at=None),
-            "data_layer": dataclasses.replace(fragment.data_layer, at=None)
-            == dataclasses.replace(outer.data_layer, at=None),
-            "policy": fragment.policy == outer.policy,
-        }
-        for key, equal in same.items():
-            if key in root and not equal:
+        for key in ("discovery", "network", "data_layer", "policy"):
+            mine, holds = getattr(manifest, key), getattr(outer, key)
+            if key != "policy":
+                mine = dataclasses.replace(mine, at=holds.at)
+            if key in root and mine != holds:
                 message = f"cannot use the {key} of an included manifest; the including one's holds"
                 at = root.document.key_at((key,))
                 self.found.append(warning("manifest.include-ignored", at, message))
+
+
+def _union(
+    known: frozenset[str] | None, keys: frozenset[str] | None, prefix: str = ""
+) -> frozenset[str] | None:
+    """Add keys, under a prefix, to those that are known; None if either are not all known."""
+    if known is None or keys is None:
+        return None
+    return known | {include.join_key(prefix, key) for key in keys}
 
 
 def _is_list(document: Document) -> bool:

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import bisect
 import dataclasses
+from typing import Annotated
 
+from lifecycle.codec import DomainId, Positive, says
 from lifecycle.manifest.choices import (
     Authority,
     Condition,
@@ -19,15 +21,15 @@ from lifecycle.manifest.choices import (
     EndpointKind,
     EndpointPolicy,
     FlowIdentification,
-    FlowTransport,
     RunKind,
     UniqueHow,
 )
 from lifecycle.manifest.diagnostics import Position, Severity
-from lifecycle.manifest.qos import QosProfile
+from lifecycle.manifest.qos import POLICIES, QosProfile
 from lifecycle.network.connection_url import ConnectionUrl
 from lifecycle.network.dscp import TransportPriorityMapping
 from lifecycle.network.five_qi import DscpMapping
+from lifecycle.network.medium import FlowTransport
 from lifecycle.network.nfe import UniqueRequirement
 
 ParameterValue = bool | int | float | str | tuple[bool | int | float | str, ...]
@@ -98,7 +100,7 @@ class Endpoint:
     name: str
     type: str
     qos: QosProfile | None
-    qos_defaults: tuple[str, ...] = ()
+    qos_defaults: tuple[Annotated[str, says(enum=[*POLICIES])], ...] = ()
     at: Position
 
 
@@ -149,8 +151,30 @@ class Quantity:
         return f"{self.name} {self.value:g}" if self.value < 1e6 else f"{self.name} {self.value}"
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)  # no slots: it is extended beside another type
+class FlowTerms:
+    """What an endpoint asks of its flow that its plan takes over as it is.
+
+    Attributes:
+        loss: highest share of messages lost or late that it bears, > 0 and <= 1; None if not
+            declared.
+        rate_hz: messages per second, > 0; likewise.
+        transport: NETWORK must not go by shared memory.
+        lossy: the data bear an unreliable transport (True), or do not (False); None leaves that to
+            the QoS and to the node's own hint, which this overrides.
+        quantities: each of its numbers that only a measurement could prove, as it is written.
+    """
+
+    unique: UniqueRequirement = UniqueRequirement.NOT_REQUIRED
+    loss: float | None = None
+    rate_hz: float | None = None
+    transport: FlowTransport = FlowTransport.ANY
+    lossy: bool | None = None
+    quantities: tuple[Quantity, ...] = ()
+
+
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class FlowNeed:
+class FlowNeed(FlowTerms):
     """What one endpoint asks of its network flow.
 
     Attributes:
@@ -164,32 +188,20 @@ class FlowNeed:
         five_qi: 3GPP TS 23.501 Table 5.7.4-1 value; None if not asked for, or left to us.
         five_qi_auto: `five_qi: auto`: the planner proposes one.
         max_delay_ms: longest delay that the flow bears, milliseconds, > 0; None if not declared.
-        loss: highest share of messages lost or late that it bears, > 0 and <= 1; likewise.
-        rate_hz: messages per second, > 0; likewise.
         max_message_size: largest serialized message, bytes, > 0; None takes the type's bound.
-        transport: NETWORK must not go by shared memory.
         non_blocking_send: a send never waits; what finds the socket's buffer full is lost.
-        lossy: the data bear an unreliable transport (True), or do not (False); None leaves that to
-            the QoS and to the node's own hint, which this overrides.
-        quantities: each of its numbers that only a measurement could prove, as it is written.
     """
 
     kind: EndpointKind
     name: str
-    unique: UniqueRequirement = UniqueRequirement.NOT_REQUIRED
     dscp: int | None = None
     transport_priority: int | None = None
     enforce: bool = True
     five_qi: int | None = None
     five_qi_auto: bool = False
     max_delay_ms: float | None = None
-    loss: float | None = None
-    rate_hz: float | None = None
     max_message_size: int | None = None
-    transport: FlowTransport = FlowTransport.ANY
     non_blocking_send: bool = False
-    lossy: bool | None = None
-    quantities: tuple[Quantity, ...] = ()
     at: Position
 
 
@@ -210,8 +222,8 @@ class ConnectionDeclaration:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Node:
-    """One node instance.
+class NodeDeclaration:
+    """What a manifest says of one node that its plan takes over as it is.
 
     Attributes:
         key: its key under `nodes:`, unique in the system (prefixed by includes as `prefix/key`).
@@ -219,13 +231,8 @@ class Node:
         namespace: absolute, `/` for the root.
         managed: True for a ROS 2 managed node; False for a plain node, which nothing can hold
             back from sending.
-        process: nodes with the same non-empty process name share one process.
+        parameters: (name, value) given on top of parameter files.
         remap: (from, to) as written.
-        positions: where parts of the node stand, by path below it: `machine`, `namespace`, `name`,
-            `process`, `remap.scan`, `parameters.rate`, `parameter_files.0`; sorted, read with
-            `where`.
-        written_paths: paths as the manifest writes them, by place: `parameter_files.0`,
-            `run.working_directory`; what other fields have of them is absolute.
     """
 
     key: str
@@ -234,20 +241,35 @@ class Node:
     machine: str
     run: Run
     managed: bool = True
-    process: str = ""
     parameters: tuple[tuple[str, ParameterValue], ...] = ()
     parameter_files: tuple[str, ...] = ()
     remap: tuple[tuple[str, str], ...] = ()
     after: tuple[After, ...] = ()
     timeouts: Timeouts = Timeouts()
+    log_level: str = ""
+    at: Position
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Node(NodeDeclaration):
+    """One node instance.
+
+    Attributes:
+        process: nodes with the same non-empty process name share one process.
+        positions: where parts of the node stand, by path below it: `machine`, `namespace`, `name`,
+            `process`, `remap.scan`, `parameters.rate`, `parameter_files.0`; sorted, read with
+            `where`.
+        written_paths: paths as the manifest writes them, by place: `parameter_files.0`,
+            `run.working_directory`; what other fields have of them is absolute.
+    """
+
+    process: str = ""
     interface: Interface = Interface()
     flows: tuple[FlowNeed, ...] = ()
     endpoints: EndpointPolicy = EndpointPolicy.DECLARED
     connections: tuple[ConnectionDeclaration, ...] = ()
-    log_level: str = ""
     positions: tuple[tuple[str, Position], ...] = ()
     written_paths: tuple[tuple[str, str], ...] = ()
-    at: Position
 
     def where(self, part: str) -> Position:
         """Return where a part of this node stands; the node's own position if that is not known."""
@@ -320,11 +342,11 @@ class Discovery:
         server_machine: runs the discovery server; empty for the first machine.
     """
 
-    domain_id: int | None = None
+    domain_id: DomainId | None = None
     mode: DiscoveryMode = DiscoveryMode.DYNAMIC
     range: DiscoveryRange = DiscoveryRange.SYSTEM_DEFAULT
     transport: FlowTransport = FlowTransport.ANY
-    first_port: int = 7910
+    first_port: Annotated[int, says(minimum=1024, maximum=65535)] = 7910
     server_machine: str = ""
     at: Position | None = None
 
@@ -362,7 +384,7 @@ class Network:
     flow_identification: FlowIdentification = FlowIdentification.PARTICIPANT
     transport_priority_mapping: TransportPriorityMapping | None = None
     five_qi_dscp: DscpMapping | None = None
-    max_datagram_bytes: int | None = None
+    max_datagram_bytes: Positive | None = None
     at: Position | None = None
 
 
@@ -425,7 +447,19 @@ class Link:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Manifest:
+class SystemDeclaration:
+    """What a manifest says of its system that the plan takes over as it is."""
+
+    system: str
+    machines: tuple[Machine, ...] = ()
+    discovery: Discovery = Discovery()
+    network: Network = Network()
+    data_layer: DataLayer = DataLayer()
+    policy: Policy = Policy()
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Manifest(SystemDeclaration):
     """One system, valid on its own; the input of `lifecycle.plan`.
 
     Attributes:
@@ -435,14 +469,8 @@ class Manifest:
     """
 
     path: str
-    system: str
     description: str = ""
     arguments: tuple[tuple[str, str], ...] = ()
-    machines: tuple[Machine, ...] = ()
-    discovery: Discovery = Discovery()
-    network: Network = Network()
-    data_layer: DataLayer = DataLayer()
-    policy: Policy = Policy()
     nodes: tuple[Node, ...] = ()
     links: tuple[Link, ...] = ()
     positions: tuple[tuple[str, Position], ...] = ()

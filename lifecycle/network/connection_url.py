@@ -20,7 +20,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import difflib
-import enum
 import functools
 import ipaddress
 import re
@@ -29,6 +28,7 @@ from typing import Any
 from urllib.parse import parse_qsl, urlencode, urlsplit
 
 from lifecycle.errors import LifecycleError
+from lifecycle.network.medium import SCHEMES, Medium
 
 _PORTS = range(1, 65536)
 _TTLS = range(256)
@@ -37,16 +37,6 @@ _DISCOVERY_SERVER = re.compile(r"[0-9a-fA-F]{2}(\.[0-9a-fA-F]{2}){11}")
 
 class ConnectionUrlError(LifecycleError):
     """A text that is no connection URL, or one that contradicts itself."""
-
-
-class ConnectionTransport(enum.Enum):
-    """How a connection carries data; values are the URL schemes."""
-
-    UDPV4 = "udpv4"
-    UDPV6 = "udpv6"
-    UDPM = "udpm"  # a multicast group, over IPv4 or IPv6 as its address says
-    TCPV4 = "tcpv4"
-    SHM = "shm"
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True, order=True)
@@ -109,8 +99,8 @@ def _prefix(name: str, value: str) -> str:
     return value.lower()
 
 
-_UDP = frozenset({ConnectionTransport.UDPV4, ConnectionTransport.UDPV6, ConnectionTransport.UDPM})
-_IP = _UDP | {ConnectionTransport.TCPV4}
+_UDP = frozenset(each for each in SCHEMES if each.is_udp)
+_IP = frozenset(each for each in SCHEMES if each.is_network)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -126,7 +116,7 @@ class Option:
 
     attribute: str
     read: Callable[[str, str], Any]
-    transports: frozenset[ConnectionTransport]
+    transports: frozenset[Medium]
     repeated: bool = False
 
     def spell(self, value: Any) -> tuple[str, ...]:
@@ -156,7 +146,7 @@ OPTIONS = {
 }
 
 
-def read_options(transport: ConnectionTransport, query: str) -> dict[str, Any]:
+def read_options(transport: Medium, query: str) -> dict[str, Any]:
     """Return what the part after `?` says, by attribute of ConnectionUrl.
 
     Raises:
@@ -183,7 +173,7 @@ def read_options(transport: ConnectionTransport, query: str) -> dict[str, Any]:
     return read
 
 
-__all__ = ["ConnectionTransport", "ConnectionUrl", "ConnectionUrlError", "Peer", "parse"]
+__all__ = ["ConnectionUrl", "ConnectionUrlError", "Peer", "parse"]
 
 _HOW = "write TRANSPORT://[ADDRESS][:PORT][?OPTION=VALUE&…], udpv4://10.77.0.1:7911"
 
@@ -211,7 +201,7 @@ class ConnectionUrl:
         non_blocking_send: never wait for room in a socket's buffer.
     """
 
-    transport: ConnectionTransport
+    transport: Medium
     address: str = ""
     port: int | None = None
     metatraffic_port: int | None = None
@@ -248,15 +238,15 @@ def parse(text: str) -> ConnectionUrl:
             f"cannot read connection URL {text!r}: {bad}", hint=_HOW
         ) from error
     try:
-        transport = ConnectionTransport(parts.scheme)
+        transport = SCHEMES[SCHEMES.index(Medium(parts.scheme))]
     except ValueError:
-        allowed = ", ".join(each.value for each in ConnectionTransport)
+        allowed = ", ".join(SCHEMES)
         # urlsplit takes no scheme with an underscore (RFC 3986 §3.1), `zmq_pgm` of the article.
         scheme = parts.scheme or (text.partition("://")[0] if "://" in text else "")
         raise ConnectionUrlError(
             f"cannot read connection URL {text!r}: unknown transport {scheme!r}; "
             f"allowed: {allowed}",
-            hint=did_you_mean(scheme, (each.value for each in ConnectionTransport)) or _HOW,
+            hint=did_you_mean(scheme, SCHEMES) or _HOW,
         ) from None
     if parts.path not in ("", "/") or parts.fragment or parts.username or parts.password:
         raise ConnectionUrlError(
@@ -282,13 +272,13 @@ def _has_host(text: str) -> bool:
 
 
 def _check(url: ConnectionUrl) -> None:
-    if url.transport is ConnectionTransport.SHM:
+    if url.transport is Medium.SHM:
         if url.address or url.port is not None:
             raise ConnectionUrlError("shm has no address and no port")
         return
     if url.port == 0:
         raise ConnectionUrlError("port 0 is none: leave it out to let the middleware choose")
-    version = {ConnectionTransport.UDPV6: 6, ConnectionTransport.UDPM: 0}.get(url.transport, 4)
+    version = url.transport.ip_version
     if url.address:
         try:
             address = ipaddress.ip_address(url.address)
@@ -296,14 +286,14 @@ def _check(url: ConnectionUrl) -> None:
             raise ConnectionUrlError(f"{url.address!r} is no IP address") from None
         if version and address.version != version:
             raise ConnectionUrlError(f"{url.address!r} is no IPv{version} address")
-        group = url.transport is ConnectionTransport.UDPM
+        group = url.transport is Medium.UDPM
         if group and not address.is_multicast:
             raise ConnectionUrlError(f"{url.address!r} is no multicast group")
         if not group and address.is_multicast:
             raise ConnectionUrlError(f"{url.address!r} is a multicast group: use udpm://")
-    elif url.transport is ConnectionTransport.UDPM:
+    elif url.transport is Medium.UDPM:
         raise ConnectionUrlError("udpm needs a group, udpm://239.255.1.9:7901")
-    if url.transport is ConnectionTransport.UDPM and url.port is None:
+    if url.transport is Medium.UDPM and url.port is None:
         raise ConnectionUrlError("udpm needs a port, udpm://239.255.1.9:7901")
 
 

@@ -17,7 +17,9 @@ import dataclasses
 import difflib
 import functools
 import re
+from typing import Annotated
 
+from lifecycle.codec import Octet, says
 from lifecycle.network.tables import read_table
 
 MAX_DSCP = 63
@@ -186,9 +188,9 @@ class TransportPriorityMapping:
         high: 0–255, that of the highest; not below `low`.
     """
 
-    mask: int
-    low: int = 0
-    high: int = 0xFF
+    mask: Annotated[int, says(minimum=0, maximum=0xFFFFFFFF)]
+    low: Octet = 0
+    high: Octet = 0xFF
 
     def __post_init__(self) -> None:
         if not 0 <= self.mask <= _BITS_32:

@@ -23,6 +23,7 @@ import dataclasses
 import enum
 from collections.abc import Iterable, Sequence
 
+from lifecycle.codec import DscpValue, FlowLabel, PortOrNone
 from lifecycle.network.address import (
     canonical,
     is_loopback,
@@ -31,6 +32,7 @@ from lifecycle.network.address import (
     may_be_same,
     socket_text,
 )
+from lifecycle.network.medium import Medium
 
 
 class TransportProtocol(enum.Enum):
@@ -105,15 +107,15 @@ class NetworkFlowEndpoint:
 
     transport_protocol: TransportProtocol
     internet_protocol: InternetProtocol
-    transport_port: int
-    flow_label: int = 0
-    dscp: int = 0
+    transport_port: PortOrNone
+    flow_label: FlowLabel = 0
+    dscp: DscpValue = 0
     internet_address: str = ""
 
     def describe(self) -> str:
         """Return it for people: `10.0.0.1:7411`, `[fd00::1]:7411`, or `shm`."""
         if self.transport_protocol is TransportProtocol.UNKNOWN:
-            return "shm"
+            return Medium.SHM
         return socket_text(self.internet_address, self.transport_port)
 
 
@@ -315,11 +317,11 @@ class FlowTuple:
     transport_protocol: TransportProtocol
     internet_protocol: InternetProtocol
     source_address: str
-    source_port: int
+    source_port: PortOrNone
     destination_address: str
-    destination_port: int
-    flow_label: int = 0
-    dscp: int = 0
+    destination_port: PortOrNone
+    flow_label: FlowLabel = 0
+    dscp: DscpValue = 0
 
     @property
     def source_is_known(self) -> bool:

@@ -32,11 +32,14 @@ from lifecycle.manifest.model import (
     DiscoveryRange,
     Endpoint,
     EndpointKind,
+    FlowTerms,
     FlowTransport,
     Link,
     Manifest,
     Node,
+    NodeDeclaration,
     RunKind,
+    SystemDeclaration,
     UniqueHow,
 )
 from lifecycle.manifest.names import resolve
@@ -54,6 +57,7 @@ from lifecycle.plan.model import (
     PlannedFlow,
     PlannedNode,
     PlannedProcess,
+    declared,
 )
 from lifecycle.plan.parameters import ParameterFiles
 from lifecycle.plan.participants import place_flows
@@ -290,12 +294,10 @@ def build_plan(manifest: Manifest, *, environment: Mapping[str, str] | None = No
     rmw = variables.get("RMW_IMPLEMENTATION", "") or DEFAULT_RMW
     wired = _wired(manifest, variables, domain_id=domain_id, rmw=rmw)
     plan = Plan(
-        system=manifest.system,
+        **declared(SystemDeclaration, manifest),
         manifest_path=manifest.path,
         domain_id=domain_id,
         discovery_range=discovery_range,
-        policy=manifest.policy,
-        machines=manifest.machines,
         processes=planned_processes(
             manifest.nodes,
             domain_id=domain_id,
@@ -308,11 +310,8 @@ def build_plan(manifest: Manifest, *, environment: Mapping[str, str] | None = No
         levels=dependency_levels(manifest.nodes),
         rmw=rmw,
         flow_identification=manifest.network.flow_identification,
-        data_layer=manifest.data_layer,
         discovery_mode=manifest.discovery.mode,
-        discovery=manifest.discovery,
         max_datagram_bytes=manifest.network.max_datagram_bytes,
-        network=manifest.network,
         server=wired.server,
         observers=wired.observers,
     )
@@ -452,30 +451,18 @@ def _planned_node(
     endpoints, connected, groups = place_declared(node.name, endpoints, node.connections, groups)
     endpoints, participants = place_flows(node.name, endpoints, groups)
     return PlannedNode(
-        key=node.key,
-        name=node.name,
-        namespace=node.namespace,
-        machine=node.machine,
+        **declared(NodeDeclaration, node),
         process=process_name(node),
-        managed=node.managed,
-        run=node.run,
         endpoints=endpoints,
         declared_parameters=node.interface.parameters,
-        parameters=node.parameters,
-        parameter_files=node.parameter_files,
         expected_parameters=files.expected(node),
         unread_parameter_files=files.unread(node),
-        remap=node.remap,
         participants=(*connected, *participants),
-        after=node.after,
-        timeouts=node.timeouts,
         endpoint_policy=node.endpoints,
-        log_level=node.log_level,
         transports=needs.node_transports(node) if ours else (),
         files=tuple(
             _planned_file(node.parameter_files, place, text) for place, text in node.written_paths
         ),
-        at=node.at,
     )
 
 
@@ -503,14 +490,9 @@ def _planned_endpoint(
         kind=endpoint.kind,
     )
     planned = PlannedEndpoint(
-        kind=endpoint.kind,
-        name=endpoint.name,
+        **declared(Endpoint, endpoint),
         resolved=resolved,
-        type=endpoint.type,
-        qos=endpoint.qos,
-        qos_defaults=endpoint.qos_defaults,
         type_hash=installed_hash(endpoint.type, prefixes),
-        at=endpoint.at,
     )
     if need is None:
         return planned
@@ -519,20 +501,15 @@ def _planned_endpoint(
         raise PlanError(message, hint=hint, at=need.need.at)
     return dataclasses.replace(
         planned,
-        unique=need.need.unique,
+        **declared(FlowTerms, need.need),
         dscp=need.dscp,
         enforce_dscp=need.need.enforce,
         dscp_reason=need.marking.reason,
         five_qi=need.five_qi,
         five_qi_reason=need.flow_class.reason,
-        transport=need.need.transport,
         max_delay_ms=need.max_delay_ms,
-        loss=need.need.loss,
-        rate_hz=need.need.rate_hz,
         max_message_size=need.max_message_size,
         max_message_size_reason=""
         if need.max_message_size == need.need.max_message_size
         else "the bound of its type",
-        lossy=need.need.lossy,
-        quantities=need.need.quantities,
     )

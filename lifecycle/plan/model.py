@@ -9,32 +9,44 @@ The one way planning fails. Owns: `PlanError`.
 from __future__ import annotations
 
 import dataclasses
+from typing import Annotated, Any
 
+from lifecycle.codec import DomainId, DscpValue, Port, Positive, says
 from lifecycle.errors import ExitCode, LifecycleError
 from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.model import (
-    After,
     Authority,
-    DataLayer,
-    Discovery,
     DiscoveryMode,
     DiscoveryRange,
-    EndpointKind,
+    Endpoint,
     EndpointPolicy,
     FlowIdentification,
+    FlowTerms,
     FlowTransport,
-    Machine,
-    Network,
+    NodeDeclaration,
     ParameterDeclaration,
     ParameterValue,
-    Policy,
     Quantity,
     Run,
-    Timeouts,
+    SystemDeclaration,
     UniqueHow,
 )
-from lifecycle.manifest.qos import QosProfile
-from lifecycle.network.nfe import UniqueRequirement
+from lifecycle.network.medium import Medium
+
+_UdpUnicast = Annotated[Medium, says(enum=[Medium.UDPV4.value, Medium.UDPV6.value])]
+
+
+def declared(as_: type, by: object) -> dict[str, Any]:
+    """Return what a manifest decided, by field: what a plan's type takes over from one of its.
+
+    A plan's types extend those of the manifest, so that what is declared is written down once, and
+    JSON of a plan has it beside what was planned.
+
+    Args:
+        as_: the manifest's type.
+        by: a value of it, or of a type that extends it.
+    """
+    return {each.name: getattr(by, each.name) for each in dataclasses.fields(as_)}
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,7 +65,7 @@ class StaticEndpoint:
     topic: str
     type: str
     profile: str
-    user_id: int
+    user_id: Port
     reliable: bool = True
     transient_local: bool = False
 
@@ -97,7 +109,7 @@ class PlannedParticipant:
             node's.
         dscp: 0–63 set on its sender sockets; None leaves them alone.
         reason: one phrase for people, "unique publisher video".
-        transports: all that it may use, "udpv4", "udpv6"; empty leaves it to the RMW.
+        transports: all that it may use, UDPV4, UDPV6; empty leaves it to the RMW.
         max_datagram_bytes: UDP payload above which RTPS splits messages itself, so that IP does
             not; None leaves it to the RMW.
         non_blocking_send: its sockets never wait; what finds a full buffer is lost.
@@ -108,10 +120,10 @@ class PlannedParticipant:
     """
 
     name: str
-    dscp: int | None
+    dscp: DscpValue | None
     reason: str
-    transports: tuple[str, ...] = ()
-    max_datagram_bytes: int | None = None
+    transports: tuple[_UdpUnicast, ...] = ()
+    max_datagram_bytes: Positive | None = None
     non_blocking_send: bool = False
     connection: str = ""
     connections: ParticipantConnections = ParticipantConnections()
@@ -119,55 +131,35 @@ class PlannedParticipant:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class PlannedEndpoint:
+class PlannedEndpoint(Endpoint, FlowTerms):
     """One endpoint as it must exist at run time.
 
     Attributes:
-        name: as declared in the interface; the handle that code uses.
         resolved: fully qualified topic, service or action name after namespace and remap.
         dscp: 0–63 of what it sends: a publisher's data, a subscription's acknowledgements.
         dscp_reason: where a DSCP comes from that is not written as such; empty if it is.
         five_qi_reason: why it is this 5QI, or none, where the manifest says `auto`; else empty.
         participant: base name of the PlannedParticipant that carries it; empty for the node's own.
-        transport: NETWORK must not go by shared memory.
         max_delay_ms: declared bound, or the shortest of the links on its topic; None without.
-        loss: declared bound of the share lost or late, > 0 and <= 1.
-        rate_hz: declared messages per second.
         max_message_size: largest serialized message, bytes: as declared, else the type's bound;
             None if the type has none or is not installed here.
         max_message_size_reason: where a size comes from that is not written as such; empty if it
             is.
-        lossy: the data bear an unreliable transport; None if nobody said.
-        qos_defaults: policies of `qos` that no manifest writes: the endpoint is made with them, and
-            nobody requires them.
-        quantities: numbers of its flow need that only a measurement could prove.
         type_hash: of the definition that is installed here (REP-2016), as `ObservedEndpoint` has
             it; empty if the type is not installed here, or without hashes.
     """
 
-    kind: EndpointKind
-    name: str
     resolved: str
-    type: str
-    qos: QosProfile | None
-    unique: UniqueRequirement = UniqueRequirement.NOT_REQUIRED
-    dscp: int | None = None
+    dscp: DscpValue | None = None
     enforce_dscp: bool = True
     dscp_reason: str = ""
     five_qi: int | None = None
     five_qi_reason: str = ""
     participant: str = ""
-    transport: FlowTransport = FlowTransport.ANY
     max_delay_ms: float | None = None
-    loss: float | None = None
-    rate_hz: float | None = None
-    max_message_size: int | None = None
+    max_message_size: Positive | None = None
     max_message_size_reason: str = ""
-    lossy: bool | None = None
-    qos_defaults: tuple[str, ...] = ()
-    quantities: tuple[Quantity, ...] = ()
     type_hash: str = ""
-    at: Position
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -184,7 +176,7 @@ class PlannedFile:
 
     place: str
     written: str
-    digest: str = ""
+    digest: Annotated[str, says(pattern="^([0-9a-f]{16})?$")] = ""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -212,19 +204,15 @@ class ExpectedParameter:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class PlannedNode:
+class PlannedNode(NodeDeclaration):
     """One node as it must exist at run time.
 
     Attributes:
-        key: the manifest key.
-        name: base name.
-        namespace: absolute.
         process: name of its PlannedProcess.
-        parameters: (name, value) given on top of parameter files.
         expected_parameters: what its parameters must be once it is configured: those declared and
             those given, see lifecycle.plan.parameters.
         unread_parameter_files: those whose values are not known here and so not expected.
-        transports: all that the node's own participant may use, "udpv4", "udpv6"; empty leaves it
+        transports: all that the node's own participant may use, UDPV4, UDPV6; empty leaves it
             to the RMW. Nodes of one process share a participant if these and `max_datagram_bytes`
             are equal.
         max_datagram_bytes: as in PlannedParticipant, for the node's own participant.
@@ -237,25 +225,13 @@ class PlannedNode:
         files: the paths among `parameter_files` and `run` as the manifest writes them.
     """
 
-    key: str
-    name: str
-    namespace: str
-    machine: str
     process: str
-    managed: bool
-    run: Run
     endpoints: tuple[PlannedEndpoint, ...]
     declared_parameters: tuple[ParameterDeclaration, ...]
-    parameters: tuple[tuple[str, ParameterValue], ...]
-    parameter_files: tuple[str, ...]
-    remap: tuple[tuple[str, str], ...]
     participants: tuple[PlannedParticipant, ...]
-    after: tuple[After, ...]
-    timeouts: Timeouts
     endpoint_policy: EndpointPolicy
-    log_level: str
-    transports: tuple[str, ...] = ()
-    max_datagram_bytes: int | None = None
+    transports: tuple[_UdpUnicast, ...] = ()
+    max_datagram_bytes: Positive | None = None
     connections: ParticipantConnections = ParticipantConnections()
     authority: Authority = Authority.NODES
     events: bool = False
@@ -263,7 +239,6 @@ class PlannedNode:
     files: tuple[PlannedFile, ...] = ()
     expected_parameters: tuple[ExpectedParameter, ...] = ()
     unread_parameter_files: tuple[str, ...] = ()
-    at: Position
 
     @property
     def full_name(self) -> str:
@@ -300,8 +275,8 @@ class PlannedFlow:
         unique: the strongest demand of a link on this pair.
         linked: a `links:` entry names this pair.
         transport: what a link says must carry it; ANY where none does.
-        medium: what will carry it, "intraprocess", "shm", "udpm", "udpv4", "udpv6" or "tcpv4";
-            empty if that is not known before the nodes' configurations are.
+        medium: the word of a Medium that will carry it; empty if that is not known before the
+            nodes' configurations are.
         medium_reason: one phrase for people, "same host", "links say so".
         quantities: numbers of its links that only a measurement could prove.
     """
@@ -332,46 +307,37 @@ class PlannedServer:
 
     machine: str
     address: str
-    port: int
+    port: Port
     tcp: bool = True
     prefix: str
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Plan:
+class Plan(SystemDeclaration):
     """A system, planned.
 
     Attributes:
         levels: node keys by dependency level; a level's nodes have no order among themselves.
         rmw: RMW identifier of processes that set none of their own, `rmw_fastrtps_cpp`.
         flow_identification: how publishers that need a unique flow get one.
-        data_layer: who wires it, from what, and whether events are followed.
         discovery_mode: how participants find each other.
-        discovery: as declared; what `discovery_mode` and `domain_id` do not say of it.
         max_datagram_bytes: UDP payload that the path carries unfragmented; None assumes Ethernet.
-        network: as declared; `flow_identification` and `max_datagram_bytes` are of it.
         server: the discovery server; None without.
         observers: (machine, how its supervisor's own participant is connected); machine is empty
             for this host. Machines without an entry leave it to the RMW.
     """
 
-    system: str
     manifest_path: str
-    domain_id: int
+    domain_id: DomainId
     discovery_range: DiscoveryRange
-    policy: Policy
-    machines: tuple[Machine, ...]
     processes: tuple[PlannedProcess, ...]
     nodes: tuple[PlannedNode, ...]
     flows: tuple[PlannedFlow, ...]
     levels: tuple[tuple[str, ...], ...]
     rmw: str = ""
     flow_identification: FlowIdentification = FlowIdentification.PARTICIPANT
-    data_layer: DataLayer = DataLayer()
     discovery_mode: DiscoveryMode = DiscoveryMode.DYNAMIC
-    discovery: Discovery = Discovery()  # noqa: RUF009 - frozen
-    max_datagram_bytes: int | None = None
-    network: Network = Network()  # noqa: RUF009 - frozen
+    max_datagram_bytes: Positive | None = None
     server: PlannedServer | None = None
     observers: tuple[tuple[str, ParticipantConnections], ...] = ()
 

@@ -15,7 +15,8 @@ import dataclasses
 from collections.abc import Collection, Iterator, Mapping
 from types import MappingProxyType
 
-from lifecycle.network.connection_url import ConnectionTransport, ConnectionUrl, Peer, parse
+from lifecycle.network.connection_url import ConnectionUrl, Peer, parse
+from lifecycle.network.medium import Medium
 from lifecycle.plan.connections.contacts import contacts_of
 from lifecycle.plan.connections.hosts import PortPool
 from lifecycle.plan.model import ParticipantConnections, Plan, PlanError, PlannedNode
@@ -111,7 +112,7 @@ def moved_observer(
         )
     urls = tuple(
         str(dataclasses.replace(url, port=port))
-        if url.transport is ConnectionTransport.TCPV4 and url.port is not None
+        if url.transport is Medium.TCPV4 and url.port is not None
         else str(url)
         for url in map(parse, connections.urls)
     )
@@ -144,7 +145,7 @@ def is_restarted_url(planned: str, reported: str, *, first_port: int) -> bool:
         ConnectionUrlError: one of them is none.
     """
     was, now = parse(planned), parse(reported)
-    if was.transport is not ConnectionTransport.TCPV4 or not (was.peers or was.server):
+    if was.transport is not Medium.TCPV4 or not (was.peers or was.server):
         return False
     if was.port is None or now.port is None or now.port < first_port + RESTART_PORTS_FROM:
         return False
@@ -173,7 +174,7 @@ def _with_port(urls: Collection[str]) -> Iterator[ConnectionUrl]:
     """Yield the URL with the TCP port; a participant has at most one (url_families)."""
     for text in urls:
         url = parse(text)
-        if url.transport is ConnectionTransport.TCPV4 and url.port is not None:
+        if url.transport is Medium.TCPV4 and url.port is not None:
             yield url
 
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from lifecycle.manifest.model import EndpointKind, EndpointPolicy, UniqueHow
+from lifecycle.network.medium import Medium
 from lifecycle.network.nfe import (
     NetworkFlowEndpoint,
     TransportProtocol,
@@ -51,11 +52,9 @@ _Place = tuple[str, str, EndpointKind | None]
 
 
 _OTHER_PROTOCOL = {
-    "tcpv4": TransportProtocol.UDP,
-    "tcpv6": TransportProtocol.UDP,
-    "udpv4": TransportProtocol.TCP,
-    "udpv6": TransportProtocol.TCP,
-    "udpm": TransportProtocol.TCP,
+    each.value: TransportProtocol.UDP if each.is_tcp else TransportProtocol.TCP
+    for each in Medium
+    if each.is_network
 }
 
 
@@ -149,7 +148,7 @@ def _transport(
     }
     common: list[str] = []
     if len(machines) == 1 and not all(map(is_ip, source)) and not all(map(is_ip, destination)):
-        common.append("shm")
+        common.append(Medium.SHM)
     arriving = {(each.transport_protocol, each.internet_protocol) for each in destination}
     for each in source:
         place = (each.transport_protocol, each.internet_protocol)

@@ -13,6 +13,7 @@ import re
 from collections.abc import Iterable
 
 from lifecycle import codec
+from lifecycle.codec import Count, DscpValue
 from lifecycle.manifest.model import EndpointKind, ParameterValue
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.network.nfe import NetworkFlowEndpoint, UniqueRequirement
@@ -39,7 +40,7 @@ class Identity:
     """
 
     machine_id: str
-    process_id: int
+    process_id: Count
     node_id: str
 
 
@@ -100,16 +101,16 @@ class EndpointReport:
     unique: UniqueRequirement = UniqueRequirement.NOT_REQUIRED
     nfes: tuple[NetworkFlowEndpoint, ...] | None = None
     participant: str = ""
-    matched: int | None = None
+    matched: Count | None = None
     peers: tuple[str, ...] | None = None
     server_matched: bool | None = None
-    dscp: int | None = None
+    dscp: DscpValue | None = None
     error: str = ""
     connection: str = ""
     mapped: bool = False
     aliases: tuple[str, ...] = ()
     lossy: bool | None = None
-    size_bytes: int | None = None
+    size_bytes: Count | None = None
     type_hash: str | None = None
 
 
@@ -166,7 +167,7 @@ class NodeConfiguration:
         name: fully qualified node name.
         state: lifecycle_msgs/State label.
         connected: the data layer is made (nested state of inactive; True while active).
-        transports: what the node can be connected by, e.g. "udpv4", "shm".
+        transports: what the node can be connected by, words of media.
         serializations: wire formats, "cdr".
         paradigms: "publish-subscribe", "request-response".
         connections: every connection that exists or was asked for.

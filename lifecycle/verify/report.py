@@ -29,11 +29,11 @@ from xml.etree import ElementTree as ET
 from lifecycle import codec
 from lifecycle.manifest.model import UniqueHow
 from lifecycle.network.dscp import describe
+from lifecycle.network.medium import NETWORK_MEDIA
 from lifecycle.plan.model import Plan
 from lifecycle.printable import json_text, lines, one_line
 from lifecycle.verify.rules import RULES
 from lifecycle.verify.rules.catalogue import Rule
-from lifecycle.verify.transport import NETWORK
 from lifecycle.verify.verdict import Finding, FlowReport, Outcome, RunEnd, Verdict
 
 _COLOURS = {Outcome.OK: "\x1b[32m", Outcome.VIOLATED: "\x1b[31m", Outcome.UNVERIFIABLE: "\x1b[33m"}
@@ -139,7 +139,7 @@ def _flows(flows: Sequence[FlowReport], *, colour: bool) -> list[str]:
         cells = [cell.ljust(size) for cell, size in zip(row, widths, strict=True) if size]
         outcome = _paint(flow.outcome.value, flow.outcome, colour=colour)
         lines.append("  " + "  ".join([*cells, outcome]))
-        if flow.effective_transport in NETWORK:
+        if flow.effective_transport in NETWORK_MEDIA:
             lines += [one_line(f"    {each.describe()}") for each in flow.tuples]
     return lines
 

@@ -15,7 +15,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from lifecycle.network.address import is_multicast
-from lifecycle.network.connection_url import ConnectionTransport, ConnectionUrlError, parse
+from lifecycle.network.connection_url import ConnectionUrlError, parse
+from lifecycle.network.medium import Medium
 from lifecycle.network.nfe import (
     InternetProtocol,
     NetworkFlowEndpoint,
@@ -25,14 +26,8 @@ from lifecycle.network.nfe import (
 from lifecycle.verify.observation import Identity
 from lifecycle.verify.view import Actual, FlowView, View
 
-INTRAPROCESS = "intraprocess"
-SHARED_MEMORY = "shm"
-MULTICAST = "udpm"
 NONE = "none"
 UNKNOWN = "unknown"
-
-NETWORK = frozenset({"udpv4", "udpv6", "tcpv4", "tcpv6", MULTICAST})
-"""Transports whose packets a network sees."""
 
 _ANY_PORT = 0
 """Of the NFE that stands for a URL: no port tells one transport from another."""
@@ -85,16 +80,15 @@ def _as_nfe(text: str) -> NetworkFlowEndpoint | None:
         url = parse(text)
     except ConnectionUrlError:
         return None
-    if url.transport is ConnectionTransport.SHM:
+    if url.transport is Medium.SHM:
         return NetworkFlowEndpoint(
             transport_protocol=TransportProtocol.UNKNOWN,
             internet_protocol=InternetProtocol.UNKNOWN,
             transport_port=_ANY_PORT,
         )
-    tcp = url.transport is ConnectionTransport.TCPV4
-    ipv6 = url.transport is ConnectionTransport.UDPV6 or ":" in url.address
+    ipv6 = url.transport.ip_version == 6 or ":" in url.address
     return NetworkFlowEndpoint(
-        transport_protocol=TransportProtocol.TCP if tcp else TransportProtocol.UDP,
+        transport_protocol=TransportProtocol.TCP if url.transport.is_tcp else TransportProtocol.UDP,
         internet_protocol=InternetProtocol.IPV6 if ipv6 else InternetProtocol.IPV4,
         transport_port=_ANY_PORT,
         internet_address=url.address or ("::" if ipv6 else "0.0.0.0"),  # noqa: S104 - any address
@@ -124,16 +118,16 @@ def carrier(
         return UNKNOWN
     same_host = publisher.machine_id == subscription.machine_id
     if same_host and publisher.process_id == subscription.process_id:
-        return INTRAPROCESS
+        return Medium.INTRAPROCESS
     if not source or not destination:
         return UNKNOWN
     if same_host and _has_shared_memory(source) and _has_shared_memory(destination):
-        return SHARED_MEMORY
+        return Medium.SHM
     leaving = {spell_transport(each) for each in source if is_ip(each)}
     groups = [each for each in destination if is_ip(each) and _is_group(each)]
     # A group has no router between here and another host: it is sent with a TTL of 0.
     if same_host and any(spell_transport(each) in leaving for each in groups):
-        return MULTICAST
+        return Medium.UDPM
     arriving = (spell_transport(each) for each in destination if is_ip(each) and each not in groups)
     return next((each for each in arriving if each in leaving), NONE)
 

@@ -8,9 +8,14 @@ from __future__ import annotations
 import dataclasses
 import enum
 from collections.abc import Iterable
+from typing import Annotated
 
+from lifecycle.codec import DscpValue, Octet, says
 from lifecycle.manifest.model import EndpointKind, UniqueHow
+from lifecycle.network.medium import Medium
 from lifecycle.network.nfe import FlowTuple, NetworkFlowEndpoint, UniqueRequirement, flow_tuples
+
+_Carrier = Annotated[str, says(enum=[*map(str, Medium), "none", "unknown"])]
 
 
 class Outcome(enum.Enum):
@@ -87,8 +92,8 @@ class FlowReport:
         five_qi: what is planned, 3GPP TS 23.501 Table 5.7.4-1; None if not asked for, or if several
             publishers differ.
         five_qi_reason: why it is this 5QI, or none, where the manifest says `auto`; else empty.
-        effective_transport: what carries it: "intraprocess", "shm", "udpv4", "udpv6", "tcpv4",
-            "tcpv6"; "unknown" where nobody tells, "none" where the ends have nothing in common.
+        effective_transport: the word of the Medium that carries it; "unknown" where nobody tells,
+            "none" where the ends have nothing in common.
         transport: "udp", "tcp", "shm or udp" …; what can carry it, as far as the NFEs tell.
         tuples: IP flows that the two ends' NFEs form, each with its 5-tuple and flow label; follows
             from source and destination. Where shared memory carries the flow, none of them does.
@@ -100,7 +105,7 @@ class FlowReport:
     source: tuple[NetworkFlowEndpoint, ...]
     destination: tuple[NetworkFlowEndpoint, ...]
     unique: UniqueHow | None
-    dscp: int | None
+    dscp: DscpValue | None
     requirement: tuple[UniqueRequirement, UniqueRequirement]
     demanded: UniqueHow
     transport: str
@@ -108,8 +113,8 @@ class FlowReport:
     max_delay_ms: float | None = None
     five_qi: int | None = None
     five_qi_reason: str = ""
-    effective_transport: str = "unknown"
-    reader_dscp: int | None = None
+    effective_transport: _Carrier = "unknown"
+    reader_dscp: DscpValue | None = None
     tuples: tuple[FlowTuple, ...] = dataclasses.field(init=False)
 
     def __post_init__(self) -> None:
@@ -174,8 +179,8 @@ class RunEnd:
     """
 
     reason: str
-    reached: str | None
-    exit_code: int
+    reached: Annotated[str, says(enum=["connected", "verified", "active"])] | None
+    exit_code: Octet
     trusted: str = ""
 
     def describe(self) -> str:

@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import EndpointKind, RunKind
 from lifecycle.manifest.qos import Durability, History, Liveliness, QosProfile, Reliability
-from lifecycle.network.connection_url import ConnectionTransport
+from lifecycle.network.medium import Medium
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan.model import (
     ParticipantConnections,
@@ -233,7 +233,7 @@ class View:
 
 def only_shared_memory(connections: ParticipantConnections) -> bool:
     """Tell whether a participant is known to have nothing but shared memory."""
-    scheme = f"{ConnectionTransport.SHM.value}:"
+    scheme = f"{Medium.SHM}:"
     return bool(connections.urls) and all(url.startswith(scheme) for url in connections.urls)
 
 

@@ -24,7 +24,7 @@ from lifecycle.cli.report import (
     write_report,
     written_or_said,
 )
-from lifecycle.codec import to_json
+from lifecycle.codec import Count, to_json
 from lifecycle.errors import ExitCode, LifecycleError
 from lifecycle.manifest import Diagnostic, Manifest, ManifestError, Severity, load
 from lifecycle.manifest.diagnostics import Position
@@ -45,7 +45,7 @@ TESTS = {
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class CheckReport:
-    """What `check --format json` prints (schema: schemas/check.v1.schema.json).
+    """What was found in one manifest and everything it includes (schemas/check.v1.schema.json).
 
     Attributes:
         ok: the exit code is 0.
@@ -58,9 +58,9 @@ class CheckReport:
     manifest: str
     ok: bool
     system: str
-    nodes: int
-    endpoints: int
-    links: int
+    nodes: Count
+    endpoints: Count
+    links: Count
     diagnostics: tuple[Diagnostic, ...]
     unresolved: tuple[Unresolved, ...] = ()
 

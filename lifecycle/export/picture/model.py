@@ -17,6 +17,7 @@ import dataclasses
 import enum
 from collections.abc import Callable, Mapping
 
+from lifecycle.codec import DomainId, Positive
 from lifecycle.verify.verdict import Finding, FlowReport, Outcome, Verdict
 from lifecycle.verify.view import View
 
@@ -100,7 +101,7 @@ class PicturedNode:
     pid: int | None
     notes: tuple[str, ...]
     participants: tuple[PicturedParticipant, ...]
-    findings: tuple[int, ...]
+    findings: tuple[Positive, ...]
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -126,7 +127,7 @@ class PicturedEnd:
     node: str
     presence: Presence
     notes: tuple[str, ...]
-    findings: tuple[int, ...]
+    findings: tuple[Positive, ...]
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -208,14 +209,14 @@ class PicturedFlow:
     dscp: str
     unique: str
     demands: tuple[str, ...]
-    findings: tuple[int, ...]
+    findings: tuple[Positive, ...]
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class PicturedFinding:
     """One finding of the verdict; `number` is what elements call it by, from 1."""
 
-    number: int
+    number: Positive
     rule: str
     outcome: Outcome
     subject: str
@@ -234,7 +235,7 @@ class Picture:
     """
 
     system: str
-    domain_id: int
+    domain_id: DomainId
     phase: str
     verdict: Outcome | None
     machines: tuple[PicturedMachine, ...]

@@ -1,13 +1,11 @@
 """Validated document → frozen types: everything of a manifest but its nodes.
 
-Owns: `Fragment`, one document's share of a system before it is joined with others by `include`,
-and the findings that need more than a schema to be seen. Pure but for reading interfaces by
-reference.
+Owns: what one document declares, before it is joined with others by `include`, and the findings
+that need more than a schema to be seen. Pure but for reading interfaces by reference.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import ipaddress
 from collections.abc import Collection, Mapping
 from pathlib import Path
@@ -19,16 +17,15 @@ from lifecycle.manifest.builders.connections import (
 )
 from lifecycle.manifest.builders.cursor import Cursor
 from lifecycle.manifest.builders.node import Findings, build_node, quantities
-from lifecycle.manifest.diagnostics import Diagnostic, Position, Severity
+from lifecycle.manifest.diagnostics import Diagnostic, Severity
 from lifecycle.manifest.model import (
     TOLERATED_NODES,
-    DataLayer,
-    Discovery,
     EndpointPolicy,
     FlowIdentification,
     FlowTransport,
     Link,
     Machine,
+    Manifest,
     Network,
     Node,
     Policy,
@@ -114,52 +111,34 @@ THIS_HOST = "local"
 _SEVERITIES = {"error": Severity.ERROR, "warning": Severity.WARNING, "ignore": None}
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Fragment:
-    """What one document declares, its includes not yet joined.
-
-    Attributes:
-        diagnostics: errors and warnings found while building; with an error among them, what is
-            wrong is left out.
-        positions: as `Manifest.positions`.
-        lost: keys of nodes that are declared and left out; None if there may be any.
-    """
-
-    system: str
-    description: str
-    machines: tuple[Machine, ...]
-    discovery: Discovery
-    network: Network
-    data_layer: DataLayer
-    policy: Policy
-    nodes: tuple[Node, ...]
-    links: tuple[Link, ...]
-    diagnostics: tuple[Diagnostic, ...]
-    positions: tuple[tuple[str, Position], ...] = ()
-    lost: frozenset[str] | None = frozenset()
-
-
-def build_fragment(
+def build_manifest(
     root: Cursor,
     *,
+    path: str,
+    arguments: tuple[tuple[str, str], ...],
     base: Path,
     environment: Mapping[str, str],
-    unsound: Collection[Place] = (),
-) -> Fragment:
-    """Build what a document declares.
+    unsound: Collection[Place],
+    found: Findings,
+) -> Manifest:
+    """Build what one document declares, its includes not yet joined.
 
     Args:
         root: a document that fits the schema, or what is left of it without the parts that do not.
+        path: as the user wrote it.
+        arguments: resolved values by name.
         base: folder that its relative paths start from.
         environment: for AMENT_PREFIX_PATH, where interfaces by reference are searched.
         unsound: links to leave out, which keep their place in the list.
+        found: findings are appended here; with an error among them, what is wrong is left out.
     """
-    found: Findings = []
     nodes = tuple(
         build_node(key, cursor, base=base, machine=THIS_HOST, environment=environment, found=found)
         for key, cursor in root.entries("nodes")
     )
-    return Fragment(
+    return Manifest(
+        path=path,
+        arguments=arguments,
         system=root.text("system"),
         description=root.text("description"),
         machines=_machines(root, nodes, found),
@@ -169,7 +148,6 @@ def build_fragment(
         policy=_policy(root),
         nodes=nodes,
         links=tuple(_link(each) for each in root.items("links") if each.place not in unsound),
-        diagnostics=tuple(found),
         positions=section_positions(root),
     )
 

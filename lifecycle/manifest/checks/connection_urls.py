@@ -21,7 +21,8 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.manifest.yaml.document import error, warning
 from lifecycle.network.address import is_loopback, may_be_same
-from lifecycle.network.connection_url import ConnectionTransport, ConnectionUrl, Peer
+from lifecycle.network.connection_url import ConnectionUrl, Peer
+from lifecycle.network.medium import Medium
 from lifecycle.network.ports import DG, MAX_DOMAIN_ID, domain_base, owner_of
 
 _WORDS = {
@@ -92,10 +93,10 @@ def _uses(
         port = getattr(url, attribute)
         if port is None:
             continue
-        group = url.transport is ConnectionTransport.UDPM
+        group = url.transport is Medium.UDPM
         yield _Use(
             host=_host(system, node),
-            tcp=url.transport is ConnectionTransport.TCPV4,
+            tcp=url.transport is Medium.TCPV4,
             group=group and attribute == "port",
             address="" if group or attribute == "output_port" else url.address,
             port=port,
@@ -106,11 +107,11 @@ def _uses(
 
 def _contacts(system: System, node: Node, url: ConnectionUrl) -> set[tuple[str, int]]:
     """Return where a connection's discovery is reached, by every address of its host."""
-    tcp = url.transport is ConnectionTransport.TCPV4
+    tcp = url.transport is Medium.TCPV4
     port = url.port if tcp else url.metatraffic_port
     if port is None:
         return set()
-    own = "" if url.transport is ConnectionTransport.UDPM else url.address
+    own = "" if url.transport is Medium.UDPM else url.address
     addresses = (
         {own}
         if own and not ipaddress.ip_address(own).is_unspecified
@@ -128,7 +129,7 @@ def _own_address(
     system: System, node: Node, url: ConnectionUrl, at: Position
 ) -> Iterator[Diagnostic]:
     host = _host(system, node)
-    if not host or not url.address or url.transport is ConnectionTransport.UDPM:
+    if not host or not url.address or url.transport is Medium.UDPM:
         return
     own = ipaddress.ip_address(url.address)
     if own.is_loopback or own.is_unspecified or own == ipaddress.ip_address(host):
@@ -222,7 +223,7 @@ def _loopback(
     at: Position,
 ) -> Iterator[Diagnostic]:
     """Judge loopback addresses where what is carried has an end elsewhere."""
-    if url.transport is ConnectionTransport.UDPM:
+    if url.transport is Medium.UDPM:
         return
     local = [str(each) for each in url.peers if is_loopback(each.address)]
     if is_loopback(url.address):
@@ -260,13 +261,9 @@ def _remote_nodes(system: System, node: Node, kind: EndpointKind, name: str) -> 
 def _together(node: Node, connection: ConnectionDeclaration) -> Iterator[Diagnostic]:
     """Judge URLs that one participant cannot have together (Fast DDS 2.14)."""
     at = node.where(f"connections.{connection.name}")
-    udp = [
-        url
-        for url in connection.urls
-        if url.transport in (ConnectionTransport.UDPV4, ConnectionTransport.UDPV6)
-    ]
+    udp = [url for url in connection.urls if url.transport in (Medium.UDPV4, Medium.UDPV6)]
     fixed = [url for url in udp if url.port]
-    shm = [url for url in connection.urls if url.transport is ConnectionTransport.SHM]
+    shm = [url for url in connection.urls if url.transport is Medium.SHM]
     rule, name = "check.connection-urls", connection.name
     if shm and fixed:
         message = (
@@ -282,9 +279,7 @@ def _together(node: Node, connection: ConnectionDeclaration) -> Iterator[Diagnos
             "server: a client finds nobody else"
         )
         yield error(rule, at, message, "leave peer= or server= out")
-    tcp = [
-        url for url in connection.urls if url.transport is ConnectionTransport.TCPV4 and url.port
-    ]
+    tcp = [url for url in connection.urls if url.transport is Medium.TCPV4 and url.port]
     if len(tcp) > 1:
         message = (
             f"cannot listen on {str(tcp[0])!r} and {str(tcp[1])!r} in {name!r}: one participant "

@@ -22,14 +22,13 @@ from lifecycle.manifest.model import (
     DiscoveryMode,
     EndpointKind,
     EndpointPolicy,
-    FlowTransport,
     Node,
     RunKind,
 )
 from lifecycle.manifest.schema import did_you_mean
 from lifecycle.manifest.yaml.document import error, warning
-from lifecycle.network.connection_url import ConnectionTransport
 from lifecycle.network.dscp import describe
+from lifecycle.network.medium import Medium
 
 _OTHER_END = {
     EndpointKind.SUBSCRIPTION: EndpointKind.PUBLISHER,
@@ -84,15 +83,6 @@ def _alone(system: System, each: Resolved, other: EndpointKind, severity: Severi
 
 
 _FLOW_NAME = re.compile(r"flow_[0-9]+\Z")
-_UDP = (ConnectionTransport.UDPV4, ConnectionTransport.UDPV6, ConnectionTransport.UDPM)
-_CARRIERS = {
-    FlowTransport.NETWORK: (*_UDP, ConnectionTransport.TCPV4),
-    FlowTransport.SHM: (ConnectionTransport.SHM,),
-    FlowTransport.UDPV4: (ConnectionTransport.UDPV4,),
-    FlowTransport.UDPV6: (ConnectionTransport.UDPV6,),
-    FlowTransport.MULTICAST: (ConnectionTransport.UDPM,),
-    FlowTransport.TCPV4: (ConnectionTransport.TCPV4,),
-}
 
 
 def check_connections(system: System, needs: FlowNeeds) -> Iterator[Diagnostic]:
@@ -223,28 +213,31 @@ def _carrier(
     connection: ConnectionDeclaration,
     kind: EndpointKind,
     each: ResolvedNeed,
-    transports: set[ConnectionTransport],
+    transports: set[Medium],
 ) -> Iterator[Diagnostic]:
     if not transports:
         return
     rule, what = "check.connection-flow", _what(kind, each)
-    spelled = ", ".join(sorted(each.value for each in transports))
-    wanted = _CARRIERS.get(each.need.transport, ())
-    if wanted and not transports & {*wanted}:
+    spelled = ", ".join(sorted(transports))
+    if not transports & {*each.need.transport.media}:
         message = (
             f"cannot carry {what} by {each.need.transport.value}: connection "
             f"{connection.name!r} has {spelled}"
         )
         hint = "add a URL of that transport to it, or remove 'transport'"
         yield error(rule, each.need.at, message, hint)
-    if each.need.lossy is False and transports == {ConnectionTransport.UDPM}:
+    if each.need.lossy is False and transports == {Medium.UDPM}:
         message = (
             f"cannot carry {what}, whose data are declared not lossy, by multicast alone, as "
             f"connection {connection.name!r} does"
         )
         hint = "add 'tcpv4://' or 'udpv4://' to it, or remove 'lossy: false'"
         yield error(rule, each.need.at, message, hint)
-    if kind is EndpointKind.SUBSCRIPTION and each.unique and not transports & {*_UDP}:
+    if (
+        kind is EndpointKind.SUBSCRIPTION
+        and each.unique
+        and not any(one.is_udp for one in transports)
+    ):
         message = (
             f"cannot give {what} a port of its own on connection {connection.name!r}: it has "
             f"{spelled}, and only UDP has one port for each subscription"

@@ -24,6 +24,7 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.manifest.schema import did_you_mean
 from lifecycle.manifest.yaml.document import error
+from lifecycle.network.medium import Medium
 
 FAST_DDS = "rmw_fastrtps"
 _FIXED = (DiscoveryMode.STATIC, DiscoveryMode.STATIC_ENDPOINTS)
@@ -122,15 +123,14 @@ def _transport(system: System, section: Position) -> Iterator[Diagnostic]:
     if transport is FlowTransport.TCPV4 and discovery.mode is DiscoveryMode.DYNAMIC:
         message = f"{what} in mode dynamic: TCP has no multicast to find anybody by"
         yield error(rule, at, message, "use 'mode: static' or 'mode: server'")
-    wanted = {FlowTransport.UDPV4: 4, FlowTransport.TCPV4: 4, FlowTransport.UDPV6: 6}
-    version = wanted.get(transport)
+    medium = transport.medium
     if discovery.mode is DiscoveryMode.SERVER and transport is FlowTransport.ANY:
-        version = 4
+        medium = Medium.TCPV4
+    version = medium.ip_version if medium else None
     for address, machines in found.items():
         if version and address and ipaddress.ip_address(address).version != version:
-            word = "tcpv4" if transport is FlowTransport.ANY else transport.value
             message = (
-                f"cannot reach machine {machines[0].name!r} at {address} by {word}, which "
+                f"cannot reach machine {machines[0].name!r} at {address} by {medium}, which "
                 "discovery uses"
             )
             hint = f"give it an IPv{version} address, or use another 'transport'"

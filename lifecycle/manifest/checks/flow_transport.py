@@ -25,6 +25,7 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.manifest.yaml.document import error, warning
 from lifecycle.network.datagram import RTPS_OVERHEAD_BYTES, datagram_bytes, max_unfragmented
+from lifecycle.network.medium import TRANSPORTS_VARIABLE
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.network.rmw_capabilities import (
     Capability,
@@ -75,16 +76,6 @@ def _judge(
     yield make("check.rmw", each.need.at, message, hint)
 
 
-TRANSPORTS_VARIABLE = "FASTDDS_BUILTIN_TRANSPORTS"
-
-
-_IP_VERSIONS = {FlowTransport.UDPV4: 4, FlowTransport.TCPV4: 4, FlowTransport.UDPV6: 6}
-_BY_VARIABLE = {
-    FlowTransport.NETWORK: "UDPv4",
-    FlowTransport.UDPV4: "UDPv4",
-    FlowTransport.UDPV6: "UDPv6",
-    FlowTransport.SHM: "SHM",
-}
 _RULE = "check.flow-transport"
 
 
@@ -142,7 +133,7 @@ def _foreign(system: System, node: Node, each: ResolvedNeed) -> Iterator[Diagnos
     if node.run.kind is RunKind.PYTHON or supervised:
         return
     what = f"{need.kind.noun} {need.name!r} of {node.key!r}"
-    value = _BY_VARIABLE.get(need.transport)
+    value = need.transport.builtin
     if value is None:
         message = (
             f"cannot carry {what} by {need.transport.value}: its participant is not ours to connect"
@@ -208,7 +199,7 @@ def _pair(
         )
         yield error(_RULE, at, message, "give both one kind of address")
     else:
-        version = _IP_VERSIONS.get(transport)
+        version = transport.medium.ip_version if transport.medium else None
         wrong = [each for each in (one, two) if each and (6 if ":" in each else 4) != version]
         if version and wrong:
             message = (

@@ -1,8 +1,8 @@
 """Joining manifests: which file an include names, and what becomes of what it declares.
 
-Owns: finding included files, refusing cycles, moving a fragment under a key prefix and a namespace,
-and joining fragments into one. Reading them is `load`'s. Looks at the file system for existence
-only.
+Owns: finding included files, refusing cycles, moving a manifest under a key prefix and a namespace,
+and joining it with the one that includes it. Reading them is `load`'s. Looks at the file system for
+existence only.
 """
 
 from __future__ import annotations
@@ -14,9 +14,8 @@ from pathlib import Path
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.builders.cursor import Cursor
 from lifecycle.manifest.builders.node import Findings
-from lifecycle.manifest.builders.system import Fragment
 from lifecycle.manifest.diagnostics import Position
-from lifecycle.manifest.model import EndpointKind, Link, Machine, Node
+from lifecycle.manifest.model import EndpointKind, Link, Machine, Manifest, Node
 from lifecycle.manifest.names import resolve
 from lifecycle.manifest.schema import did_you_mean
 from lifecycle.manifest.yaml.document import error
@@ -94,43 +93,41 @@ def _siblings(path: Path) -> list[str]:
         return []
 
 
-def move(fragment: Fragment, *, prefix: str, namespace: str) -> Fragment:
-    """Put a fragment under a key prefix and a namespace.
+def move(manifest: Manifest, *, prefix: str, namespace: str) -> Manifest:
+    """Put a manifest under a key prefix and a namespace.
 
     Names of nodes move with their namespace, and so do relative topic names; an absolute topic
     name stays where it is. A link's topic goes where its publisher goes.
     """
-    old = {node.key: node for node in fragment.nodes}
-    new = {node.key: _move_node(node, prefix, namespace) for node in fragment.nodes}
+    old = {node.key: node for node in manifest.nodes}
+    new = {node.key: _move_node(node, prefix, namespace) for node in manifest.nodes}
     links = tuple(
         dataclasses.replace(
             link,
             topic=_moved_topic(link, old, new),
-            from_node=_join_key(prefix, link.from_node),
-            to_node=_join_key(prefix, link.to_node),
+            from_node=join_key(prefix, link.from_node),
+            to_node=join_key(prefix, link.to_node),
         )
-        for link in fragment.links
+        for link in manifest.links
     )
-    lost = fragment.lost
-    if lost is not None:
-        lost = frozenset(_join_key(prefix, key) for key in lost)
-    return dataclasses.replace(fragment, nodes=tuple(new.values()), links=links, lost=lost)
+    return dataclasses.replace(manifest, nodes=tuple(new.values()), links=links)
 
 
 def _move_node(node: Node, prefix: str, namespace: str) -> Node:
     outer, inner = namespace.strip("/"), node.namespace.strip("/")
     return dataclasses.replace(
         node,
-        key=_join_key(prefix, node.key),
+        key=join_key(prefix, node.key),
         namespace="/" + "/".join(part for part in (outer, inner) if part),
-        process=_join_key(prefix, node.process) if node.process else "",
+        process=join_key(prefix, node.process) if node.process else "",
         after=tuple(
-            dataclasses.replace(each, node=_join_key(prefix, each.node)) for each in node.after
+            dataclasses.replace(each, node=join_key(prefix, each.node)) for each in node.after
         ),
     )
 
 
-def _join_key(prefix: str, key: str) -> str:
+def join_key(prefix: str, key: str) -> str:
+    """Return what a key of an included manifest is called in the one that includes it."""
     return f"{prefix}/{key}" if prefix else key
 
 
@@ -154,13 +151,13 @@ def _topic(node: Node, name: str) -> str:
         return ""
 
 
-def join(outer: Fragment, inner: Fragment, at: Position, found: Findings) -> Fragment:
-    """Add an included fragment to the one that includes it.
+def join(outer: Manifest, inner: Manifest, at: Position, found: Findings) -> Manifest:
+    """Add an included manifest to the one that includes it.
 
     The discovery, network, data layer and policy of the including one hold.
 
     Args:
-        outer: the including fragment.
+        outer: the including manifest.
         inner: the included one, moved to its place.
         at: the include.
         found: findings are appended here.
@@ -181,7 +178,6 @@ def join(outer: Fragment, inner: Fragment, at: Position, found: Findings) -> Fra
         nodes=tuple(nodes.values()),
         machines=tuple(machines.values()),
         links=(*outer.links, *inner.links),
-        lost=None if outer.lost is None or inner.lost is None else outer.lost | inner.lost,
     )
 
 

@@ -35,10 +35,10 @@ import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from lifecycle.middleware.discovery.probe import HEADER, Door, doors_of, send
-from lifecycle.middleware.fastdds.url_profile import UDPV4, UDPV6
 from lifecycle.middleware.sockets.dscp import own_udp_socket, socket_descriptors
 from lifecycle.middleware.sockets.url_check import open_sockets
 from lifecycle.network.connection_url import ConnectionUrl
+from lifecycle.network.medium import Medium
 
 _UNANSWERED = 2
 """Retransmissions in a row after which a connection is dead for whoever is leaving: the kernel
@@ -189,10 +189,10 @@ def remove_participants(
     messages = [disposal(each) for each in prefixes]
     doors = {
         kind: [*_asked(domain_id, urls, environment, kind), *_listening(pids, kind)]
-        for kind in (UDPV4, UDPV6)
+        for kind in (Medium.UDPV4, Medium.UDPV6)
     }
     output = next((url.output_port for url in urls if url.output_port), None)
-    for kind, family in ((UDPV4, socket.AF_INET), (UDPV6, socket.AF_INET6)):
+    for kind, family in ((Medium.UDPV4, socket.AF_INET), (Medium.UDPV6, socket.AF_INET6)):
         if not doors[kind]:
             continue
         own = None if output is None else own_udp_socket(family, output)
@@ -202,19 +202,19 @@ def remove_participants(
 
 
 def _asked(
-    domain_id: int, urls: Sequence[ConnectionUrl], environment: Mapping[str, str], kind: str
+    domain_id: int, urls: Sequence[ConnectionUrl], environment: Mapping[str, str], kind: Medium
 ) -> Iterator[Door]:
     for found, doors in doors_of(domain_id, urls, environment):
         if found == kind:
             yield from doors
 
 
-def _listening(pids: Iterable[int], kind: str) -> Iterator[Door]:
+def _listening(pids: Iterable[int], kind: Medium) -> Iterator[Door]:
     """Yield where processes of this host receive; those that are gone receive nothing."""
     for pid in pids:
         with contextlib.suppress(OSError):
             for each in open_sockets(pid):
                 if each.kind == kind and not ipaddress.ip_address(each.address).is_multicast:
                     any_ = ipaddress.ip_address(each.address).is_unspecified
-                    loopback = "::1" if kind == UDPV6 else "127.0.0.1"
+                    loopback = "::1" if kind is Medium.UDPV6 else "127.0.0.1"
                     yield Door(address=loopback if any_ else each.address, port=each.port)

@@ -17,6 +17,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from lifecycle.errors import MiddlewareError
+from lifecycle.network.medium import TRANSPORTS_VARIABLE
 from lifecycle.plan.model import PlannedServer
 
 PROGRAM = "fast-discovery-server"
@@ -51,7 +52,7 @@ def discovery_server_command(
     for variable in (
         "FASTRTPS_DEFAULT_PROFILES_FILE",
         "FASTDDS_DEFAULT_PROFILES_FILE",
-        "FASTDDS_BUILTIN_TRANSPORTS",
+        TRANSPORTS_VARIABLE,
         "ROS_DISCOVERY_SERVER",
     ):
         current.pop(variable, None)

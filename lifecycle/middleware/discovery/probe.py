@@ -36,8 +36,6 @@ from lifecycle.middleware.fastdds.url_profile import (
     DISCOVERY_GROUP,
     LOCALHOST_PEERS_RANGE,
     LOOPBACK,
-    UDPV4,
-    UDPV6,
     Family,
     families,
     leaves_discovery_open,
@@ -45,6 +43,7 @@ from lifecycle.middleware.fastdds.url_profile import (
 from lifecycle.middleware.sockets.dscp import own_udp_socket
 from lifecycle.middleware.sockets.url_check import open_sockets
 from lifecycle.network.connection_url import ConnectionUrl
+from lifecycle.network.medium import TRANSPORTS_VARIABLE, Medium
 from lifecycle.network.ports import DG, PARTICIPANTS_PER_DOMAIN, participant_ports
 
 RANGE_VARIABLE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
@@ -206,14 +205,14 @@ def announcement(locators: Iterable[tuple[str, int]]) -> bytes:
     return HEADER + prefix + info_timestamp + struct.pack("<BBH", 0x15, 0x05, len(body)) + body
 
 
-def discovery_ports(domain_id: int, kind: str = "udpv4") -> tuple[int, ...]:
+def discovery_ports(domain_id: int, kind: Medium = Medium.UDPV4) -> tuple[int, ...]:
     """Return the UDP ports of this process on which participants hear discovery.
 
     Read from the kernel, never inferred: a taken port moves a participant to another one.
 
     Args:
         domain_id: 0–232.
-        kind: "udpv4" or "udpv6".
+        kind: UDPV4 or UDPV6.
     """
     first = participant_ports(domain_id, 0).discovery_unicast
     last = participant_ports(domain_id, 0).discovery_multicast + DG
@@ -236,7 +235,7 @@ _CHOICES = frozenset(
 )
 """Elements of a participant profile that say where others are looked for, or by what."""
 
-_FAMILIES = {UDPV4: socket.AF_INET, UDPV6: socket.AF_INET6}
+_FAMILIES = {Medium.UDPV4: socket.AF_INET, Medium.UDPV6: socket.AF_INET6}
 
 
 def knock_for(
@@ -264,7 +263,7 @@ def knock_for(
     range_ = _range(environment)
     return tuple(
         _knock_around(domain_id, kind, range_, environment)
-        for kind in (tuple(family.kind for family in found) or (UDPV4,))
+        for kind in (tuple(family.kind for family in found) or (Medium.UDPV4,))
     )
 
 
@@ -279,7 +278,7 @@ def doors_of(
         environment: as for `knock_for`.
 
     Returns:
-        "udpv4" or "udpv6" and the doors of that family; nothing where discovery allows no UDP.
+        UDPV4 or UDPV6 and the doors of that family; nothing where discovery allows no UDP.
     """
     if any(url.server for url in urls) or (not urls and chosen_otherwise(environment)):
         return ()
@@ -291,7 +290,7 @@ def doors_of(
     range_ = _range(environment)
     return tuple(
         (kind, _doors_around(domain_id, kind, range_, environment))
-        for kind in (tuple(family.kind for family in found) or (() if urls else (UDPV4,)))
+        for kind in (tuple(family.kind for family in found) or (() if urls else (Medium.UDPV4,)))
         if range_ != "OFF"
     )
 
@@ -318,7 +317,7 @@ def chosen_otherwise(environment: Mapping[str, str]) -> bool:
 
 
 def _has_udpv4(environment: Mapping[str, str]) -> bool:
-    builtin = environment.get("FASTDDS_BUILTIN_TRANSPORTS", "").partition("?")[0].upper()
+    builtin = environment.get(TRANSPORTS_VARIABLE, "").partition("?")[0].upper()
     return builtin in _WITH_UDP
 
 
@@ -371,10 +370,12 @@ def discovery_peers(
         for door in well_known_doors(domain_id, host, min(count, LOCALHOST_PEERS_RANGE))
     ]
     group = participant_ports(domain_id, 0).discovery_multicast
-    return ((DISCOVERY_GROUP[UDPV4], group), *found)
+    return ((DISCOVERY_GROUP[Medium.UDPV4], group), *found)
 
 
-def _knock_around(domain_id: int, kind: str, range_: str, environment: Mapping[str, str]) -> Knock:
+def _knock_around(
+    domain_id: int, kind: Medium, range_: str, environment: Mapping[str, str]
+) -> Knock:
     if range_ == "OFF":
         return Knock((), (), ())
     doors = _doors_around(domain_id, kind, range_, environment)
@@ -384,14 +385,14 @@ def _knock_around(domain_id: int, kind: str, range_: str, environment: Mapping[s
 
 
 def _doors_around(
-    domain_id: int, kind: str, range_: str, environment: Mapping[str, str]
+    domain_id: int, kind: Medium, range_: str, environment: Mapping[str, str]
 ) -> tuple[Door, ...]:
     """Return this host's ports, and with the range SUBNET the group and the static peers'."""
     doors = [*well_known_doors(domain_id, LOOPBACK[kind], PARTICIPANTS_PER_DOMAIN)]
     if range_ == "SUBNET":
         doors += group_doors(domain_id, kind, addresses_of(kind))
         for peer in static_peers(environment):
-            if (":" in peer) == (kind == UDPV6):
+            if (":" in peer) == (kind is Medium.UDPV6):
                 doors += well_known_doors(domain_id, peer, LOCALHOST_PEERS_RANGE)
     return tuple(doors)
 
@@ -442,14 +443,14 @@ def well_known_doors(domain_id: int, address: str, participants: int) -> Iterato
         yield Door(address=address, port=port)
 
 
-def group_doors(domain_id: int, kind: str, interfaces: Iterable[str]) -> Iterator[Door]:
+def group_doors(domain_id: int, kind: Medium, interfaces: Iterable[str]) -> Iterator[Door]:
     """Yield the group of discovery by each interface."""
     port = participant_ports(domain_id, 0).discovery_multicast
     for interface in interfaces:
         yield Door(address=DISCOVERY_GROUP[kind], port=port, interface=interface)
 
 
-def addresses_of(kind: str, *, loopback: bool = False) -> dict[str, tuple[str, ...]]:
+def addresses_of(kind: Medium, *, loopback: bool = False) -> dict[str, tuple[str, ...]]:
     """Return this host's addresses of a family by interface; interfaces without one are left out.
 
     Link-local ones of IPv6 mean nothing to others without an interface of theirs.

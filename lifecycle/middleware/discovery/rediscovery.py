@@ -38,14 +38,13 @@ from lifecycle.middleware.discovery.probe import (
 )
 from lifecycle.middleware.fastdds.url_profile import (
     DISCOVERY_GROUP,
-    UDPV4,
-    UDPV6,
     Family,
     families,
     leaves_discovery_open,
 )
 from lifecycle.middleware.sockets.dscp import own_udp_socket, socket_descriptors
 from lifecycle.network.connection_url import ConnectionUrl
+from lifecycle.network.medium import Medium
 from lifecycle.network.ports import participant_ports
 
 _PARTICIPANTS = 32
@@ -54,7 +53,7 @@ _PARTICIPANTS = 32
 _ANSWERED_AT = 32
 """Participants of this host that an announcement names; each is 56 bytes of one datagram."""
 
-_SOCKET = {UDPV4: socket.AF_INET, UDPV6: socket.AF_INET6}
+_SOCKET = {Medium.UDPV4: socket.AF_INET, Medium.UDPV6: socket.AF_INET6}
 
 
 def call_out(
@@ -84,12 +83,13 @@ def call_out(
         return
     if environment.get(RANGE_VARIABLE, "").upper() in ("LOCALHOST", "OFF"):
         return  # nobody is looked for on another host
-    kinds = tuple(family.kind for family in found) if urls else (UDPV4,)
+    kinds = tuple(family.kind for family in found) if urls else (Medium.UDPV4,)
     for kind in kinds:
-        _call_around(domain_id, kind, [each for each in peers if (":" in each) == (kind == UDPV6)])
+        ipv6 = kind is Medium.UDPV6
+        _call_around(domain_id, kind, [each for each in peers if (":" in each) == ipv6])
 
 
-def _call_around(domain_id: int, kind: str, peers: Sequence[str]) -> None:
+def _call_around(domain_id: int, kind: Medium, peers: Sequence[str]) -> None:
     interfaces = addresses_of(kind)
     group_port = participant_ports(domain_id, 0).discovery_multicast
     ports = discovery_ports(domain_id, kind)

@@ -44,7 +44,8 @@ from lifecycle.middleware.sockets import dscp as marks
 from lifecycle.middleware.sockets.dscp import never_wait
 from lifecycle.middleware.sockets.nfe import get_network_flow_endpoints, has_shared_memory
 from lifecycle.middleware.sockets.url_check import open_sockets
-from lifecycle.network.connection_url import ConnectionTransport, ConnectionUrl
+from lifecycle.network.connection_url import ConnectionUrl
+from lifecycle.network.medium import Medium
 from lifecycle.network.nfe import NetworkFlowEndpoint, UniqueRequirement
 from lifecycle.plan.model import ParticipantConnections
 
@@ -91,7 +92,7 @@ def fixed_sockets(settings: ParticipantSettings) -> set[int]:
 def uses_shared_memory(node: Node, settings: ParticipantSettings) -> bool:
     """Tell whether it has the transport, without a probe that static discovery would not allow."""
     if settings.urls:
-        return any(url.transport is ConnectionTransport.SHM for url in settings.urls)
+        return any(url.transport is Medium.SHM for url in settings.urls)
     return has_shared_memory(node)
 
 
@@ -118,7 +119,7 @@ class FlowParticipant:
         namespace: absolute.
         domain_id: 0–232.
         dscp: 0–63, set on its sender sockets before any user data can leave them; None leaves them.
-        transports: all that it may use, "udpv4", "udpv6"; empty leaves it to the RMW, which
+        transports: all that it may use, UDPV4, UDPV6; empty leaves it to the RMW, which
             prefers shared memory on one host. Both means that a peer with both gets data twice.
         max_datagram_bytes: largest UDP payload it sends, 500–65500: longer messages are split by
             RTPS, so that IP has nothing to fragment; 1400 fits Ethernet. None leaves it to the RMW.
@@ -144,7 +145,7 @@ class FlowParticipant:
         domain_id: int,
         *,
         dscp: int | None = None,
-        transports: Sequence[str] = (),
+        transports: Sequence[Medium] = (),
         max_datagram_bytes: int | None = None,
         non_blocking_send: bool = False,
         arguments: Sequence[str] = (),

@@ -29,6 +29,7 @@ from lifecycle.middleware.fastdds.profiles import child as _child
 from lifecycle.middleware.fastdds.profiles import text as _text
 from lifecycle.network.connection_url import ConnectionUrl
 from lifecycle.network.connection_url import parse as parse_url
+from lifecycle.network.medium import RMW_DEFAULT, TRANSPORTS_VARIABLE, Medium
 from lifecycle.plan.connections.static_endpoints import GRAPH_TOPIC, GRAPH_TYPE, MAX_USER_ID
 from lifecycle.plan.model import ParticipantConnections, StaticEndpoint, StaticParticipant
 
@@ -134,9 +135,6 @@ def _check(endpoint: StaticEndpoint, participant: StaticParticipant, seen: dict[
 
 
 _SKIP_DEFAULT_FILE_VARIABLE = "SKIP_DEFAULT_XML"
-_BUILTIN_TRANSPORTS_VARIABLE = "FASTDDS_BUILTIN_TRANSPORTS"
-_TYPES = {"udpv4": "UDPv4", "udpv6": "UDPv6", "shm": "SHM"}
-_IP_TRANSPORTS = ("udpv4", "udpv6")
 _TRANSPORT_CHOICES = ("userTransports", "useBuiltinTransports", "builtinTransports")
 _LOOPBACK = url_profile.LOOPBACK
 _LOCALHOST_PEERS_RANGE = url_profile.LOCALHOST_PEERS_RANGE
@@ -150,7 +148,7 @@ class ParticipantSettings:
     """What a participant needs that the process's default does not give it.
 
     Attributes:
-        transports: all that it may use, "udpv4" and "udpv6"; empty leaves it to the RMW, which
+        transports: all that it may use, UDPV4 and UDPV6; empty leaves it to the RMW, which
             has shared memory and UDP over IPv4. Both means that messages for a peer that has both
             go twice. Inside a process Fast DDS calls functions whatever the transports.
         max_datagram_bytes: largest UDP payload that it sends, 500–65500; longer messages are split
@@ -167,7 +165,7 @@ class ParticipantSettings:
         MiddlewareError: out of range, or URLs that one participant cannot have together.
     """
 
-    transports: tuple[str, ...] = ()
+    transports: tuple[Medium, ...] = ()
     max_datagram_bytes: int | None = None
     non_blocking_send: bool = False
     urls: tuple[ConnectionUrl, ...] = ()
@@ -180,7 +178,7 @@ class ParticipantSettings:
         cls,
         connections: ParticipantConnections,
         *,
-        transports: tuple[str, ...] = (),
+        transports: tuple[Medium, ...] = (),
         max_datagram_bytes: int | None = None,
         non_blocking_send: bool = False,
         super_client: bool = False,
@@ -220,11 +218,11 @@ class ParticipantSettings:
             )
         if self.static_participants:
             own_endpoints(self.static_name, self.static_participants)
-        unknown = [each for each in self.transports if each not in _IP_TRANSPORTS]
+        unknown = [each for each in self.transports if each not in _LOOPBACK]
         if unknown or len(set(self.transports)) != len(self.transports):
             raise MiddlewareError(
                 f"cannot use transports {', '.join(map(repr, self.transports))}: allowed are "
-                f"{' and '.join(map(repr, _IP_TRANSPORTS))}, each once"
+                f"{' and '.join(map(repr, _LOOPBACK))}, each once"
             )
         size = self.max_datagram_bytes
         if size is not None and not _MIN_DATAGRAM_BYTES <= size <= _MAX_DATAGRAM_BYTES:
@@ -346,7 +344,7 @@ def profile(
             _text(config, "static_edp_xml_config", f"data://{table}")
     elif settings.chooses_transports:
         # Fast DDS's own default where none is asked for: shared memory and UDP over IPv4.
-        kinds = settings.transports or ("shm", "udpv4")
+        kinds = settings.transports or RMW_DEFAULT
         descriptors = ET.SubElement(profiles, "transport_descriptors")
         chosen = ET.SubElement(rtps, "userTransports")
         for kind in kinds:
@@ -377,27 +375,27 @@ def _refuse_second_choice(
                 f"of {base.file!r} already chooses its transports (<{chosen[0]}>)",
                 hint=f"take <{chosen[0]}> out of it, or what needs {wish} out of the manifest",
             )
-    variable = environment.get(_BUILTIN_TRANSPORTS_VARIABLE, "")
+    variable = environment.get(TRANSPORTS_VARIABLE, "")
     if variable and not settings.transports and not settings.urls:
         raise MiddlewareError(
-            f"cannot give a participant {wish}: {_BUILTIN_TRANSPORTS_VARIABLE}={variable!r} "
+            f"cannot give a participant {wish}: {TRANSPORTS_VARIABLE}={variable!r} "
             "already chooses its transports",
-            hint=f"unset it, or say {_BUILTIN_TRANSPORTS_VARIABLE}={variable}?non_blocking=true",
+            hint=f"unset it, or say {TRANSPORTS_VARIABLE}={variable}?non_blocking=true",
         )
 
 
-def _descriptor(name: str, kind: str, settings: ParticipantSettings) -> ET.Element:
+def _descriptor(name: str, kind: Medium, settings: ParticipantSettings) -> ET.Element:
     descriptor = ET.Element("transport_descriptor")
     _text(descriptor, "transport_id", name)
-    _text(descriptor, "type", _TYPES[kind])
-    if settings.non_blocking_send and kind in _IP_TRANSPORTS:
+    _text(descriptor, "type", url_profile.TYPES[kind])
+    if settings.non_blocking_send and kind in _LOOPBACK:
         _text(descriptor, "non_blocking_send", "true")
     # Not maxMessageSize: it is the receive buffer's size as well, and would cut what others send.
     return descriptor
 
 
 def _discover_as_localhost(
-    builtin: ET.Element, kinds: tuple[str, ...], peers: tuple[str, ...]
+    builtin: ET.Element, kinds: tuple[Medium, ...], peers: tuple[str, ...]
 ) -> None:
     """Do what rmw_fastrtps's create_participant does for LOCALHOST, per transport."""
     families = [kind for kind in kinds if kind in _LOOPBACK]
@@ -416,13 +414,13 @@ def _discover_as_localhost(
         _text(locator, "address", _LOOPBACK[family])
 
 
-def _families_of(peer: str, families: list[str]) -> list[str]:
+def _families_of(peer: str, families: list[Medium]) -> list[Medium]:
     """Return the families a peer can be reached by; a name may be reached by any."""
     try:
         version = ipaddress.ip_address(peer).version
     except ValueError:
         return families
-    return [family for family in families if family == f"udpv{version}"]
+    return [family for family in families if Medium(family).ip_version == version]
 
 
 def _set_property(rtps: ET.Element, name: str, value: str) -> None:

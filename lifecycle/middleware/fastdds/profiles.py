@@ -17,6 +17,7 @@ from pathlib import Path
 from xml.etree import ElementTree as ET
 
 from lifecycle.errors import MiddlewareError
+from lifecycle.network.medium import Medium
 
 PROFILES_FILE_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 DEFAULT_FILE = "DEFAULT_FASTRTPS_PROFILES.xml"
@@ -49,7 +50,7 @@ def discovery_profile(
     locators = "".join(
         f"<locator><{kind}><address>{address}</address><port>{port}</port></{kind}></locator>"
         for address, port in peers
-        for kind in ("udpv6" if ":" in address else "udpv4",)
+        for kind in (Medium.UDPV6 if ":" in address else Medium.UDPV4,)
     )
     searched = f"<initialPeersList>{locators}</initialPeersList>" if locators else ""
     return f"""<?xml version="1.0" encoding="UTF-8"?>
@@ -112,16 +113,16 @@ def text(parent: ET.Element, tag: str, content: str) -> None:
     ET.SubElement(parent, tag).text = content
 
 
-def locator(parent: ET.Element, kind: str, address: str, port: int | None) -> None:
+def locator(parent: ET.Element, kind: Medium, address: str, port: int | None) -> None:
     """Add a UDP locator to a list.
 
     Args:
         parent: the list.
-        kind: "udpv4" or "udpv6".
+        kind: UDPV4 or UDPV6.
         address: empty for any.
         port: None for the well-known one.
     """
-    element = ET.SubElement(ET.SubElement(parent, "locator"), kind)
+    element = ET.SubElement(ET.SubElement(parent, "locator"), kind.value)
     if address:
         text(element, "address", address)
     if port is not None:
@@ -140,7 +141,7 @@ def tcp_locator(
         logical: the port inside the connection, which Fast DDS tells traffic apart by; None for
             the well-known ones.
     """
-    element = ET.SubElement(ET.SubElement(parent, "locator"), "tcpv4")
+    element = ET.SubElement(ET.SubElement(parent, "locator"), Medium.TCPV4.value)
     if address:
         text(element, "address", address)
     if physical is not None:

@@ -26,11 +26,11 @@ from lifecycle.middleware.fastdds.profiles import child as _child
 from lifecycle.middleware.fastdds.profiles import locator as _locator
 from lifecycle.middleware.fastdds.profiles import tcp_locator as _tcp_locator
 from lifecycle.middleware.fastdds.profiles import text as _text
-from lifecycle.network.connection_url import ConnectionTransport, ConnectionUrl, Peer
+from lifecycle.network.connection_url import ConnectionUrl, Peer
+from lifecycle.network.medium import Medium
 from lifecycle.network.ports import participant_ports
 
-UDPV4, UDPV6, TCPV4, SHM = "udpv4", "udpv6", "tcpv4", "shm"
-LOOPBACK = {UDPV4: "127.0.0.1", UDPV6: "::1"}
+LOOPBACK = {Medium.UDPV4: "127.0.0.1", Medium.UDPV6: "::1"}
 """The transports that carry UDP, and where each finds this host."""
 
 
@@ -39,12 +39,12 @@ class Family:
     """One transport of a participant: all URLs that it serves.
 
     Attributes:
-        kind: "udpv4", "udpv6", "tcpv4" or "shm".
+        kind: UDPV4, UDPV6, TCPV4 or SHM.
         urls: at least one.
         interfaces: addresses or names that it is bound to; empty for all.
     """
 
-    kind: str
+    kind: Medium
     urls: tuple[ConnectionUrl, ...]
     interfaces: tuple[str, ...] = ()
 
@@ -56,12 +56,12 @@ class Family:
     @property
     def unicast(self) -> tuple[ConnectionUrl, ...]:
         """Its URLs that are no groups."""
-        return tuple(url for url in self.urls if url.transport is not ConnectionTransport.UDPM)
+        return tuple(url for url in self.urls if url.transport is not Medium.UDPM)
 
     @property
     def groups(self) -> tuple[ConnectionUrl, ...]:
         """Its URLs that are groups."""
-        return tuple(url for url in self.urls if url.transport is ConnectionTransport.UDPM)
+        return tuple(url for url in self.urls if url.transport is Medium.UDPM)
 
 
 def families(urls: Sequence[ConnectionUrl]) -> tuple[Family, ...]:
@@ -70,7 +70,7 @@ def families(urls: Sequence[ConnectionUrl]) -> tuple[Family, ...]:
     Raises:
         MiddlewareError: URLs that one participant cannot have together.
     """
-    by_kind: dict[str, list[ConnectionUrl]] = {}
+    by_kind: dict[Medium, list[ConnectionUrl]] = {}
     for url in urls:
         by_kind.setdefault(transport_of(url), []).append(url)
     found = tuple(
@@ -93,16 +93,16 @@ def leaves_discovery_open(urls: Iterable[ConnectionUrl]) -> bool:
         or not url.multicast
         or url.metatraffic_port
         or url.interfaces
-        or (url.address and url.transport is not ConnectionTransport.UDPM)
+        or (url.address and url.transport is not Medium.UDPM)
         for url in udp
     )
 
 
-def transport_of(url: ConnectionUrl) -> str:
+def transport_of(url: ConnectionUrl) -> Medium:
     """Return the kind of transport that a URL is served by; a group's is that of its address."""
-    if url.transport is ConnectionTransport.UDPM:
-        return UDPV4 if ipaddress.ip_address(url.address).version == 4 else UDPV6
-    return str(url.transport.value)
+    if url.transport is Medium.UDPM:
+        return Medium.UDPV4 if ipaddress.ip_address(url.address).version == 4 else Medium.UDPV6
+    return url.transport
 
 
 def _interfaces(urls: Sequence[ConnectionUrl]) -> tuple[str, ...]:
@@ -110,7 +110,7 @@ def _interfaces(urls: Sequence[ConnectionUrl]) -> tuple[str, ...]:
     found: dict[str, None] = {}
     free = [url for url in urls if not _bound_to(url)]
     bound = [url for url in urls if _bound_to(url)]
-    if free and bound and not all(url.transport is ConnectionTransport.UDPM for url in free):
+    if free and bound and not all(url.transport is Medium.UDPM for url in free):
         raise MiddlewareError(
             f"cannot use {str(free[0])!r} on all interfaces and {str(bound[0])!r} on some: one "
             "participant has one transport for both",
@@ -124,7 +124,7 @@ def _interfaces(urls: Sequence[ConnectionUrl]) -> tuple[str, ...]:
 def _bound_to(url: ConnectionUrl) -> tuple[str, ...]:
     if url.interfaces:
         return url.interfaces
-    group = url.transport is ConnectionTransport.UDPM
+    group = url.transport is Medium.UDPM
     if group or not url.address or ipaddress.ip_address(url.address).is_unspecified:
         return ()
     return (url.address,)
@@ -141,7 +141,7 @@ def _check(found: Sequence[Family], urls: Sequence[ConnectionUrl]) -> None:
                     f"cannot use {spelt} together: one participant has one {option}",
                     hint="give them to different connections",
                 )
-        listening = [url for url in family.urls if url.port] if family.kind == TCPV4 else []
+        listening = [url for url in family.urls if url.port] if family.kind is Medium.TCPV4 else []
         if len(listening) > 1:
             raise MiddlewareError(
                 f"cannot listen on {str(listening[0])!r} and {str(listening[1])!r}: one "
@@ -150,7 +150,7 @@ def _check(found: Sequence[Family], urls: Sequence[ConnectionUrl]) -> None:
             )
     kinds = {family.kind for family in found}
     fixed = [url for url in urls if transport_of(url) in LOOPBACK and url.port]
-    if SHM in kinds and fixed:
+    if Medium.SHM in kinds and fixed:
         raise MiddlewareError(
             f"cannot use 'shm://' beside {str(fixed[0])!r}: a profile with fixed ports cannot say "
             "where shared memory listens, so it would not",
@@ -166,7 +166,7 @@ def _check(found: Sequence[Family], urls: Sequence[ConnectionUrl]) -> None:
         )
 
 
-DISCOVERY_GROUP = {UDPV4: "239.255.0.1", UDPV6: "ff1e::ffff:efff:1"}
+DISCOVERY_GROUP = {Medium.UDPV4: "239.255.0.1", Medium.UDPV6: "ff1e::ffff:efff:1"}
 """Where Fast DDS 2.14 announces participants by multicast."""
 
 ANNOUNCED_S = 0.5
@@ -237,7 +237,7 @@ def _add_metatraffic(
 ) -> None:
     """Say where discovery arrives, if Fast DDS would not do as asked by itself."""
     fixed = any(url.metatraffic_port for family in found for url in family.urls)
-    tcp_alone = all(family.kind == TCPV4 for family in found)
+    tcp_alone = all(family.kind is Medium.TCPV4 for family in found)
     udp = any(family.udp for family in found)
     if not (fixed or tcp_alone or (udp and not multicast)):
         return
@@ -248,7 +248,7 @@ def _add_metatraffic(
             addresses = dict.fromkeys(url.address for url in family.unicast) or {"": None}
             for address in addresses:
                 _locator(unicast, family.kind, address, port)
-        elif family.kind == TCPV4:
+        elif family.kind is Medium.TCPV4:
             logical = participant_ports(domain_id, 0).discovery_unicast
             for url in family.urls:
                 _tcp_locator(unicast, url.address, url.port, logical)
@@ -270,7 +270,7 @@ def _add_peers(
     searched = ET.Element("initialPeersList")
     for family in found:
         for peer in dict.fromkeys(peer for url in family.urls for peer in url.peers):
-            if family.kind == TCPV4:
+            if family.kind is Medium.TCPV4:
                 _tcp_locator(searched, peer.address, peer.port, None)
             else:
                 _locator(searched, family.kind, peer.address, peer.port)
@@ -301,7 +301,7 @@ def _add_servers(builtin: ET.Element, urls: Sequence[ConnectionUrl], *, super_cl
             prefix = _counted(url.server_prefix, index)
             remote = ET.SubElement(servers, "RemoteServer", prefix=prefix)
             listened = ET.SubElement(remote, "metatrafficUnicastLocatorList")
-            if url.transport is ConnectionTransport.TCPV4:
+            if url.transport is Medium.TCPV4:
                 # A server's logical port is its physical one.
                 _tcp_locator(listened, server.address, server.port, server.port)
             else:
@@ -332,23 +332,20 @@ def _all_ports_fixed(found: Sequence[Family]) -> bool:
     )
 
 
-def _may_be(address: str, kind: str) -> bool:
+def _may_be(address: str, kind: Medium) -> bool:
     """Whether a peer can be reached by a family; a name may be, by any."""
     try:
         version = ipaddress.ip_address(address).version
     except ValueError:
         return True
-    return kind == f"udpv{version}"
+    return kind.ip_version == version
 
 
 __all__ = [
     "DISCOVERY_GROUP",
     "LOCALHOST_PEERS_RANGE",
     "LOOPBACK",
-    "SHM",
-    "TCPV4",
-    "UDPV4",
-    "UDPV6",
+    "TYPES",
     "Family",
     "add_urls",
     "families",
@@ -358,7 +355,7 @@ __all__ = [
 LOCALHOST_PEERS_RANGE = 32
 """Participants looked for on a peer without a port; rmw_fastrtps's own number for LOCALHOST."""
 
-_TYPES = {UDPV4: "UDPv4", UDPV6: "UDPv6", TCPV4: "TCPv4", SHM: "SHM"}
+TYPES = {Medium.UDPV4: "UDPv4", Medium.UDPV6: "UDPv6", Medium.TCPV4: "TCPv4", Medium.SHM: "SHM"}
 
 
 def add_urls(
@@ -420,7 +417,7 @@ def add_urls(
 def _descriptor(name: str, family: Family, *, non_blocking: bool, open_peers: bool) -> ET.Element:
     descriptor = ET.Element("transport_descriptor")
     _text(descriptor, "transport_id", f"{name}_{family.kind}")
-    _text(descriptor, "type", _TYPES[family.kind])
+    _text(descriptor, "type", TYPES[family.kind])
     if family.udp:
         ttl = next((url.ttl for url in family.urls if url.ttl is not None), None)
         if ttl is not None:
@@ -430,7 +427,7 @@ def _descriptor(name: str, family: Family, *, non_blocking: bool, open_peers: bo
             _text(descriptor, "output_port", str(output))
         if non_blocking:
             _text(descriptor, "non_blocking_send", "true")
-    if family.kind != SHM:
+    if family.kind is not Medium.SHM:
         peers = [peer for url in family.urls for peer in url.peers]
         wide = open_peers or any(peer.port is None for peer in peers)
         range_ = LOCALHOST_PEERS_RANGE if wide and family.udp else 1
@@ -440,7 +437,7 @@ def _descriptor(name: str, family: Family, *, non_blocking: bool, open_peers: bo
         for each in family.interfaces:
             is_name = _is_name(each)
             _text(allowed, "interface" if is_name else "address", each)
-    if family.kind == TCPV4:
+    if family.kind is Medium.TCPV4:
         _keep_dialling_whole(descriptor)
         ports = [url.port for url in family.urls if url.port]
         if ports:
@@ -468,15 +465,15 @@ def _add_user_traffic(rtps: ET.Element, found: Sequence[Family], domain_id: int)
     """Say where data arrives, if any of it is fixed: then Fast DDS adds nothing by itself."""
     groups = [(family, url) for family in found for url in family.groups]
     ports = any(url.port for family in found if family.udp for url in family.unicast)
-    with_tcp = any(family.kind == TCPV4 for family in found)
-    if not groups and not ports and (not with_tcp or any(f.kind == SHM for f in found)):
+    with_tcp = any(family.kind is Medium.TCPV4 for family in found)
+    if not groups and not ports and (not with_tcp or any(f.kind is Medium.SHM for f in found)):
         return
     unicast = ET.SubElement(rtps, "defaultUnicastLocatorList")
     for family in found:
         for url in family.unicast:
             if family.udp:
                 _locator(unicast, family.kind, url.address, url.port)
-            elif family.kind == TCPV4:
+            elif family.kind is Medium.TCPV4:
                 logical = participant_ports(domain_id, 0).user_unicast
                 _tcp_locator(unicast, url.address, url.port, logical)
         if family.udp and not family.unicast:

@@ -31,7 +31,7 @@ from lifecycle.middleware.rcl.graph_queries import endpoints_of, endpoints_of_no
 from lifecycle.middleware.rcl.hidden_node import quiet_node
 from lifecycle.middleware.rcl.stale_node_filter import StaleNodeFilter
 from lifecycle.middleware.rcl.type_hash import with_service_hashes
-from lifecycle.network.connection_url import ConnectionTransport
+from lifecycle.network.medium import Medium
 from lifecycle.plan.model import ParticipantConnections
 from lifecycle.verify.noise import (
     NO_NAMES,
@@ -246,7 +246,7 @@ class GraphObserver:
         servers = [
             (server.address, server.port)
             for url in self.urls
-            if url.transport is ConnectionTransport.TCPV4
+            if url.transport is Medium.TCPV4
             for server in url.server
             if server.port is not None
         ]

@@ -19,12 +19,13 @@ import psutil
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds.url_profile import Family, families
-from lifecycle.network.connection_url import ConnectionTransport, ConnectionUrl
+from lifecycle.network.connection_url import ConnectionUrl
+from lifecycle.network.medium import Medium
 
 _TABLES = (
-    ("udp", "udpv4", socket.AF_INET),
-    ("udp6", "udpv6", socket.AF_INET6),
-    ("tcp", "tcpv4", socket.AF_INET),
+    ("udp", Medium.UDPV4, socket.AF_INET),
+    ("udp6", Medium.UDPV6, socket.AF_INET6),
+    ("tcp", Medium.TCPV4, socket.AF_INET),
 )
 _FAMILIES = {kind: family for _, kind, family in _TABLES}
 _LISTEN = "0A"  # TCP_LISTEN of linux/tcp_states.h
@@ -36,13 +37,13 @@ class OpenSocket:
 
     Attributes:
         inode: tells it apart for as long as it is open.
-        kind: "udpv4", "udpv6" or "tcpv4".
+        kind: UDPV4, UDPV6 or TCPV4.
         address: what it is bound to.
         port: 1–65535.
     """
 
     inode: int
-    kind: str
+    kind: Medium
     address: str
     port: int
 
@@ -61,7 +62,7 @@ def check_host(urls: Sequence[ConnectionUrl]) -> None:
                 addresses.add(entry.address.partition("%")[0])
     for url in urls:
         wanted = [each for each in url.interfaces if each not in names]
-        group = url.transport is ConnectionTransport.UDPM
+        group = url.transport is Medium.UDPM
         if url.address and not group and not ipaddress.ip_address(url.address).is_unspecified:
             wanted.append(url.address)
         for each in wanted:
@@ -87,7 +88,7 @@ def check_free(urls: Sequence[ConnectionUrl]) -> None:
         if family.kind not in _FAMILIES:
             continue
         for url, what, port in _ports(family):
-            group = url.transport is ConnectionTransport.UDPM
+            group = url.transport is Medium.UDPM
             if group and port == url.port:
                 continue  # a group's port is shared
             address = "" if group else url.address
@@ -130,15 +131,15 @@ def open_sockets(pid: int | None = None) -> tuple[OpenSocket, ...]:
     return tuple(each for each in _bound_sockets() if each.inode in ours)
 
 
-def _is_free(kind: str, address: str, port: int) -> bool:
-    stream = kind == "tcpv4"
-    any_ = "::" if kind == "udpv6" else "0.0.0.0"  # noqa: S104 - only to see whether it is free
+def _is_free(kind: Medium, address: str, port: int) -> bool:
+    stream = kind.is_tcp
+    any_ = "::" if kind is Medium.UDPV6 else "0.0.0.0"  # noqa: S104 - only to see whether it is free
     with socket.socket(
         _FAMILIES[kind], socket.SOCK_STREAM if stream else socket.SOCK_DGRAM
     ) as probe:
         if stream:  # as Fast DDS does: connections that are over are not in the way
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        if kind == "udpv6":
+        if kind is Medium.UDPV6:
             probe.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
         try:
             probe.bind((address or any_, port))
@@ -158,7 +159,7 @@ def _taken(url: ConnectionUrl, what: str, port: int) -> MiddlewareError:
 
 
 def _ports(family: Family) -> Iterator[tuple[ConnectionUrl, str, int]]:
-    protocol = "TCP" if family.kind == "tcpv4" else "UDP"
+    protocol = "TCP" if family.kind.is_tcp else "UDP"
     for url in family.urls:
         for attribute in ("port", "metatraffic_port", "output_port"):
             port = getattr(url, attribute)
@@ -174,7 +175,7 @@ def _bound_sockets() -> Iterator[OpenSocket]:
         with contextlib.suppress(FileNotFoundError):  # a kernel without IPv6
             for line in path.read_text(encoding="ascii").splitlines()[1:]:
                 fields = line.split()
-                if kind == "tcpv4" and fields[3] != _LISTEN:
+                if kind.is_tcp and fields[3] != _LISTEN:
                     continue
                 address, _, port = fields[1].partition(":")
                 if int(port, 16):

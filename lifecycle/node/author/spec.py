@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING
 
 from lifecycle.errors import BringUpError, LifecycleError
 from lifecycle.manifest.diagnostics import Position
-from lifecycle.manifest.model import EndpointPolicy, Run, RunKind, Timeouts
+from lifecycle.manifest.model import EndpointPolicy, Run, RunKind
 from lifecycle.node.author.handlers import nearest
 from lifecycle.plan.model import PlannedNode
 
@@ -121,18 +121,11 @@ def plan_without_manifest(node_class: type, *, name: str, namespace: str) -> Pla
         namespace=namespace,
         machine="",
         process=name,
-        managed=True,
         run=Run(kind=RunKind.ATTACH),
         endpoints=(),
         declared_parameters=(),
-        parameters=(),
-        parameter_files=(),
-        remap=(),
         participants=(),
-        after=(),
-        timeouts=Timeouts(),
         endpoint_policy=EndpointPolicy.OPEN,
-        log_level="",
         events=True,
         at=at,
     )

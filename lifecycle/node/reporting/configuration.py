@@ -43,6 +43,7 @@ from lifecycle.middleware import (
     is_server_matched,
     matched_with,
 )
+from lifecycle.network.medium import Medium
 from lifecycle.network.nfe import (
     InternetProtocol,
     NetworkFlowEndpoint,
@@ -87,12 +88,12 @@ def transports() -> tuple[str, ...]:
     """
     if get_rmw_implementation_identifier() != _CONFIGURABLE_RMW:
         return ()
-    found = ["tcpv4", "udpm", "udpv4"]
+    found = [Medium.TCPV4, Medium.UDPM, Medium.UDPV4]
     if os.access(_SHARED_MEMORY, os.W_OK):
-        found.append("shm")
+        found.append(Medium.SHM)
     try:
         if _IPV6_ADDRESSES.read_text(encoding="ascii").strip():
-            found.append("udpv6")
+            found.append(Medium.UDPV6)
     except OSError:
         pass  # a kernel without IPv6
     return tuple(sorted(found))
@@ -327,7 +328,7 @@ def _transports(endpoints: tuple[EndpointReport, ...]) -> tuple[str, ...]:
 
 def _transport(nfe: NetworkFlowEndpoint) -> str:
     if nfe.transport_protocol is TransportProtocol.UNKNOWN:
-        return "shm"
+        return Medium.SHM
     version = {InternetProtocol.IPV4: "v4", InternetProtocol.IPV6: "v6"}
     return f"{nfe.transport_protocol.value}{version.get(nfe.internet_protocol, '')}"
 

@@ -11,10 +11,9 @@ import ipaddress
 from collections.abc import Collection, Iterable, Mapping, Sequence
 
 from lifecycle.manifest.model import DiscoveryMode, DiscoveryRange, FlowTransport
-from lifecycle.network.connection_url import ConnectionTransport, ConnectionUrl, Peer, parse
+from lifecycle.network.connection_url import ConnectionUrl, Peer, parse
+from lifecycle.network.medium import Medium
 from lifecycle.plan.model import Plan
-
-UDP = (ConnectionTransport.UDPV4, ConnectionTransport.UDPV6, ConnectionTransport.UDPM)
 
 _SPARE = 4
 """Participants of other systems and tools on a host, which take ports before or between ours."""
@@ -26,12 +25,12 @@ class Contact:
 
     Attributes:
         host: its host, see `lifecycle.plan.connections.hosts`.
-        transport: "udpv4", "udpv6" or "tcpv4".
+        transport: UDPV4, UDPV6 or TCPV4.
         peer: address and port, as `peer=` of a connection URL.
     """
 
     host: str
-    transport: str
+    transport: Medium
     peer: Peer
 
 
@@ -48,17 +47,16 @@ def contacts_of(host: str, urls: Iterable[str]) -> tuple[Contact, ...]:
 
 def _contact(host: str, url: ConnectionUrl) -> Contact | None:
     address, port = url.address, url.metatraffic_port
-    transport = url.transport.value
-    if url.transport is ConnectionTransport.UDPM:
+    if url.transport is Medium.UDPM:
         # The group is where data go; discovery listens on the interfaces.
-        address, transport = next(iter(url.interfaces), ""), "udpv4"
-    elif url.transport is ConnectionTransport.TCPV4:
+        address = next(iter(url.interfaces), "")
+    elif url.transport is Medium.TCPV4:
         port = url.port
     if port is None:
         return None
     return Contact(
         host=host,
-        transport=transport,
+        transport=url.transport.unicast,
         peer=Peer(address=address or host or "127.0.0.1", port=port),
     )
 
@@ -69,7 +67,7 @@ def ports_of(urls: Iterable[ConnectionUrl]) -> tuple[int, ...]:
         port
         for url in urls
         for port in (
-            None if url.transport is ConnectionTransport.UDPM else url.port,
+            None if url.transport is Medium.UDPM else url.port,
             url.metatraffic_port,
             url.output_port,
         )
@@ -77,9 +75,7 @@ def ports_of(urls: Iterable[ConnectionUrl]) -> tuple[int, ...]:
     )
 
 
-def peers_by(
-    transport: ConnectionTransport, contacts: Iterable[Contact], *, host: str
-) -> tuple[Peer, ...]:
+def peers_by(transport: Medium, contacts: Iterable[Contact], *, host: str) -> tuple[Peer, ...]:
     """Return the peers that a URL of this transport can look for, sorted, each once.
 
     Args:
@@ -87,21 +83,20 @@ def peers_by(
         contacts: everybody who is to be found.
         host: of the participant with the URL; a group with TTL 0 reaches nobody elsewhere.
     """
-    group = transport is ConnectionTransport.UDPM
-    kind = "udpv4" if group else transport.value
+    group = transport is Medium.UDPM
     return tuple(
         sorted(
             {
                 each.peer
                 for each in contacts
-                if each.transport == kind and (not group or each.host == host)
+                if each.transport == transport.unicast and (not group or each.host == host)
             }
         )
     )
 
 
 def fixed_url(
-    transport: ConnectionTransport,
+    transport: Medium,
     address: str,
     ports: Sequence[int],
     peers: Sequence[Peer],
@@ -114,7 +109,7 @@ def fixed_url(
         ports: metatraffic, user data and source port for UDP; the listening port for TCP.
         peers: whom it looks for.
     """
-    if transport is ConnectionTransport.TCPV4:
+    if transport is Medium.TCPV4:
         return ConnectionUrl(
             transport=transport, address=address, port=ports[0], peers=tuple(peers)
         )

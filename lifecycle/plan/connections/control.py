@@ -17,7 +17,8 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 
 from lifecycle.manifest.model import Discovery, DiscoveryMode, FlowTransport, RunKind
-from lifecycle.network.connection_url import ConnectionTransport, ConnectionUrl, Peer, parse
+from lifecycle.network.connection_url import ConnectionUrl, Peer, parse
+from lifecycle.network.medium import Medium
 from lifecycle.plan.connections.contacts import Contact, contacts_of, fixed_url, peers_by
 from lifecycle.plan.connections.hosts import LOOPBACK, Hosts, PortPool
 from lifecycle.plan.model import (
@@ -27,8 +28,8 @@ from lifecycle.plan.model import (
     PlannedServer,
 )
 
-DEFAULT_PREFIX = ConnectionUrl(transport=ConnectionTransport.TCPV4).server_prefix
-_SHM = ParticipantConnections(urls=(str(ConnectionUrl(transport=ConnectionTransport.SHM)),))
+DEFAULT_PREFIX = ConnectionUrl(transport=Medium.TCPV4).server_prefix
+_SHM = ParticipantConnections(urls=(str(ConnectionUrl(transport=Medium.SHM)),))
 _FIXED = (DiscoveryMode.STATIC, DiscoveryMode.STATIC_ENDPOINTS)
 
 
@@ -102,7 +103,7 @@ def connect_control(
         return _everywhere(nodes, _SHM, extra=extra), dataclasses.replace(
             control, observers=tuple((host, _SHM) for host in hosts.used)
         )
-    kind = ConnectionTransport(transport.value)
+    (kind,) = transport.media
     if discovery.mode is DiscoveryMode.DYNAMIC:
         same = ParticipantConnections(urls=(str(ConnectionUrl(transport=kind)),))
         return _everywhere(nodes, same, extra=extra), dataclasses.replace(
@@ -148,14 +149,14 @@ def _everywhere(
 def _with_ports(
     nodes: Sequence[PlannedNode],
     control: Control,
-    kind: ConnectionTransport,
+    kind: Medium,
     hosts: Hosts,
     pool: PortPool,
     *,
     extra: bool,
 ) -> tuple[tuple[PlannedNode, ...], Control]:
     """Give each participant its own ports, and all the others as peers or the server."""
-    count = 1 if kind is ConnectionTransport.TCPV4 else 3
+    count = 1 if kind is Medium.TCPV4 else 3
     slots: dict[tuple[str, str, str], tuple[str, tuple[int, ...]]] = {}
     for host, ports in control.observer_ports:
         slots["observer", host, ""] = (host, ports[3:] if count == 1 else ports[:3])
@@ -201,12 +202,12 @@ def _with_ports(
 
 def _urls(
     slots: dict[tuple[str, str, str], tuple[str, tuple[int, ...]]],
-    kind: ConnectionTransport,
+    kind: Medium,
     server: PlannedServer | None,
     hosts: Hosts,
 ) -> dict[tuple[str, str, str], str]:
     """Spell each participant's URL."""
-    v6 = kind is ConnectionTransport.UDPV6
+    v6 = kind is Medium.UDPV6
     alone = {
         key: fixed_url(kind, hosts.address(host, ipv6=v6), ports, ())
         for key, (host, ports) in slots.items()
@@ -225,7 +226,7 @@ def _urls(
     def looks_for(key: tuple[str, str, str], other: tuple[str, str, str]) -> bool:
         # Two ends that dial each other refuse both connections (Fast DDS 2.14). Observers come
         # first, so whoever dials them finds them there.
-        return order[other] < order[key] if kind is ConnectionTransport.TCPV4 else other != key
+        return order[other] < order[key] if kind is Medium.TCPV4 else other != key
 
     return {
         key: str(
@@ -238,14 +239,6 @@ def _urls(
         )
         for key, url in alone.items()
     }
-
-
-_KINDS = {
-    ConnectionTransport.UDPV4: "udpv4",
-    ConnectionTransport.UDPM: "udpv4",
-    ConnectionTransport.UDPV6: "udpv6",
-    ConnectionTransport.TCPV4: "tcpv4",
-}
 
 
 def with_tcp(control: Control, hosts: Hosts) -> tuple[tuple[str, ParticipantConnections], ...]:
@@ -286,9 +279,9 @@ def connect_observers(
         if each.connection and not each.connections.static_participants
         for text in each.connections.urls
     ]
-    kinds = {_KINDS[url.transport] for _, url in urls if url.transport in _KINDS}
+    kinds = {url.transport.unicast for _, url in urls if url.transport.is_network}
     if may_use_tcp:
-        kinds.add("tcpv4")
+        kinds.add(Medium.TCPV4)
     # Whoever is found by multicast, or looks for the observer, need not be looked for.
     ours = {
         contact.peer
@@ -298,12 +291,12 @@ def connect_observers(
     contacts = [
         contact
         for host, url in urls
-        if not url.multicast or url.transport is ConnectionTransport.TCPV4
+        if not url.multicast or url.transport is Medium.TCPV4
         if not ours & {*url.peers}
         for contact in contacts_of(host, (str(url),))
     ]
     if fixed:
-        kinds -= {"udpv4", "udpv6"}
+        kinds = {each for each in kinds if each.is_tcp}
     found = (
         (host, _observer(host, base, kinds, contacts, control, hosts))
         for host, base in _bases(control, hosts).items()
@@ -319,7 +312,7 @@ def _bases(control: Control, hosts: Hosts) -> Mapping[str, ParticipantConnection
 def _observer(  # noqa: PLR0917 - all are needed, and it is called once
     host: str,
     base: ParticipantConnections,
-    kinds: set[str],
+    kinds: set[Medium],
     contacts: Sequence[Contact],
     control: Control,
     hosts: Hosts,
@@ -329,23 +322,23 @@ def _observer(  # noqa: PLR0917 - all are needed, and it is called once
     own = {contact.peer for contact in contacts_of(host, base.urls)}
     wanted = [each for each in contacts if each.peer not in own]
     urls = _base_urls(base)
-    has = {_KINDS[url.transport] for url in urls if url.transport in _KINDS}
+    has = {url.transport.unicast for url in urls if url.transport.is_network}
     needed = kinds - has
     if not needed and not any(_peers(url, wanted, host) for url in urls):
         return base
-    if "tcpv4" in needed:
+    if Medium.TCPV4 in needed:
         urls = _with_tcp(base, control, host, hosts)
-    for kind in ("udpv4", "udpv6"):
+    for kind in (Medium.UDPV4, Medium.UDPV6):
         if kind in needed:
-            urls.append(ConnectionUrl(transport=ConnectionTransport(kind)))
+            urls.append(ConnectionUrl(transport=kind))
     return dataclasses.replace(base, urls=tuple(str(_meeting(url, wanted, host)) for url in urls))
 
 
 def _base_urls(base: ParticipantConnections) -> list[ConnectionUrl]:
     """Return the URLs of an observer; where the RMW chooses, what it would choose."""
     return [parse(text) for text in base.urls] or [
-        ConnectionUrl(transport=ConnectionTransport.SHM),
-        ConnectionUrl(transport=ConnectionTransport.UDPV4),
+        ConnectionUrl(transport=Medium.SHM),
+        ConnectionUrl(transport=Medium.UDPV4),
     ]
 
 
@@ -360,7 +353,7 @@ def _with_tcp(
     address = LOOPBACK if ":" in host else hosts.address(host) if host or not hosts.several else ""
     return [
         *urls,
-        ConnectionUrl(transport=ConnectionTransport.TCPV4, address=address, port=port),
+        ConnectionUrl(transport=Medium.TCPV4, address=address, port=port),
     ]
 
 

@@ -15,7 +15,8 @@ import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 
 from lifecycle.manifest.model import EndpointKind, Machine, RunKind
-from lifecycle.network.connection_url import ConnectionTransport, parse
+from lifecycle.network.connection_url import parse
+from lifecycle.network.medium import Medium
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.network.ports import MAX_PORT, participant_ports
 from lifecycle.plan.model import Plan, PlanError, PlannedNode, PlannedProcess
@@ -226,7 +227,7 @@ def demand(plan: Plan) -> tuple[MachineDemand, ...]:
 
 def _owner(process: PlannedProcess, node: PlannedNode) -> str:
     """Name the participant that a node shares with those of its process that are like it."""
-    facts = [*node.transports]
+    facts: list[str] = [*node.transports]
     if node.max_datagram_bytes is not None:
         facts.append(f"{node.max_datagram_bytes} bytes")
     return f"{process.name} ({', '.join(facts)})" if facts else process.name
@@ -237,8 +238,8 @@ def _participant(
 ) -> ParticipantDemand:
     parsed = [parse(text) for text in urls]
     # A group's port is the group's, not the participant's.
-    fixed = [each for each in parsed if each.transport is not ConnectionTransport.UDPM]
-    if parsed and all(each.transport is ConnectionTransport.SHM for each in parsed):
+    fixed = [each for each in parsed if each.transport is not Medium.UDPM]
+    if parsed and all(each.transport is Medium.SHM for each in parsed):
         return ParticipantDemand(
             owner=owner, index=index, discovery_port=0, user_port=0, shared_memory=True
         )

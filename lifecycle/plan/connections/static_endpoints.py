@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 
 from lifecycle.manifest.model import EndpointKind, RunKind
 from lifecycle.manifest.qos import Durability, Reliability
-from lifecycle.network.connection_url import ConnectionTransport
+from lifecycle.network.medium import Medium
 from lifecycle.plan.connections.contacts import contacts_of, fixed_url
 from lifecycle.plan.connections.control import participant_name
 from lifecycle.plan.connections.hosts import Hosts, PortPool
@@ -50,7 +50,7 @@ def place_static(
     """
     placed = [_place(node) for node in nodes]
     v6 = any(":" in host for host in hosts.used)
-    kind = ConnectionTransport.UDPV6 if v6 else ConnectionTransport.UDPV4
+    kind = Medium.UDPV6 if v6 else Medium.UDPV4
     ports = {
         (node.key, each.name): (hosts.host(node.machine), pool.take(hosts.host(node.machine), 3))
         for node in placed

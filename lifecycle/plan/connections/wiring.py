@@ -31,6 +31,7 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.manifest.yaml.document import error
 from lifecycle.network.dscp import describe
+from lifecycle.network.medium import TRANSPORTS_VARIABLE, Medium
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan.connections.control import (
     connect_control,
@@ -68,7 +69,6 @@ _SERVERS = {
     EndpointKind.ACTION_CLIENT: EndpointKind.ACTION_SERVER,
 }
 _WORDS = {EndpointKind.SERVICE_CLIENT: "service", EndpointKind.ACTION_CLIENT: "action"}
-_NO_UDP = frozenset(("shm", "tcpv4"))
 
 _End = tuple[PlannedNode, PlannedEndpoint]
 
@@ -142,7 +142,7 @@ def _services(
 def _without_udp(
     node: PlannedNode, each: PlannedEndpoint, by: tuple[str, ...]
 ) -> Iterator[Diagnostic]:
-    if not by or not {*by} <= _NO_UDP:
+    if not by or not {*by} <= {Medium.SHM, Medium.TCPV4}:
         return
     has = ", ".join(by)
     if each.dscp is not None and each.enforce_dscp:
@@ -299,18 +299,11 @@ def variables_of(discovery: Discovery, server: PlannedServer | None) -> tuple[tu
         if server.tcp:
             return (
                 ("ROS_DISCOVERY_SERVER", f"TCPv4:[{server.address}]:{server.port}"),
-                ("FASTDDS_BUILTIN_TRANSPORTS", "NONE"),
+                (TRANSPORTS_VARIABLE, "NONE"),
             )
-        return (("ROS_DISCOVERY_SERVER", at), ("FASTDDS_BUILTIN_TRANSPORTS", "UDPv4"))
-    value = _BUILTIN.get(discovery.transport)
-    return (("FASTDDS_BUILTIN_TRANSPORTS", value),) if value else ()
-
-
-_BUILTIN = {
-    FlowTransport.SHM: "SHM",
-    FlowTransport.UDPV4: "UDPv4",
-    FlowTransport.UDPV6: "UDPv6",
-}
+        return (("ROS_DISCOVERY_SERVER", at), (TRANSPORTS_VARIABLE, "UDPv4"))
+    value = discovery.transport.builtin
+    return ((TRANSPORTS_VARIABLE, value),) if value else ()
 
 
 def _by_machine(

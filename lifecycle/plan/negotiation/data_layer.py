@@ -11,13 +11,8 @@ import dataclasses
 from lifecycle.manifest.model import EndpointKind, FlowTransport
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.network.connection_url import Peer
+from lifecycle.network.medium import CONNECTABLE, RMW_DEFAULT, Medium
 from lifecycle.plan.connections.contacts import Contact
-
-TRANSPORTS = ("shm", "udpv4", "udpv6", "udpm", "tcpv4")
-"""All that a connection can be made of."""
-
-RMW_DEFAULT = ("shm", "udpv4")
-"""What a participant has if nobody says anything (Fast DDS 2.14)."""
 
 PARADIGMS = ("publish-subscribe", "request-response")
 """Topics; services, and actions, which consist of both."""
@@ -83,7 +78,7 @@ class Party:
     full_name: str
     host: str
     process: str
-    transports: tuple[str, ...] = TRANSPORTS
+    transports: tuple[str, ...] = CONNECTABLE
     own: tuple[str, ...] = RMW_DEFAULT
     connectable: bool = True
     serializations: tuple[str, ...] = SERIALIZATIONS
@@ -100,7 +95,7 @@ class Terms:
     Attributes:
         fixed: every port is planned, and nobody is found by multicast.
         server: the discovery server that every connection must know; None without.
-        server_tcp: it listens on TCP; else on UDP.
+        server_medium: it listens on TCPV4 or UDPV4.
         first_port: first of the ports given out, per host.
         taken: by host, ports that are not given out.
         multicast_group: first of the groups given out.
@@ -110,7 +105,7 @@ class Terms:
 
     fixed: bool = False
     server: Peer | None = None
-    server_tcp: bool = True
+    server_medium: Medium = Medium.TCPV4
     first_port: int = 7910
     taken: tuple[tuple[str, tuple[int, ...]], ...] = ()
     multicast_group: str = "239.255.1.1"

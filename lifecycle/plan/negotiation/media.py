@@ -11,11 +11,8 @@ from collections.abc import Collection
 
 from lifecycle.manifest.model import FlowTransport
 from lifecycle.network.datagram import is_fragmented, max_unfragmented
+from lifecycle.network.medium import Medium
 from lifecycle.plan.negotiation.data_layer import Party, PartyEndpoint
-
-INTRAPROCESS = "intraprocess"
-MULTICAST = "udpm"
-_IP = ("udpv4", "udpv6", "tcpv4", MULTICAST)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,7 +75,7 @@ def carried(writer: Collection[str], reader: Collection[str], *, same_host: bool
     more than one means that it arrives twice.
 
     Args:
-        writer: transports of one participant, "shm", "udpv4", "udpv6", "tcpv4" or a group
+        writer: transports of one participant, words of media; a group is
             `udpm@239.255.1.9:7901`.
         reader: of the other one.
         same_host: whether they share memory and loopback.
@@ -86,36 +83,23 @@ def carried(writer: Collection[str], reader: Collection[str], *, same_host: bool
     Returns:
         Media, sorted; empty if they never meet.
     """
-    if same_host and "shm" in writer and "shm" in reader:
-        return ["shm"]
-    found = set()
-    groups = {each for each in writer if each.startswith(MULTICAST)}
+    if same_host and Medium.SHM in writer and Medium.SHM in reader:
+        return [Medium.SHM]
+    found: set[str] = set()
+    groups = {each for each in writer if each.startswith(Medium.UDPM)}
     if same_host and groups & {*reader}:
-        found.add(MULTICAST)
+        found.add(Medium.UDPM)
     elif _has_ipv4(writer, same_host=same_host) and _has_ipv4(reader, same_host=same_host):
         # A group with TTL 0 also receives what comes to loopback by unicast.
-        found.add("udpv4")
-    found |= {each for each in ("udpv6", "tcpv4") if each in writer and each in reader}
+        found.add(Medium.UDPV4)
+    found |= {each for each in (Medium.UDPV6, Medium.TCPV4) if each in writer and each in reader}
     return sorted(found)
 
 
 def _has_ipv4(transports: Collection[str], *, same_host: bool) -> bool:
-    return "udpv4" in transports or (
-        same_host and any(each.startswith(MULTICAST) for each in transports)
+    return Medium.UDPV4 in transports or (
+        same_host and any(each.startswith(Medium.UDPM) for each in transports)
     )
-
-
-def satisfies(medium: str, wish: FlowTransport) -> bool:
-    """Return whether a medium is what was asked for."""
-    if wish is FlowTransport.ANY:
-        return True
-    if wish is FlowTransport.NETWORK:
-        return medium in _IP
-    if wish is FlowTransport.SHM:
-        return medium in ("shm", INTRAPROCESS)
-    if wish is FlowTransport.MULTICAST:
-        return medium in (MULTICAST, INTRAPROCESS, "tcpv4")
-    return bool(medium == wish.value)
 
 
 def wish_of(pair: Pair) -> tuple[FlowTransport, str]:
@@ -147,7 +131,7 @@ def choose(
     wish, who = wish_of(pair)
     if pair.same_process:
         if wish in (FlowTransport.ANY, FlowTransport.SHM, FlowTransport.MULTICAST):
-            return Choice(medium=INTRAPROCESS, reason="same process")
+            return Choice(medium=Medium.INTRAPROCESS, reason="same process")
         return Choice(
             problem=f"cannot carry {pair.subject} by {wish.value}: both are in process "
             f"{pair.publisher.process!r}, and inside a process no transport is used",
@@ -161,7 +145,7 @@ def choose(
         else _asked(pair, wish, who, by_multicast=by_multicast)
     )
     other = pair.reader.transport
-    if pair.link is FlowTransport.ANY and choice.medium and not satisfies(choice.medium, other):
+    if pair.link is FlowTransport.ANY and choice.medium and not other.accepts(choice.medium):
         return Choice(
             problem=f"cannot carry {pair.subject}: the publisher asks for "
             f"{pair.writer.transport.value}, the subscription for {other.value}",
@@ -207,10 +191,10 @@ def _common(pair: Pair) -> set[str]:
     """Return media that both ends can have."""
     common = {*_able(pair.publisher)} & {*_able(pair.subscription)}
     if not pair.same_host:
-        common -= {"shm", MULTICAST}
+        common -= {Medium.SHM, Medium.UDPM}
         families = {":" in each for each in (pair.publisher.host, pair.subscription.host) if each}
-        common -= {"udpv4", "tcpv4"} if True in families else set()
-        common -= {"udpv6"} if False in families else set()
+        common -= {Medium.UDPV4, Medium.TCPV4} if True in families else set()
+        common -= {Medium.UDPV6} if False in families else set()
     return common
 
 
@@ -222,7 +206,7 @@ def _asked(pair: Pair, wish: FlowTransport, who: str, *, by_multicast: bool) -> 
             _by(pair.subscription, pair.reader),
             same_host=pair.same_host,
         )
-        if len(present) == 1 and present[0] in _IP:
+        if len(present) == 1 and present[0] in wish.media:
             return Choice(medium=present[0], reason=who)
         order = _ip_order(pair)
         medium = next((each for each in order if each in common), "")
@@ -231,10 +215,10 @@ def _asked(pair: Pair, wish: FlowTransport, who: str, *, by_multicast: bool) -> 
         )
     if wish is FlowTransport.MULTICAST and not pair.same_host:
         wish, who = FlowTransport.TCPV4, "multicast stays on its host"
-    medium = MULTICAST if wish is FlowTransport.MULTICAST else wish.value
+    (medium,) = wish.media
     if medium not in common:
         return _none_common(pair, f" by {wish.value}, as {who}")
-    if by_multicast and not pair.same_host and medium == "udpv4":
+    if by_multicast and not pair.same_host and medium is Medium.UDPV4:
         return Choice(
             problem=f"cannot carry {pair.subject} by udpv4: the publisher sends by multicast with "
             "TTL 0 on its own host, and one participant has one TTL for UDP",
@@ -249,7 +233,8 @@ def _by(party: Party, endpoint: PartyEndpoint) -> tuple[str, ...]:
 
 def _ip_order(pair: Pair) -> tuple[str, ...]:
     ipv6 = ":" in pair.publisher.host or ":" in pair.subscription.host
-    return ("udpv6", "udpv4", "tcpv4") if ipv6 else ("udpv4", "udpv6", "tcpv4")
+    udp = (Medium.UDPV6, Medium.UDPV4) if ipv6 else (Medium.UDPV4, Medium.UDPV6)
+    return (*udp, Medium.TCPV4)
 
 
 def _unasked(
@@ -265,14 +250,14 @@ def _unasked(
         return _near(pair, default, listeners)
     common = _common(pair)
     tcp = _why_tcp(pair, by_multicast=by_multicast, max_datagram_bytes=max_datagram_bytes)
-    if tcp and "tcpv4" in {*common, default}:
-        return Choice(medium="tcpv4", reason=tcp)
+    if tcp and Medium.TCPV4 in {*common, default}:
+        return Choice(medium=Medium.TCPV4, reason=tcp)
     if by_multicast:
         return _none_common(pair, " by tcpv4, as multicast stays on its host")
     medium = default or next((each for each in _ip_order(pair) if each in common), "")
     if not medium:
         return _none_common(pair, "")
-    usual = medium in (default, "udpv4")
+    usual = medium in (default, Medium.UDPV4)
     return Choice(
         medium=medium, reason="other host" if usual else "other host, and no UDP over IPv4 between"
     )
@@ -281,11 +266,11 @@ def _unasked(
 def _near(pair: Pair, default: str, listeners: int) -> Choice:
     """Choose on one host: what is there anyway, shared memory, one datagram for all, unicast."""
     common = _common(pair)
-    if default or "shm" in common:
-        return Choice(medium=default or "shm", reason="same host")
-    if listeners > 1 and MULTICAST in common:
+    if default or Medium.SHM in common:
+        return Choice(medium=default or Medium.SHM, reason="same host")
+    if listeners > 1 and Medium.UDPM in common:
         reason = f"{listeners} processes of the host listen, and not by shared memory"
-        return Choice(medium=MULTICAST, reason=reason)
+        return Choice(medium=Medium.UDPM, reason=reason)
     medium = next((each for each in _ip_order(pair) if each in common), "")
     if medium:
         return Choice(medium=medium, reason="same host, and no common shared memory")

@@ -17,7 +17,8 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from lifecycle.manifest.model import EndpointKind, FlowTransport
-from lifecycle.network.connection_url import ConnectionTransport, ConnectionUrl, parse
+from lifecycle.network.connection_url import ConnectionUrl, parse
+from lifecycle.network.medium import Medium
 from lifecycle.plan.connections.contacts import Contact, contacts_of, peers_by, ports_of
 from lifecycle.plan.connections.hosts import LOOPBACK, LOOPBACK6, PortPool
 from lifecycle.plan.model import PlanError
@@ -31,8 +32,6 @@ from lifecycle.plan.negotiation.data_layer import (
     Terms,
 )
 from lifecycle.plan.negotiation.media import (
-    INTRAPROCESS,
-    MULTICAST,
     Choice,
     Pair,
     carried,
@@ -44,7 +43,6 @@ GROUP_PORTS_FROM = 1000
 """How far above `first_port` the ports of groups begin: out of the way of everybody's own."""
 
 _NOT_WORD = re.compile(r"[^A-Za-z0-9]+")
-_ORDER = ("shm", "udpm", "udpv4", "udpv6", "tcpv4")
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -147,7 +145,7 @@ def _drafts(wanted: Sequence[Wanted]) -> list[_Draft]:
 def _name(transports: Iterable[str], group: str, alone: str) -> str:
     """Name a connection by what it is: `tcpv4`, `udpm_tcpv4_video`, `udpv4_publishers_video`."""
     topics = [each.partition("@")[2] for each in transports if "@" in each]
-    words = [each for each in _ORDER if each in _plain(transports)]
+    words: list[str] = [each for each in Medium if each in _plain(transports)]
     words += [_NOT_WORD.sub("_", each).strip("_") for each in (*topics, group, alone) if each]
     return "_".join(words)
 
@@ -172,7 +170,7 @@ def _groups(
     for draft in drafts:
         for text in kept.get(draft.key, ()):
             url = parse(text)
-            if url.transport is ConnectionTransport.UDPM:
+            if url.transport is Medium.UDPM:
                 found.setdefault(_topic(draft), url)
     return found
 
@@ -180,13 +178,13 @@ def _groups(
 def _reason(draft: _Draft) -> str:
     ends = [each.endpoint for each in draft.members]
     topics = ", ".join(dict.fromkeys(each.resolved for each in ends))
-    media = " and ".join(each for each in _ORDER if each in _plain(draft.transports))
+    media = " and ".join(each for each in Medium if each in _plain(draft.transports))
     return f"{topics} by {media}"
 
 
-def _address(host: str, transport: ConnectionTransport) -> str:
+def _address(host: str, transport: Medium) -> str:
     """Return where a participant of a host listens; on loopback for the other IP version."""
-    if transport is ConnectionTransport.UDPV6:
+    if transport is Medium.UDPV6:
         return host if ":" in host else LOOPBACK6
     return LOOPBACK if ":" in host else host or LOOPBACK
 
@@ -243,7 +241,7 @@ class _Writer:
             )
         lowest = min(self._terms.first_port + GROUP_PORTS_FROM, 65535)
         return ConnectionUrl(
-            transport=ConnectionTransport.UDPM,
+            transport=Medium.UDPM,
             address=group,
             port=self._pool.take_everywhere(self._hosts, lowest),
             ttl=0,
@@ -254,20 +252,19 @@ class _Writer:
         """Return a connection's transports with its own ports, still without peers."""
         host = draft.party.host
         fixed = self._terms.fixed
-        for kind in _ORDER:
-            if kind not in _plain(draft.transports):
+        for transport in Medium:
+            if transport not in _plain(draft.transports):
                 continue
-            transport = ConnectionTransport(kind)
-            if transport is ConnectionTransport.SHM:
+            if transport is Medium.SHM:
                 yield ConnectionUrl(transport=transport)
-            elif transport is ConnectionTransport.UDPM:
+            elif transport is Medium.UDPM:
                 group = self._groups[_topic(draft)]
                 bare = dataclasses.replace(group, metatraffic_port=None, peers=(), multicast=True)
                 if fixed:
                     (port,) = self._pool.take(host)
                     bare = dataclasses.replace(bare, metatraffic_port=port, multicast=False)
                 yield bare
-            elif transport is ConnectionTransport.TCPV4:
+            elif transport is Medium.TCPV4:
                 (port,) = self._pool.take(host)
                 yield ConnectionUrl(
                     transport=transport, address=_address(host, transport), port=port
@@ -284,12 +281,11 @@ class _Writer:
                 )
             else:
                 # Each sample would go twice to IPv6's global and link-local addresses.
-                own = host if transport is ConnectionTransport.UDPV6 and ":" in host else ""
+                own = host if transport is Medium.UDPV6 and ":" in host else ""
                 yield ConnectionUrl(transport=transport, address=own)
-        if self._terms.server is not None:
-            server = "tcpv4" if self._terms.server_tcp else "udpv4"
-            if server not in _plain(draft.transports):
-                yield ConnectionUrl(transport=ConnectionTransport(server))
+        server = self._terms.server_medium
+        if self._terms.server is not None and server not in _plain(draft.transports):
+            yield ConnectionUrl(transport=server)
 
     def urls(self, draft: _Draft) -> tuple[str, ...]:
         """Return a new connection's URLs."""
@@ -297,12 +293,12 @@ class _Writer:
         found = []
         for url in self._plain[draft.key]:
             if self._terms.server is not None:
-                served = "tcpv4" if self._terms.server_tcp else "udpv4"
-                server = (self._terms.server,) if url.transport.value == served else ()
+                served = url.transport is self._terms.server_medium
+                server = (self._terms.server,) if served else ()
                 found.append(dataclasses.replace(url, server=server))
-            elif url.transport is ConnectionTransport.SHM:
+            elif url.transport is Medium.SHM:
                 found.append(url)
-            elif self._terms.fixed or url.transport is ConnectionTransport.TCPV4:
+            elif self._terms.fixed or url.transport is Medium.TCPV4:
                 known = peers_by(url.transport, contacts, host=draft.party.host)
                 found.append(dataclasses.replace(url, peers=known))
             else:
@@ -418,7 +414,7 @@ def _choose(
                 listeners=_listeners(pair, pairs),
                 max_datagram_bytes=terms.max_datagram_bytes,
             )
-            if choices[index].medium == MULTICAST:
+            if choices[index].medium == Medium.UDPM:
                 groups.add(writer)
     chosen, problems = [], []
     for index, pair in enumerate(pairs):
@@ -466,7 +462,7 @@ def _foreign(pair: Pair) -> bool:
 
 def _token(pair: Pair, medium: str) -> str:
     """Spell a medium as a transport; a topic has a group of its own."""
-    return f"{MULTICAST}@{pair.writer.resolved}" if medium == MULTICAST else medium
+    return f"{medium}@{pair.writer.resolved}" if medium == Medium.UDPM else medium
 
 
 class _Carriers:
@@ -489,7 +485,7 @@ class _Carriers:
             self._ends[_reader(pair)] = pair.subscription, pair.reader
             for key in (_writer(pair), _reader(pair)):
                 found = self._needs.setdefault(key, set())
-                if choice.medium != INTRAPROCESS:
+                if choice.medium != Medium.INTRAPROCESS:
                     found.add(_token(pair, choice.medium))
         self._settle()
 
@@ -534,7 +530,7 @@ class _Carriers:
     def _impossible(self, key: _Key) -> bool:
         """Whether an endpoint's connection would need shared memory beside fixed UDP ports."""
         found = self._moved.get(key, set())
-        return self._fixed and "shm" in found and bool({"udpv4", "udpv6"} & found)
+        return self._fixed and Medium.SHM in found and bool({Medium.UDPV4, Medium.UDPV6} & found)
 
     def _transports(self, key: _Key) -> set[str]:
         if key in self._moved:
@@ -552,13 +548,13 @@ class _Carriers:
     def _holds(self, pair: Pair, choice: Choice) -> bool:
         present = self._present(pair)
         # Inside a process it is enough that the participants find each other.
-        return bool(present) if choice.medium == INTRAPROCESS else present == [choice.medium]
+        return bool(present) if choice.medium == Medium.INTRAPROCESS else present == [choice.medium]
 
     def _move(self, pair: Pair, choice: Choice) -> bool:
         for key in (_writer(pair), _reader(pair)):
             if key in self._moved:
-                if choice.medium == INTRAPROCESS and "shm" not in self._moved[key]:
-                    self._moved[key].add("shm")
+                if choice.medium == Medium.INTRAPROCESS and Medium.SHM not in self._moved[key]:
+                    self._moved[key].add(Medium.SHM)
                     return True
                 continue
             party, endpoint = self._ends[key]
@@ -611,8 +607,8 @@ class _Carriers:
 
 def _together(transports: set[str]) -> set[str]:
     """Return the transports of one participant: a group on loopback also receives by unicast."""
-    grouped = any(each.startswith(MULTICAST) for each in transports)
-    return transports - {"udpv4"} if grouped else set(transports)
+    grouped = any(each.startswith(Medium.UDPM) for each in transports)
+    return transports - {Medium.UDPV4} if grouped else set(transports)
 
 
 def _order(key: _Key) -> tuple[str, str, str]:

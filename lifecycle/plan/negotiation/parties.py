@@ -20,7 +20,14 @@ from lifecycle.manifest.model import (
     FlowTransport,
     RunKind,
 )
-from lifecycle.network.connection_url import ConnectionTransport, ConnectionUrl, Peer, parse
+from lifecycle.network.connection_url import ConnectionUrl, Peer, parse
+from lifecycle.network.medium import (
+    BUILTIN_TRANSPORTS,
+    CONNECTABLE,
+    RMW_DEFAULT,
+    TRANSPORTS_VARIABLE,
+    Medium,
+)
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.network.ports import DG, domain_base
 from lifecycle.plan.connections.contacts import contacts_of, ports_of
@@ -36,8 +43,6 @@ from lifecycle.plan.model import (
     PlannedServer,
 )
 from lifecycle.plan.negotiation.data_layer import (
-    RMW_DEFAULT,
-    TRANSPORTS,
     NegotiatedConnection,
     Party,
     PartyEndpoint,
@@ -55,9 +60,9 @@ def transports_of(urls: Iterable[str]) -> tuple[str, ...]:
 
 
 def _transport(url: ConnectionUrl) -> str:
-    if url.transport is ConnectionTransport.UDPM:
-        return f"udpm@{url.address}:{url.port}"
-    return str(url.transport.value)
+    if url.transport is Medium.UDPM:
+        return f"{url.transport}@{url.address}:{url.port}"
+    return url.transport
 
 
 def wishes_of(flows: Iterable[PlannedFlow]) -> Mapping[tuple[str, str, str], FlowTransport]:
@@ -92,7 +97,7 @@ def party_of_node(
         full_name=node.full_name,
         host=host,
         process=node.process,
-        transports=TRANSPORTS if ours else own if known else (),
+        transports=CONNECTABLE if ours else own if known else (),
         own=own if known else (),
         connectable=ours,
         endpoints=tuple(endpoint_of(node, each) for each in node.endpoints if each.kind.is_topic),
@@ -101,23 +106,13 @@ def party_of_node(
     )
 
 
-_BUILTIN = {
-    "DEFAULT": RMW_DEFAULT,
-    "SHM": ("shm",),
-    "UDPv4": ("udpv4",),
-    "UDPv6": ("udpv6",),
-    "LARGE_DATA": ("shm", "tcpv4", "udpv4"),
-    "NONE": ("tcpv4",),
-}
-
-
 def _by_variable(node: PlannedNode, variables: Mapping[str, str]) -> tuple[str, ...]:
     """Return the transports that variables give a node; () for a word of another kind."""
     environment = dict(node.run.environment)
     if node.run.kind is RunKind.COMMAND:
         environment = {**variables, **environment}
-    word = environment.get("FASTDDS_BUILTIN_TRANSPORTS", "").partition("?")[0]
-    return _BUILTIN.get(word or "DEFAULT", ())
+    word = environment.get(TRANSPORTS_VARIABLE, "").partition("?")[0]
+    return BUILTIN_TRANSPORTS.get(word or "DEFAULT", ())
 
 
 def endpoint_of(node: PlannedNode, each: PlannedEndpoint) -> PartyEndpoint:
@@ -245,7 +240,7 @@ def make_terms(
     return Terms(
         fixed=is_fixed(discovery),
         server=None if server is None else Peer(address=server.address, port=server.port),
-        server_tcp=server is None or server.tcp,
+        server_medium=Medium.TCPV4 if server is None or server.tcp else Medium.UDPV4,
         first_port=discovery.first_port,
         taken=tuple((host, tuple(sorted(ports))) for host, ports in sorted(taken.items())),
         multicast_group=data_layer.multicast_group,

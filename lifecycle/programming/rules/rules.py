@@ -17,6 +17,7 @@ from lifecycle.manifest.model import EndpointKind
 from lifecycle.network.address import canonical, is_loopback, is_multicast, is_wildcard, socket_text
 from lifecycle.network.dscp import describe, parse_dscp
 from lifecycle.network.five_qi import DscpMapping
+from lifecycle.network.medium import Medium
 from lifecycle.network.nfe import FlowTuple, InternetProtocol, TransportProtocol, is_ip
 from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedNode
 from lifecycle.programming.rules.packet_filter import (
@@ -25,15 +26,15 @@ from lifecycle.programming.rules.packet_filter import (
     check_port,
     check_same_family,
 )
-from lifecycle.verify.transport import INTRAPROCESS, SHARED_MEMORY, UNKNOWN
+from lifecycle.verify.transport import UNKNOWN
 from lifecycle.verify.verdict import FlowReport, Outcome
 
 MAX_FLOW_LABEL = 0xFFFFF
 """Twenty bits (RFC 6437)."""
 
 _UNSEEN = {
-    SHARED_MEMORY: "shared memory: no packet that a network could see",
-    INTRAPROCESS: "one process: no packet that a network could see",
+    Medium.SHM.value: "shared memory: no packet that a network could see",
+    Medium.INTRAPROCESS.value: "one process: no packet that a network could see",
 }
 """Why no network sees a flow, by its effective transport."""
 
@@ -219,7 +220,7 @@ def _candidates(
         return
     unknown = report.effective_transport == UNKNOWN
     if unknown and not all(map(is_ip, (*report.source, *report.destination))):
-        left_out.append(_left(report, _UNSEEN[SHARED_MEMORY]))
+        left_out.append(_left(report, _UNSEEN[Medium.SHM]))
     publisher = _node(plan, report.publisher)
     subscription = _node(plan, report.subscription)
     remote = publisher is None or subscription is None or not _same_host(plan, report)

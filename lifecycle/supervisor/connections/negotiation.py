@@ -10,7 +10,8 @@ import dataclasses
 from collections.abc import Collection, Iterable, Iterator, Mapping
 
 from lifecycle.manifest.model import Authority, DataLayerSource, EndpointKind, EndpointPolicy
-from lifecycle.network.connection_url import ConnectionTransport, parse
+from lifecycle.network.connection_url import parse
+from lifecycle.network.medium import CONNECTABLE, RMW_DEFAULT, Medium
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan import (
     DataLayerGraph,
@@ -30,7 +31,7 @@ from lifecycle.plan import (
     with_graph,
 )
 from lifecycle.plan.connections.contacts import contacts_of, ports_of
-from lifecycle.plan.negotiation.data_layer import RMW_DEFAULT, TRANSPORTS, PartyEndpoint
+from lifecycle.plan.negotiation.data_layer import PartyEndpoint
 from lifecycle.plan.negotiation.parties import FAST_DDS, endpoint_of, transports_of
 from lifecycle.supervisor.connections.desired_state import Instructions, planned_instructions
 from lifecycle.supervisor.connections.unwired import not_wired
@@ -81,7 +82,7 @@ def party_of(
         full_name=configuration.name,
         host=host,
         process=str(configuration.identity.process_id),
-        transports=(configuration.transports or TRANSPORTS) if known else (),
+        transports=(configuration.transports or CONNECTABLE) if known else (),
         own=(transports_of(own_urls) or default) if known else (),
         connectable=known,
         serializations=configuration.serializations,
@@ -206,7 +207,7 @@ class NegotiatedSource:
         for each in self.graph.connections:
             if each.node in keys:
                 urls = (parse(text) for text in each.urls)
-                tcp = (url for url in urls if url.transport is ConnectionTransport.TCPV4)
+                tcp = (url for url in urls if url.transport is Medium.TCPV4)
                 taken.setdefault(hosts[each.node], set()).update(ports_of(tcp))
         self._terms = dataclasses.replace(
             self._terms,

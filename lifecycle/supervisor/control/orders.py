@@ -14,6 +14,7 @@ from collections.abc import Collection, Iterable, Iterator
 from lifecycle.codec import to_plain
 from lifecycle.errors import BringUpError, ExitCode, UsageError
 from lifecycle.manifest.model import DataLayerSource
+from lifecycle.network.medium import Medium
 from lifecycle.plan import Change, Plan, PlannedNode, changes, with_files_of_now
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.processes.spawn import ProcessState
@@ -243,7 +244,8 @@ class Revisions:
             raise refuse("its data layer is negotiated by the manifest that runs")
         if self._options.program:
             raise refuse("networks are programmed by the manifest that runs")
-        if any(url.startswith("tcpv4:") for each in (running, plan) for url in _urls(each)):
+        tcp = f"{Medium.TCPV4}:"
+        if any(url.startswith(tcp) for each in (running, plan) for url in _urls(each)):
             raise refuse("a TCP port that was used is not connected to again by who used it")
         if order.node:
             self._check_node(order, plan, found)

@@ -17,7 +17,8 @@ import psutil
 
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest.model import Machine, Manifest
-from lifecycle.network.connection_url import ConnectionTransport, Peer, parse
+from lifecycle.network.connection_url import Peer, parse
+from lifecycle.network.medium import Medium
 from lifecycle.plan.model import ParticipantConnections, Plan, PlannedProcess
 from lifecycle.plan.negotiation.parties import urls_of
 from lifecycle.verify.observation import NodeConfiguration
@@ -159,9 +160,9 @@ def onlooker_connections(
     urls = []
     for text in connections.urls:
         url = parse(text)
-        if url.transport is not ConnectionTransport.UDPM:
+        if url.transport is not Medium.UDPM:
             url = dataclasses.replace(url, port=None, metatraffic_port=None, output_port=None)
-        if url.transport is ConnectionTransport.TCPV4 and not url.server:
+        if url.transport is Medium.TCPV4 and not url.server:
             url = dataclasses.replace(url, peers=tuple(sorted({*url.peers, *listening})))
         urls.append(str(url))
     return dataclasses.replace(connections, urls=tuple(urls))
@@ -171,7 +172,7 @@ def _tcp_listeners(urls: Iterable[str]) -> Iterator[Peer]:
     """Yield where participants with these URLs listen for TCP."""
     for text in urls:
         url = parse(text)
-        if url.transport is ConnectionTransport.TCPV4 and url.port and url.address:
+        if url.transport is Medium.TCPV4 and url.port and url.address:
             yield Peer(address=url.address, port=url.port)
 
 

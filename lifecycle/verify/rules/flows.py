@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from lifecycle.manifest.model import EndpointKind, Quantity, UniqueHow
+from lifecycle.network.medium import Medium
 from lifecycle.network.nfe import (
     FlowUniqueness,
     NetworkFlowEndpoint,
@@ -210,7 +211,7 @@ def _spell_all(nfes: tuple[NetworkFlowEndpoint, ...]) -> str:
 
 def _spell(nfe: NetworkFlowEndpoint) -> str:
     if nfe.transport_protocol is TransportProtocol.UNKNOWN:
-        return "shm"
+        return Medium.SHM
     address = nfe.internet_address
     host = f"[{address}]" if ":" in address else address
     return f"{nfe.transport_protocol.value} {host}:{nfe.transport_port}"

@@ -10,11 +10,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from lifecycle.manifest.model import FlowTransport
+from lifecycle.network.medium import NETWORK_MEDIA, Medium
 from lifecycle.verify.rules.catalogue import Heals, Rule
 from lifecycle.verify.transport import (
-    INTRAPROCESS,
-    MULTICAST,
-    NETWORK,
     NONE,
     UNKNOWN,
     effective_transport,
@@ -42,9 +40,7 @@ WRONG_MEDIUM = Rule(
 RULES = (WRONG_TRANSPORT, WRONG_MEDIUM)
 
 _WORDS = {
-    INTRAPROCESS: "handed over inside their process",
-    MULTICAST: "UDP multicast",
-    "shm": "shared memory",
+    **{each.value: each.meaning for each in Medium},
     NONE: "no transport that both have",
     UNKNOWN: "not known",
 }
@@ -60,7 +56,7 @@ def check(view: View) -> Iterator[Finding]:
             continue  # it is missing, and that is said
         used = effective_transport(view, flow)
         demanding = [end for end in ends if end.planned.transport is FlowTransport.NETWORK]
-        if demanding and used not in NETWORK:
+        if demanding and used not in NETWORK_MEDIA:
             yield _not_by_network(flow, demanding[0], used)
         elif flow.planned.medium not in ("", used) and _is_decided(view, flow):
             yield _otherwise(flow, used)

@@ -10,14 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lifecycle.network.connection_url import (
-    ConnectionTransport,
     ConnectionUrl,
     ConnectionUrlError,
     Peer,
     parse,
 )
+from lifecycle.network.medium import Medium
 
-T = ConnectionTransport
+T = Medium
 _HOW = "write TRANSPORT://[ADDRESS][:PORT][?OPTION=VALUE&…], udpv4://10.77.0.1:7911"
 _OPTIONS = (
     "metatraffic_port, output_port, peer, multicast, server, server_prefix, ttl, interface, dscp, "

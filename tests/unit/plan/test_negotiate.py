@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from lifecycle.manifest.model import EndpointKind, FlowTransport
 from lifecycle.network.connection_url import Peer, parse
+from lifecycle.network.medium import CONNECTABLE, RMW_DEFAULT
 from lifecycle.plan import (
     DataLayerGraph,
     Party,
@@ -19,7 +20,6 @@ from lifecycle.plan import (
     negotiate,
 )
 from lifecycle.plan.connections.contacts import Contact
-from lifecycle.plan.negotiation.data_layer import RMW_DEFAULT, TRANSPORTS
 from lifecycle.plan.negotiation.parties import transports_of
 
 STRING = "std_msgs/msg/String"
@@ -174,7 +174,7 @@ def test_each_topic_that_goes_by_multicast_has_a_group_and_a_port_of_its_own():
 
 
 def test_many_listeners_without_shared_memory_share_one_datagram():
-    none = tuple(each for each in TRANSPORTS if each != "shm")
+    none = tuple(each for each in CONNECTABLE if each != "shm")
     graph = negotiate(
         [
             party("p", pub(), own=("udpv6",)),
@@ -391,7 +391,7 @@ def _system(seed: int) -> tuple[list[Party], dict[tuple[str, str, str], Wish], T
     parties = []
     for key in draw.sample("abcdef", draw.randint(0, 5)):
         own = draw.choice((RMW_DEFAULT, ("shm",), ("udpv4",), ("tcpv4",), ("udpv6",)))
-        able = draw.choice((TRANSPORTS, draw.sample(TRANSPORTS, draw.randint(0, 4))))
+        able = draw.choice((CONNECTABLE, draw.sample(CONNECTABLE, draw.randint(0, 4))))
         parties.append(
             party(
                 key,

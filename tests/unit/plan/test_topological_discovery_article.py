@@ -26,7 +26,8 @@ from lifecycle.manifest.model import (
     Machine,
     Policy,
 )
-from lifecycle.network.connection_url import ConnectionTransport, ConnectionUrlError, parse
+from lifecycle.network.connection_url import ConnectionUrlError, parse
+from lifecycle.network.medium import Medium
 from lifecycle.node.host.control import Operation
 from lifecycle.plan import (
     DataLayerGraph,
@@ -248,7 +249,7 @@ def test_iterating_over_the_instructions_is_connect_to_for_each_url_then_map_to_
 def test_the_articles_url_is_a_multicast_group_and_a_port():
     url = parse("udpm://225.82.79.83:11311/")
     assert (url.transport, url.address, url.port) == (
-        ConnectionTransport.UDPM,
+        Medium.UDPM,
         "225.82.79.83",
         11311,
     )
@@ -401,8 +402,8 @@ def test_intelligent_multicast_is_a_group_with_ttl_0_here_and_tcp_to_other_machi
     }
     (connection,) = plan.node("talker").participants
     group, tcp = (parse(each) for each in connection.connections.urls)
-    assert (group.transport, group.ttl) == (ConnectionTransport.UDPM, 0)
-    assert tcp.transport is ConnectionTransport.TCPV4
+    assert (group.transport, group.ttl) == (Medium.UDPM, 0)
+    assert tcp.transport is Medium.TCPV4
 
 
 def test_everybody_who_negotiates_from_the_same_configurations_comes_to_the_same_graph():
@@ -430,7 +431,7 @@ def test_a_client_server_master_makes_no_choice_and_every_flow_is_tcp():
     for each in plan.nodes:
         (url,) = (parse(text) for text in each.connections.urls)
         assert (url.transport, url.server) == (
-            ConnectionTransport.TCPV4,
+            Medium.TCPV4,
             parse(plan.node("p").connections.urls[0]).server,
         )
 

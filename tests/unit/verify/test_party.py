@@ -9,10 +9,11 @@ import pytest
 from lifecycle.manifest.model import EndpointKind, FlowTransport
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.network.connection_url import Peer
+from lifecycle.network.medium import CONNECTABLE, RMW_DEFAULT
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan.connections.contacts import Contact
 from lifecycle.plan.model import ParticipantConnections, PlannedNode, PlannedParticipant
-from lifecycle.plan.negotiation.data_layer import RMW_DEFAULT, TRANSPORTS, Party, PartyEndpoint
+from lifecycle.plan.negotiation.data_layer import Party, PartyEndpoint
 from lifecycle.supervisor.connections.negotiation import party_of
 from lifecycle.verify import NodeConfiguration
 from lifecycle.verify.observation import ConnectionReport
@@ -83,7 +84,7 @@ def test_what_a_node_says_that_it_can_speak_is_what_it_takes_part_with():
 
 
 def test_a_node_that_names_no_transports_can_be_connected_by_all():
-    assert party_of(camera(transports=()), "h").transports == TRANSPORTS
+    assert party_of(camera(transports=()), "h").transports == CONNECTABLE
 
 
 def test_a_node_of_an_rmw_that_we_cannot_connect_has_no_transports_at_all():

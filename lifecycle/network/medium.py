@@ -1,0 +1,141 @@
+"""What carries data from one participant to another: media, and what a manifest may ask for.
+
+Owns: the one enum of media, with what plan, checks and verification need to know of each, and
+`FlowTransport`, the words of a manifest's `transport:`. What Fast DDS calls a transport in a
+profile is `middleware.fastdds.url_profile`'s. Pure.
+"""
+
+from __future__ import annotations
+
+import enum
+
+
+class Medium(str, enum.Enum):
+    """What carries data. A member is its word, wherever text is wanted.
+
+    In the order in which a connection is named after several.
+    """
+
+    SHM = "shm"
+    UDPM = "udpm"  # a multicast group, over IPv4 or IPv6 as its address says
+    UDPV4 = "udpv4"
+    UDPV6 = "udpv6"
+    TCPV4 = "tcpv4"
+    TCPV6 = "tcpv6"  # seen at others; nothing of ours is connected by it
+    INTRAPROCESS = "intraprocess"  # handed over inside a process
+
+    def __str__(self) -> str:
+        """Return the word; as StrEnum does, which Python 3.10 has not."""
+        return str(self.value)
+
+    def __repr__(self) -> str:
+        """Return the word in quotes, as messages have it."""
+        return repr(self.value)
+
+    @property
+    def is_udp(self) -> bool:
+        """Whether it is UDP, to one or to a group."""
+        return self in (Medium.UDPM, Medium.UDPV4, Medium.UDPV6)
+
+    @property
+    def is_tcp(self) -> bool:
+        """Whether it is TCP."""
+        return self in (Medium.TCPV4, Medium.TCPV6)
+
+    @property
+    def is_network(self) -> bool:
+        """Whether its packets are what a network sees."""
+        return self.is_udp or self.is_tcp
+
+    @property
+    def ip_version(self) -> int | None:
+        """4 or 6; None where it is either, or no IP."""
+        return {"v4": 4, "v6": 6}.get(self.value[-2:])
+
+    @property
+    def unicast(self) -> Medium:
+        """What its participants are found by: of a group's, UDP over IPv4."""
+        return Medium.UDPV4 if self is Medium.UDPM else self
+
+    @property
+    def meaning(self) -> str:
+        """What people read; of an IP transport its word."""
+        return _MEANINGS.get(self, self.value)
+
+
+_MEANINGS = {
+    Medium.INTRAPROCESS: "handed over inside their process",
+    Medium.UDPM: "UDP multicast",
+    Medium.SHM: "shared memory",
+}
+
+NETWORK_MEDIA = frozenset(each for each in Medium if each.is_network)
+"""Media whose packets a network sees."""
+
+SCHEMES = (Medium.UDPV4, Medium.UDPV6, Medium.UDPM, Medium.TCPV4, Medium.SHM)
+"""Media that connections are made of, the schemes of their URLs."""
+
+CONNECTABLE = (Medium.SHM, Medium.UDPV4, Medium.UDPV6, Medium.UDPM, Medium.TCPV4)
+"""The same, in the order in which a node says what it can be connected by."""
+
+RMW_DEFAULT = (Medium.SHM, Medium.UDPV4)
+"""What a participant has if nobody says anything (Fast DDS 2.14)."""
+
+TRANSPORTS_VARIABLE = "FASTDDS_BUILTIN_TRANSPORTS"
+
+BUILTIN_TRANSPORTS = {
+    "DEFAULT": RMW_DEFAULT,
+    "SHM": (Medium.SHM,),
+    "UDPv4": (Medium.UDPV4,),
+    "UDPv6": (Medium.UDPV6,),
+    "LARGE_DATA": (Medium.SHM, Medium.TCPV4, Medium.UDPV4),
+    "NONE": (Medium.TCPV4,),
+}
+"""What a participant has by each word of FASTDDS_BUILTIN_TRANSPORTS."""
+
+
+class FlowTransport(enum.Enum):
+    """What a manifest asks to carry data: any, a class of media, or one medium."""
+
+    ANY = "any"  # the middleware chooses; Fast DDS prefers shared memory on one host
+    NETWORK = "network"  # an IP socket, never shared memory
+    SHM = Medium.SHM.value
+    UDPV4 = Medium.UDPV4.value
+    UDPV6 = Medium.UDPV6.value
+    MULTICAST = "multicast"  # one datagram for all subscribers of a host, TTL 0
+    TCPV4 = Medium.TCPV4.value
+
+    @property
+    def media(self) -> tuple[Medium, ...]:
+        """The media of connections that are what is asked for; all of them for ANY."""
+        if self is FlowTransport.ANY:
+            return CONNECTABLE
+        if self is FlowTransport.NETWORK:
+            return tuple(each for each in CONNECTABLE if each.is_network)
+        return (Medium.UDPM if self is FlowTransport.MULTICAST else Medium(self.value),)
+
+    @property
+    def medium(self) -> Medium | None:
+        """The one medium that is asked for; None for ANY and NETWORK."""
+        return self.media[0] if len(self.media) == 1 else None
+
+    @property
+    def builtin(self) -> str | None:
+        """The word of FASTDDS_BUILTIN_TRANSPORTS that gives a participant it; None without."""
+        wanted = Medium.UDPV4 if self is FlowTransport.NETWORK else self.medium
+        words = (each for each, has in BUILTIN_TRANSPORTS.items() if has == (wanted,))
+        return next((each for each in words if each != "NONE"), None)
+
+    def accepts(self, medium: str) -> bool:
+        """Return whether data that go by this medium go as asked for.
+
+        Inside a process nothing leaves shared memory; a group stays on its host, and the other
+        subscribers of its topic get theirs by TCP.
+        """
+        if self is FlowTransport.ANY or medium in self.media:
+            return True
+        also = {
+            FlowTransport.SHM: (Medium.INTRAPROCESS,),
+            FlowTransport.MULTICAST: (Medium.INTRAPROCESS, Medium.TCPV4),
+        }
+        return medium in also.get(self, ())

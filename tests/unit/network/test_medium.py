@@ -1,0 +1,70 @@
+"""What carries data: one enum, whose members are words wherever text is wanted."""
+
+from __future__ import annotations
+
+import ast
+import json
+from pathlib import Path
+
+import pytest
+
+import lifecycle
+from lifecycle.codec import from_json, to_json
+from lifecycle.network.medium import (
+    CONNECTABLE,
+    NETWORK_MEDIA,
+    SCHEMES,
+    FlowTransport,
+    Medium,
+)
+
+
+def test_a_medium_is_its_word_in_text_in_json_and_as_a_key() -> None:
+    assert f"{Medium.SHM} {Medium.UDPV4!r}" == "shm 'udpv4'"
+    assert ", ".join(sorted((Medium.UDPV6, Medium.SHM))) == "shm, udpv6"
+    assert {"udpm": 1}[Medium.UDPM] == 1
+    assert to_json({Medium.TCPV4: [Medium.SHM]}) == b'{"tcpv4":["shm"]}'
+    assert json.dumps([Medium.SHM]) == '["shm"]'
+    assert from_json(b'["shm","udpm"]', tuple[Medium, ...]) == (Medium.SHM, Medium.UDPM)
+
+
+def test_connections_are_made_of_the_same_media_however_they_are_listed() -> None:
+    assert {*CONNECTABLE} == {*SCHEMES}
+    assert {*Medium} - {*SCHEMES} == {Medium.TCPV6, Medium.INTRAPROCESS}
+    assert {*Medium} - NETWORK_MEDIA == {Medium.SHM, Medium.INTRAPROCESS}
+
+
+@pytest.mark.parametrize(
+    ("asked", "accepted", "builtin"),
+    [
+        (FlowTransport.ANY, {*Medium}, None),
+        (
+            FlowTransport.NETWORK,
+            {Medium.UDPM, Medium.UDPV4, Medium.UDPV6, Medium.TCPV4},
+            "UDPv4",
+        ),
+        (FlowTransport.SHM, {Medium.SHM, Medium.INTRAPROCESS}, "SHM"),
+        (FlowTransport.UDPV4, {Medium.UDPV4}, "UDPv4"),
+        (FlowTransport.UDPV6, {Medium.UDPV6}, "UDPv6"),
+        (FlowTransport.MULTICAST, {Medium.UDPM, Medium.TCPV4, Medium.INTRAPROCESS}, None),
+        (FlowTransport.TCPV4, {Medium.TCPV4}, None),
+    ],
+)
+def test_what_a_manifest_asks_for_is_met_by_some_media(
+    asked: FlowTransport, accepted: set[Medium], builtin: str | None
+) -> None:
+    assert {each for each in Medium if asked.accepts(each)} == accepted
+    assert asked.builtin == builtin
+
+
+def test_no_module_spells_a_medium_itself() -> None:
+    root = Path(lifecycle.__file__).parent
+    words = {each.value for each in Medium}
+    found = [
+        f"{path.relative_to(root)}:{each.lineno}"
+        for path in root.rglob("*.py")
+        if path != root / "network/medium.py"
+        for each in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(each, ast.Constant) and each.value in words
+    ]
+    assert found == []
