@@ -41,7 +41,7 @@ def configured_before_any_connect(system: System) -> frozenset[str]:
     """Return the keys of this supervisor's managed nodes that no `after:` holds behind a connect.
 
     A managed node's start waits for `started` alone and its configure for `configured`; but the
-    start of a plain node waits for any condition, and whoever stands on it waits with it.
+    start of a plain node waits for any condition, and a node that depends on it waits with it.
     """
     held: dict[str, bool] = {}
 
@@ -84,7 +84,7 @@ CALM_S = 10.0
 
 
 class Reaching(Protocol):
-    """How nodes that are not ours are reached, see eyes.ObserverParticipant."""
+    """How nodes that are not ours are reached, see ObserverParticipant."""
 
     def node_interface(self, node: str) -> Hand:
         """Return what drives the node interface of any node that has one, by full name."""

@@ -1,4 +1,4 @@
-"""What an authority tells one node, and what is left to tell it.
+"""Desired state of one node's connections and mappings, and the steps that it still lacks.
 
 Owns: `Instructions`, the connections and mappings that a node must have; `Wired`, those that it
 has; and `steps`, the difference in the order in which it is made. Comparing what must be with what

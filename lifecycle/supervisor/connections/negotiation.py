@@ -1,7 +1,7 @@
-"""Instructions that are negotiated from what nodes report, and the plan that follows from them.
+"""Desired state that is negotiated from what nodes report, and the plan that follows from it.
 
-Owns: `NegotiatedSource`: which nodes take part, on which host each is, and how the outcome is told
-to nodes and to the verifier. The rules of negotiation are lifecycle.plan's. Pure.
+Owns: `NegotiatedSource`: which nodes take part, on which host each is, and how the outcome reaches
+nodes and the verifier. The rules of negotiation are lifecycle.plan's. Pure.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""What a run does to networks: programs them once flows are verified, and leaves nothing behind.
+"""Programs networks for a run once its flows are verified, and leaves nothing behind.
 
 Owns: when programming happens in a run, and when the blocking `Programmer` is called: for the
 latest flows only, again after a failure with growing pauses, in time before something expires, and
 one last time to remove everything; the loop is never held up. Without `--program` nothing is made;
-what somebody applied by hand goes with the system. The package that programs takes long to import
+what a person applied goes with the system. The package that programs takes long to import
 and most runs do not need it, so it loads on first use. Must not import rclpy.
 """
 
@@ -234,7 +234,7 @@ class Networks:
     Args:
         system: its name, which failures are about.
         directory: of the run.
-        emit: where notices go, and where verdicts are heard.
+        emit: where notices go, and where verdicts come from.
         programmer: None programs nothing.
     """
 
@@ -355,7 +355,7 @@ def open_networks(
 
 
 def remove_programmed(directory: Path, within_s: float | None = None) -> tuple[str, ...]:
-    """Remove everything that a run has in networks, whoever applied it; say what was done.
+    """Remove everything that a run has in networks, also what a person applied; say what was done.
 
     Args:
         directory: of the run.

@@ -1,4 +1,4 @@
-"""Talking to a supervisor that runs: which one a word means, its status, its end.
+"""Client of a running supervisor: finds it by name, reads its status, gives orders, ends it.
 
 Owns: `find_run`, `status`, `look`, `differences`, `order`, `down`. Must not import rclpy.
 """

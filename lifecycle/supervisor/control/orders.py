@@ -1,6 +1,6 @@
 """Orders to a supervisor that holds a system: pause, resume, restart.
 
-Owns: `Order`, which orders fit which phase, and the mailbox that hands them to the session one by
+Owns: `Order`, which orders fit which phase, and the mailbox that gives them to the session one by
 one. How they are carried out is sequence.py's. Must not import rclpy.
 """
 
@@ -127,7 +127,7 @@ class Pending:
         self.done: asyncio.Future[Done] = asyncio.get_running_loop().create_future()
 
     def finish(self, done: Done) -> None:
-        """Tell who gave it; a second time is harmless."""
+        """Answer who gave it; a second time is harmless."""
         if not self.done.done():
             self.done.set_result(done)
 

@@ -173,7 +173,7 @@ class ControlServer:
                 writer.close()
 
     def changed(self) -> None:
-        """Tell those who follow that there is something new to see."""
+        """Notify those who follow that there is something new to see."""
         self._changed.set()
         self._changed = asyncio.Event()
 
@@ -209,7 +209,7 @@ class ControlServer:
             gone.cancel()
 
     async def close(self, exit_code: int) -> None:
-        """Tell those who asked for it that all is over, and stop listening; bounded."""
+        """Answer those who asked for it that all is over, and stop listening; bounded."""
         if self._server is None:
             return
         self._server.close()

@@ -1,4 +1,4 @@
-"""What a supervisor can say of its system at one moment, for tables and for `lifecycle status`.
+"""Status of a running system at one moment, for tables and for `lifecycle status`.
 
 Owns: the status types and how they are drawn from the running system and its last verdict. Must not
 import rclpy.
@@ -23,8 +23,8 @@ class NodeStatus:
 
     Attributes:
         node: fully qualified name.
-        process: name of its process; empty if somebody else runs it.
-        process_state: None if somebody else runs it.
+        process: name of its process; empty if this supervisor does not run it.
+        process_state: None if this supervisor does not run it.
         state: lifecycle_msgs/State label; empty for a node that is not managed.
         doing: what it does or waits for; empty when nothing.
         matched: publishers and subscriptions that report at least one match.

@@ -1,4 +1,4 @@
-"""Deactivates managed nodes that somebody else activates while the gate is closed for them.
+"""Deactivates managed nodes that others activate while the gate is closed for them.
 
 Owns: `ActivationGuard`: which active nodes were not asked to be, how often they are deactivated
 again, and the finding that keeps the gate closed until they are inactive. Nodes in our hosts refuse
@@ -24,7 +24,7 @@ from lifecycle.verify.rules.state import ACTIVATED_AT_CLOSED_GATE
 from lifecycle.verify.verdict import Finding, Outcome
 
 TRIES = 5
-"""Somebody who activates a node again and again is not fought for ever: its finding stays."""
+"""A node that is activated again and again is not deactivated for ever: its finding stays."""
 
 
 class Seeing(Protocol):
@@ -35,7 +35,7 @@ class Seeing(Protocol):
 
 
 class Changing(Protocol):
-    """When it is worth looking again, see judge.Changes."""
+    """When it is worth looking again, see verification_loop.Changes."""
 
     @property
     def count(self) -> int:

@@ -59,7 +59,7 @@ def closes(verdict: Verdict, *, strict: bool) -> bool:
 
 
 class Judging(Protocol):
-    """What a permit asks about the verdict that it came from, see judge.VerificationLoop."""
+    """What a permit asks about the verdict that it came from, see VerificationLoop."""
 
     def is_current(self, verdict: Verdict) -> bool:
         """Whether nothing changed since the look that `verdict` came from."""
@@ -72,7 +72,7 @@ class Permit:
     """The right to send activate requests. Only `Gate.judge` makes one.
 
     Attributes:
-        verdict: the one that it stands on; a newer one, once it was renewed.
+        verdict: the one that it rests on; a newer one, once it was renewed.
         sent: names of the nodes that were sent their requests.
     """
 

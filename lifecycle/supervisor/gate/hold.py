@@ -1,4 +1,4 @@
-"""Holding a system that is up: watched, and ordered about from outside.
+"""Holds a system that is up: watches it, and carries out orders (pause, resume, restart).
 
 Owns: `Holding`: for how long, what ends it, and how orders (pause, resume, restart) come in and are
 answered. What an order does is sequence.py's.
@@ -41,12 +41,12 @@ class Holding:
         system: what is held.
         judge: judges it at every change.
         changes: what it waits for.
-        regulator: carries out orders, and knows the phase.
+        gate_sequence: carries out orders, and knows the phase.
         revisions: knows which manifest runs.
-        vigil: over the processes.
+        process_monitor: notices processes that end.
         emit: where events go.
         note_segments: called when processes may be new.
-        keep_going: a process that ends is told of, and does not end the run.
+        keep_going: a process that ends is reported, and does not end the run.
     """
 
     def __init__(

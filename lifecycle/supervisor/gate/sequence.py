@@ -52,7 +52,7 @@ def undiscovered(
 ) -> str | None:
     """Return the full name of the node to start again; None where that would mend nothing.
 
-    Of two ends that do not match either may be the one that is not heard: it is who lacks most,
+    Of two ends that do not match either may be the undiscovered one: it is who lacks most,
     then who was started again least often, then the last by name.
 
     Args:
@@ -88,11 +88,11 @@ class GateSequence:
 
     Args:
         alive: see above.
-        leaves: told the names of processes that end because we want it, and `comes_back` once
-            they are started anew.
+        leaves: called with the names of processes that end because we want it, and `comes_back`
+            once they are started anew.
         forget: drops what a node reported before it was restarted.
         vanishes: waits, bounded, until the graph shows no node of this name.
-        replanned: told the names of nodes that the plan connects otherwise from now on.
+        replanned: called with the names of nodes that the plan connects otherwise from now on.
         program: programs networks with the flows of a verdict within seconds, done when it returns.
         following: keeps looking at the nodes of others, and at ours that others may drive, for the
             length of its block.
@@ -312,7 +312,7 @@ class GateSequence:
         self._replanned(each.name for each in nodes)
 
     async def verify(self, timeout_s: float) -> Permit:
-        """Judge the system as it stands until its gate opens; activate nothing.
+        """Judge the system as it is until its gate opens; activate nothing.
 
         Args:
             timeout_s: seconds, for all of it.

@@ -1,4 +1,4 @@
-"""Judging the running system: level-triggered, debounced, until it is clear.
+"""Verifies the running system at every change: level-triggered, debounced, until it is clear.
 
 Owns: when `verify` is called again and how long a verdict that closes the gate is waited out.
 Nothing is polled: the graph, or a node over its control channel, says when to look again. Must not
@@ -33,7 +33,7 @@ from lifecycle.verify.verdict import Finding, Outcome, Stage, Verdict
 
 PASSING_S = 1.0
 """Discovery shows a newcomer's endpoints before its name, measured 0.02–0.45 s earlier; what nodes
-have only just been told, or have just made in code, is seen 0.01–0.1 s later."""
+have only just been asked for, or have just made in code, is seen 0.01–0.1 s later."""
 
 _Key = tuple[str, str, str, EndpointKind | None]
 _Place = tuple[object, ...]
@@ -55,12 +55,12 @@ class GracePeriod:
     def standing(
         self, last: Verdict | None, verdict: Verdict, expected: Plan, now_s: float
     ) -> tuple[Verdict, float | None]:
-        """Return the verdict that stands, and after how many seconds it has to be judged again.
+        """Return the verdict that holds, and after how many seconds it has to be judged again.
 
-        The seconds are None where what was found now stands.
+        The seconds are None where what was found now holds.
 
         Args:
-            last: the verdict that stands so far; None before the first.
+            last: the verdict that holds so far; None before the first.
             verdict: what was found now.
             expected: the plan that it was judged against.
             now_s: on any clock that only goes forward.
@@ -134,7 +134,7 @@ BURST_S = 0.05
 """... or a burst lasts longer than this."""
 
 SETTLED_S = 0.5
-"""A finding that time does not heal stands once it is unchanged for so long."""
+"""A finding that time does not heal counts once it is unchanged for so long."""
 
 UNVERIFIABLE_S = 3.5
 """What cannot be verified may be unseen yet; Fast DDS announces a late participant every 3 s."""
@@ -210,20 +210,20 @@ class Changes:
 
 
 class Looker(Protocol):
-    """Who else acts on what is seen, and what is wrong with that; see wiring.Authority."""
+    """What acts on observations, and has findings of its own; see connections/authority.py."""
 
     def look(self, observation: Observation) -> None:
         """Take what was seen, before it is judged."""
 
     def findings(self) -> tuple[Finding, ...]:
-        """Return what the observation alone does not tell."""
+        """Return what the observation alone does not show."""
 
 
 class VerificationLoop:
     """Judges one system.
 
     Attributes:
-        latest: the verdict that stands; None before the first.
+        latest: the verdict that holds; None before the first.
         seen: what was seen last.
         ahead: names of the nodes that an earlier gate let through, which are active before it.
     """
@@ -284,10 +284,10 @@ class VerificationLoop:
         return self.latest
 
     async def settled(self, stage: Stage) -> tuple[Verdict, float | None]:
-        """Look and judge now, and give what may pass by itself a moment to do so (grace_period.py).
+        """Look and judge now, and give what may pass by itself a moment to do so (GracePeriod).
 
         Returns:
-            The verdict that stands, and after how many seconds it must be judged again if it is
+            The verdict that holds, and after how many seconds it must be judged again if it is
             not what was found now.
         """
         found = await self._look(stage)
@@ -334,12 +334,12 @@ class VerificationLoop:
     async def until_clear(
         self, stage: Stage, timeout_s: float, *, unchanged_s: float | None = None
     ) -> Verdict:
-        """Judge until the gate may open, a finding that cannot heal stands, or time is up.
+        """Judge until the gate may open, a finding that cannot heal persists, or time is up.
 
         Args:
             stage: what the system has come to.
             timeout_s: seconds, for all of it.
-            unchanged_s: seconds after which findings stand that have not changed, even if they
+            unchanged_s: seconds after which findings count that have not changed, even if they
                 could heal; None waits for these until time is up.
 
         Returns:

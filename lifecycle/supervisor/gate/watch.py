@@ -1,4 +1,4 @@
-"""Watching a system that is up: judged again at every change, dead processes noticed at once.
+"""Watches a system that is up: verified again at every change, dead processes noticed at once.
 
 Owns: the hold phase. What follows from what it sees is session.py's. Must not import rclpy.
 """

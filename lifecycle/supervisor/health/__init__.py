@@ -1,1 +1,1 @@
-"""Who is alive: processes, nodes and other supervisors of the system."""
+"""Liveliness of the processes, nodes and other supervisors of a system."""

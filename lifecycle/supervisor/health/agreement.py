@@ -1,8 +1,8 @@
-"""Whether the supervisors of one system planned the same, and which of them was shut down.
+"""Compares the plans of the supervisors of one system, and notices which was shut down.
 
 Owns: announcing our plan, comparing those of others with it, and the findings that come of it. A
 manifest with another node, another argument or another flow need on one of the hosts passes every
-check of the running graph there: only the plans tell. Nothing here polls. Must not import rclpy.
+check of the running graph there: only the plans show it. Nothing here polls. Must not import rclpy.
 """
 
 from __future__ import annotations
@@ -58,14 +58,14 @@ class Notices(Protocol):
 
 
 class Air(Protocol):
-    """What carries notices, see eyes.ObserverParticipant."""
+    """What carries notices, see ObserverParticipant."""
 
     def plan_notices(self, on_notice: Callable[[str], None]) -> Notices:
         """Take part in the exchange of plans; the callback comes from any thread."""
 
 
 class Connected(Protocol):
-    """Who knows which supervisors are connected, see neighbours.PeerSupervisors."""
+    """Knows which supervisors are connected, see PeerSupervisors."""
 
     @property
     def machines(self) -> frozenset[str]:

@@ -2,7 +2,7 @@
 
 Owns: `Liveliness`, which turns what is noticed of processes and machines into events, findings and
 the status of nodes. Nothing here waits or asks: the kernel says that a process was stopped or that
-an executor hangs (middleware/process/busy_timer.py), DDS that a machine is not heard any more. A
+an executor hangs (middleware/process/busy_timer.py), DDS that a machine is lost. A
 process that ended is not silent but dead, see watch.py. Must not import rclpy.
 """
 
@@ -181,10 +181,10 @@ class Liveliness:
 
 
 class Presence:
-    """Tells which nodes joined and left the graph between two observations.
+    """Reports which nodes joined and left the graph between two observations.
 
     Hidden nodes, whose names begin with an underscore, are left out, as are tools: the one are
-    participants of nodes that are told of anyway, of the other a verdict tells.
+    participants of nodes that are reported anyway, the other are in the verdict.
     """
 
     def __init__(self, emit: Emitter) -> None:

@@ -1,8 +1,8 @@
-"""Who runs the plan's other nodes: whether they are heard, and what they say of those nodes.
+"""Liveliness of the supervisors of other machines, and of attached nodes: found, lost, left.
 
-Owns: being heard by the supervisors of other machines, hearing them and the attached nodes that
-tell that they are there, and calling out while somebody is missing. Event driven but for the calls,
-which end with the silence. Must not import rclpy.
+Owns: announcing ourselves to other supervisors, noticing them and the attached nodes that announce
+themselves, what they report of silent nodes, and asking all to announce themselves while one is
+missing. Event driven but for that, which ends with the silence. Must not import rclpy.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Doing something while every process of the system lives.
+"""Runs a phase for as long as every process of the system lives.
 
 Owns: `ProcessMonitor`: what runs in it is ended by the first process that ends unasked.
 """
@@ -33,7 +33,7 @@ class ProcessMonitor:
     async def during(self, phase: Coroutine[Any, Any, object]) -> None:
         """Run a phase; the end of any process of the system ends it.
 
-        A step in progress on a node of that process tells more, so it may speak first.
+        A step in progress on a node of that process knows more, so it may fail first.
 
         Raises:
             StepFailedError: a process ended.

@@ -42,7 +42,7 @@ from lifecycle.supervisor.run.failure import (
 T = TypeVar("T")
 
 _DEATH_S = 0.5
-"""A closed channel usually means a dying process; its end tells more than the channel did."""
+"""A closed channel usually means a dying process; its end says more than the channel did."""
 
 _WORDS_S = 0.1
 """For what a process wrote to its channel just before it ended."""
@@ -67,10 +67,10 @@ _TO_UNDO = (Operation.CONFIGURE, Operation.CONNECT)
 
 
 class Wirer(Protocol):
-    """Who makes the nodes' connections and mappings, see wiring.Authority."""
+    """Makes the nodes' connections and mappings, see connections/authority.py."""
 
     async def ready(self, node: NodeRun) -> None:
-        """Wait until everybody is configured whose interface this node's wiring depends on."""
+        """Wait until every node is configured whose interface this node's wiring depends on."""
 
     async def wire(self, node: NodeRun) -> None:
         """Make all that a configured node must have before it connects; raises BringUpError."""
@@ -140,7 +140,7 @@ class BringUp:
             raise self._failure() or self._late(timeout_s) from None
 
     async def deactivate(self, nodes: Iterable[NodeRun] | None = None) -> None:
-        """Deactivate every active node, those first that stand on others.
+        """Deactivate every active node, those first that depend on others.
 
         Args:
             nodes: only these, which were asked to activate; None for all that are active.

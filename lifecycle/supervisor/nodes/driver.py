@@ -1,4 +1,4 @@
-"""How one managed node is driven: over our control channel, or through its lifecycle services.
+"""Drives one managed node: over our control channel, or through its lifecycle services.
 
 Owns: `NodeDriver` and its two kinds. The order of operations is bring_up.py's. Must not import
 rclpy; the services come from middleware/ behind a Protocol.
@@ -28,7 +28,7 @@ FINALIZED = "finalized"
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Standing:
-    """Where a node stands after an operation.
+    """State of a node after an operation.
 
     Attributes:
         state: lifecycle_msgs/State label.
@@ -45,7 +45,7 @@ class NodeDriver(Protocol):
     """Drives one managed node. Deadlines are the caller's: every call may be cancelled."""
 
     async def start(self) -> Standing:
-        """Wait until the node can be driven, and say where it stands."""
+        """Wait until the node can be driven, and return its state."""
 
     async def perform(self, operation: Operation, permit: Permit | None = None) -> Standing:
         """Do one operation.
@@ -171,7 +171,7 @@ _NESTED = (Operation.CONNECT, Operation.DISCONNECT)
 
 
 class ServiceDriver:
-    """Drives a managed node that we do not host, wherever it stands already.
+    """Drives a managed node that we do not host, whatever state it is in already.
 
     A request that was refused or not answered is judged by the state that is read afterwards.
     """
@@ -265,7 +265,7 @@ class ServiceDriver:
 
 
 class ServiceHand:
-    """Wires a node through its node interface, whoever hosts it.
+    """Wires a node through its node interface, in whichever process it is.
 
     Args:
         services: clients.

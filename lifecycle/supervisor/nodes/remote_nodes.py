@@ -1,6 +1,6 @@
 """Nodes of the plan that another supervisor brings up, on another machine.
 
-Owns: `RemoteNode`, how far such a node has come as far as the graph and its own report tell, and
+Owns: `RemoteNode`, how far such a node has come as far as the graph and its own report show, and
 `RemoteNodes`, which keeps that up to date. Nothing here is driven: each supervisor activates its
 own. Must not import rclpy.
 """
@@ -23,14 +23,14 @@ its announcer may not be matched yet."""
 
 
 class Seeing(Protocol):
-    """The eyes of a supervisor, see lifecycle.graph.Graph."""
+    """What a supervisor sees of the graph, see lifecycle.graph.Graph."""
 
     async def observe(self, plan: Plan) -> Observation:
         """Return what the graph holds now, nodes' own reports included."""
 
 
 class Changing(Protocol):
-    """When it is worth looking again, see judge.Changes."""
+    """When it is worth looking again, see verification_loop.Changes."""
 
     @property
     def count(self) -> int:
@@ -41,7 +41,7 @@ class Changing(Protocol):
 
 
 class RemoteNode:
-    """One node that somebody else brings up.
+    """One node that another supervisor brings up.
 
     Attributes:
         reached: every condition that holds as of the last look.
@@ -63,7 +63,7 @@ class RemoteNode:
         return condition in self.reached
 
     def see(self, observation: Observation) -> None:
-        """Take what was seen, and tell who waits."""
+        """Take what was seen, and notify who waits."""
         reached = frozenset(_conditions(self.planned, observation))
         if reached != self.reached:
             self.reached = reached

@@ -41,7 +41,7 @@ _REFRESH_S = 1.0
 
 
 class GraphObserver(Protocol):
-    """The eyes of a supervisor, see lifecycle.graph.Graph."""
+    """What a supervisor sees of the graph, see lifecycle.graph.Graph."""
 
     async def observe(self, plan: Plan) -> Observation:
         """Return what the graph holds now, with the configurations put here and read there."""
@@ -62,13 +62,13 @@ class NodeRun:
 
     Attributes:
         driver: None for a node that is not managed.
-        process: None for a node that somebody else starts.
+        process: None for a node that this supervisor does not start.
         reach: how far it has come.
         doing: what it does or waits for at this moment, for messages; empty when nothing.
         undo: what has to be undone, oldest first.
         stuck: an operation on it was given up: a polite request would wait behind it.
         connections: names of what the authority connected it to, oldest first.
-        tells: its host tells unasked when its configuration changes.
+        tells: its host reports unasked when its configuration changes.
     """
 
     def __init__(self, planned: PlannedNode, emit: Emitter) -> None:
@@ -115,7 +115,7 @@ class NodeRun:
         return _ORDER.index(self.reach) >= _ORDER.index(_CONDITIONS[condition])
 
     def advance(self, reach: Reach, standing: Standing | None = None) -> None:
-        """Note that the node came to `reach`, and tell the listeners and who waits for it."""
+        """Note that the node came to `reach`, and notify the listeners and who waits for it."""
         self.reach = reach
         if standing is not None:
             self._take(standing.state, connected=standing.connected)
@@ -123,16 +123,16 @@ class NodeRun:
         self._tell()
 
     def learn(self, configuration: NodeConfiguration | None) -> None:
-        """Take the configuration that somebody asked for; None is nothing to take.
+        """Take a configuration that was asked for; None is nothing to take.
 
-        Of a node whose host tells, every configuration has been taken in the order of its channel
-        by now (System.on_host_event): what a reply carried may be older than what was told since.
+        Of a node whose host reports, every configuration has been taken in the order of its channel
+        by now (System.on_host_event): what a reply carried may be older than what came since.
         """
         if configuration is not None and not self.tells:
             self.configuration = configuration
 
     def report(self, state: str, *, connected: bool) -> None:
-        """Note a state that the node itself told, whoever asked for it."""
+        """Note a state that the node itself reported, asked by us or by others."""
         if (state, connected) != (self.state, self.connected):
             self._take(state, connected=connected)
             self._tell()
@@ -179,7 +179,7 @@ class System:
         logs: likewise, with what could not be written there.
         machines: those whose nodes it brings up; None if that is all of them.
         remote: the plan's other nodes, which another supervisor brings up.
-        touched: set whenever a node told something of itself: time to judge again.
+        touched: set whenever a node reported something of itself: time to judge again.
         liveliness: which nodes are silent.
         present: names of the nodes that are in the graph; None before it was first looked at.
         first: the plan as the run began with it.
@@ -309,7 +309,7 @@ class System:
         )
 
     def on_host_event(self, event: HostEvent) -> None:
-        """Take a host's word on one of its nodes, in the order in which it comes.
+        """Take a host's event about one of its nodes, in the order in which it comes.
 
         Of a reply this is the configuration; the rest is for who asked.
         """
@@ -346,7 +346,7 @@ class System:
         return tuple(node for key, node in self.remote.items() if key in keys)
 
     def dependents(self, key: str) -> tuple[NodeRun, ...]:
-        """Return the nodes that stand on `key`: those that are taken down before it."""
+        """Return the nodes that depend on `key`: those that are taken down before it."""
         return tuple(
             node
             for node in self.nodes.values()
@@ -354,9 +354,9 @@ class System:
         )
 
     async def refresh(self, observer: GraphObserver) -> None:
-        """Read the configuration of every reachable node and hand it to the observer.
+        """Read the configuration of every reachable node and give it to the observer.
 
-        One whose host tells of every change by itself is not asked. A node that does not answer
+        One whose host reports every change by itself is not asked. A node that does not answer
         keeps its last one: that it is gone is for the graph and its process to say.
         """
         nodes = [

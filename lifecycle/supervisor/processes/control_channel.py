@@ -25,7 +25,7 @@ _CLOSE_S = 0.5
 """For a host to read what it was sent before."""
 
 _UNASKED = frozenset({"state", "configuration"})
-"""Events by which a host tells of a node without having been asked."""
+"""Events by which a host reports on a node without having been asked."""
 
 
 class ChannelClosedError(BringUpError):
@@ -49,7 +49,8 @@ class ControlChannel:
 
     Args:
         spec: what it hosts.
-        on_state: told what it says of its nodes unasked, and of each reply with a configuration.
+        on_state: called with what it says of its nodes unasked, and with each reply that has a
+            configuration.
         on_hang: called with why its executor is busy for too long, with None when it came back.
 
     Attributes:

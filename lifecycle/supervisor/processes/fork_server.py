@@ -147,7 +147,7 @@ class ForkServerChild:
         self.note_stops()
 
     def note_stops(self) -> None:
-        """Tell that it was stopped or continues, where we are its parent."""
+        """Report that it was stopped or continues, where we are its parent."""
         if not self._is_ours:
             return
         with contextlib.suppress(ChildProcessError):
@@ -181,7 +181,7 @@ class ForkServer:
 
     Args:
         process: the first one.
-        emit: is told if one dies.
+        emit: where it is reported if one dies.
     """
 
     def __init__(self, process: ForkServerProcess, emit: Emitter | None = None) -> None:

@@ -1,4 +1,4 @@
-"""What a supervisor and its fork server say to each other.
+"""Messages between a supervisor and its fork server.
 
 Owns: the messages, each one datagram of JSON on an AF_UNIX SOCK_SEQPACKET pair, with descriptors
 beside it (SCM_RIGHTS, unix(7)). Imports nothing of this room: the fork server must start fast.

@@ -1,4 +1,4 @@
-"""What the processes of a system print: split into lines, kept, written to files.
+"""Logs of a system's processes: output split into lines, kept, written to rotated files.
 
 Owns: `LineReader` (pipe → lines), `ProcessLog` (last lines of one process and its file, which is
 rotated), `LogDirectory` (what of a run's logs is missing) and where files go (`log_directory`, the

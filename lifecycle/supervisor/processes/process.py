@@ -60,12 +60,13 @@ class ManagedProcess:
 
     Attributes:
         planned: what the plan says of it.
-        state: see states.py.
+        state: see spawn.py.
         channel: to our host; None for a foreign command.
         child: None before it was spawned.
         ended: resolves with how it ended.
         asked_to_end: `end` was called while it lived.
-        on_stop: told True when a signal stopped it, False when it continues; set before `spawn`.
+        on_stop: called with True when a signal stopped it, False when it continues; set before
+            `spawn`.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""What starting one operating system process means: the request, the child, the Protocols.
+"""Interface for starting operating system processes: the request, the child, the Protocols.
 
 Owns: `SpawnRequest`, `Child`, `Spawner`. The real ones live in fork_server.py; tests bring their
 own. Must not import rclpy.
@@ -96,7 +96,7 @@ class SpawnRequest:
         stdout: descriptor; the spawner does not close it.
         stderr: descriptor.
         control: descriptor of the host's end of the control channel; None for a foreign command.
-        on_stop: told True when a signal stopped the process (signal(7), Stop), False when it
+        on_stop: called with True when a signal stopped the process (signal(7), Stop), False when it
             continues.
     """
 

@@ -1,4 +1,4 @@
-"""Judging a system that runs already, started by us or by anyone.
+"""Verifies a system that runs already, started by us or by others.
 
 Owns: `judge_running`: looks from outside, as one more participant, until the verdict is ok or the
 time is up. Must not import rclpy.
@@ -79,7 +79,7 @@ def judge_running(plan: Plan, *, timeout_s: float, strict: bool) -> Seen:
 
 
 async def following(plan: Plan, on_look: Callable[[Seen], None]) -> None:
-    """Look at every change and hand over what was seen and its verdict, until cancelled.
+    """Look at every change and give what was seen and its verdict, until cancelled.
 
     What may pass by itself is given a moment to do so, see grace_period.py.
     """

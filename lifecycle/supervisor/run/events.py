@@ -1,6 +1,6 @@
-"""What a supervisor tells its listeners, as typed events.
+"""Typed events of a run, which listeners get from its supervisor.
 
-Owns: the event types, their JSON names, and `Emitter`, which hands each event to every listener in
+Owns: the event types, their JSON names, and `Emitter`, which gives each event to every listener in
 order. Presentation lives in cli/. Must not import rclpy.
 """
 
@@ -176,11 +176,11 @@ class NodeLeft:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class MachineConnection:
-    """The supervisor of another machine is heard, or not heard any more.
+    """The supervisor of another machine is connected, or not any more.
 
     Attributes:
         machine: its name in the manifest.
-        established: it is heard.
+        established: it is connected.
         lost_s: for how long it was not; 0 the first time.
         left: its supervisor was shut down and said so; else the connection was lost.
     """
@@ -314,7 +314,7 @@ Listener = Callable[[Event], None]
 
 
 class Emitter:
-    """Hands every event to every listener, in the order of their registration.
+    """Gives every event to every listener, in the order of their registration.
 
     Args:
         clock: seconds, on any clock that only goes forward.
@@ -335,7 +335,7 @@ class Emitter:
         self._listeners.append(listener)
 
     def __call__(self, event: Event) -> None:
-        """Hand `event` to every listener."""
+        """Give `event` to every listener."""
         for listener in tuple(self._listeners):
             listener(event)
 

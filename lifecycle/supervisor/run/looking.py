@@ -83,7 +83,7 @@ def attached_picture(plan: Plan, *, timeout_s: float) -> Picture:
 
 
 def attached_pictures(plan: Plan, on_picture: Callable[[Picture], None]) -> None:
-    """Look from outside and hand over each picture that differs from the last, for ever."""
+    """Look from outside and give each picture that differs from the last, for ever."""
     last: Picture | None = None
 
     def take(seen: Seen) -> None:

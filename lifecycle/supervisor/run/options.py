@@ -1,4 +1,4 @@
-"""What a person may ask of `up`, and what came of it.
+"""Options of `lifecycle up`, and the result of a run.
 
 Owns: `Until`, `UpOptions`, `UpResult`, and which processes belong to this machine. Must not import
 rclpy.
@@ -42,7 +42,7 @@ class UpOptions:
     """How to bring a system up.
 
     Attributes:
-        stop_after_s: hold it so long, ≥ 0; None holds an active system until it is told to end,
+        stop_after_s: hold it so long, ≥ 0; None holds an active system until it is asked to end,
             and does not hold one that is only connected or verified.
         timeout_s: for everything from the first start to the system being active, > 0.
         strict: what cannot be verified keeps the gate closed.
@@ -119,7 +119,7 @@ def local_processes(plan: Plan, machine: str) -> tuple[PlannedProcess, ...]:
 
 
 def observer_connections(plan: Plan, machine: str = "") -> ParticipantConnections:
-    """Return how the participant of a supervisor, or of whoever looks on, is connected here.
+    """Return how the participant of a supervisor, or of an onlooker, is connected here.
 
     Fast DDS discovers nobody by shared memory once a participant has another transport too
     (NetworkFactory::getDefaultMetatrafficMulticastLocators). Where nodes have nothing else, neither
@@ -144,7 +144,7 @@ def _connected_to(url: str) -> ParticipantConnections:
 def onlooker_connections(
     plan: Plan, heard: Iterable[NodeConfiguration] = ()
 ) -> ParticipantConnections:
-    """Return how whoever looks on beside the supervisor of this host is connected.
+    """Return how an onlooker beside the supervisor of this host is connected.
 
     As that one is, but on ports that are free: whom it asks answers to wherever it asks from. By
     TCP nodes dial the supervisor, and nobody dials an onlooker: it dials everybody who listens.

@@ -287,7 +287,7 @@ class Session:
         return result
 
     async def leave(self) -> None:
-        """Be heard no more, after `run`; Fast DDS can hang in it."""
+        """Leave the exchange with other supervisors, after `run`; Fast DDS can hang in it."""
         self._observer_participant.prepare_to_leave()
         self._agreement.close()
         await self._peer_supervisors.close()

@@ -3,7 +3,7 @@
 Owns: `Ending`, which no SIGINT, SIGTERM or SIGHUP escapes. By default SIGTERM would kill a
 supervisor whose participant already has files in /dev/shm, and a KeyboardInterrupt that is raised
 in a destructor or while a module is imported is printed and forgotten. Imports next to nothing:
-it stands before the imports of everything else.
+it comes before the imports of everything else.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SIGTERM or SIGHUP: see session.py."""
 
 
 class Ended(KeyboardInterrupt):
-    """Somebody asked the run to end before it had a session; raised where it then was.
+    """A signal asked the run to end before it had a session; raised where it then was.
 
     Attributes:
         number: the signal.

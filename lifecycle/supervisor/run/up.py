@@ -108,10 +108,10 @@ def up(
     Args:
         plan: what to bring up.
         options: how.
-        listeners: told every event, in this thread. One that raises is told nothing more; the run
+        listeners: get every event, in this thread. One that raises gets nothing more; the run
             goes on to its end, and then what it raised is raised.
         forerunner: used and ended.
-        ending: has been told of signals since before this call; entered by the caller.
+        ending: has noted signals since before this call; entered by the caller.
         on_start: given the way to ask for the status, once there is a system.
         conclude: given how the run ended, once nothing of the system runs any more; returns the
             exit code. What it does not write may be lost: leaving the graph comes after it, and

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from lifecycle.codec import from_json, to_json
-from lifecycle.manifest.model import RunKind
+from lifecycle.manifest.model import Condition, RunKind
 from lifecycle.node.host.control import Operation
 from lifecycle.plan.model import Plan, PlannedNode
 from lifecycle.run_directory import RunDirectory, short_path
@@ -49,6 +49,7 @@ from lifecycle.supervisor.run.session import Session
 from lifecycle.supervisor.run.signals import Ending
 from lifecycle.verify.observation import NodeConfiguration, Observation, ObservedNode
 from lifecycle.verify.verdict import Verdict
+from tests.builders import plan_of, planned_node
 from tests.unit.supervisor.fakes import FakeSpawner, interface_of
 
 T = TypeVar("T")
@@ -531,3 +532,52 @@ class SessionWorld:
             elif rest == Operation.ACTIVATE.value and not kind.startswith("["):
                 assert kind in opened, f"{kind} was activated while its gate was closed"
                 assert verdict in ("ok", "unverifiable"), f"{kind} was activated on {verdict}"
+
+
+CHAIN = plan_of(planned_node("camera"), planned_node("viewer", after={"camera": Condition.ACTIVE}))
+
+CONNECTED = [
+    "camera start",
+    "viewer start",
+    "/camera configure",
+    "/viewer configure",
+    "/camera connect",
+    "/viewer connect",
+    "[system] connected at 0.0 s",
+]
+VERIFIED = ["[verdict] connected ok", "[system] verified at 0.0 s", "networks programmed (ok)"]
+OPENED = "[gate] ok: /camera, /viewer"
+ACTIVATED = [OPENED, "/camera activate", "/viewer activate", "[system] active at 0.0 s"]
+
+CAMERA_DOWN = ["/camera disconnect", "/camera cleanup", "/camera shutdown"]
+VIEWER_DOWN = ["/viewer disconnect", "/viewer cleanup", "/viewer shutdown"]
+DOWN = ["/viewer deactivate", *VIEWER_DOWN, "/camera deactivate", *CAMERA_DOWN]
+"""In reverse order of what was done, and of who waited for whom."""
+
+KILLED = ["camera SIGTERM", "[notice] process 'camera' had to be ended with SIGTERM"]
+"""It is in the middle of a step, and not asked for anything more."""
+
+BACK = [*VIEWER_DOWN, *CAMERA_DOWN]
+"""Of a system that was connected and not activated."""
+
+ATTACHED = plan_of(
+    planned_node("camera"),
+    planned_node("base", kind=RunKind.ATTACH, after={"camera": Condition.ACTIVE}),
+)
+"""Another program runs `base`; the supervisor configures and activates it."""
+
+CHANGED = "the system changed before every node was activated"
+
+REFUSED = """cannot activate: the verdict is violated
+  graph.undeclared-node: cannot allow node /intruder: the manifest does not declare it"""
+
+REFUSED_AGAIN = """cannot activate: the system changed before every node was activated, and its \
+verdict now is violated
+  graph.undeclared-node: cannot allow node /intruder: the manifest does not declare it"""
+
+INTRUDED = "graph.undeclared-node /intruder"
+
+
+def over(exit_code: int) -> list[str]:
+    """The end of every outline."""
+    return ["networks restored", f"[stopped] {exit_code}"]
