@@ -4,6 +4,9 @@ Owns: when nodes are wired and how often again. What each node must have comes f
 (the plan, or a negotiation); what is missing from desired_state.py; how a node is told from
 driver.py. Everything is level-triggered: each look compares what must be with what is, so that a
 lost connection, a new endpoint and the first wiring are one case. Must not import rclpy.
+
+Which nodes are configured before any node is connected. Owns: that question, which a
+negotiation asks before it waits: what it waits for must not in turn wait for a connection.
 """
 
 from __future__ import annotations

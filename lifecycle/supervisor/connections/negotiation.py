@@ -2,6 +2,15 @@
 
 Owns: `NegotiatedSource`: which nodes take part, on which host each is, and how the outcome reaches
 nodes and the verifier. The rules of negotiation are lifecycle.plan's. Pure.
+
+What must be of a system whose connections are negotiated, for an observer that decides nothing.
+Owns:
+`Expectation`. What the authority of such a system decided is in no manifest, but negotiation is
+a pure function: whoever knows the same node configurations comes to the same data layer graph,
+but for ports and groups that were given out earlier, and those are in the nodes' reports.
+
+Node configurations as parties of a negotiation. Owns: `party_of`: what a node says of itself,
+under what its manifest says of it.
 """
 
 from __future__ import annotations

@@ -2,6 +2,11 @@
 
 Owns: `Order`, which orders fit which phase, and the mailbox that gives them to the session one by
 one. How they are carried out is sequence.py's. Must not import rclpy.
+
+Whether a manifest is still the one that runs, and whether a running system can take a new one.
+Owns: `Revisions`: an order that comes with a plan is refused where that plan is not the one
+that runs, unless it says to reload it; and what cannot be reloaded while the supervisor runs,
+with the reason. What differs is `plan.comparison`'s to say. Must not import rclpy.
 """
 
 from __future__ import annotations

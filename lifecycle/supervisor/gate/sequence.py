@@ -3,6 +3,16 @@
 Owns: the one way from a connected to an active system: judge, permit, networks, activate, judge
 again; and the steps of each order. What is active stays so only as long as the gate that let it
 through; nothing is activated again before a new verdict opens it again. Must not import rclpy.
+
+Who was not discovered over TCP although it is there, and is to be started again on a fresh
+port. Owns: `undiscovered`, which reads that from a verdict. Starting again is sequence.py's.
+
+Fast DDS 2.14 sometimes never uses a connection that it has dialled: if the answer to what it
+said first comes before the port inside the connection was noted, which happens when the thread
+that dials loses its processor in between, the answer is passed over (BIND_CONNECTION_RESPONSE
+in RTCPMessageManager::processRTCPMessage). Then nothing is sent that way for as long as the two
+live, and who was dialled takes no other connection from the same port. A participant on another
+port meets everybody anew.
 """
 
 from __future__ import annotations

@@ -3,6 +3,10 @@
 Owns: when `verify` is called again and how long a verdict that closes the gate is waited out.
 Nothing is polled: the graph, or a node over its control channel, says when to look again. Must not
 import rclpy.
+
+What is wrong for a passing moment only, because the facts of one change arrive one by one.
+Owns: `GracePeriod`: which findings may pass by themselves while a system is watched, and for
+how long a verdict that is worse by these alone is kept back. The gate knows no such patience.
 """
 
 from __future__ import annotations

@@ -2,6 +2,9 @@
 
 Owns: `StaleNodes`: which participants were a process's, and when everybody is made to forget them.
 How is lifecycle.middleware.discovery.dead_peers'. Must not import rclpy.
+
+Waiting until discovery shows a node, or no longer does. Owns: `Sightings`. Looked at again
+whenever anything changes, and never otherwise.
 """
 
 from __future__ import annotations

@@ -2,6 +2,9 @@
 
 Owns: `SpawnRequest`, `Child`, `Spawner`. The real ones live in fork_server.py; tests bring their
 own. Must not import rclpy.
+
+Process states and their legal changes. Owns: `ProcessState`, `ProcessExit` and the table of
+changes. The words are not node states: only nodes are "active".
 """
 
 from __future__ import annotations

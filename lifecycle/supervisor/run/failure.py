@@ -2,6 +2,10 @@
 
 Owns: `StepFailedError`, the ids of the `run.*` rules and how failures join a verdict, so that
 every run ends in one verdict that names each cause once. Pure.
+
+Running things side by side so that the first failure ends them all. Owns: `together`, what
+asyncio.TaskGroup does, which Python 3.10 does not have, `ended`, and `Worker`, a thread for
+what blocks.
 """
 
 from __future__ import annotations

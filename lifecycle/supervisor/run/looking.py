@@ -2,6 +2,10 @@
 
 Owns: where the observation of a picture comes from and when the next picture is due. What is drawn
 is export's. Must not import rclpy.
+
+Looking at a running system of anybody's nodes until nothing new turns up. Owns:
+`capture_running`: when discovery has settled, and what each node is asked. Must not import
+rclpy at module level.
 """
 
 from __future__ import annotations
