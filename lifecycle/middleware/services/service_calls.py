@@ -18,6 +18,7 @@ from typing import Any
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.client import Client
 from rclpy.executors import ExternalShutdownException, ShutdownException, SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.task import Future
 
@@ -25,6 +26,7 @@ from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.rcl.graph import GraphObserver
 
 _logger = logging.getLogger(__name__)
+InvalidHandle = rclpy_implementation.InvalidHandle
 
 _FIRST_ATTEMPT_S = 0.1
 """So long a server of rmw_fastrtps waits for the client's reader before it drops its reply."""
@@ -94,8 +96,26 @@ class ServiceCalls:
             before: awaited when the first request is about to leave; what it raises keeps it back.
 
         Raises:
-            ServiceUnansweredError: at the deadline.
+            ServiceUnansweredError: at the deadline, or as soon as the service is forgotten.
         """
+        try:
+            return await self._call(
+                service, type_, request, timeout_s=timeout_s, repeat=repeat, before=before
+            )
+        except InvalidHandle as error:
+            # Its node left, and its client was destroyed meanwhile.
+            raise ServiceUnansweredError(service, found=False, timeout_s=timeout_s) from error
+
+    async def _call(
+        self,
+        service: str,
+        type_: type[Any],
+        request: object,
+        *,
+        timeout_s: float,
+        repeat: bool,
+        before: Callable[[], Awaitable[None]] | None,
+    ) -> Any:
         loop = asyncio.get_running_loop()
         deadline = loop.time() + timeout_s
         client = self._client(service, type_)

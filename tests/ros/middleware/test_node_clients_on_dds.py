@@ -294,3 +294,16 @@ def test_destroying_ends_the_thread(observer: GraphObserver) -> None:
     clients.destroy()
     clients.destroy()
     assert not [each for each in threading.enumerate() if each.name == "service-calls"]
+
+
+def test_a_question_to_a_node_that_is_forgotten_meanwhile_is_unanswered(
+    clients: NodeClients,
+) -> None:
+    async def ask() -> None:
+        asking = asyncio.ensure_future(clients.get_state("/absent", timeout_s=5.0))
+        await asyncio.sleep(0)
+        clients.forget("/absent")
+        await asking
+
+    with pytest.raises(ServiceUnansweredError):
+        asyncio.run(ask())
