@@ -1,8 +1,8 @@
 """`--report FILE`: a verdict in the format that the suffix says, whatever the command's end.
 
-Owns: which suffix means which format, and `Report`: the file is emptied before anything is started,
-so that nothing old is taken for new, and written on every exit code. Imports next to nothing: it is
-opened before the rest of a command is imported.
+Owns: which suffix means which format, and `ReportFile`: the file is emptied before anything is
+started, so that nothing old is taken for new, and written on every exit code. Imports next to
+nothing: it is opened before the rest of a command is imported.
 """
 
 from __future__ import annotations
@@ -166,7 +166,7 @@ def format_verdict(
     return render_text(verdict, colour=colour)
 
 
-class Report:
+class ReportFile:
     """The report of one command; use it in a `with` around all that may fail.
 
     Whatever leaves the block, the file says how the command ended: the verdict given to `end`, or
@@ -184,7 +184,7 @@ class Report:
         self._plan: Plan | None = None
         self._ended = False
 
-    def __enter__(self) -> Report:  # noqa: PYI034 - typing.Self is not in Python 3.10
+    def __enter__(self) -> ReportFile:  # noqa: PYI034 - typing.Self is not in Python 3.10
         return self
 
     def begin(self, plan: Plan) -> None:

@@ -119,7 +119,7 @@ def give_order(  # noqa: PLR0917 - in the order of the command line
         ManifestError: the manifest cannot be loaded.
     """
     from lifecycle.supervisor.control.client import order
-    from lifecycle.supervisor.control.server import Ask, Question
+    from lifecycle.supervisor.control.server import ControlRequest, Question
 
     path, plan = target_plan(os.environ, target, assignments, machine)
     if reload and plan is None:
@@ -130,7 +130,7 @@ def give_order(  # noqa: PLR0917 - in the order of the command line
         _say_differences(path, plan)
     if reload:
         load_manifest(target, assignments, quiet=True, machine=machine)
-    question = Question(ask=Ask(verb), node=node, plan=plan, reload=reload)
+    question = Question(ask=ControlRequest(verb), node=node, plan=plan, reload=reload)
     try:
         answer = order(path, question, timeout)
     except TimeoutError:

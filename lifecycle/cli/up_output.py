@@ -56,7 +56,7 @@ from lifecycle.supervisor.run.options import UpResult
 from lifecycle.verify import Outcome, Stage, Verdict, missing, not_ok, render_text, to_json
 
 
-class Output(Protocol):
+class RunOutput(Protocol):
     """A listener that also shows how the run ended."""
 
     def __call__(self, event: Event) -> None:
@@ -80,7 +80,7 @@ class Sink(Protocol):
 
 
 @contextlib.contextmanager
-def output(format_: str) -> Iterator[Output]:
+def output(format_: str) -> Iterator[RunOutput]:
     """Give the output for `format_`, and for text what suits the terminal.
 
     A run neither waits for who reads it nor ends with him: what happens is in the control socket,

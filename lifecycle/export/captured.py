@@ -19,7 +19,6 @@ from lifecycle.manifest.names import (
 )
 from lifecycle.manifest.qos import History, QosProfile
 from lifecycle.network.nfe import InternetProtocol, UniqueRequirement
-from lifecycle.verify.noise import is_noise_endpoint, is_noise_node, known_node
 from lifecycle.verify.observation import (
     EndpointReport,
     NodeConfiguration,
@@ -27,6 +26,7 @@ from lifecycle.verify.observation import (
     ObservedEndpoint,
     ObservedNode,
 )
+from lifecycle.verify.tool_filter import is_noise_endpoint, is_noise_node, known_node
 
 _TYPE = re.compile(r"[a-zA-Z][a-zA-Z0-9_]*/(msg|srv|action)/[a-zA-Z][a-zA-Z0-9_]*")
 _NOISE_PARAMETERS = ("use_sim_time", "start_type_description_service")

@@ -20,7 +20,7 @@ from collections.abc import Iterable, Mapping
 
 from lifecycle.manifest.model import EndpointKind, RunKind
 from lifecycle.plan.model import Plan, PlannedNode, PlannedProcess
-from lifecycle.verify.noise import GRAPH_TOPIC, NODE_SERVICES, OUR_SERVICES
+from lifecycle.verify.tool_filter import GRAPH_TOPIC, NODE_SERVICES, OUR_SERVICES
 
 OVERRIDE = "ROS_SECURITY_ENCLAVE_OVERRIDE"
 """The variable by which rcl takes an enclave for every context of a process."""

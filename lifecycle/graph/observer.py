@@ -24,13 +24,6 @@ from lifecycle.graph.parameters import ParameterReadings
 from lifecycle.graph.scheduler import Remove, set_within
 from lifecycle.graph.state import Answer, GraphState, Look
 from lifecycle.plan.model import Plan
-from lifecycle.verify.noise import (
-    NO_NAMES,
-    DeclaredNames,
-    is_noise_node,
-    known_node,
-    tolerating_pattern,
-)
 from lifecycle.verify.observation import (
     EndpointReport,
     Identity,
@@ -38,6 +31,13 @@ from lifecycle.verify.observation import (
     Observation,
     ObservedEndpoint,
     ObservedNode,
+)
+from lifecycle.verify.tool_filter import (
+    NO_NAMES,
+    DeclaredNames,
+    is_noise_node,
+    known_node,
+    tolerating_pattern,
 )
 
 _logger = logging.getLogger(__name__)

@@ -354,7 +354,7 @@ def read_interface(
         The interface, with `source` set, and every finding. After an error the interface holds
         what could be read.
     """
-    reading = _Reading(search_prefixes(environment))
+    reading = _NodlReading(search_prefixes(environment))
     reading.follow(reference, Path(base), at, ())
     reading.report_collisions()
     interface = Interface(
@@ -363,7 +363,7 @@ def read_interface(
     return interface, tuple(reading.found)
 
 
-class _Reading:
+class _NodlReading:
     """One walk over a document and its includes; collects entities and findings."""
 
     def __init__(self, prefixes: tuple[Path, ...]) -> None:

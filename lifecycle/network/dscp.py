@@ -51,14 +51,14 @@ class CodePoint:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class _Table:
+class _DscpTable:
     code_points: tuple[CodePoint, ...]
 
 
 @functools.cache
 def code_points() -> tuple[CodePoint, ...]:
     """Every named code point, by rising number."""
-    return read_table("dscp", _Table).code_points
+    return read_table("dscp", _DscpTable).code_points
 
 
 @functools.cache

@@ -94,14 +94,14 @@ class Proposal:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class _Table:
+class _FiveQiTable:
     sources: dict[str, str]
     values: tuple[FiveQi, ...]
 
 
 @functools.cache
-def _table() -> _Table:
-    return read_table("five_qi", _Table)
+def _table() -> _FiveQiTable:
+    return read_table("five_qi", _FiveQiTable)
 
 
 def five_qis(*, include_flagged: bool = False) -> tuple[FiveQi, ...]:

@@ -87,14 +87,14 @@ class Feasibility:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class _Table:
+class _CapabilityTable:
     rmws: tuple[RmwCapabilities, ...]
 
 
 @functools.cache
 def rmw_table() -> tuple[RmwCapabilities, ...]:
     """Return the whole table."""
-    return read_table("rmw_capabilities", _Table).rmws
+    return read_table("rmw_capabilities", _CapabilityTable).rmws
 
 
 def capabilities(rmw: str) -> RmwCapabilities:

@@ -1,7 +1,7 @@
 """Manifest → Plan: the computational and the data layer graph of a system, ready to run. Pure."""
 
 from lifecycle.plan.build import build_plan, check_plan, effective_domain, with_files_of_now
-from lifecycle.plan.comparison import Change, changes, differences, plan_checksum
+from lifecycle.plan.comparison import PlanDifference, changes, differences, plan_checksum
 from lifecycle.plan.connections.wiring import with_graph
 from lifecycle.plan.model import (
     ParticipantConnections,
@@ -30,7 +30,6 @@ from lifecycle.plan.participants import ParticipantCost, owner_of, participants_
 from lifecycle.plan.restart import is_restarted_url, moved_observer, moving_nodes, restarted
 
 __all__ = [
-    "Change",
     "DataLayerGraph",
     "NegotiatedConnection",
     "NegotiatedFlow",
@@ -40,6 +39,7 @@ __all__ = [
     "Party",
     "PartyEndpoint",
     "Plan",
+    "PlanDifference",
     "PlanError",
     "PlannedEndpoint",
     "PlannedFile",

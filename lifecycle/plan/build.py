@@ -47,8 +47,7 @@ from lifecycle.manifest.yaml.document import error
 from lifecycle.manifest.yaml.source import read_bytes
 from lifecycle.network.ports import MAX_DOMAIN_ID, domain_of
 from lifecycle.network.rmw_capabilities import DEFAULT_RMW
-from lifecycle.plan.command import command_line
-from lifecycle.plan.connections.wiring import Wired, place_declared, variables_of, wire
+from lifecycle.plan.connections.wiring import WiredSystem, place_declared, variables_of, wire
 from lifecycle.plan.model import (
     Plan,
     PlanError,
@@ -60,7 +59,7 @@ from lifecycle.plan.model import (
     declared,
 )
 from lifecycle.plan.parameters import ParameterFiles
-from lifecycle.plan.participants import place_flows
+from lifecycle.plan.participants import command_line, place_flows
 
 
 def dependency_levels(nodes: Sequence[Node]) -> tuple[tuple[str, ...], ...]:
@@ -356,7 +355,9 @@ def check_plan(
     return ()
 
 
-def _wired(manifest: Manifest, variables: Mapping[str, str], *, domain_id: int, rmw: str) -> Wired:
+def _wired(
+    manifest: Manifest, variables: Mapping[str, str], *, domain_id: int, rmw: str
+) -> WiredSystem:
     """Plan nodes, flows and how they are connected."""
     prefixes = search_prefixes(variables)
     needs = FlowNeeds(manifest, prefixes)

@@ -52,7 +52,7 @@ _ENDPOINT_DERIVED = (
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Change:
+class PlanDifference:
     """One difference between two plans.
 
     Attributes:
@@ -70,12 +70,14 @@ class Change:
     at: Position | None = None
 
 
-def changes(old: Plan, new: Plan) -> tuple[Change, ...]:
+def changes(old: Plan, new: Plan) -> tuple[PlanDifference, ...]:
     """Return every difference between what two plans declare, the system's first, then by node."""
     before, after = _document(old), _document(new)
     places = _positions(new)
     return tuple(
-        Change(path=".".join(path), node=_node_of(path), old=was, new=now, at=_at(path, places))
+        PlanDifference(
+            path=".".join(path), node=_node_of(path), old=was, new=now, at=_at(path, places)
+        )
         for path, was, now in sorted(
             _compared((), before, after), key=lambda each: (each[0][0] == "nodes", each[0])
         )

@@ -42,7 +42,7 @@ class _Given(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class _File:
+class _GivenFile:
     shown: str
     sections: tuple[Section, ...]
     is_read: bool
@@ -57,7 +57,7 @@ class ParameterFiles:
 
     def __init__(self, manifest: str) -> None:
         self._manifest = manifest
-        self._files: dict[str, _File] = {}
+        self._files: dict[str, _GivenFile] = {}
 
     def expected(self, node: Node) -> tuple[ExpectedParameter, ...]:
         """Return what a node's parameters must be: the declared ones first, then the given ones."""
@@ -103,13 +103,13 @@ class ParameterFiles:
             found[name] = _Given(value, GIVEN, optional=False, at=at)
         return found
 
-    def _file(self, path: str) -> _File:
+    def _file(self, path: str) -> _GivenFile:
         from lifecycle.manifest.checks.parameters import read_sections, shown_path
 
         if path not in self._files:
             shown = shown_path(path, self._manifest)
             sections, flaws = read_sections(path, shown=shown)
-            self._files[path] = _File(shown=shown, sections=sections, is_read=not flaws)
+            self._files[path] = _GivenFile(shown=shown, sections=sections, is_read=not flaws)
         return self._files[path]
 
 

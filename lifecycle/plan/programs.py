@@ -19,8 +19,8 @@ from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.model import Endpoint, EndpointKind, Manifest, Node, RunKind
 from lifecycle.manifest.schema import did_you_mean
 from lifecycle.manifest.yaml.document import error, warning
-from lifecycle.plan.command import find_executable
 from lifecycle.plan.model import PlanError
+from lifecycle.plan.participants import find_executable
 from lifecycle.plan.python_source import (
     Handler,
     NodeClass,
@@ -42,7 +42,7 @@ _PYTHON = re.compile(r"python(3(\.\d+)?)?")
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Unresolved:
+class UnresolvedProgram:
     """Something of a node that could not be looked for here.
 
     Attributes:
@@ -70,7 +70,7 @@ class Resolution:
     """
 
     diagnostics: tuple[Diagnostic, ...] = ()
-    unresolved: tuple[Unresolved, ...] = ()
+    unresolved: tuple[UnresolvedProgram, ...] = ()
 
 
 def resolve_programs(
@@ -96,7 +96,7 @@ def resolve_programs(
 class _Looking:
     def __init__(self, environment: Mapping[str, str]) -> None:
         self.found: list[Diagnostic] = []
-        self.unresolved: list[Unresolved] = []
+        self.unresolved: list[UnresolvedProgram] = []
         self._environment = environment
         self._sources: dict[str, Sources] = {}
         self._classes: dict[tuple[str, str], NodeClass | NotThereError | UnknownError] = {}
@@ -117,7 +117,7 @@ class _Looking:
             self.found.append(error(RULE, at, problem.message, problem.hint))
         else:
             reason = f"it is for machine {node.machine!r}; here, {_half(problem.message)}"
-            self.unresolved.append(Unresolved(at=at, subject=subject, reason=reason))
+            self.unresolved.append(UnresolvedProgram(at=at, subject=subject, reason=reason))
 
     # Python
 
@@ -135,7 +135,7 @@ class _Looking:
             remote_nodes = not is_ours and found.message.startswith("cannot find module")
             self._missing(node, "run.python", subject, found, is_ours=not remote_nodes)
         elif isinstance(found, UnknownError):
-            self.unresolved.append(Unresolved(at=at, subject=subject, reason=found.message))
+            self.unresolved.append(UnresolvedProgram(at=at, subject=subject, reason=found.message))
         elif found.is_node is False:
             message = (
                 f"cannot use {name!r} of {module} ({found.file}) as a node: it is no node class"
@@ -167,7 +167,7 @@ class _Looking:
         if found.unknown:
             of = "handlers" if found.is_ours else "node class"
             self.unresolved.append(
-                Unresolved(at=at, subject=f"{of} of {subject}", reason=found.unknown)
+                UnresolvedProgram(at=at, subject=f"{of} of {subject}", reason=found.unknown)
             )
             # What is there is there, whatever else may be.
             problems = [each for each in problems if each.message.startswith("cannot use")]
@@ -175,7 +175,7 @@ class _Looking:
             reason = f"its code declares endpoints itself; {problems and problems[0].message}"
             reason = reason if problems else "its code declares endpoints itself"
             self.unresolved.append(
-                Unresolved(at=at, subject=f"endpoints of {subject}", reason=reason)
+                UnresolvedProgram(at=at, subject=f"endpoints of {subject}", reason=reason)
             )
             return
         self.found += problems
@@ -200,7 +200,7 @@ class _Looking:
         if not self._environment.get("AMENT_PREFIX_PATH"):
             reason = "AMENT_PREFIX_PATH is empty; source the setup file of its workspace"
             at = _at(node, "run.package")
-            self.unresolved.append(Unresolved(at=at, subject=subject, reason=reason))
+            self.unresolved.append(UnresolvedProgram(at=at, subject=subject, reason=reason))
             return
         try:
             find_executable(run, self._environment, at=node.at)

@@ -1,14 +1,6 @@
 """Plan × Observation → Verdict, and the verdict's reports. Pure: no ROS, no files, no clock."""
 
 from lifecycle.verify.judge import missing, not_ok, verify
-from lifecycle.verify.noise import (
-    action_part,
-    fold_actions,
-    is_noise_endpoint,
-    is_noise_node,
-    our_nodes,
-    without_noise,
-)
 from lifecycle.verify.observation import (
     EndpointReport,
     Identity,
@@ -19,6 +11,14 @@ from lifecycle.verify.observation import (
 )
 from lifecycle.verify.report import render_text, to_json, to_junit, to_sarif
 from lifecycle.verify.rules import RULES, Rule
+from lifecycle.verify.tool_filter import (
+    action_part,
+    fold_actions,
+    is_noise_endpoint,
+    is_noise_node,
+    our_nodes,
+    without_noise,
+)
 from lifecycle.verify.verdict import (
     NOT_JUDGED,
     Finding,

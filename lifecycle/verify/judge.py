@@ -21,10 +21,10 @@ from lifecycle.network.nfe import (
     is_ip,
 )
 from lifecycle.plan.model import Plan
-from lifecycle.verify.layout import lay_out
-from lifecycle.verify.noise import OUR_NODES
+from lifecycle.verify.matcher import lay_out
 from lifecycle.verify.observation import Observation
 from lifecycle.verify.rules import CHECKS, rule
+from lifecycle.verify.tool_filter import OUR_NODES
 from lifecycle.verify.transport import effective_transport
 from lifecycle.verify.uniqueness import Uniqueness
 from lifecycle.verify.verdict import (

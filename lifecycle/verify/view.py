@@ -21,7 +21,6 @@ from lifecycle.plan.model import (
     PlannedFlow,
     PlannedNode,
 )
-from lifecycle.verify.noise import DeclaredNames
 from lifecycle.verify.observation import (
     EndpointReport,
     Identity,
@@ -30,6 +29,7 @@ from lifecycle.verify.observation import (
     ObservedEndpoint,
     ObservedNode,
 )
+from lifecycle.verify.tool_filter import DeclaredNames
 from lifecycle.verify.verdict import Stage
 
 UNKNOWN_QOS = QosProfile(
@@ -70,7 +70,7 @@ class Actual:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Seen:
+class SeenEndpoint:
     """An endpoint of the graph, declared or not, with all that is known of it.
 
     Attributes:
@@ -177,14 +177,14 @@ class View:
     foreign: tuple[ObservedEndpoint, ...]
     tools: dict[str, str]
     of_tools: tuple[ObservedEndpoint, ...]
-    seen: tuple[Seen, ...]
+    seen: tuple[SeenEndpoint, ...]
     flows: tuple[FlowView, ...]
 
     @property
-    def seen_of_tools(self) -> tuple[Seen, ...]:
+    def seen_of_tools(self) -> tuple[SeenEndpoint, ...]:
         """Publishers and subscriptions of tools, which others may be matched with too."""
         return tuple(
-            Seen(
+            SeenEndpoint(
                 kind=each.kind,
                 node=each.node,
                 name=each.name,

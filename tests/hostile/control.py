@@ -16,7 +16,7 @@ from lifecycle.codec import to_json, to_plain
 from lifecycle.manifest import load
 from lifecycle.plan import build_plan
 from lifecycle.run_directory import connect
-from lifecycle.supervisor.control.server import Ask, Question, ask
+from lifecycle.supervisor.control.server import ControlRequest, Question, ask
 from tests.hostile.attack import (
     Attack,
     HostileClass,
@@ -50,7 +50,7 @@ class Running:
 
     def check(self) -> None:
         """Whoever asks properly is answered at once, whatever others sent before."""
-        answer = ask(self.run / "control", Question(ask=Ask.STATUS), WAIT_S)
+        answer = ask(self.run / "control", Question(ask=ControlRequest.STATUS), WAIT_S)
         if answer is None or answer.status is None:
             raise Unhandled(f"no status any more: {answer}; {self.up.events[-2:]}")
 
@@ -98,9 +98,9 @@ def _crowd(system: Running) -> None:
 
 def _followers_that_do_not_read(system: Running) -> None:
     for _ in range(20):
-        system.connect().sendall(to_json(Question(ask=Ask.FOLLOW)) + b"\n")
+        system.connect().sendall(to_json(Question(ask=ControlRequest.FOLLOW)) + b"\n")
     for _ in range(20):
-        system.connect().sendall(to_json(Question(ask=Ask.LOOK)) * 1 + b"\n")
+        system.connect().sendall(to_json(Question(ask=ControlRequest.LOOK)) * 1 + b"\n")
     system.check()
 
 
@@ -128,7 +128,7 @@ def _other_plan(change: str, verb: str, system: Running) -> None:
 
 
 def _ordered(node: str, system: Running) -> None:
-    question = Question(ask=Ask.RESTART, node=node)
+    question = Question(ask=ControlRequest.RESTART, node=node)
     answer = ask(system.run / "control", question, 10.0)
     if answer is None or answer.exit_code in {None, 0, 70} or not answer.error:
         raise Unhandled(f"restart of {node!r}: {answer}")
@@ -199,7 +199,7 @@ def attacks(rng: random.Random) -> list[Attack]:
     def add(name: str, function: Callable[..., None], *arguments: object) -> None:
         found.append(Attack(name=name, run=functools.partial(function, *arguments)))
 
-    good = to_json(Question(ask=Ask.STATUS)) + b"\n"
+    good = to_json(Question(ask=ControlRequest.STATUS)) + b"\n"
     for number in range(40):
         then = rng.choice(("hang up", "reset", "read", "stay"))
         add(f"question changed {number}, {then}", _sent, mutated(good, rng), then)

@@ -33,7 +33,7 @@ from lifecycle.programming.apply.errors import ProgrammingError
 from lifecycle.programming.apply.ledger import Ledger
 from lifecycle.programming.apply.nft import root_qdiscs
 from lifecycle.programming.apply.settings import load_settings
-from lifecycle.programming.apply.tool import HostTool, Output
+from lifecycle.programming.apply.tool import HostTool, ToolOutput
 from lifecycle.programming.rules.nftables import parse_managed_comment
 from lifecycle.run_directory import read_record
 from lifecycle.supervisor.control.server import Answer, Question
@@ -92,7 +92,7 @@ def _ledger(path: Path) -> object:
 
 
 def _qdiscs(data: bytes, _: Path) -> object:
-    return root_qdiscs(FakeTool(("tc", Output(returncode=0, stdout=_text(data), stderr=""))))
+    return root_qdiscs(FakeTool(("tc", ToolOutput(returncode=0, stdout=_text(data), stderr=""))))
 
 
 def _printed(data: bytes, folder: Path) -> object:
@@ -104,7 +104,7 @@ def _tc(data: bytes, folder: Path) -> object:
     from lifecycle.programming.apply.tc import TcTarget
     from lifecycle.programming.rules.tc import TcSettings
 
-    tool = FakeTool(("tc", Output(returncode=0, stdout=_text(data), stderr="")))
+    tool = FakeTool(("tc", ToolOutput(returncode=0, stdout=_text(data), stderr="")))
     settings = TcSettings(device="eth0", link_kbit=20_000)
     return TcTarget("robot", settings, Ledger(folder, "robot"), tool).plan([])
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import yaml
 
-from lifecycle.verify.noise import GRAPH_TOPIC
+from lifecycle.verify.tool_filter import GRAPH_TOPIC
 from tests.hostile.answers import ANSWERS, MESSAGES
 from tests.hostile.attack import (
     Attack,

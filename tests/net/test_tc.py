@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from lifecycle.programming.apply import tc
-from lifecycle.programming.apply.changes import ChangeKind, Changes
+from lifecycle.programming.apply.changes import ChangeKind, TargetChanges
 from lifecycle.programming.apply.errors import (
     MissingFeatureError,
     NotOursError,
@@ -21,7 +21,7 @@ from lifecycle.programming.apply.errors import (
 )
 from lifecycle.programming.apply.ledger import Ledger
 from lifecycle.programming.apply.tc import TcTarget, probe_features
-from lifecycle.programming.apply.tool import HostTool, Output
+from lifecycle.programming.apply.tool import HostTool, ToolOutput
 from lifecycle.programming.rules.rules import FlowRule
 from lifecycle.programming.rules.tc import TcFeatures, TcMatch, TcSettings
 from tests.net.hosts import Host, Hosts, lacking
@@ -105,7 +105,7 @@ def bench(hosts: tuple[Host, Host], tmp_path: Path) -> Iterator[Bench]:
     one.run("tc", "qdisc", "del", "dev", "e0", "root", check=False)
 
 
-def kinds(changes: Changes) -> list[str]:
+def kinds(changes: TargetChanges) -> list[str]:
     return [each.kind.value for each in changes.changes]
 
 
@@ -362,7 +362,7 @@ class StopsAt:
         self._tool = HostTool(host.command())
         self._line = line
 
-    def run(self, argv: Sequence[str], *, stdin: str = "") -> Output:
+    def run(self, argv: Sequence[str], *, stdin: str = "") -> ToolOutput:
         probing = argv[0] == "unshare"
         broken = stdin if probing else stdin.replace(self._line, f"{self._line} nonsense", 1)
         return self._tool.run(argv, stdin=broken)

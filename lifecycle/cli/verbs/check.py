@@ -29,7 +29,7 @@ from lifecycle.errors import ExitCode, LifecycleError
 from lifecycle.manifest import Diagnostic, Manifest, ManifestError, Severity, load
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.plan import check_plan, effective_domain
-from lifecycle.plan.programs import Resolution, Unresolved
+from lifecycle.plan.programs import Resolution, UnresolvedProgram
 from lifecycle.printable import json_text, lines
 
 _NOT_XML = re.compile(r"[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
@@ -62,7 +62,7 @@ class CheckReport:
     endpoints: Count
     links: Count
     diagnostics: tuple[Diagnostic, ...]
-    unresolved: tuple[Unresolved, ...] = ()
+    unresolved: tuple[UnresolvedProgram, ...] = ()
 
     def exit_code(self, *, strict: bool) -> ExitCode:
         """Return what `check` exits with."""
@@ -188,7 +188,7 @@ _UNRESOLVED = "program.unresolved"
 
 
 def _result(
-    rule: str, rules: list[str], level: str, text: str, found: Diagnostic | Unresolved
+    rule: str, rules: list[str], level: str, text: str, found: Diagnostic | UnresolvedProgram
 ) -> dict[str, object]:
     at = found.at
     return {

@@ -19,7 +19,7 @@ from lifecycle.printable import lines
 
 if TYPE_CHECKING:
     from lifecycle.plan.model import Plan
-    from lifecycle.programming.apply import Changes, Programmer, TargetOptions, Treatment
+    from lifecycle.programming.apply import Programmer, TargetChanges, TargetOptions, Treatment
     from lifecycle.verify.verdict import FlowReport, Verdict
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -382,7 +382,7 @@ def _open(
     return open_programmer(plan, options, environment=os.environ, treatment=treatment)
 
 
-def _show(changes: Iterable[Changes], *, done: bool) -> None:
+def _show(changes: Iterable[TargetChanges], *, done: bool) -> None:
     for each in changes:
         click.echo(each.render(done=done))
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lifecycle.cli.common import format_option, load_manifest, manifest_arguments, timeout_option
-from lifecycle.cli.report import Report, report_option, written_or_said
+from lifecycle.cli.report import ReportFile, report_option, written_or_said
 from lifecycle.cli.verbs.flows_program import (
     chosen,
     program_options,
@@ -19,7 +19,7 @@ from lifecycle.errors import ExitCode, UsageError
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from lifecycle.cli.up_output import Output
+    from lifecycle.cli.up_output import RunOutput
     from lifecycle.programming.apply import TargetOptions, Treatment
     from lifecycle.supervisor.run.options import UpResult
 
@@ -85,7 +85,7 @@ def command(
     from lifecycle.supervisor.run.signals import Ended, Ending
 
     try:
-        with Ending() as ending, Report(report, strict=strict) as written:
+        with Ending() as ending, ReportFile(report, strict=strict) as written:
             from lifecycle.supervisor.connections.networks import token_variables
             from lifecycle.supervisor.run.up import Forerunner
 
@@ -134,7 +134,7 @@ def command(
         return ended.exit_code
 
 
-def _finished(result: UpResult, listener: Output, written: Report) -> ExitCode:
+def _finished(result: UpResult, listener: RunOutput, written: ReportFile) -> ExitCode:
     """Write and show how a run ended; return its exit code, no success without its report."""
     unwritten = written_or_said(lambda: written.end(result.verdict, result.plan))
     listener.finish(result)

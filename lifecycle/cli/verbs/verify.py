@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from lifecycle.cli.common import format_option, load_manifest, manifest_arguments, timeout_option
-from lifecycle.cli.report import Report, format_verdict, report_option, written_or_said
+from lifecycle.cli.report import ReportFile, format_verdict, report_option, written_or_said
 from lifecycle.errors import ExitCode
 from lifecycle.printable import lines
 
@@ -35,7 +35,7 @@ def command(  # noqa: PLR0917 - click passes options by name
     from lifecycle.supervisor.run.signals import Ended, Ending
 
     try:
-        with Ending() as ending, Report(report, strict=strict) as written:
+        with Ending() as ending, ReportFile(report, strict=strict) as written:
             from lifecycle.plan import build_plan
             from lifecycle.supervisor.run.attach import judge_running
 

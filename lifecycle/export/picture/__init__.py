@@ -8,7 +8,7 @@ from lifecycle.export.picture.build import Supervised, build_picture, planned_pi
 from lifecycle.export.picture.dot import picture_to_dot
 from lifecycle.export.picture.html import picture_to_html
 from lifecycle.export.picture.mermaid import picture_to_mermaid
-from lifecycle.export.picture.model import NodeState, Picture, Presence
+from lifecycle.export.picture.model import Picture, PicturedNodeState, Presence
 from lifecycle.export.picture.svg import picture_to_svg
 from lifecycle.export.picture.text import picture_to_text
 
@@ -23,8 +23,8 @@ WRITERS: Mapping[str, Callable[[Picture], str]] = {
 
 __all__ = [
     "WRITERS",
-    "NodeState",
     "Picture",
+    "PicturedNodeState",
     "Presence",
     "Supervised",
     "build_picture",

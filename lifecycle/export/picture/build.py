@@ -12,17 +12,17 @@ from collections.abc import Iterable, Mapping
 from lifecycle.export.picture.lines import pictured_flows, pictured_lines, pictured_participants
 from lifecycle.export.picture.model import (
     Basis,
-    NodeState,
     Picture,
     PicturedFinding,
     PicturedMachine,
     PicturedNode,
+    PicturedNodeState,
     PicturedProcess,
     Presence,
 )
 from lifecycle.manifest.model import RunKind
 from lifecycle.plan.model import Plan
-from lifecycle.verify.layout import lay_out
+from lifecycle.verify.matcher import lay_out
 from lifecycle.verify.observation import Observation
 from lifecycle.verify.verdict import Stage, Verdict
 from lifecycle.verify.view import View
@@ -31,10 +31,10 @@ UNKNOWN_NODE = ""
 """Stands for the node of endpoints whose node nobody tells."""
 
 _STATES = {
-    "active": NodeState.ACTIVE,
-    "inactive": NodeState.INACTIVE,
-    "unconfigured": NodeState.UNCONFIGURED,
-    "finalized": NodeState.FINALIZED,
+    "active": PicturedNodeState.ACTIVE,
+    "inactive": PicturedNodeState.INACTIVE,
+    "unconfigured": PicturedNodeState.UNCONFIGURED,
+    "finalized": PicturedNodeState.FINALIZED,
 }
 
 
@@ -143,32 +143,36 @@ def _node(id_: str, name: str, basis: Basis, supervised: Supervised) -> Pictured
     )
 
 
-def _state(name: str, view: View, presence: Presence, supervised: Supervised) -> NodeState:
+def _state(name: str, view: View, presence: Presence, supervised: Supervised) -> PicturedNodeState:
     observed = view.observed.get(name)
     configuration = view.configurations.get(name)
     if supervised.dead:
-        return NodeState.DEAD
+        return PicturedNodeState.DEAD
     if presence is Presence.MISSING:
-        return NodeState.ABSENT
+        return PicturedNodeState.ABSENT
     if presence is Presence.PLANNED:
-        return NodeState.MANAGED if view.planned[name].managed else NodeState.PLAIN
+        return PicturedNodeState.MANAGED if view.planned[name].managed else PicturedNodeState.PLAIN
     if supervised.silent:
-        return NodeState.SILENT
+        return PicturedNodeState.SILENT
     told = (observed.state if observed else None) or (configuration.state if configuration else "")
     if told:
-        state = _STATES.get(told, NodeState.CHANGING)
+        state = _STATES.get(told, PicturedNodeState.CHANGING)
         connected = configuration is not None and configuration.connected
-        return NodeState.CONNECTED if connected and state is NodeState.INACTIVE else state
+        return (
+            PicturedNodeState.CONNECTED
+            if connected and state is PicturedNodeState.INACTIVE
+            else state
+        )
     return _untold(None if observed is None else observed.managed, presence)
 
 
-def _untold(managed: bool | None, presence: Presence) -> NodeState:
+def _untold(managed: bool | None, presence: Presence) -> PicturedNodeState:
     """The state of a node that tells none."""
     if managed is False:
-        return NodeState.PLAIN
+        return PicturedNodeState.PLAIN
     # A declared node was asked; one that nobody declared was not.
     asked = managed and presence is Presence.PRESENT
-    return NodeState.SILENT if asked else NodeState.UNKNOWN
+    return PicturedNodeState.SILENT if asked else PicturedNodeState.UNKNOWN
 
 
 def _notes(name: str, basis: Basis, supervised: Supervised) -> Iterable[str]:

@@ -32,7 +32,7 @@ from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan.model import PlannedEndpoint, PlannedNode
 from lifecycle.verify.observation import NodeConfiguration
 from lifecycle.verify.verdict import Finding, FlowReport, Outcome
-from lifecycle.verify.view import Actual, FlowView, Seen, View
+from lifecycle.verify.view import Actual, FlowView, SeenEndpoint, View
 
 _KINDS = (
     (LineKind.TOPIC, EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION),
@@ -42,7 +42,7 @@ _KINDS = (
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class _End:
+class _LineEnd:
     kind: EndpointKind
     name: str
     node: str
@@ -73,7 +73,7 @@ def pictured_lines(basis: Basis, nodes: Mapping[str, PicturedNode]) -> Iterable[
             number += 1
 
 
-def _ends(basis: Basis) -> Iterable[_End]:
+def _ends(basis: Basis) -> Iterable[_LineEnd]:
     for each in basis.view.actual:
         there = each.observed is not None
         actual = each.observed.type if each.observed else each.planned.type
@@ -81,7 +81,7 @@ def _ends(basis: Basis) -> Iterable[_End]:
         error = (each.report.error,) if each.report and each.report.error else ()
         # Where somebody looked, the flow tells beside it whether that is so.
         asked = tuple(_asked(each.node, each.planned)) if basis.verdict is None else ()
-        yield _End(
+        yield _LineEnd(
             kind=each.planned.kind,
             name=each.planned.resolved,
             node=each.node.full_name,
@@ -90,7 +90,7 @@ def _ends(basis: Basis) -> Iterable[_End]:
             notes=(*differs, *error, *asked),
         )
     for other in (*basis.view.undeclared, *basis.view.foreign, *basis.view.unattributed):
-        yield _End(
+        yield _LineEnd(
             kind=other.kind,
             name=other.name,
             node=other.node,
@@ -115,14 +115,14 @@ def _asked(node: PlannedNode, endpoint: PlannedEndpoint) -> Iterable[str]:
 
 
 def _pictured(
-    basis: Basis, ends: Sequence[_End], nodes: Mapping[str, PicturedNode]
+    basis: Basis, ends: Sequence[_LineEnd], nodes: Mapping[str, PicturedNode]
 ) -> Iterable[PicturedEnd]:
     """One end per node and presence: several endpoints of a node on one name are one end."""
     for node, presence in dict.fromkeys((each.node, each.presence) for each in ends):
         same = [each for each in ends if (each.node, each.presence) == (node, presence)]
         several = (f"{len(same)} endpoints",) if len(same) > 1 else ()
 
-        def concerns(finding: Finding, node: str = node, end: _End = same[0]) -> bool:
+        def concerns(finding: Finding, node: str = node, end: _LineEnd = same[0]) -> bool:
             return (
                 finding.subject == end.name
                 and finding.node in (node, "")
@@ -140,11 +140,11 @@ def _pictured(
 def _arrows(
     basis: Basis,
     name: str,
-    sources: Sequence[_End],
-    targets: Sequence[_End],
+    sources: Sequence[_LineEnd],
+    targets: Sequence[_LineEnd],
     nodes: Mapping[str, PicturedNode],
 ) -> Iterable[PicturedArrow]:
-    pairs: dict[tuple[str, str], tuple[_End, _End]] = {}
+    pairs: dict[tuple[str, str], tuple[_LineEnd, _LineEnd]] = {}
     for source in sources:
         for target in targets:
             pairs.setdefault((source.node, target.node), (source, target))
@@ -334,7 +334,7 @@ def _undeclared(
     view: View, nodes: Mapping[str, PicturedNode], *, first: int
 ) -> Iterable[PicturedFlow]:
     """Pairs of one topic and type of which at least one end is not declared."""
-    sides: dict[tuple[str, str, EndpointKind], list[Seen]] = {}
+    sides: dict[tuple[str, str, EndpointKind], list[SeenEndpoint]] = {}
     for seen in view.seen:
         sides.setdefault((seen.name, seen.type, seen.kind), []).append(seen)
     done: dict[tuple[str, str, str], None] = {}

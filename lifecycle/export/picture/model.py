@@ -44,7 +44,7 @@ class Presence(enum.Enum):
         return self in (Presence.PRESENT, Presence.PLANNED)
 
 
-class NodeState(enum.Enum):
+class PicturedNodeState(enum.Enum):
     """What a node is doing, as far as anybody tells."""
 
     ACTIVE = "active"
@@ -95,7 +95,7 @@ class PicturedNode:
     id: str
     name: str
     presence: Presence
-    state: NodeState
+    state: PicturedNodeState
     machine: str
     process: str
     pid: int | None
@@ -261,7 +261,7 @@ class Picture:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Look:
+class Appearance:
     """How one state looks; `ink` is readable on `fill`."""
 
     symbol: str
@@ -270,18 +270,18 @@ class Look:
 
 
 STATES = {
-    NodeState.ACTIVE: Look(symbol="●", fill="#009e73", ink="#ffffff"),
-    NodeState.CONNECTED: Look(symbol="◉", fill="#0072b2", ink="#ffffff"),
-    NodeState.INACTIVE: Look(symbol="◐", fill="#56b4e9"),
-    NodeState.UNCONFIGURED: Look(symbol="○", fill="#f0e442"),
-    NodeState.FINALIZED: Look(symbol="■", fill="#8c8c8c", ink="#ffffff"),
-    NodeState.CHANGING: Look(symbol="◌", fill="#f7f3b0"),
-    NodeState.PLAIN: Look(symbol="◆", fill="#cfe8e0"),
-    NodeState.UNKNOWN: Look(symbol="?", fill="#e3e8ee"),
-    NodeState.SILENT: Look(symbol="◇", fill="#e69f00"),
-    NodeState.DEAD: Look(symbol="✖", fill="#1b2733", ink="#ffffff"),
-    NodeState.ABSENT: Look(symbol="∅", fill="#ffffff", ink="#b3261e"),
-    NodeState.MANAGED: Look(symbol="▣", fill="#dbe6f3"),
+    PicturedNodeState.ACTIVE: Appearance(symbol="●", fill="#009e73", ink="#ffffff"),
+    PicturedNodeState.CONNECTED: Appearance(symbol="◉", fill="#0072b2", ink="#ffffff"),
+    PicturedNodeState.INACTIVE: Appearance(symbol="◐", fill="#56b4e9"),
+    PicturedNodeState.UNCONFIGURED: Appearance(symbol="○", fill="#f0e442"),
+    PicturedNodeState.FINALIZED: Appearance(symbol="■", fill="#8c8c8c", ink="#ffffff"),
+    PicturedNodeState.CHANGING: Appearance(symbol="◌", fill="#f7f3b0"),
+    PicturedNodeState.PLAIN: Appearance(symbol="◆", fill="#cfe8e0"),
+    PicturedNodeState.UNKNOWN: Appearance(symbol="?", fill="#e3e8ee"),
+    PicturedNodeState.SILENT: Appearance(symbol="◇", fill="#e69f00"),
+    PicturedNodeState.DEAD: Appearance(symbol="✖", fill="#1b2733", ink="#ffffff"),
+    PicturedNodeState.ABSENT: Appearance(symbol="∅", fill="#ffffff", ink="#b3261e"),
+    PicturedNodeState.MANAGED: Appearance(symbol="▣", fill="#dbe6f3"),
 }
 
 LINES = {
@@ -308,9 +308,9 @@ PRESENCE_WORDS = {
 }
 
 OUTCOMES = {
-    Outcome.OK: Look(symbol="✓", fill="#009e73", ink="#ffffff"),
-    Outcome.VIOLATED: Look(symbol="✗", fill="#b3261e", ink="#ffffff"),
-    Outcome.UNVERIFIABLE: Look(symbol="?", fill="#e69f00"),
+    Outcome.OK: Appearance(symbol="✓", fill="#009e73", ink="#ffffff"),
+    Outcome.VIOLATED: Appearance(symbol="✗", fill="#b3261e", ink="#ffffff"),
+    Outcome.UNVERIFIABLE: Appearance(symbol="?", fill="#e69f00"),
 }
 
 

@@ -11,8 +11,8 @@ from lifecycle.export.picture.model import (
     OUTCOMES,
     PRESENCE_WORDS,
     STATES,
-    NodeState,
     Picture,
+    PicturedNodeState,
     Presence,
 )
 from lifecycle.export.picture.views import (
@@ -244,7 +244,7 @@ def _legend_entries(picture: Picture) -> Iterator[tuple[str, str]]:
     """(drawing of 24×16 pixels, words)."""
     plan = picture.verdict is None
     # What runs may change from one picture to the next, and a missing node is said as missing.
-    states = set(NodeState) - {NodeState.ABSENT, NodeState.MANAGED}
+    states = set(PicturedNodeState) - {PicturedNodeState.ABSENT, PicturedNodeState.MANAGED}
     if plan:
         states = {node.state for node in picture.nodes()}
     for state, look in STATES.items():

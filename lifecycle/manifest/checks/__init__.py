@@ -38,7 +38,7 @@ from lifecycle.manifest.checks.nodes import (
     check_processes,
 )
 from lifecycle.manifest.checks.parameters import check_parameter_files, check_parameters
-from lifecycle.manifest.checks.system import Partial, System
+from lifecycle.manifest.checks.system import DeclaredSystem, Partial
 from lifecycle.manifest.diagnostics import Diagnostic
 from lifecycle.manifest.flows import FlowNeeds
 from lifecycle.manifest.installed_types import search_prefixes
@@ -57,7 +57,7 @@ class Scope:
         environment: of the process that will run the system.
     """
 
-    system: System
+    system: DeclaredSystem
     machines: tuple[str, ...]
     environment: Mapping[str, str]
 
@@ -173,7 +173,7 @@ def check(
         Every error and warning, in the order of their places in each document.
     """
     scope = Scope(
-        system=System.of(manifest),
+        system=DeclaredSystem.of(manifest),
         machines=tuple(each.name for each in manifest.machines),
         environment=os.environ if environment is None else environment,
     )

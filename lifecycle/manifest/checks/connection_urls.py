@@ -10,7 +10,7 @@ import dataclasses
 import ipaddress
 from collections.abc import Iterator
 
-from lifecycle.manifest.checks.system import System, spell
+from lifecycle.manifest.checks.system import DeclaredSystem, spell
 from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.model import (
     ConnectionDeclaration,
@@ -45,7 +45,7 @@ class _Use:
     at: Position
 
 
-def check_urls(system: System) -> Iterator[Diagnostic]:
+def check_urls(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about the URLs of every declared connection."""
     uses: list[_Use] = []
     contacts: set[tuple[str, int]] = set()
@@ -64,7 +64,7 @@ def check_urls(system: System) -> Iterator[Diagnostic]:
 
 
 def _urls(
-    system: System,
+    system: DeclaredSystem,
 ) -> Iterator[tuple[Node, ConnectionDeclaration, ConnectionUrl, Position]]:
     for node in system.manifest.nodes:
         for connection in node.connections:
@@ -77,13 +77,13 @@ def _urls(
                 )
 
 
-def _host(system: System, node: Node) -> str:
+def _host(system: DeclaredSystem, node: Node) -> str:
     found = (each.address for each in system.manifest.machines if each.name == node.machine)
     return next(found, "")
 
 
 def _uses(
-    system: System,
+    system: DeclaredSystem,
     node: Node,
     connection: ConnectionDeclaration,
     url: ConnectionUrl,
@@ -105,7 +105,7 @@ def _uses(
         )
 
 
-def _contacts(system: System, node: Node, url: ConnectionUrl) -> set[tuple[str, int]]:
+def _contacts(system: DeclaredSystem, node: Node, url: ConnectionUrl) -> set[tuple[str, int]]:
     """Return where a connection's discovery is reached, by every address of its host."""
     tcp = url.transport is Medium.TCPV4
     port = url.port if tcp else url.metatraffic_port
@@ -126,7 +126,7 @@ def _contacts(system: System, node: Node, url: ConnectionUrl) -> set[tuple[str, 
 
 
 def _own_address(
-    system: System, node: Node, url: ConnectionUrl, at: Position
+    system: DeclaredSystem, node: Node, url: ConnectionUrl, at: Position
 ) -> Iterator[Diagnostic]:
     host = _host(system, node)
     if not host or not url.address or url.transport is Medium.UDPM:
@@ -162,7 +162,7 @@ def _collisions(uses: list[_Use]) -> Iterator[Diagnostic]:
         seen[use.host, use.tcp, use.port].append(use)
 
 
-def _well_known(system: System, uses: list[_Use]) -> Iterator[Diagnostic]:
+def _well_known(system: DeclaredSystem, uses: list[_Use]) -> Iterator[Diagnostic]:
     """Judge ports that participants of the system's own domain take by themselves."""
     discovery = system.manifest.discovery
     domain = discovery.domain_id or 0
@@ -191,7 +191,7 @@ def _well_known(system: System, uses: list[_Use]) -> Iterator[Diagnostic]:
 
 
 def _peers(
-    system: System, url: ConnectionUrl, at: Position, contacts: set[tuple[str, int]]
+    system: DeclaredSystem, url: ConnectionUrl, at: Position, contacts: set[tuple[str, int]]
 ) -> Iterator[Diagnostic]:
     """Warn of peers whom nobody of the system is."""
     discovery = system.manifest.discovery
@@ -216,7 +216,7 @@ def _peers(
 
 
 def _loopback(
-    system: System,
+    system: DeclaredSystem,
     node: Node,
     connection: ConnectionDeclaration,
     url: ConnectionUrl,
@@ -240,7 +240,9 @@ def _loopback(
             return
 
 
-def _remote_nodes(system: System, node: Node, kind: EndpointKind, name: str) -> Iterator[str]:
+def _remote_nodes(
+    system: DeclaredSystem, node: Node, kind: EndpointKind, name: str
+) -> Iterator[str]:
     """Yield nodes of other hosts that have the other end of a topic."""
     other = {
         EndpointKind.PUBLISHER: EndpointKind.SUBSCRIPTION,

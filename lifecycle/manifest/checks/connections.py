@@ -13,7 +13,13 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 
-from lifecycle.manifest.checks.system import Resolved, System, full_name, implicit_names, spell
+from lifecycle.manifest.checks.system import (
+    DeclaredSystem,
+    Resolved,
+    full_name,
+    implicit_names,
+    spell,
+)
 from lifecycle.manifest.diagnostics import Diagnostic, Position, Severity
 from lifecycle.manifest.flows import FlowNeeds, ResolvedNeed
 from lifecycle.manifest.model import (
@@ -46,7 +52,7 @@ _RULES = {
 }
 
 
-def check_counterparts(system: System) -> Iterator[Diagnostic]:
+def check_counterparts(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about endpoints that nothing in the manifest connects to."""
     implicit = implicit_names(system)
     for each in system.endpoints:
@@ -59,7 +65,7 @@ def check_counterparts(system: System) -> Iterator[Diagnostic]:
             yield _alone(system, each, other, severity)
 
 
-def _severity(system: System, kind: EndpointKind) -> Severity | None:
+def _severity(system: DeclaredSystem, kind: EndpointKind) -> Severity | None:
     policy = system.manifest.policy
     severity = policy.unheard if kind is EndpointKind.PUBLISHER else policy.unpublished
     if severity is Severity.ERROR and system.is_open:
@@ -67,7 +73,9 @@ def _severity(system: System, kind: EndpointKind) -> Severity | None:
     return severity
 
 
-def _alone(system: System, each: Resolved, other: EndpointKind, severity: Severity) -> Diagnostic:
+def _alone(
+    system: DeclaredSystem, each: Resolved, other: EndpointKind, severity: Severity
+) -> Diagnostic:
     kind, policy = each.endpoint.kind, "unpublished"
     if kind is EndpointKind.PUBLISHER:
         message = f"cannot be heard on {each.name!r}: no node of this system subscribes to it"
@@ -85,7 +93,7 @@ def _alone(system: System, each: Resolved, other: EndpointKind, severity: Severi
 _FLOW_NAME = re.compile(r"flow_[0-9]+\Z")
 
 
-def check_connections(system: System, needs: FlowNeeds) -> Iterator[Diagnostic]:
+def check_connections(system: DeclaredSystem, needs: FlowNeeds) -> Iterator[Diagnostic]:
     """Yield findings about every declared connection, but for `check_mapped_endpoints`."""
     hidden: dict[str, tuple[Node, ConnectionDeclaration]] = {}
     for node in system.manifest.nodes:
@@ -96,13 +104,13 @@ def check_connections(system: System, needs: FlowNeeds) -> Iterator[Diagnostic]:
             yield from _flows(node, each, needs)
 
 
-def check_mapped_endpoints(system: System) -> Iterator[Diagnostic]:
+def check_mapped_endpoints(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about what connections carry, whatever their URLs are."""
     for node in system.manifest.nodes:
         yield from _endpoints(node)
 
 
-def _foreign(system: System, node: Node) -> Iterator[Diagnostic]:
+def _foreign(system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
     if node.run.kind is RunKind.PYTHON:
         return
     at = node.where(f"connections.{node.connections[0].name}")
@@ -154,7 +162,7 @@ def _endpoints(node: Node) -> Iterator[Diagnostic]:
 
 
 def _name(
-    system: System,
+    system: DeclaredSystem,
     node: Node,
     connection: ConnectionDeclaration,
     hidden: dict[str, tuple[Node, ConnectionDeclaration]],

@@ -9,7 +9,7 @@ from __future__ import annotations
 import ipaddress
 from collections.abc import Iterator, Mapping
 
-from lifecycle.manifest.checks.system import System, rmw_of
+from lifecycle.manifest.checks.system import DeclaredSystem, rmw_of
 from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.model import (
     Authority,
@@ -30,7 +30,7 @@ FAST_DDS = "rmw_fastrtps"
 _FIXED = (DiscoveryMode.STATIC, DiscoveryMode.STATIC_ENDPOINTS)
 
 
-def check_discovery(system: System, environment: Mapping[str, str]) -> Iterator[Diagnostic]:
+def check_discovery(system: DeclaredSystem, environment: Mapping[str, str]) -> Iterator[Diagnostic]:
     """Yield findings about discovery and the data layer's authority."""
     discovery = system.manifest.discovery
     if discovery.at is not None:
@@ -49,7 +49,7 @@ def _mode(discovery: Discovery) -> str:
     return f"discovery mode {discovery.mode.value}"
 
 
-def _range(system: System, section: Position) -> Iterator[Diagnostic]:
+def _range(system: DeclaredSystem, section: Position) -> Iterator[Diagnostic]:
     discovery = system.manifest.discovery
     at = system.manifest.where("discovery.range", section)
     if (
@@ -63,7 +63,7 @@ def _range(system: System, section: Position) -> Iterator[Diagnostic]:
         yield error("check.discovery-range", at, message, "remove 'range'")
 
 
-def hosts(system: System) -> dict[str, list[Machine]]:
+def hosts(system: DeclaredSystem) -> dict[str, list[Machine]]:
     """Return the machines that nodes run on, by address; those without one are this host."""
     used = {node.machine for node in system.manifest.nodes}
     found: dict[str, list[Machine]] = {}
@@ -73,7 +73,7 @@ def hosts(system: System) -> dict[str, list[Machine]]:
     return found
 
 
-def _addresses(system: System, section: Position) -> Iterator[Diagnostic]:
+def _addresses(system: DeclaredSystem, section: Position) -> Iterator[Diagnostic]:
     """Judge addresses that others must know beforehand."""
     discovery, found = system.manifest.discovery, hosts(system)
     at = system.manifest.where("discovery.mode", section)
@@ -104,7 +104,7 @@ def _addresses(system: System, section: Position) -> Iterator[Diagnostic]:
         yield error("check.discovery-address", at, message, hint)
 
 
-def _transport(system: System, section: Position) -> Iterator[Diagnostic]:
+def _transport(system: DeclaredSystem, section: Position) -> Iterator[Diagnostic]:
     discovery = system.manifest.discovery
     at = system.manifest.where("discovery.transport", section)
     transport, found = discovery.transport, hosts(system)
@@ -137,7 +137,7 @@ def _transport(system: System, section: Position) -> Iterator[Diagnostic]:
             yield error(rule, machines[0].at, message, hint)
 
 
-def _server(system: System, section: Position) -> Iterator[Diagnostic]:
+def _server(system: DeclaredSystem, section: Position) -> Iterator[Diagnostic]:
     discovery = system.manifest.discovery
     name = discovery.server_machine
     at = system.manifest.where("discovery.server_machine", section)
@@ -163,7 +163,7 @@ def _server(system: System, section: Position) -> Iterator[Diagnostic]:
 
 
 def _rmws(
-    system: System, environment: Mapping[str, str], section: Position
+    system: DeclaredSystem, environment: Mapping[str, str], section: Position
 ) -> Iterator[Diagnostic]:
     """Only Fast DDS can be told all this; a server serves only its own kind."""
     discovery = system.manifest.discovery
@@ -217,7 +217,9 @@ def _foreign(discovery: Discovery, node: Node) -> Iterator[Diagnostic]:
     yield error("check.discovery-foreign", node.where("run"), message, hint)
 
 
-def _unfound(system: System, environment: Mapping[str, str], node: Node) -> Iterator[Diagnostic]:
+def _unfound(
+    system: DeclaredSystem, environment: Mapping[str, str], node: Node
+) -> Iterator[Diagnostic]:
     """Judge a command that is told to use IPv6 and to look on this host alone.
 
     rmw_fastrtps_cpp 8.4 does the latter by the peer 127.0.0.1, and no variable names another.
@@ -241,7 +243,7 @@ def _unfound(system: System, environment: Mapping[str, str], node: Node) -> Iter
     yield error("check.discovery-foreign", node.where("run"), message, hint)
 
 
-def _authority(system: System) -> Iterator[Diagnostic]:
+def _authority(system: DeclaredSystem) -> Iterator[Diagnostic]:
     layer = system.manifest.data_layer
     if layer.at is None:
         return

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 from lifecycle.manifest.checks.discovery import FAST_DDS
-from lifecycle.manifest.checks.system import System, rmw_of
+from lifecycle.manifest.checks.system import DeclaredSystem, rmw_of
 from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.flows import FlowNeeds, ResolvedNeed
 from lifecycle.manifest.model import (
@@ -38,7 +38,7 @@ from lifecycle.network.rmw_capabilities import (
 
 
 def check_middleware(
-    system: System, needs: FlowNeeds, environment: Mapping[str, str]
+    system: DeclaredSystem, needs: FlowNeeds, environment: Mapping[str, str]
 ) -> Iterator[Diagnostic]:
     """Yield findings about what the RMW of a node cannot do.
 
@@ -80,7 +80,7 @@ _RULE = "check.flow-transport"
 
 
 def check_transport(
-    system: System, needs: FlowNeeds, environment: Mapping[str, str]
+    system: DeclaredSystem, needs: FlowNeeds, environment: Mapping[str, str]
 ) -> Iterator[Diagnostic]:
     """Yield findings about transports and datagrams."""
     for node in system.manifest.nodes:
@@ -96,7 +96,7 @@ def check_transport(
 
 
 def _wish(
-    system: System, node: Node, each: ResolvedNeed, environment: Mapping[str, str]
+    system: DeclaredSystem, node: Node, each: ResolvedNeed, environment: Mapping[str, str]
 ) -> Iterator[Diagnostic]:
     need = each.need
     yield from _foreign(system, node, each)
@@ -116,7 +116,9 @@ def _wish(
         yield from _pair(system, ends, each.topic, need.transport, need.at)
 
 
-def _link(system: System, link: Link, environment: Mapping[str, str]) -> Iterator[Diagnostic]:
+def _link(
+    system: DeclaredSystem, link: Link, environment: Mapping[str, str]
+) -> Iterator[Diagnostic]:
     ends = [system.nodes.get(key) for key in (link.from_node, link.to_node)]
     if ends[0] is None or ends[1] is None:
         return  # `links` says so
@@ -126,7 +128,7 @@ def _link(system: System, link: Link, environment: Mapping[str, str]) -> Iterato
     yield from _pair(system, (ends[0], ends[1]), link.topic, link.transport, link.at)
 
 
-def _foreign(system: System, node: Node, each: ResolvedNeed) -> Iterator[Diagnostic]:
+def _foreign(system: DeclaredSystem, node: Node, each: ResolvedNeed) -> Iterator[Diagnostic]:
     """Warn where a participant is not ours: its transports can only be set from outside."""
     need = each.need
     supervised = system.manifest.data_layer.authority is Authority.SUPERVISOR and node.managed
@@ -165,7 +167,7 @@ def _rmw(
 
 
 def _pair(
-    system: System,
+    system: DeclaredSystem,
     ends: tuple[Node, Node],
     topic: str,
     transport: FlowTransport,
@@ -214,13 +216,13 @@ def _process(node: Node) -> str:
     return node.process or node.key
 
 
-def _address(system: System, node: Node) -> str:
+def _address(system: DeclaredSystem, node: Node) -> str:
     return next(
         (each.address for each in system.manifest.machines if each.name == node.machine), ""
     )
 
 
-def _fragments(system: System, node: Node, each: ResolvedNeed) -> Iterator[Diagnostic]:
+def _fragments(system: DeclaredSystem, node: Node, each: ResolvedNeed) -> Iterator[Diagnostic]:
     size = each.max_message_size
     if each.max_datagram_bytes is None or size is None:
         return
@@ -246,7 +248,7 @@ def _fragments(system: System, node: Node, each: ResolvedNeed) -> Iterator[Diagn
     yield warning("check.flow-fragments", each.need.at, message, hint)
 
 
-def _ipv6(system: System, environment: Mapping[str, str]) -> Iterator[Diagnostic]:
+def _ipv6(system: DeclaredSystem, environment: Mapping[str, str]) -> Iterator[Diagnostic]:
     """Warn of IPv6 machines under Fast DDS's default transports, which are IPv4 and shared memory.
 
     Without IPv6 in them, participants neither find nor reach each other over such addresses.

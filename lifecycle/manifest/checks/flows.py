@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from lifecycle.manifest.checks.system import Resolved, System, spell
+from lifecycle.manifest.checks.system import DeclaredSystem, Resolved, spell
 from lifecycle.manifest.diagnostics import Diagnostic
 from lifecycle.manifest.flows import OWN_FLOW, FlowNeeds, ResolvedNeed
 from lifecycle.manifest.model import (
@@ -43,14 +43,14 @@ _KEPT_BY_CLASS = ("max_delay_ms", "loss")
 """What a class promises whatever the rate; the others depend on what an operator configures."""
 
 
-def check_flow_endpoints(system: System) -> Iterator[Diagnostic]:
+def check_flow_endpoints(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about flow needs of endpoints that are not declared."""
     for node in system.manifest.nodes:
         for need in node.flows:
             yield from _endpoint(node, need)
 
 
-def check_flows(system: System, needs: FlowNeeds) -> Iterator[Diagnostic]:
+def check_flows(system: DeclaredSystem, needs: FlowNeeds) -> Iterator[Diagnostic]:
     """Yield findings about flow needs, but for `check_flow_endpoints`."""
     for node in system.manifest.nodes:
         for each in needs.of_node(node):
@@ -194,7 +194,7 @@ _ASK = "ask for 'unique: strictly_required', or give each a DSCP of its own"
 _OWN = "give it another DSCP, or none: then it gets one that nobody has"
 
 
-def check_identifiers(system: System, needs: FlowNeeds) -> Iterator[Diagnostic]:
+def check_identifiers(system: DeclaredSystem, needs: FlowNeeds) -> Iterator[Diagnostic]:
     """Yield findings about publishers that their DSCP tells apart.
 
     All nodes are counted. The article counts subscriptions too; here they are told apart by their
@@ -206,21 +206,25 @@ def check_identifiers(system: System, needs: FlowNeeds) -> Iterator[Diagnostic]:
         yield from _relied_on(system, needs)
 
 
-def _publishers(system: System, needs: FlowNeeds) -> Iterator[tuple[Resolved, ResolvedNeed]]:
+def _publishers(
+    system: DeclaredSystem, needs: FlowNeeds
+) -> Iterator[tuple[Resolved, ResolvedNeed]]:
     for each in system.endpoints:
         need = needs.of(each.node.key, each.endpoint.kind, each.endpoint.name)
         if need is not None and each.endpoint.kind is EndpointKind.PUBLISHER:
             yield each, need
 
 
-def _subscriptions(system: System, needs: FlowNeeds) -> Iterator[tuple[Resolved, ResolvedNeed]]:
+def _subscriptions(
+    system: DeclaredSystem, needs: FlowNeeds
+) -> Iterator[tuple[Resolved, ResolvedNeed]]:
     for each in system.endpoints:
         need = needs.of(each.node.key, each.endpoint.kind, each.endpoint.name)
         if need is not None and each.endpoint.kind is EndpointKind.SUBSCRIPTION:
             yield each, need
 
 
-def _repurposed(system: System, needs: FlowNeeds) -> Iterator[Diagnostic]:
+def _repurposed(system: DeclaredSystem, needs: FlowNeeds) -> Iterator[Diagnostic]:
     publishers = list(_publishers(system, needs))
     relying = {id(need) for _, need in _relying(system, needs)}
     asking = [each for each in publishers if each[1].unique or id(each[1]) in relying]
@@ -258,7 +262,7 @@ def _repurposed(system: System, needs: FlowNeeds) -> Iterator[Diagnostic]:
         yield warning("check.dscp-repurposed", at, message, hint)
 
 
-def _relied_on(system: System, needs: FlowNeeds) -> Iterator[Diagnostic]:
+def _relied_on(system: DeclaredSystem, needs: FlowNeeds) -> Iterator[Diagnostic]:
     """Judge publishers that only their DSCP tells apart although nobody said so.
 
     A link may demand a unique flow of a publisher that asks for none but is marked: then its DSCP
@@ -285,7 +289,7 @@ def _relied_on(system: System, needs: FlowNeeds) -> Iterator[Diagnostic]:
             yield error("check.dscp-not-unique", need.need.at, message, _ASK)
 
 
-def _relying(system: System, needs: FlowNeeds) -> Iterator[tuple[Resolved, ResolvedNeed]]:
+def _relying(system: DeclaredSystem, needs: FlowNeeds) -> Iterator[tuple[Resolved, ResolvedNeed]]:
     demanded = {
         (link.from_node, link.topic)
         for link in system.manifest.links
@@ -301,7 +305,7 @@ def _relying(system: System, needs: FlowNeeds) -> Iterator[tuple[Resolved, Resol
 _VERBS = {EndpointKind.PUBLISHER: "publish", EndpointKind.SUBSCRIPTION: "subscribe to"}
 
 
-def check_links(system: System) -> Iterator[Diagnostic]:
+def check_links(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about the topic and the ends of every link."""
     for link in system.manifest.links:
         if problem := full_name_problem(link.topic):
@@ -316,7 +320,7 @@ def check_links(system: System) -> Iterator[Diagnostic]:
         yield from (each for each in ends if isinstance(each, Diagnostic))
 
 
-def check_link_uniqueness(system: System, needs: FlowNeeds) -> Iterator[Diagnostic]:
+def check_link_uniqueness(system: DeclaredSystem, needs: FlowNeeds) -> Iterator[Diagnostic]:
     """Yield findings about links that demand of flows what their ends do not ask for."""
     for link in system.manifest.links:
         if full_name_problem(link.topic) or not {link.from_node, link.to_node} <= {*system.nodes}:
@@ -331,7 +335,7 @@ def check_link_uniqueness(system: System, needs: FlowNeeds) -> Iterator[Diagnost
 
 
 def _end(
-    system: System, link: Link, key: str, kind: EndpointKind
+    system: DeclaredSystem, link: Link, key: str, kind: EndpointKind
 ) -> Iterator[Resolved | Diagnostic]:
     """Yield the endpoints at one end of a link, or why there are none."""
     if not system.may_exist(key):

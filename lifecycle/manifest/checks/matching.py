@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from lifecycle.manifest.checks.system import Resolved, System
+from lifecycle.manifest.checks.system import DeclaredSystem, Resolved
 from lifecycle.manifest.diagnostics import Diagnostic
 from lifecycle.manifest.installed_types import TypeLookup, TypeStatus, look_up
 from lifecycle.manifest.model import EndpointKind, RunKind
@@ -22,7 +22,7 @@ from lifecycle.manifest.yaml.document import error, warning
 _MANUAL = "MANUAL_BY_TOPIC"
 
 
-def check_qos(system: System) -> Iterator[Diagnostic]:
+def check_qos(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about every pair of endpoints that the resolved names bring together."""
     for name in system.names(EndpointKind.SUBSCRIPTION):
         publishers = system.named(EndpointKind.PUBLISHER, name)
@@ -101,7 +101,7 @@ FAMILIES = {
 """The kinds that meet under one name; topics, services and actions do not see each other."""
 
 
-def check_types(system: System, prefixes: Sequence[Path]) -> Iterator[Diagnostic]:
+def check_types(system: DeclaredSystem, prefixes: Sequence[Path]) -> Iterator[Diagnostic]:
     """Yield findings about types."""
     yield from _missing(system, prefixes)
     for family, kinds in FAMILIES.items():
@@ -113,7 +113,7 @@ def check_types(system: System, prefixes: Sequence[Path]) -> Iterator[Diagnostic
             yield from _mismatches(family, name, ends)
 
 
-def _missing(system: System, prefixes: Sequence[Path]) -> Iterator[Diagnostic]:
+def _missing(system: DeclaredSystem, prefixes: Sequence[Path]) -> Iterator[Diagnostic]:
     answers: dict[str, TypeLookup] = {}
     absent: set[str] = set()
     for node in system.manifest.nodes:

@@ -13,8 +13,8 @@ from collections.abc import Iterator
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.checks.system import (
+    DeclaredSystem,
     Resolved,
-    System,
     full_name,
     read_rule,
     spell,
@@ -38,7 +38,7 @@ from lifecycle.manifest.yaml.document import error, warning
 _ANSWERING = (EndpointKind.SERVICE_SERVER, EndpointKind.ACTION_SERVER)
 
 
-def check_names(system: System) -> Iterator[Diagnostic]:
+def check_names(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about the names of nodes and endpoints."""
     for node in system.manifest.nodes:
         yield from _illegal_node(node)
@@ -57,7 +57,7 @@ def _illegal_node(node: Node) -> Iterator[Diagnostic]:
         yield error("check.name", node.where("namespace"), message)
 
 
-def _illegal_endpoints(system: System) -> Iterator[Diagnostic]:
+def _illegal_endpoints(system: DeclaredSystem) -> Iterator[Diagnostic]:
     for each in system.unresolved:
         node, endpoint = each.node, each.endpoint
         noun = endpoint.kind.noun
@@ -68,7 +68,7 @@ def _illegal_endpoints(system: System) -> Iterator[Diagnostic]:
             yield error("check.name", endpoint.at, each.problem.message, each.problem.hint)
 
 
-def _duplicate_nodes(system: System) -> Iterator[Diagnostic]:
+def _duplicate_nodes(system: DeclaredSystem) -> Iterator[Diagnostic]:
     first: dict[str, Node] = {}
     for node in system.manifest.nodes:
         other = first.setdefault(full_name(node), node)
@@ -112,7 +112,7 @@ def _remapped(each: Resolved) -> bool:
 _ACTIONS = (EndpointKind.ACTION_SERVER, EndpointKind.ACTION_CLIENT)
 
 
-def check_remaps(system: System) -> Iterator[Diagnostic]:
+def check_remaps(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about remap rules."""
     resolved: dict[str, list[Resolved]] = {}
     for each in system.endpoints:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Collection, Iterator, Mapping
 
-from lifecycle.manifest.checks.system import System, spell
+from lifecycle.manifest.checks.system import DeclaredSystem, spell
 from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.flows import FlowNeeds
 from lifecycle.manifest.model import After, Condition, EndpointKind, Machine, Node, RunKind
@@ -34,7 +34,7 @@ _SUPERVISOR = 1
 """The observer of the supervisor that each host has."""
 
 
-def check_machines(system: System, declared: Collection[str]) -> Iterator[Diagnostic]:
+def check_machines(system: DeclaredSystem, declared: Collection[str]) -> Iterator[Diagnostic]:
     """Yield findings about nodes on machines that are not `declared`."""
     for node in system.manifest.nodes:
         if node.machine not in declared:
@@ -45,7 +45,7 @@ def check_machines(system: System, declared: Collection[str]) -> Iterator[Diagno
             yield error("check.unknown-machine", node.where("machine"), message, hint)
 
 
-def check_processes(system: System) -> Iterator[Diagnostic]:
+def check_processes(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about processes that nodes share."""
     first: dict[str, Node] = {}
     for node in system.manifest.nodes:
@@ -90,7 +90,7 @@ def _apart(node: Node, other: Node, at: Position) -> Iterator[Diagnostic]:
 
 
 def check_ports(
-    system: System, needs: FlowNeeds, environment: Mapping[str, str]
+    system: DeclaredSystem, needs: FlowNeeds, environment: Mapping[str, str]
 ) -> Iterator[Diagnostic]:
     """Yield findings about the domain, and about room for the ports of all participants.
 
@@ -118,7 +118,7 @@ def check_ports(
         yield from _crowded(system, needs, host, domain, discovery.at or host[0].at)
 
 
-def _hosts(system: System) -> list[list[Machine]]:
+def _hosts(system: DeclaredSystem) -> list[list[Machine]]:
     """Group machines that are one host: of one address, or of none, which stands for this host."""
     hosts: dict[str, list[Machine]] = {}
     for machine in system.manifest.machines:
@@ -127,7 +127,7 @@ def _hosts(system: System) -> list[list[Machine]]:
 
 
 def _crowded(
-    system: System, needs: FlowNeeds, host: list[Machine], domain: int, at: Position
+    system: DeclaredSystem, needs: FlowNeeds, host: list[Machine], domain: int, at: Position
 ) -> Iterator[Diagnostic]:
     names = {machine.name: None for machine in host}
     nodes = [node for node in system.manifest.nodes if node.machine in names]
@@ -165,7 +165,7 @@ def _participants(nodes: list[Node], needs: FlowNeeds) -> int:
     return len(shared) + extra
 
 
-def check_order(system: System) -> Iterator[Diagnostic]:
+def check_order(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about the order in which nodes come up."""
     for node in system.manifest.nodes:
         for after in node.after:
@@ -199,7 +199,7 @@ def _unmanaged(node: Node, after: After, other: Node) -> Iterator[Diagnostic]:
         yield warning("check.after-unmanaged", after.at, message, f"write '{key}: started'")
 
 
-def cycles(system: System) -> Iterator[Diagnostic]:
+def cycles(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Report each circle once, at the edge that closes it; iterative, so depth has no limit."""
     edges = {
         key: [each for each in node.after if each.node in system.nodes and each.node != key]

@@ -25,7 +25,7 @@ import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from lifecycle.manifest.checks.system import System, full_name
+from lifecycle.manifest.checks.system import DeclaredSystem, full_name
 from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, Severity
 from lifecycle.manifest.model import Node, ParameterValue, RunKind
 from lifecycle.manifest.nodl import nearest_file
@@ -123,7 +123,7 @@ def _show(value: ParameterValue) -> str:
     return quote(value)
 
 
-def check_parameters(system: System) -> Iterator[Diagnostic]:
+def check_parameters(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about the parameters of every node."""
     for node in system.manifest.nodes:
         yield from _given(node)
@@ -304,7 +304,7 @@ class _Reading:
 
 
 @dataclasses.dataclass(slots=True, kw_only=True)
-class _File:
+class _ParameterFile:
     """A file, read once for all nodes that name it."""
 
     shown: str
@@ -313,13 +313,13 @@ class _File:
     readable: bool = True
 
 
-def check_parameter_files(system: System) -> Iterator[Diagnostic]:
+def check_parameter_files(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about every parameter file that a node names."""
-    files: dict[str, _File] = {}
+    files: dict[str, _ParameterFile] = {}
     for node in system.manifest.nodes:
         for index, path in enumerate(node.parameter_files):
             if path not in files:
-                files[path] = _File(shown=shown_path(path, system.manifest.path))
+                files[path] = _ParameterFile(shown=shown_path(path, system.manifest.path))
                 yield from _read(path, files[path], node, index)
             files[path].readers.append(node)
     for path, file in files.items():
@@ -338,7 +338,7 @@ def shown_path(path: str, manifest: str) -> str:
     return os.path.normpath(folder / os.path.relpath(path, folder))
 
 
-def _read(path: str, file: _File, node: Node, index: int) -> Iterator[Diagnostic]:
+def _read(path: str, file: _ParameterFile, node: Node, index: int) -> Iterator[Diagnostic]:
     at = node.where(f"parameter_files.{index}")
     if not os.path.lexists(path):
         message = f"cannot find the parameter file {file.shown!r}"
@@ -350,7 +350,9 @@ def _read(path: str, file: _File, node: Node, index: int) -> Iterator[Diagnostic
     yield from found
 
 
-def _unmatched_node(path: str, file: _File, node: Node, manifest: str) -> Iterator[Diagnostic]:
+def _unmatched_node(
+    path: str, file: _ParameterFile, node: Node, manifest: str
+) -> Iterator[Diagnostic]:
     name = full_name(node)
     if any(section.matches(name) for section in file.sections):
         return
@@ -364,7 +366,7 @@ def _unmatched_node(path: str, file: _File, node: Node, manifest: str) -> Iterat
     yield warning("check.parameter-file-unmatched", at, message, hint)
 
 
-def _unmatched_sections(file: _File, system: System) -> Iterator[Diagnostic]:
+def _unmatched_sections(file: _ParameterFile, system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Warn of sections for nobody in a file that is of use otherwise: most are misspelt."""
     names = [full_name(node) for node in system.manifest.nodes]
     dead = [each for each in file.sections if not any(each.matches(name) for name in names)]
@@ -376,7 +378,7 @@ def _unmatched_sections(file: _File, system: System) -> Iterator[Diagnostic]:
         yield warning("check.parameter-file-unmatched", section.at, message, hint)
 
 
-def _values(file: _File, node: Node) -> Iterator[Diagnostic]:
+def _values(file: _ParameterFile, node: Node) -> Iterator[Diagnostic]:
     declared = {each.name: each for each in node.interface.parameters}
     for section in file.sections:
         if not section.matches(full_name(node)):
@@ -397,7 +399,7 @@ def _values(file: _File, node: Node) -> Iterator[Diagnostic]:
                 yield error("check.parameter-undeclared", at, message, hint)
 
 
-def _unknown_to_all(file: _File) -> Iterator[Diagnostic]:
+def _unknown_to_all(file: _ParameterFile) -> Iterator[Diagnostic]:
     """Warn of a value for many nodes that none of them declares; some not declaring it is usual."""
     for section in file.sections:
         nodes = [node for node in file.readers if section.matches(full_name(node))]

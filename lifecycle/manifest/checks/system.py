@@ -47,7 +47,7 @@ class Resolved:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Unresolved:
+class UnresolvedEndpoint:
     """An endpoint whose name cannot be resolved, and why."""
 
     node: Node
@@ -56,7 +56,7 @@ class Unresolved:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class System:
+class DeclaredSystem:
     """A manifest and what follows from it alone.
 
     Attributes:
@@ -68,14 +68,14 @@ class System:
 
     manifest: Manifest
     endpoints: tuple[Resolved, ...]
-    unresolved: tuple[Unresolved, ...]
+    unresolved: tuple[UnresolvedEndpoint, ...]
     lost: frozenset[str] | None = frozenset()
 
     @classmethod
-    def of(cls, manifest: Manifest, *, lost: frozenset[str] | None = frozenset()) -> System:
+    def of(cls, manifest: Manifest, *, lost: frozenset[str] | None = frozenset()) -> DeclaredSystem:
         """Resolve every endpoint of a manifest; rules that rcl refuses are left out."""
         resolved: list[Resolved] = []
-        unresolved: list[Unresolved] = []
+        unresolved: list[UnresolvedEndpoint] = []
         for node in manifest.nodes:
             rules = usable_rules(node)
             for endpoint in node.interface.endpoints:
@@ -138,7 +138,7 @@ class System:
 
 def _resolve(
     node: Node, endpoint: Endpoint, rules: tuple[tuple[str, str], ...]
-) -> Resolved | Unresolved:
+) -> Resolved | UnresolvedEndpoint:
     try:
         name = resolve(
             endpoint.name,
@@ -148,7 +148,7 @@ def _resolve(
             kind=endpoint.kind,
         )
     except LifecycleError as problem:
-        return Unresolved(node=node, endpoint=endpoint, problem=problem)
+        return UnresolvedEndpoint(node=node, endpoint=endpoint, problem=problem)
     return Resolved(node=node, endpoint=endpoint, name=name)
 
 
@@ -206,7 +206,7 @@ _OF_THE_GRAPH = (
 )
 
 
-def implicit_names(system: System) -> frozenset[tuple[EndpointKind, str]]:
+def implicit_names(system: DeclaredSystem) -> frozenset[tuple[EndpointKind, str]]:
     """Return kind and fully qualified name of every endpoint that exists undeclared."""
     names = set(_OF_THE_GRAPH)
     for node in system.manifest.nodes:
@@ -248,14 +248,14 @@ class Partial:
     lost: frozenset[str] | None
     machines: frozenset[str] | None
 
-    def system(self, *needed: str) -> System:
+    def system(self, *needed: str) -> DeclaredSystem:
         """Return the nodes of which the `needed` parts are sound."""
         nodes = self.manifest.nodes
         kept = tuple(each for each in nodes if not self.flawed.get(each.key, set()) & {*needed})
         lost = self.lost
         if lost is not None:
             lost |= {each.key for each in nodes} - {each.key for each in kept}
-        return System.of(dataclasses.replace(self.manifest, nodes=kept), lost=lost)
+        return DeclaredSystem.of(dataclasses.replace(self.manifest, nodes=kept), lost=lost)
 
     def sound(self, *sections: str) -> bool:
         """Whether nothing is wrong in these sections."""

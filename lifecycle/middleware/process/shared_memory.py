@@ -51,7 +51,7 @@ _LEAST_ROOM_BYTES = 1 << 15
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class _File:
+class _SharedFile:
     path: Path
     group: str
     inode: _Inode
@@ -165,7 +165,7 @@ def leftovers(*, only: Collection[str] | None = None) -> tuple[str, ...]:
 
 
 def _unused(only: Collection[str] | None, *, remove: bool) -> tuple[str, ...]:
-    groups: dict[str, list[_File]] = {}
+    groups: dict[str, list[_SharedFile]] = {}
     for file in _files():
         groups.setdefault(file.group, []).append(file)
     wanted = groups if only is None else {_group(name) for name in only} & set(groups)
@@ -180,7 +180,7 @@ def _unused(only: Collection[str] | None, *, remove: bool) -> tuple[str, ...]:
 
 
 @contextlib.contextmanager
-def _claimed(files: Collection[_File]) -> Iterator[bool]:
+def _claimed(files: Collection[_SharedFile]) -> Iterator[bool]:
     """Hold a group against all other processes for the length of the block.
 
     Yields:
@@ -204,7 +204,7 @@ def _claimed(files: Collection[_File]) -> Iterator[bool]:
 
 
 @contextlib.contextmanager
-def _claim(file: _File) -> Iterator[None]:
+def _claim(file: _SharedFile) -> Iterator[None]:
     """Hold one file.
 
     Raises:
@@ -225,7 +225,7 @@ def _claim(file: _File) -> Iterator[None]:
         os.close(descriptor)
 
 
-def _files(group: str = "") -> list[_File]:
+def _files(group: str = "") -> list[_SharedFile]:
     """Return the files of one group, or of all."""
     found = []
     for entry in _listing(_DIRECTORY):
@@ -235,7 +235,7 @@ def _files(group: str = "") -> list[_File]:
         with contextlib.suppress(FileNotFoundError):
             status = entry.stat(follow_symlinks=False)
             found.append(
-                _File(
+                _SharedFile(
                     path=Path(entry.path),
                     group=of,
                     inode=(status.st_dev, status.st_ino),

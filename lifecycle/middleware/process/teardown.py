@@ -21,7 +21,7 @@ from lifecycle.middleware.process.control import exit_after
 _logger = logging.getLogger(__name__)
 
 
-class _Node(Protocol):
+class _LeavingNode(Protocol):
     @property
     def waitables(self) -> Iterable[object]: ...
 
@@ -41,7 +41,7 @@ class _Destroyable(Protocol):
 def leave_and_exit(
     code: int,
     *,
-    nodes: Iterable[_Node] = (),
+    nodes: Iterable[_LeavingNode] = (),
     contexts: Iterable[_Context] = (),
     participants: Iterable[_Destroyable] = (),
     deadline_s: float = 2.0,
@@ -79,7 +79,7 @@ def leave_and_exit(
         os._exit(code)
 
 
-def _release(node: _Node) -> None:
+def _release(node: _LeavingNode) -> None:
     """Destroy a node and everything hanging on it that would keep its participant alive.
 
     rclpy's destroy_node forgets action servers and clients and a managed node's state machine;

@@ -1,7 +1,7 @@
 """The ROS graph as discovery shows it, read in one go and watched without polling.
 
 Owns: the observer's participant, and the translation of graph queries into observation
-types. What tools bring along is left out by `lifecycle.verify.noise`.
+types. What tools bring along is left out by `lifecycle.verify.tool_filter`.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ from lifecycle.middleware.rcl.stale_node_filter import StaleNodeFilter
 from lifecycle.middleware.rcl.type_hash import with_service_hashes
 from lifecycle.network.medium import Medium
 from lifecycle.plan.model import ParticipantConnections
-from lifecycle.verify.noise import (
+from lifecycle.verify.observation import ObservedEndpoint, ObservedNode
+from lifecycle.verify.tool_filter import (
     NO_NAMES,
     DeclaredNames,
     fold_actions,
@@ -41,7 +42,6 @@ from lifecycle.verify.noise import (
     known_node,
     without_noise,
 )
-from lifecycle.verify.observation import ObservedEndpoint, ObservedNode
 
 ANSWER_S = 0.15
 """A participant that a probe reaches, on this host or the next one, answers within so long."""

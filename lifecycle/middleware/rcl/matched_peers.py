@@ -81,7 +81,7 @@ def matched_with(
         return library.matched(entity, candidates)
 
 
-class _Library:
+class _MatchLibrary:
     """The functions, bound; get it from `_library`."""
 
     def __init__(self) -> None:
@@ -175,11 +175,11 @@ class _Library:
 
 
 @functools.lru_cache(maxsize=1)
-def _library() -> _Library | None:
+def _library() -> _MatchLibrary | None:
     """Return the functions; None where the libraries are others."""
     abi.load()
     try:
-        return _Library()
+        return _MatchLibrary()
     except (OSError, AttributeError, ValueError):
         return None
 

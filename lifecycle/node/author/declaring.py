@@ -20,7 +20,7 @@ from lifecycle.manifest.model import EndpointKind, EndpointPolicy
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware import from_rclpy
 from lifecycle.node.author.handlers import Handlers, match, needs_handler
-from lifecycle.node.connections.data_layer import CONFIGURED, DataLayer
+from lifecycle.node.connections.data_layer import CONFIGURED, NodeDataLayer
 from lifecycle.node.endpoints.mapping import Key, find_endpoint
 from lifecycle.node.lifecycle.machine import NodeState
 from lifecycle.plan.model import PlannedEndpoint, PlannedNode
@@ -105,7 +105,7 @@ class DeclaredInCode:
     def __init__(
         self,
         spec: PlannedNode,
-        data_layer: DataLayer,
+        data_layer: NodeDataLayer,
         *,
         node: str,
         state: Callable[[], NodeState],

@@ -26,13 +26,19 @@ from lifecycle.node.author.declaring import DeclaredInCode
 from lifecycle.node.author.handlers import alternatives
 from lifecycle.node.author.spec import Mode
 from lifecycle.node.connections.connection_status import ConnectionEvent, ConnectionEvents
-from lifecycle.node.connections.data_layer import DataLayer, NodeInterface
+from lifecycle.node.connections.data_layer import NodeDataLayer, NodeInterface
 from lifecycle.node.connections.remote_interface import RemoteInterface
 from lifecycle.node.endpoints.making import wire_name
 from lifecycle.node.lifecycle.controller import Controller
 from lifecycle.node.lifecycle.execution import SUCCESS, Result
-from lifecycle.node.lifecycle.gate import Gate
-from lifecycle.node.lifecycle.machine import Change, NodeState, Outcome, RefusedError, Request
+from lifecycle.node.lifecycle.gate import NodeGate
+from lifecycle.node.lifecycle.machine import (
+    CallbackOutcome,
+    NodeState,
+    RefusedError,
+    StateChange,
+    TransitionRequest,
+)
 from lifecycle.node.lifecycle.services import LifecycleServices, Turns
 from lifecycle.node.reporting import configuration
 from lifecycle.node.reporting.configuration import ConfigurationChanges
@@ -84,7 +90,7 @@ class Undeclared:
 _WITHOUT_DATA_LAYER = (NodeState.INACTIVE_DISCONNECTED, NodeState.UNCONFIGURED, NodeState.FINALIZED)
 """A node that comes to one of these is not the one that was verified any more."""
 
-BRING_UP = (Request.CONFIGURE, Request.CONNECT, Request.ACTIVATE)
+BRING_UP = (TransitionRequest.CONFIGURE, TransitionRequest.CONNECT, TransitionRequest.ACTIVATE)
 
 
 class Managed:
@@ -104,7 +110,12 @@ class Managed:
     """
 
     def __init__(
-        self, node: LifecycleNode, spec: PlannedNode, mode: Mode, gate: Gate, supervisor: str = ""
+        self,
+        node: LifecycleNode,
+        spec: PlannedNode,
+        mode: Mode,
+        gate: NodeGate,
+        supervisor: str = "",
     ) -> None:
         self._node = node
         self._supervisor = supervisor
@@ -126,7 +137,7 @@ class Managed:
         )
         node.add_post_set_parameters_callback(lambda _: self.configuration_changes.touch())
         self.undeclared = Undeclared(self.configuration_changes.touch)
-        self.data_layer = DataLayer(
+        self.data_layer = NodeDataLayer(
             node,
             gate=gate,
             client_group=self.client_group,
@@ -174,7 +185,7 @@ class Managed:
         """Call `listener(node)` after every change of state, whoever caused it."""
         self._listeners.append(listener)
 
-    async def change(self, request: Request | str) -> Result:
+    async def change(self, request: TransitionRequest | str) -> Result:
         """Run a transition from inside the executor: `await node.lifecycle.change("connect")`.
 
         Raises:
@@ -184,7 +195,7 @@ class Managed:
         """
         return await self._change(_known(request))
 
-    async def change_for_supervisor(self, request: Request | str) -> Result:
+    async def change_for_supervisor(self, request: TransitionRequest | str) -> Result:
         """Run a transition that the supervisor asked for; its activate is the gate's permit.
 
         Whoever it lets through may be deactivated and activated again by anybody, until the
@@ -196,12 +207,12 @@ class Managed:
             LifecycleError: likewise.
         """
         known = _known(request)
-        if self._supervisor and known is Request.DEACTIVATE:
+        if self._supervisor and known is TransitionRequest.DEACTIVATE:
             self._let_through = False
             if self.state is NodeState.INACTIVE_CONNECTED:
                 return SUCCESS
         result = await self._controller.change(known)
-        if known is Request.ACTIVATE and result.outcome is Outcome.SUCCESS:
+        if known is TransitionRequest.ACTIVATE and result.outcome is CallbackOutcome.SUCCESS:
             self._let_through = True
         return result
 
@@ -210,7 +221,7 @@ class Managed:
         result = SUCCESS
         for request in BRING_UP:
             result = await self._change(request)
-            if result.outcome is not Outcome.SUCCESS:
+            if result.outcome is not CallbackOutcome.SUCCESS:
                 break
         return result
 
@@ -319,8 +330,8 @@ class Managed:
             self._member.connection_event(event)
         self.connection_events.tell(event)
 
-    async def _change(self, request: Request) -> Result:
-        if request is Request.ACTIVATE and not self._let_through:
+    async def _change(self, request: TransitionRequest) -> Result:
+        if request is TransitionRequest.ACTIVATE and not self._let_through:
             raise RefusedError(
                 f"cannot activate {self.full_name}: the gate of its supervisor is closed",
                 hint=f"it is activated once {self._supervisor!r} is verified; a paused system: "
@@ -328,15 +339,15 @@ class Managed:
             )
         return await self._controller.change(request)
 
-    async def _change_by_service(self, request: Request) -> bool:
+    async def _change_by_service(self, request: TransitionRequest) -> bool:
         try:
             result = await self._change(request)
         except RefusedError as refused:
             self._node.get_logger().warning(str(refused))
             return False
-        return result.outcome is Outcome.SUCCESS
+        return result.outcome is CallbackOutcome.SUCCESS
 
-    def _changed(self, change: Change) -> None:
+    def _changed(self, change: StateChange) -> None:
         """Follow a change of the machine: the gate first, then tell the world."""
         if change.goal is NodeState.ACTIVE:
             self.gate.open()
@@ -352,9 +363,9 @@ class Managed:
             listener(self._node)
 
 
-def _known(request: Request | str) -> Request:
+def _known(request: TransitionRequest | str) -> TransitionRequest:
     try:
-        return Request(request)
+        return TransitionRequest(request)
     except ValueError as error:
-        hint = alternatives(str(request), [each.value for each in Request])
+        hint = alternatives(str(request), [each.value for each in TransitionRequest])
         raise LifecycleError(f"cannot take transition {request!r}", hint=hint) from error

@@ -56,7 +56,7 @@ from lifecycle.node.author.spec import (
 from lifecycle.node.connections.connection_status import ConnectionEvent
 from lifecycle.node.connections.connections import Connection, connections_of
 from lifecycle.node.endpoints.publisher import DeclaredPublisher
-from lifecycle.node.lifecycle.gate import Gate, GatedPublisher, GatedTimer
+from lifecycle.node.lifecycle.gate import GatedPublisher, GatedTimer, NodeGate
 from lifecycle.node.lifecycle.machine import NodeState
 from lifecycle.node.reporting import configuration
 from lifecycle.verify.observation import ConnectionReport
@@ -116,7 +116,7 @@ class GatedFactories(Node):  # type: ignore[misc]  # rclpy is not typed
     """Makes and destroys publishers, subscriptions, timers, clients and services as rclpy does."""
 
     lifecycle: Managed
-    _gate: Gate | None = None
+    _gate: NodeGate | None = None
     """None until rclpy has made its own publishers: those are never held back."""
 
     def create_publisher(
@@ -400,7 +400,7 @@ class LifecycleNode(Declarations, LocalInterface, GatedFactories):
             options.setdefault("use_global_arguments", construction.use_global_arguments)
             mode = construction.mode or mode
         super().__init__(name, namespace=namespace, context=context, **options)
-        self._gate = Gate()
+        self._gate = NodeGate()
         spec = planned or plan_without_manifest(
             type(self), name=self.get_name(), namespace=self.get_namespace()
         )

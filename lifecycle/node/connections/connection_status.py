@@ -102,7 +102,7 @@ class ConnectionEvents:
                     listener(event)
 
 
-class Standing:
+class ConnectionStatus:
     """The standing of one node's connections and mappings.
 
     Args:

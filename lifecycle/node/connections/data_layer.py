@@ -21,7 +21,7 @@ from rclpy.task import Future
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import Authority, EndpointKind
-from lifecycle.node.connections.connection_status import ConnectionEvent, Standing
+from lifecycle.node.connections.connection_status import ConnectionEvent, ConnectionStatus
 from lifecycle.node.connections.connections import ConnectError, Connection, Connections
 from lifecycle.node.endpoints.endpoint_table import EndpointTable, PlannedPlaces
 from lifecycle.node.endpoints.making import Maker
@@ -34,7 +34,7 @@ from lifecycle.plan.model import ParticipantConnections, PlannedEndpoint, Planne
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup
 
-    from lifecycle.node.lifecycle.gate import Gate, Later
+    from lifecycle.node.lifecycle.gate import Later, NodeGate
 
 
 _ALIASED = (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION, EndpointKind.SERVICE_SERVER)
@@ -42,7 +42,7 @@ _ALIASED = (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION, EndpointKind.SERV
 HandlerOf = Callable[[PlannedEndpoint], Callable[..., Any] | None]
 
 
-class DataLayer:
+class NodeDataLayer:
     """Declared endpoints of one node and their mapping onto connections.
 
     Args:
@@ -65,7 +65,7 @@ class DataLayer:
         self,
         node: Node,
         *,
-        gate: Gate,
+        gate: NodeGate,
         client_group: CallbackGroup,
         event_group: CallbackGroup,
         later: Later,
@@ -80,7 +80,7 @@ class DataLayer:
         self.endpoints = EndpointTable(node, gate, changed)
         mappings = self.endpoints.mappings
         self.connections = Connections(node)
-        self.standing = Standing(self.connections, mappings, tell)
+        self.standing = ConnectionStatus(self.connections, mappings, tell)
         self._mapper = Mapper(
             node,
             Placer(node, self._maker, gate=gate, event_group=event_group, later=later, after=after),
@@ -325,7 +325,9 @@ class NodeInterface:
         state: of the node, now.
     """
 
-    def __init__(self, node: str, data_layer: DataLayer, state: Callable[[], NodeState]) -> None:
+    def __init__(
+        self, node: str, data_layer: NodeDataLayer, state: Callable[[], NodeState]
+    ) -> None:
         self._node = node
         self._data_layer = data_layer
         self._state = state

@@ -19,7 +19,7 @@ from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import Authority, EndpointKind
 from lifecycle.middleware import import_interface
 from lifecycle.node.author.handlers import alternatives
-from lifecycle.node.connections.connection_status import Standing
+from lifecycle.node.connections.connection_status import ConnectionStatus
 from lifecycle.node.connections.connections import ConnectError, Connection, Connections
 from lifecycle.node.endpoints.mapper import Mapper
 from lifecycle.node.endpoints.mapping import Key, Mapping, UnknownEndpointError, find_endpoint
@@ -27,7 +27,7 @@ from lifecycle.node.endpoints.publisher import DeclaredPublisher, Kept
 from lifecycle.plan.model import PlannedEndpoint, PlannedNode, PlannedParticipant
 
 if TYPE_CHECKING:
-    from lifecycle.node.lifecycle.gate import Gate
+    from lifecycle.node.lifecycle.gate import NodeGate
 
 
 class EndpointTable:
@@ -43,7 +43,7 @@ class EndpointTable:
         handles: of its publishers, by name.
     """
 
-    def __init__(self, node: Node, gate: Gate, changed: Callable[[], None]) -> None:
+    def __init__(self, node: Node, gate: NodeGate, changed: Callable[[], None]) -> None:
         self._node = node
         self._name = node.get_fully_qualified_name()
         self._gate = gate
@@ -157,7 +157,7 @@ class PlannedPlaces:
         mappings: AbstractMapping[Key, Mapping],
         connections: Connections,
         mapper: Mapper,
-        standing: Standing,
+        standing: ConnectionStatus,
     ) -> None:
         self._name = node
         self._mappings = mappings

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup
 
     from lifecycle.node.connections.connections import Connection
-    from lifecycle.node.lifecycle.gate import Gate, Later
+    from lifecycle.node.lifecycle.gate import Later, NodeGate
 
 CLIENTS = frozenset({EndpointKind.SERVICE_CLIENT, EndpointKind.ACTION_CLIENT})
 _ACTIONS = frozenset({EndpointKind.ACTION_SERVER, EndpointKind.ACTION_CLIENT})
@@ -45,7 +45,7 @@ class Maker:
         self,
         node: Node,
         *,
-        gate: Gate,
+        gate: NodeGate,
         client_group: CallbackGroup,
         later: Later,
     ) -> None:

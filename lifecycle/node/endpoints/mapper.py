@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from rclpy.task import Future
 
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.node.connections.connection_status import Standing
+from lifecycle.node.connections.connection_status import ConnectionStatus
 from lifecycle.node.connections.connections import Connection, Connections
 from lifecycle.node.endpoints.making import CLIENTS
 from lifecycle.node.endpoints.mapping import Key, Mapping, Placement
@@ -47,7 +47,7 @@ class Mapper:
         mappings: AbstractMapping[Key, Mapping],
         handles: AbstractMapping[str, DeclaredPublisher],
         connections: Connections,
-        standing: Standing,
+        standing: ConnectionStatus,
         after: After,
         changed: Callable[[], None],
     ) -> None:

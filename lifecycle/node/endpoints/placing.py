@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from rclpy.subscription import Subscription
 
     from lifecycle.node.endpoints.making import Maker
-    from lifecycle.node.lifecycle.gate import Gate, Later
+    from lifecycle.node.lifecycle.gate import Later, NodeGate
 
 
 SETTLE_S = 0.25
@@ -197,7 +197,7 @@ class Placer:
         node: Node,
         maker: Maker,
         *,
-        gate: Gate,
+        gate: NodeGate,
         event_group: CallbackGroup,
         later: Later,
         after: After,

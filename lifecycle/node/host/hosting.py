@@ -39,7 +39,7 @@ from lifecycle.node.host.control import (
     report_failure,
 )
 from lifecycle.node.host.loop import NodeLoop, Watchdog, on_signal
-from lifecycle.node.lifecycle.machine import Outcome
+from lifecycle.node.lifecycle.machine import CallbackOutcome
 from lifecycle.plan.model import PlannedNode
 from lifecycle.verify.observation import NodeConfiguration
 
@@ -89,7 +89,9 @@ class HostCommands:
             await _NODE_INTERFACE[command.operation](node.lifecycle.interface, command)
             return self._reply(command, ok=True)
         result = await node.lifecycle.change_for_supervisor(command.operation.value)
-        return self._reply(command, ok=result.outcome is Outcome.SUCCESS, error=result.error)
+        return self._reply(
+            command, ok=result.outcome is CallbackOutcome.SUCCESS, error=result.error
+        )
 
     def _reply(
         self, command: Command, *, ok: bool, error: str = "", describe: bool = True

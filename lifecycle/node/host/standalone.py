@@ -35,7 +35,7 @@ from lifecycle.middleware.process.busy_timer import BusySign, Overdue
 from lifecycle.node.author.node import LifecycleNode
 from lifecycle.node.author.spec import Construction, Mode, constructing, parse_mode
 from lifecycle.node.host.loop import NodeLoop, Watchdog, on_signal
-from lifecycle.node.lifecycle.machine import Outcome
+from lifecycle.node.lifecycle.machine import CallbackOutcome
 from lifecycle.plan.model import PlannedNode
 
 _SAID_AGAIN_S = (0.1, 0.3)
@@ -165,7 +165,7 @@ async def _bring_up(node: LifecycleNode, loop: NodeLoop, tell: Callable[[str], N
         traceback.print_exc()
         tell(f"cannot bring up {_name(node)}: {error}")
     else:
-        if result.outcome is Outcome.SUCCESS:
+        if result.outcome is CallbackOutcome.SUCCESS:
             return
         tell(f"cannot bring up {_name(node)}: {result.error}")
     loop.stop("a failed bring-up", code=ExitCode.BRING_UP_FAILED)

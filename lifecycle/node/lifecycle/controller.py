@@ -16,15 +16,15 @@ from lifecycle.manifest.model import Timeouts
 from lifecycle.node.lifecycle import execution
 from lifecycle.node.lifecycle.execution import SUCCESS, Interruptible, Result
 from lifecycle.node.lifecycle.machine import (
-    Change,
+    CallbackOutcome,
     LifecycleMachine,
     NodeState,
-    Outcome,
-    Request,
+    StateChange,
+    TransitionRequest,
 )
 
 
-class Node(Protocol):
+class ControlledNode(Protocol):
     """What the controller needs of a node; `LifecycleNode` provides it."""
 
     @property
@@ -68,7 +68,9 @@ class Controller:
         <Outcome.SUCCESS: 'transition_success'>
     """
 
-    def __init__(self, node: Node, timeouts: Timeouts, on_change: Callable[[Change], None]) -> None:
+    def __init__(
+        self, node: ControlledNode, timeouts: Timeouts, on_change: Callable[[StateChange], None]
+    ) -> None:
         self.machine = LifecycleMachine(on_change)
         self._node = node
         self._timeouts = timeouts
@@ -87,7 +89,7 @@ class Controller:
             NodeState.ERRORPROCESSING: self._process_error,
         }
 
-    async def change(self, request: Request) -> Result:
+    async def change(self, request: TransitionRequest) -> Result:
         """Run a whole transition, with everything it takes on the way.
 
         Returns:
@@ -103,7 +105,7 @@ class Controller:
         returned = SUCCESS
         while not self.machine.state.steady:
             result = await self._step(argument)
-            if result.outcome is not Outcome.SUCCESS:
+            if result.outcome is not CallbackOutcome.SUCCESS:
                 self._node.report(result)
                 returned = returned if returned.error else result
             with self._lock:
@@ -122,7 +124,7 @@ class Controller:
             await _Steady(self.machine)
         if self.machine.state is NodeState.FINALIZED:
             return SUCCESS
-        return await self.change(Request.SHUTDOWN)
+        return await self.change(TransitionRequest.SHUTDOWN)
 
     def cancel(self, reason: str) -> bool:
         """Make a running async callback fail; returns whether one was running.
@@ -141,7 +143,7 @@ class Controller:
             return await self._steps[state](argument)
         except Exception as error:  # noqa: BLE001 - reported with its traceback, then ERROR
             return Result(
-                outcome=Outcome.ERROR,
+                outcome=CallbackOutcome.ERROR,
                 error=f"cannot finish {state.value} of {self._node.full_name}: {error!r}",
                 trace=traceback.format_exc(),
             )
@@ -151,9 +153,9 @@ class Controller:
             self._node.prepare()
         except LifecycleError as error:
             self._node.unprepare()
-            return Result(outcome=Outcome.FAILURE, error=str(error))
+            return Result(outcome=CallbackOutcome.FAILURE, error=str(error))
         result = await self._user("on_configure", argument, self._timeouts.configure_s)
-        if result.outcome is Outcome.FAILURE:
+        if result.outcome is CallbackOutcome.FAILURE:
             self._node.unprepare()
         return result
 
@@ -161,9 +163,9 @@ class Controller:
         try:
             self._node.make_data_layer()
         except LifecycleError as error:
-            return Result(outcome=Outcome.FAILURE, error=str(error))
+            return Result(outcome=CallbackOutcome.FAILURE, error=str(error))
         result = await self._user("on_connect", argument, self._timeouts.connect_s)
-        if result.outcome is Outcome.FAILURE:
+        if result.outcome is CallbackOutcome.FAILURE:
             self._node.remove_data_layer()
         return result
 
@@ -175,19 +177,19 @@ class Controller:
 
     async def _disconnect(self, argument: object) -> Result:
         result = await self._user("on_disconnect", argument, self._timeouts.connect_s)
-        if result.outcome is Outcome.SUCCESS:
+        if result.outcome is CallbackOutcome.SUCCESS:
             self._node.remove_data_layer()
         return result
 
     async def _clean_up(self, argument: object) -> Result:
         result = await self._user("on_cleanup", argument, self._timeouts.cleanup_s)
-        if result.outcome is Outcome.SUCCESS:
+        if result.outcome is CallbackOutcome.SUCCESS:
             self._node.unprepare()
         return result
 
     async def _shut_down(self, argument: object) -> Result:
         result = await self._user("on_shutdown", argument, self._timeouts.shutdown_s)
-        if result.outcome is not Outcome.ERROR:
+        if result.outcome is not CallbackOutcome.ERROR:
             self._take_down()
         return result
 

@@ -17,7 +17,7 @@ from collections.abc import Callable, Coroutine, Generator
 from typing import Any
 
 from lifecycle.errors import LifecycleError
-from lifecycle.node.lifecycle.machine import Outcome
+from lifecycle.node.lifecycle.machine import CallbackOutcome
 
 
 class DeadlineError(LifecycleError):
@@ -37,14 +37,14 @@ class Result:
         trace: the exception's traceback for the log; empty where there was none.
     """
 
-    outcome: Outcome
+    outcome: CallbackOutcome
     error: str = ""
     trace: str = ""
 
 
-SUCCESS = Result(outcome=Outcome.SUCCESS)
+SUCCESS = Result(outcome=CallbackOutcome.SUCCESS)
 
-_RETURN_TYPES = frozenset({"Outcome", "TransitionCallbackReturnType"})
+_RCLPY_TYPE = "TransitionCallbackReturnType"
 
 
 class Interruptible:
@@ -120,16 +120,18 @@ async def call(
         elif time.monotonic() - began >= deadline_s:
             took_s = time.monotonic() - began
             return Result(
-                outcome=Outcome.ERROR,
+                outcome=CallbackOutcome.ERROR,
                 error=f"cannot accept {what}: it blocked for {took_s:.1f} s, its deadline is "
                 f"{deadline_s:g} s; make it `async def` so that it can be interrupted",
             )
     except LifecycleError as error:
-        return Result(outcome=Outcome.ERROR, error=str(error), trace=traceback.format_exc())
+        return Result(outcome=CallbackOutcome.ERROR, error=str(error), trace=traceback.format_exc())
     except Exception as error:  # noqa: BLE001 - the user's code: reported, then ERROR
         line = f"{type(error).__name__}: {error}" + (f"; {todo}" if (todo := hint(error)) else "")
         return Result(
-            outcome=Outcome.ERROR, error=f"{what} raised {line}", trace=traceback.format_exc()
+            outcome=CallbackOutcome.ERROR,
+            error=f"{what} raised {line}",
+            trace=traceback.format_exc(),
         )
     return judge(returned, what=what)
 
@@ -150,19 +152,23 @@ def hint(error: Exception) -> str:
 def judge(returned: object, *, what: str) -> Result:
     """Turn a callback's return value into a Result.
 
-    None means SUCCESS. rclpy's TransitionCallbackReturn and our Outcome are told by their names,
-    so that this needs no rclpy. Anything else is an ERROR, also where rclpy would break.
+    None means SUCCESS. rclpy's TransitionCallbackReturn is known by its name, so that this needs no
+    rclpy. Anything else is an ERROR, also where rclpy would break.
     """
     name = "SUCCESS" if returned is None else getattr(returned, "name", "")
-    known = returned is None or type(returned).__name__ in _RETURN_TYPES
-    if not known or name not in Outcome.__members__:
+    known = (
+        returned is None
+        or isinstance(returned, CallbackOutcome)
+        or type(returned).__name__ == _RCLPY_TYPE
+    )
+    if not known or name not in CallbackOutcome.__members__:
         return Result(
-            outcome=Outcome.ERROR,
+            outcome=CallbackOutcome.ERROR,
             error=f"cannot use {returned!r}, returned by {what}; return SUCCESS, FAILURE, ERROR, "
             "or None for SUCCESS",
         )
-    outcome = Outcome[name]
-    if outcome is Outcome.SUCCESS:
+    outcome = CallbackOutcome[name]
+    if outcome is CallbackOutcome.SUCCESS:
         return SUCCESS
     return Result(outcome=outcome, error=f"{what} returned {name}")
 

@@ -33,7 +33,7 @@ class Gated(Protocol):
         """Stop data."""
 
 
-class Gate:
+class NodeGate:
     """All gated entities of one node; closed until the node is active."""
 
     def __init__(self) -> None:

@@ -113,7 +113,7 @@ _STEADY = frozenset(
 )
 
 
-class Outcome(enum.Enum):
+class CallbackOutcome(enum.Enum):
     """What a transition callback came to; values are rcl_lifecycle's transition labels."""
 
     SUCCESS = "transition_success"
@@ -121,7 +121,7 @@ class Outcome(enum.Enum):
     ERROR = "transition_error"
 
 
-class Request(enum.Enum):
+class TransitionRequest(enum.Enum):
     """What may be asked of a node; values are the labels that other tools use."""
 
     CONFIGURE = "configure"
@@ -145,7 +145,7 @@ class Transition:
 
 def _edges() -> tuple[Transition, ...]:
     """Return rcl_lifecycle's transition map in its order, then connect and disconnect."""
-    ok, failure, error = (outcome.value for outcome in Outcome)
+    ok, failure, error = (outcome.value for outcome in CallbackOutcome)
     rows: tuple[tuple[int, str, State, State], ...] = (
         (1, "configure", UNCONFIGURED, CONFIGURING),
         (10, ok, CONFIGURING, INACTIVE),
@@ -183,19 +183,19 @@ TRANSITION_GRAPH = _edges()
 """In the order in which rcl_lifecycle answers get_transition_graph; connect and disconnect last."""
 
 _S = NodeState
-_REQUESTS: tuple[tuple[Request, NodeState, NodeState], ...] = (
-    (Request.CONFIGURE, _S.UNCONFIGURED, _S.CONFIGURING),
-    (Request.CONNECT, _S.INACTIVE_DISCONNECTED, _S.CONNECTING),
-    (Request.DISCONNECT, _S.INACTIVE_CONNECTED, _S.DISCONNECTING),
-    (Request.ACTIVATE, _S.INACTIVE_DISCONNECTED, _S.ACTIVATING_DISCONNECTED),
-    (Request.ACTIVATE, _S.INACTIVE_CONNECTED, _S.ACTIVATING_CONNECTED),
-    (Request.DEACTIVATE, _S.ACTIVE, _S.DEACTIVATING),
-    (Request.CLEANUP, _S.INACTIVE_DISCONNECTED, _S.CLEANINGUP_DISCONNECTED),
-    (Request.CLEANUP, _S.INACTIVE_CONNECTED, _S.CLEANINGUP_CONNECTED),
-    (Request.SHUTDOWN, _S.UNCONFIGURED, _S.SHUTTINGDOWN),
-    (Request.SHUTDOWN, _S.INACTIVE_DISCONNECTED, _S.SHUTTINGDOWN),
-    (Request.SHUTDOWN, _S.INACTIVE_CONNECTED, _S.SHUTTINGDOWN),
-    (Request.SHUTDOWN, _S.ACTIVE, _S.SHUTTINGDOWN),
+_REQUESTS: tuple[tuple[TransitionRequest, NodeState, NodeState], ...] = (
+    (TransitionRequest.CONFIGURE, _S.UNCONFIGURED, _S.CONFIGURING),
+    (TransitionRequest.CONNECT, _S.INACTIVE_DISCONNECTED, _S.CONNECTING),
+    (TransitionRequest.DISCONNECT, _S.INACTIVE_CONNECTED, _S.DISCONNECTING),
+    (TransitionRequest.ACTIVATE, _S.INACTIVE_DISCONNECTED, _S.ACTIVATING_DISCONNECTED),
+    (TransitionRequest.ACTIVATE, _S.INACTIVE_CONNECTED, _S.ACTIVATING_CONNECTED),
+    (TransitionRequest.DEACTIVATE, _S.ACTIVE, _S.DEACTIVATING),
+    (TransitionRequest.CLEANUP, _S.INACTIVE_DISCONNECTED, _S.CLEANINGUP_DISCONNECTED),
+    (TransitionRequest.CLEANUP, _S.INACTIVE_CONNECTED, _S.CLEANINGUP_CONNECTED),
+    (TransitionRequest.SHUTDOWN, _S.UNCONFIGURED, _S.SHUTTINGDOWN),
+    (TransitionRequest.SHUTDOWN, _S.INACTIVE_DISCONNECTED, _S.SHUTTINGDOWN),
+    (TransitionRequest.SHUTDOWN, _S.INACTIVE_CONNECTED, _S.SHUTTINGDOWN),
+    (TransitionRequest.SHUTDOWN, _S.ACTIVE, _S.SHUTTINGDOWN),
 )
 _OUTCOMES: tuple[tuple[NodeState, NodeState, NodeState, NodeState], ...] = (
     # in this state, goes on SUCCESS to, on FAILURE to, on ERROR to
@@ -230,7 +230,7 @@ _OUTCOMES: tuple[tuple[NodeState, NodeState, NodeState, NodeState], ...] = (
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Change:
+class StateChange:
     """One change of the machine.
 
     Attributes:
@@ -266,7 +266,7 @@ class LifecycleMachine:
         'inactive/disconnected'
     """
 
-    def __init__(self, on_change: Callable[[Change], None] | None = None) -> None:
+    def __init__(self, on_change: Callable[[StateChange], None] | None = None) -> None:
         self._on_change = on_change
         self._model = _Model()
         self._machine = transitions.Machine(
@@ -279,7 +279,7 @@ class LifecycleMachine:
         for request, start, goal in _REQUESTS:
             self._machine.add_transition(request.value, start, goal)
         for start, *goals in _OUTCOMES:
-            for outcome, goal in zip(Outcome, goals, strict=True):
+            for outcome, goal in zip(CallbackOutcome, goals, strict=True):
                 self._machine.add_transition(outcome.value, start, goal)
 
     @property
@@ -287,11 +287,11 @@ class LifecycleMachine:
         """The current state."""
         return self._model.state
 
-    def allowed(self) -> tuple[Request, ...]:
-        """Requests that are taken now, in the order of `Request`."""
+    def allowed(self) -> tuple[TransitionRequest, ...]:
+        """Requests that are taken now, in the order of `TransitionRequest`."""
         return tuple(
             request
-            for request in Request
+            for request in TransitionRequest
             if any(r is request and start is self.state for r, start, _ in _REQUESTS)
         )
 
@@ -307,7 +307,7 @@ class LifecycleMachine:
         seen = self.state.seen
         return tuple(t for t in TRANSITION_GRAPH if t.start == seen and t.label != hidden)
 
-    def resolve(self, transition_id: int, label: str = "") -> Request | None:
+    def resolve(self, transition_id: int, label: str = "") -> TransitionRequest | None:
         """Return what a ChangeState request means here; None if this state does not offer it.
 
         A label wins over the id, as in rcl_lifecycle.
@@ -315,10 +315,10 @@ class LifecycleMachine:
         for transition in self.available_transitions():
             if transition.label == label if label else transition.id == transition_id:
                 # Outcomes are edges too, but only the node itself may take them.
-                return next((r for r in Request if r.value == transition.label), None)
+                return next((r for r in TransitionRequest if r.value == transition.label), None)
         return None
 
-    def request(self, request: Request) -> None:
+    def request(self, request: TransitionRequest) -> None:
         """Begin a transition.
 
         Raises:
@@ -328,10 +328,10 @@ class LifecycleMachine:
             raise RefusedError(self._refusal(request))
         before = self.state
         self._trigger(request.value)
-        connecting = request in {Request.CONNECT, Request.DISCONNECT}
+        connecting = request in {TransitionRequest.CONNECT, TransitionRequest.DISCONNECT}
         self._announce(before, None if connecting else request.value)
 
-    def finish(self, outcome: Outcome) -> None:
+    def finish(self, outcome: CallbackOutcome) -> None:
         """End the running step of a transition with what its callback came to.
 
         Raises:
@@ -347,13 +347,13 @@ class LifecycleMachine:
         label: str | None = outcome.value
         if before.seen == self.state.seen:
             label = None
-            if outcome is Outcome.SUCCESS and before is NodeState.CONNECTING:
-                label = Request.CONNECT.value
-            elif outcome is Outcome.SUCCESS and before is NodeState.DISCONNECTING:
-                label = Request.DISCONNECT.value
+            if outcome is CallbackOutcome.SUCCESS and before is NodeState.CONNECTING:
+                label = TransitionRequest.CONNECT.value
+            elif outcome is CallbackOutcome.SUCCESS and before is NodeState.DISCONNECTING:
+                label = TransitionRequest.DISCONNECT.value
         self._announce(before, label)
 
-    def _refusal(self, request: Request) -> str:
+    def _refusal(self, request: TransitionRequest) -> str:
         if not self.state.steady:
             return (
                 f"cannot {request.value} while the node is {self.state.value!r}: "
@@ -378,4 +378,4 @@ class LifecycleMachine:
             if event is None:  # an error inside connect leaves inactive by no edge of rcl's
                 event = Transition(id=0, label="", start=start, goal=goal)
         if self._on_change is not None:
-            self._on_change(Change(start=before, goal=self.state, event=event))
+            self._on_change(StateChange(start=before, goal=self.state, event=event))

@@ -22,7 +22,7 @@ from rclpy.timer import Timer
 from std_srvs.srv import Trigger
 
 from lifecycle.node.lifecycle import machine
-from lifecycle.node.lifecycle.machine import LifecycleMachine, Request
+from lifecycle.node.lifecycle.machine import LifecycleMachine, TransitionRequest
 
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup
@@ -39,7 +39,7 @@ class LifecycleServices:
         node: Node,
         *,
         state_machine: LifecycleMachine,
-        change: Callable[[Request], Coroutine[Any, Any, bool]],
+        change: Callable[[TransitionRequest], Coroutine[Any, Any, bool]],
         refuse: Callable[[str], None],
         configuration: Callable[[], str],
         group: CallbackGroup,

@@ -52,7 +52,7 @@ from lifecycle.network.nfe import (
 from lifecycle.node.author import parameters
 from lifecycle.node.author.declaring import interface_name
 from lifecycle.node.connections.connections import Connection
-from lifecycle.node.connections.data_layer import DataLayer
+from lifecycle.node.connections.data_layer import NodeDataLayer
 from lifecycle.node.endpoints.making import CLIENTS, wire_name
 from lifecycle.node.endpoints.mapping import Mapping, count_peers
 from lifecycle.node.lifecycle.machine import NodeState
@@ -136,7 +136,7 @@ def collect(
     node: Node,
     state: NodeState,
     spec: PlannedNode,
-    data_layer: DataLayer,
+    data_layer: NodeDataLayer,
     undeclared: Iterable[tuple[EndpointKind, Any]],
 ) -> NodeConfiguration:
     """Return the configuration of `node` as it is now.
@@ -173,7 +173,9 @@ def collect(
     return dataclasses.replace(configuration, checksum=checksum(configuration))
 
 
-def connection_reports(spec: PlannedNode, data_layer: DataLayer) -> tuple[ConnectionReport, ...]:
+def connection_reports(
+    spec: PlannedNode, data_layer: NodeDataLayer
+) -> tuple[ConnectionReport, ...]:
     """Return every connection that exists or was asked for, the node's own participant first."""
     connections = data_layer.connections
     made = tuple(

@@ -165,7 +165,7 @@ def _without_udp(
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Wired:
+class WiredSystem:
     """Nodes and flows with their data layer.
 
     Attributes:
@@ -185,7 +185,7 @@ def wire(
     *,
     domain_id: int,
     rmws: Mapping[str, str],
-) -> Wired:
+) -> WiredSystem:
     """Connect everything.
 
     Args:
@@ -258,7 +258,7 @@ def wire(
         fixed=is_fixed(discovery),
         may_use_tcp=not static and _may_use_tcp(nodes, flows),
     )
-    return Wired(
+    return WiredSystem(
         nodes=tuple(nodes),
         flows=tuple(flows),
         server=control.server,

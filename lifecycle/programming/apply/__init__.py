@@ -6,7 +6,7 @@ touch only what a ledger or a mark says is ours. Public: what is in `__all__`.
 
 from __future__ import annotations
 
-from lifecycle.programming.apply.changes import Change, ChangeKind, Changes, Target
+from lifecycle.programming.apply.changes import ChangeKind, FlowChange, Target, TargetChanges
 from lifecycle.programming.apply.errors import (
     HttpError,
     MissingFeatureError,
@@ -29,9 +29,8 @@ from lifecycle.programming.apply.tc import parse_queue, parse_rate
 
 __all__ = [
     "KINDS",
-    "Change",
     "ChangeKind",
-    "Changes",
+    "FlowChange",
     "HttpError",
     "MissingFeatureError",
     "NotOursError",
@@ -42,6 +41,7 @@ __all__ = [
     "SettingsError",
     "Swept",
     "Target",
+    "TargetChanges",
     "TargetOptions",
     "Treatment",
     "open_programmer",

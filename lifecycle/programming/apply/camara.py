@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from lifecycle.programming.apply.errors import HttpError
 from lifecycle.programming.apply.http import Api, Fields, as_segment, show, text_of
 from lifecycle.programming.apply.ledger import Entry
-from lifecycle.programming.apply.remote import Ask, Body, Made, asks_of
+from lifecycle.programming.apply.remote import Body, Made, RemoteRequest, asks_of
 from lifecycle.programming.apply.settings import CamaraTargetSettings
 from lifecycle.programming.rules.camara import camara_sessions
 from lifecycle.programming.rules.rules import FlowRule
@@ -55,7 +55,7 @@ class CamaraService:
         """URL of the server."""
         return self._api.url
 
-    def asks(self, rules: Sequence[FlowRule]) -> tuple[tuple[Ask, ...], tuple[str, ...]]:
+    def asks(self, rules: Sequence[FlowRule]) -> tuple[tuple[RemoteRequest, ...], tuple[str, ...]]:
         """Return one session per flow and device."""
         return asks_of(camara_sessions(rules, self._settings.asked()))
 

@@ -31,7 +31,7 @@ _SIGNS = {
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Change:
+class FlowChange:
     """One flow in one target.
 
     Attributes:
@@ -47,7 +47,7 @@ class Change:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Changes:
+class TargetChanges:
     """What one target has to do, or did.
 
     Attributes:
@@ -57,7 +57,7 @@ class Changes:
     """
 
     target: str
-    changes: tuple[Change, ...] = ()
+    changes: tuple[FlowChange, ...] = ()
     left_out: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 
@@ -66,7 +66,7 @@ class Changes:
         """Whether there is anything to do."""
         return any(each.kind is not ChangeKind.KEEP for each in self.changes)
 
-    def of(self, kind: ChangeKind) -> tuple[Change, ...]:
+    def of(self, kind: ChangeKind) -> tuple[FlowChange, ...]:
         """Return the changes of one kind."""
         return tuple(each for each in self.changes if each.kind is kind)
 
@@ -105,11 +105,11 @@ class Target(Protocol):
         """For people: "nft table inet flowqos_teleop"."""
         ...
 
-    def plan(self, rules: Sequence[FlowRule]) -> Changes:
+    def plan(self, rules: Sequence[FlowRule]) -> TargetChanges:
         """Compare what should be with what is; changes nothing."""
         ...
 
-    def apply(self, rules: Sequence[FlowRule]) -> Changes:
+    def apply(self, rules: Sequence[FlowRule]) -> TargetChanges:
         """Make it so, and return what was done; a second time changes nothing."""
         ...
 
@@ -117,7 +117,7 @@ class Target(Protocol):
         """Return what would be sent, checked as far as that is possible; changes nothing."""
         ...
 
-    def remove(self) -> Changes:
+    def remove(self) -> TargetChanges:
         """Delete everything of ours."""
         ...
 
@@ -131,12 +131,12 @@ def describe_rule(rule: FlowRule) -> str:
     return f"{rule.describe()}, {asks(rule)}"
 
 
-def deletions(target: str, entries: Iterable[tuple[str, str]], detail: str = "") -> Changes:
+def deletions(target: str, entries: Iterable[tuple[str, str]], detail: str = "") -> TargetChanges:
     """Return the removal of (key, what) pairs as changes."""
-    return Changes(
+    return TargetChanges(
         target=target,
         changes=tuple(
-            Change(kind=ChangeKind.DELETE, key=key, what=what, detail=detail)
+            FlowChange(kind=ChangeKind.DELETE, key=key, what=what, detail=detail)
             for key, what in entries
         ),
     )

@@ -19,7 +19,7 @@ from lifecycle.programming.apply.http import (
     text_of,
 )
 from lifecycle.programming.apply.ledger import Entry
-from lifecycle.programming.apply.remote import Ask, Body, Made, asks_of
+from lifecycle.programming.apply.remote import Body, Made, RemoteRequest, asks_of
 from lifecycle.programming.apply.settings import NefTargetSettings
 from lifecycle.programming.rules.nef import nef_subscriptions
 from lifecycle.programming.rules.packet_filter import parse_filter
@@ -61,7 +61,7 @@ class NefService:
         """URL of the server."""
         return self._api.url
 
-    def asks(self, rules: Sequence[FlowRule]) -> tuple[tuple[Ask, ...], tuple[str, ...]]:
+    def asks(self, rules: Sequence[FlowRule]) -> tuple[tuple[RemoteRequest, ...], tuple[str, ...]]:
         """Return one subscription per flow and device."""
         return asks_of(nef_subscriptions(rules, self._settings.asked()))
 

@@ -9,9 +9,9 @@ import re
 from collections.abc import Sequence
 
 from lifecycle.programming.apply.changes import (
-    Change,
     ChangeKind,
-    Changes,
+    FlowChange,
+    TargetChanges,
     deletions,
     describe_rule,
 )
@@ -60,7 +60,7 @@ class NftTarget:
         """The table."""
         return f"nft table {FAMILY} {self._table}"
 
-    def plan(self, rules: Sequence[FlowRule]) -> Changes:
+    def plan(self, rules: Sequence[FlowRule]) -> TargetChanges:
         """Compare the table with the rules.
 
         Raises:
@@ -68,14 +68,14 @@ class NftTarget:
             PrivilegeError: reading needs the same privilege as writing.
         """
         marking, left_out = _marking(rules)
-        return Changes(
+        return TargetChanges(
             target=self.name,
             changes=self._compare(marking),
             left_out=left_out,
             warnings=self._warnings() if marking else (),
         )
 
-    def apply(self, rules: Sequence[FlowRule]) -> Changes:
+    def apply(self, rules: Sequence[FlowRule]) -> TargetChanges:
         """Replace the table if anything differs."""
         marking, _ = _marking(rules)
         if not marking:
@@ -121,7 +121,7 @@ class NftTarget:
             raise refused
         return f"# Not checked: this kernel allows no user namespaces.\n{text}"
 
-    def remove(self) -> Changes:
+    def remove(self) -> TargetChanges:
         """Delete the table if it is ours."""
         record = self._ledger.record(KIND, self._table)
         listing = self._listing()
@@ -139,15 +139,15 @@ class NftTarget:
         """A table does not expire."""
         return None
 
-    def _nothing_to_mark(self, rules: Sequence[FlowRule]) -> Changes:
+    def _nothing_to_mark(self, rules: Sequence[FlowRule]) -> TargetChanges:
         """No rule, no table."""
         left_out = _marking(rules)[1]
         if self._ledger.record(KIND, self._table) is None and not self._listing():
-            return Changes(target=self.name, left_out=left_out)
+            return TargetChanges(target=self.name, left_out=left_out)
         removed = self.remove()
-        return Changes(target=self.name, changes=removed.changes, left_out=left_out)
+        return TargetChanges(target=self.name, changes=removed.changes, left_out=left_out)
 
-    def _compare(self, rules: Sequence[FlowRule]) -> tuple[Change, ...]:
+    def _compare(self, rules: Sequence[FlowRule]) -> tuple[FlowChange, ...]:
         listing = self._listing()
         if listing:
             self._insist_ours(listing)
@@ -170,9 +170,12 @@ class NftTarget:
                 same = old.digest == rules_digest([rule]) and not detail
                 kind = ChangeKind.KEEP if same else ChangeKind.UPDATE
             why = gone if old is None else detail
-            changes.append(Change(kind=kind, key=rule.key, what=describe_rule(rule), detail=why))
+            changes.append(
+                FlowChange(kind=kind, key=rule.key, what=describe_rule(rule), detail=why)
+            )
         changes += [
-            Change(kind=ChangeKind.DELETE, key=each.key, what=each.what) for each in before.values()
+            FlowChange(kind=ChangeKind.DELETE, key=each.key, what=each.what)
+            for each in before.values()
         ]
         return tuple(changes)
 

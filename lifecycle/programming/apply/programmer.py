@@ -22,7 +22,7 @@ from lifecycle.errors import LifecycleError
 from lifecycle.network.address import canonical, is_loopback
 from lifecycle.network.five_qi import DscpMapping
 from lifecycle.plan.model import Plan, PlannedNode
-from lifecycle.programming.apply.changes import Changes, Target
+from lifecycle.programming.apply.changes import Target, TargetChanges
 from lifecycle.programming.apply.errors import PartlyError
 from lifecycle.programming.apply.ledger import Ledger, has_ledger, owner_is_dead
 from lifecycle.programming.apply.targets import TargetOptions, Targets
@@ -136,7 +136,7 @@ class Programmer:
             label_flows=self._treatment.label_flows,
         )
 
-    def diff(self, flows: Iterable[FlowReport]) -> tuple[Changes, ...]:
+    def diff(self, flows: Iterable[FlowReport]) -> tuple[TargetChanges, ...]:
         """Return what `update` would do; changes no network."""
         rules = self._take(flows)
         with self._ledger.locked():
@@ -153,7 +153,7 @@ class Programmer:
         *,
         hold: bool = False,
         within_s: float | None = None,
-    ) -> tuple[Changes, ...]:
+    ) -> tuple[TargetChanges, ...]:
         """Bring every target up to date with these flows.
 
         Args:
@@ -188,7 +188,7 @@ class Programmer:
             due = [each.renew() for each in self._targets]
         return min((each for each in due if each is not None), default=None)
 
-    def close(self, *, within_s: float | None = None) -> tuple[Changes, ...]:
+    def close(self, *, within_s: float | None = None) -> tuple[TargetChanges, ...]:
         """Remove everything that the ledger lists, by whichever target it was made.
 
         Args:
@@ -271,7 +271,7 @@ def open_programmer(
 
 def remove_all(
     ledger: Ledger, targets: Targets | None = None, *, within_s: float | None = None
-) -> tuple[Changes, ...]:
+) -> tuple[TargetChanges, ...]:
     """Remove everything that a ledger lists.
 
     Args:
@@ -301,7 +301,7 @@ class Swept:
         errors: what could not be removed, and why; it stays listed.
     """
 
-    removed: tuple[Changes, ...] = ()
+    removed: tuple[TargetChanges, ...] = ()
     errors: tuple[LifecycleError, ...] = ()
 
 
@@ -314,7 +314,7 @@ def sweep_orphans(root: Path, *, own: str = "", within_s: float | None = None) -
         within_s: for all that servers are asked; None for the patience with each request.
     """
     until_s = math.inf if within_s is None else time.monotonic() + within_s
-    removed: list[Changes] = []
+    removed: list[TargetChanges] = []
     errors: list[LifecycleError] = []
     for directory in sorted(root.iterdir()) if root.is_dir() else ():
         if not has_ledger(directory) or (directory.name != own and is_held(directory)):
@@ -326,7 +326,7 @@ def sweep_orphans(root: Path, *, own: str = "", within_s: float | None = None) -
     return Swept(removed=tuple(removed), errors=tuple(errors))
 
 
-def remove_run(directory: Path, *, within_s: float | None = None) -> tuple[Changes, ...]:
+def remove_run(directory: Path, *, within_s: float | None = None) -> tuple[TargetChanges, ...]:
     """Remove everything that a run has in networks, also what somebody applied by hand.
 
     For `lifecycle down`.
@@ -354,7 +354,7 @@ class Removal:
         self._ledger = Ledger(directory, _system(directory))
         self._targets = Targets(self._ledger)
 
-    def close(self, *, within_s: float | None) -> tuple[Changes, ...]:
+    def close(self, *, within_s: float | None) -> tuple[TargetChanges, ...]:
         """Remove it.
 
         Args:
@@ -373,7 +373,7 @@ class Removal:
         self._targets.deadline.cancel()
 
 
-def _sweep(directory: Path, within_s: float) -> tuple[Changes, ...]:
+def _sweep(directory: Path, within_s: float) -> tuple[TargetChanges, ...]:
     file = Ledger(directory, _system(directory)).read()
     return remove_run(directory, within_s=within_s) if owner_is_dead(file) else ()
 
@@ -403,10 +403,10 @@ def _with_held(
 _T = TypeVar("_T")
 
 
-def _each(things: Iterable[_T], do: Callable[[_T], Changes]) -> tuple[Changes, ...]:
+def _each(things: Iterable[_T], do: Callable[[_T], TargetChanges]) -> tuple[TargetChanges, ...]:
     """Do it to each, whatever becomes of the others."""
     every = tuple(things)
-    done: list[Changes] = []
+    done: list[TargetChanges] = []
     errors: list[LifecycleError] = []
     for each in every:
         try:

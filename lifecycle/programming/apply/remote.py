@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from lifecycle.errors import LifecycleError
-from lifecycle.programming.apply.changes import Change, ChangeKind, Changes, describe_rule
+from lifecycle.programming.apply.changes import ChangeKind, FlowChange, TargetChanges, describe_rule
 from lifecycle.programming.apply.errors import HttpError, PartlyError
 from lifecycle.programming.apply.ledger import (
     Entry,
@@ -46,7 +46,7 @@ class Made:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Ask:
+class RemoteRequest:
     """One thing to ask for.
 
     Attributes:
@@ -59,10 +59,10 @@ class Ask:
     body: Body
 
 
-def asks_of(found: Requests[B]) -> tuple[tuple[Ask, ...], tuple[str, ...]]:
+def asks_of(found: Requests[B]) -> tuple[tuple[RemoteRequest, ...], tuple[str, ...]]:
     """Return what `Service.asks` does, of the requests that rules became."""
     asks = tuple(
-        Ask(key=each.key, what=describe_rule(each.rule), body=each.content.body())
+        RemoteRequest(key=each.key, what=describe_rule(each.rule), body=each.content.body())
         for each in found.requests
     )
     return asks, tuple(map(str, found.left_out))
@@ -81,7 +81,7 @@ class Service(Protocol):
         """URL of the server."""
         ...
 
-    def asks(self, rules: Sequence[FlowRule]) -> tuple[tuple[Ask, ...], tuple[str, ...]]:
+    def asks(self, rules: Sequence[FlowRule]) -> tuple[tuple[RemoteRequest, ...], tuple[str, ...]]:
         """Return what is to be asked for, and each flow that this interface cannot say, and why."""
         ...
 
@@ -133,21 +133,21 @@ class RemoteTarget:
         """The server."""
         return f"{self._service.kind} at {self._service.scope}"
 
-    def plan(self, rules: Sequence[FlowRule]) -> Changes:
+    def plan(self, rules: Sequence[FlowRule]) -> TargetChanges:
         """Compare rules, ledger and server; asks the server about each thing of ours."""
         asks, left_out = self._service.asks(rules)
         wanted = {each.key for each in asks}
         changes = [
-            Change(kind=ChangeKind.DELETE, key=each.key, what=each.what)
+            FlowChange(kind=ChangeKind.DELETE, key=each.key, what=each.what)
             for each in self._record().entries
             if each.key not in wanted
         ]
         for ask in asks:
             kind, detail = self._compare(self._record().entry(ask.key), ask.body)
-            changes.append(Change(kind=kind, key=ask.key, what=ask.what, detail=detail))
-        return Changes(target=self.name, changes=tuple(changes), left_out=left_out)
+            changes.append(FlowChange(kind=kind, key=ask.key, what=ask.what, detail=detail))
+        return TargetChanges(target=self.name, changes=tuple(changes), left_out=left_out)
 
-    def apply(self, rules: Sequence[FlowRule]) -> Changes:
+    def apply(self, rules: Sequence[FlowRule]) -> TargetChanges:
         """Make it so, one flow after the other.
 
         Raises:
@@ -155,7 +155,7 @@ class RemoteTarget:
         """
         planned = self.plan(rules)
         bodies = {each.key: each.body for each in self._service.asks(rules)[0]}
-        done: list[Change] = []
+        done: list[FlowChange] = []
         errors: list[tuple[str, LifecycleError]] = []
         # Deletions come first in the plan: what is in the way of something new goes before it.
         for change in planned.changes:
@@ -170,9 +170,9 @@ class RemoteTarget:
         return dataclasses.replace(planned, changes=tuple(done))
 
     def _partly(
-        self, total: int, errors: Sequence[tuple[str, LifecycleError]], done: Sequence[Change]
+        self, total: int, errors: Sequence[tuple[str, LifecycleError]], done: Sequence[FlowChange]
     ) -> PartlyError:
-        made = Changes(target=self.name, changes=tuple(done))
+        made = TargetChanges(target=self.name, changes=tuple(done))
         return PartlyError(
             self.name, total, errors, done=[made.render(done=True)] if made.pending else ()
         )
@@ -183,17 +183,17 @@ class RemoteTarget:
         shown = [{"key": each.key, "flow": each.what, "body": each.body} for each in asks]
         return json.dumps(shown, indent=2, ensure_ascii=False) + "\n"
 
-    def remove(self) -> Changes:
+    def remove(self) -> TargetChanges:
         """Delete everything of ours at the server.
 
         Raises:
             PartlyError: some could not be deleted; they stay in the ledger.
         """
         entries = self._record().entries
-        done: list[Change] = []
+        done: list[FlowChange] = []
         errors: list[tuple[str, LifecycleError]] = []
         for entry in entries:
-            change = Change(kind=ChangeKind.DELETE, key=entry.key, what=entry.what)
+            change = FlowChange(kind=ChangeKind.DELETE, key=entry.key, what=entry.what)
             try:
                 self._delete(entry)
             except LifecycleError as error:
@@ -202,7 +202,7 @@ class RemoteTarget:
                 done.append(change)
         if errors:
             raise self._partly(len(entries), errors, done)
-        return Changes(target=self.name, changes=tuple(done))
+        return TargetChanges(target=self.name, changes=tuple(done))
 
     def renew(self) -> float | None:
         """Prolong what is due.
@@ -248,7 +248,7 @@ class RemoteTarget:
             return ChangeKind.UPDATE, seen.differs
         return ChangeKind.KEEP, seen.detail
 
-    def _make(self, change: Change, body: Body) -> str:
+    def _make(self, change: FlowChange, body: Body) -> str:
         """Make one change; returns what is to be told of it."""
         entry = self._record().entry(change.key)
         if change.kind is ChangeKind.DELETE:
@@ -263,7 +263,7 @@ class RemoteTarget:
             return self._create(change, body)
         return ""
 
-    def _create(self, change: Change, body: Body) -> str:
+    def _create(self, change: FlowChange, body: Body) -> str:
         self._note(_entry(change, body, None))
         try:
             made = self._service.create(body)
@@ -313,7 +313,7 @@ class RemoteTarget:
             self._ledger.drop(record.target, record.scope)
 
 
-def _entry(change: Change, body: Body, made: Made | None) -> Entry:
+def _entry(change: FlowChange, body: Body, made: Made | None) -> Entry:
     text = json.dumps(body, sort_keys=True)
     return Entry(
         key=change.key,

@@ -12,9 +12,9 @@ import re
 from collections.abc import Iterable, Sequence
 
 from lifecycle.programming.apply.changes import (
-    Change,
     ChangeKind,
-    Changes,
+    FlowChange,
+    TargetChanges,
     deletions,
     describe_rule,
 )
@@ -192,7 +192,7 @@ class TcTarget:
         """The device."""
         return f"tc on {self._settings.device}"
 
-    def plan(self, rules: Sequence[FlowRule]) -> Changes:
+    def plan(self, rules: Sequence[FlowRule]) -> TargetChanges:
         """Compare the device with the rules.
 
         Raises:
@@ -214,13 +214,14 @@ class TcTarget:
                 same = old.digest == entry.digest and not detail
                 kind = ChangeKind.KEEP if same else ChangeKind.UPDATE
             why = detail if old is not None or not root else ""
-            changes.append(Change(kind=kind, key=entry.key, what=entry.what, detail=why))
+            changes.append(FlowChange(kind=kind, key=entry.key, what=entry.what, detail=why))
         changes += [
-            Change(kind=ChangeKind.DELETE, key=each.key, what=each.what) for each in before.values()
+            FlowChange(kind=ChangeKind.DELETE, key=each.key, what=each.what)
+            for each in before.values()
         ]
-        return Changes(target=self.name, changes=tuple(changes), left_out=left_out)
+        return TargetChanges(target=self.name, changes=tuple(changes), left_out=left_out)
 
-    def apply(self, rules: Sequence[FlowRule]) -> Changes:
+    def apply(self, rules: Sequence[FlowRule]) -> TargetChanges:
         """Bring qdisc, classes and filters up to date."""
         planned = self.plan(rules)
         classed, _ = self._classed(rules)
@@ -298,11 +299,11 @@ class TcTarget:
         text = self._render(classed, with_qdisc=True)
         return f"# Not checked: tc has no dry run.\n{text}"
 
-    def remove(self) -> Changes:
+    def remove(self) -> TargetChanges:
         """Delete the qdisc if it is ours, and with it all below."""
         record = self._record()
         if not record.digest:
-            return Changes(target=self.name)
+            return TargetChanges(target=self.name)
         entries: list[tuple[str, str]] = []
         if self._root() is not None and self._own_root(record):
             entries = [(each.key, each.what) for each in record.entries]

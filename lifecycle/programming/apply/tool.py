@@ -49,7 +49,7 @@ _NO_FEATURE = re.compile(
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Output:
+class ToolOutput:
     """What a program left."""
 
     returncode: int
@@ -60,7 +60,7 @@ class Output:
 class Tool(Protocol):
     """Runs one program to its end."""
 
-    def run(self, argv: Sequence[str], *, stdin: str = "") -> Output:
+    def run(self, argv: Sequence[str], *, stdin: str = "") -> ToolOutput:
         """Run it and return what it left, whatever its exit code.
 
         Raises:
@@ -80,7 +80,7 @@ class HostTool:
     def __init__(self, prefix: Sequence[str] = ()) -> None:
         self._prefix = tuple(prefix)
 
-    def run(self, argv: Sequence[str], *, stdin: str = "") -> Output:
+    def run(self, argv: Sequence[str], *, stdin: str = "") -> ToolOutput:
         """Run it, see Tool."""
         # Distributions keep these in sbin, which is not on every user's path.
         path = f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"
@@ -109,7 +109,7 @@ class HostTool:
             ) from error
         except OSError as error:
             raise ProgrammingError(f"cannot run {shlex.join(argv)!r}: {error.strerror}") from error
-        return Output(returncode=done.returncode, stdout=done.stdout, stderr=done.stderr)
+        return ToolOutput(returncode=done.returncode, stdout=done.stdout, stderr=done.stderr)
 
 
 def demand(tool: Tool, argv: Sequence[str], *, doing: str, stdin: str = "") -> str:
@@ -162,12 +162,12 @@ def qdiscs_of(text: str, argv: Sequence[str], *, doing: str) -> tuple[Qdisc, ...
         ) from error
 
 
-def refused(output: Output, *, by: str) -> bool:
+def refused(output: ToolOutput, *, by: str) -> bool:
     """Whether a program failed for want of a privilege, or the program `by` that starts it did."""
     return bool(_NO_PRIVILEGE.search(output.stderr)) or output.stderr.startswith(f"{by}:")
 
 
-def failure(output: Output, argv: Sequence[str], *, doing: str) -> ProgrammingError:
+def failure(output: ToolOutput, argv: Sequence[str], *, doing: str) -> ProgrammingError:
     """Return the error that a failed program means."""
     command = shlex.join(argv)
     said = _first_line(output.stderr) or f"exit code {output.returncode}"

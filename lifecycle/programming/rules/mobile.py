@@ -51,7 +51,7 @@ B = TypeVar("B", bound=Content)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Request(Generic[T]):
+class NetworkRequest(Generic[T]):
     """What to ask the network for one flow and one of its ends.
 
     Attributes:
@@ -71,7 +71,7 @@ class Request(Generic[T]):
 class Requests(Generic[T]):
     """Everything to ask the network for, and what cannot be asked."""
 
-    requests: tuple[Request[T], ...]
+    requests: tuple[NetworkRequest[T], ...]
     left_out: tuple[LeftOut, ...]
 
 
@@ -134,7 +134,7 @@ def requests_of(
         devices: which ends are devices.
         make: the body for one flow and one of its ends; a ValueError leaves the flow out.
     """
-    requests: list[Request[T]] = []
+    requests: list[NetworkRequest[T]] = []
     left: list[LeftOut] = []
     for rule in rules:
         made = _made(rule, devices, make)
@@ -240,11 +240,11 @@ def document(name: str, found: Requests[B], left_out: Iterable[LeftOut]) -> str:
 
 def _made(
     rule: FlowRule, devices: Devices, make: Callable[[FlowRule, DeviceEnd], T]
-) -> list[Request[T]] | str:
+) -> list[NetworkRequest[T]] | str:
     """A rule's requests, or why there are none."""
     try:
         return [
-            Request(
+            NetworkRequest(
                 # As stable as the rule's own key: a manifest keeps it whatever the ports are.
                 key=f"{rule.key} {'to' if end.direction is Direction.OUT else 'from'} device",
                 rule=rule,

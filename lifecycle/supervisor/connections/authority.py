@@ -18,20 +18,19 @@ from typing import Protocol
 
 from lifecycle.errors import BringUpError
 from lifecycle.graph import set_within
-from lifecycle.manifest.model import Authority as AuthorityKind
-from lifecycle.manifest.model import Condition, DataLayerSource
+from lifecycle.manifest.model import Authority, Condition, DataLayerSource
 from lifecycle.node.host.control import Operation
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.connections.desired_state import (
+    ActualState,
     Instructions,
     Step,
-    Wired,
+    not_wired,
     planned_instructions,
     steps,
     wired,
 )
 from lifecycle.supervisor.connections.negotiation import NegotiatedSource
-from lifecycle.supervisor.connections.unwired import not_wired
 from lifecycle.supervisor.nodes.driver import ACTIVE, INACTIVE
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.run.events import Emitter, Notice, WiringChanged, WiringLost
@@ -93,14 +92,14 @@ class Reaching(Protocol):
         """Return what drives the node interface of any node that has one, by full name."""
 
 
-def authority_of(system: System, emit: Emitter, reaching: Reaching) -> Authority | None:
+def authority_of(system: System, emit: Emitter, reaching: Reaching) -> ConnectionAuthority | None:
     """Return who wires `system`; None if its nodes do it themselves."""
     layer = system.plan.data_layer
-    if layer.authority is not AuthorityKind.SUPERVISOR:
+    if layer.authority is not Authority.SUPERVISOR:
         return None
     dynamic = layer.source is DataLayerSource.DYNAMIC
     source = NegotiatedSource(system.plan) if dynamic else PlannedSource(system.plan)
-    return Authority(system, source, emit, hand_of=reaching.node_interface)
+    return ConnectionAuthority(system, source, emit, hand_of=reaching.node_interface)
 
 
 class Source(Protocol):
@@ -156,7 +155,7 @@ class PlannedSource:
 class _Wiring:
     """What the authority knows of one node that it wires."""
 
-    told: Wired = dataclasses.field(default_factory=Wired)
+    told: ActualState = dataclasses.field(default_factory=ActualState)
     ours: list[str] = dataclasses.field(default_factory=list)
     settled: tuple[Instructions, str] | None = None  # with this configuration nothing was missing
     rounds: int = 0
@@ -165,7 +164,7 @@ class _Wiring:
     given_up: str = ""  # checksum of the configuration with which the tries were used up
 
 
-class Authority:
+class ConnectionAuthority:
     """Wires the nodes of one supervisor, and those that joined without being declared.
 
     Args:
@@ -376,7 +375,7 @@ class Authority:
         # Also after a success: one that does not show in the node's own report is none.
         return _backoff_s(wiring.rounds)
 
-    def _tell_lost(self, wiring: _Wiring, has: Wired, name: str) -> None:
+    def _tell_lost(self, wiring: _Wiring, has: ActualState, name: str) -> None:
         """Say what the node had been given and has no more."""
         there = {connection for connection, _ in has.connections}
         for connection, _ in wiring.told.connections:

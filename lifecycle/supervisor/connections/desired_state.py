@@ -1,8 +1,9 @@
 """Desired state of one node's connections and mappings, and the steps that it still lacks.
 
-Owns: `Instructions`, the connections and mappings that a node must have; `Wired`, those that it
-has; and `steps`, the difference in the order in which it is made. Comparing what must be with what
-is makes one and the same thing of the first wiring, of a change and of making again what was lost.
+Owns: `Instructions`, the connections and mappings that a node must have; `ActualState`, those that
+it has; and `steps`, the difference in the order in which it is made. Comparing what must be with
+what is makes one and the same thing of the first wiring, of a change and of making again what was
+lost.
 Pure.
 """
 
@@ -14,6 +15,8 @@ from collections.abc import Collection, Mapping
 from lifecycle.node.host.control import Operation
 from lifecycle.plan.model import ParticipantConnections, PlannedNode
 from lifecycle.verify.observation import NodeConfiguration
+from lifecycle.verify.rules import run
+from lifecycle.verify.verdict import Finding, Outcome
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,7 +36,7 @@ class Instructions:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Wired:
+class ActualState:
     """What one node has.
 
     Attributes:
@@ -44,7 +47,7 @@ class Wired:
     connections: tuple[tuple[str, tuple[str, ...]], ...] = ()
     mappings: tuple[tuple[str, str], ...] = ()
 
-    def after(self, step: Step) -> Wired:
+    def after(self, step: Step) -> ActualState:
         """Return what the node has once `step` was made."""
         connections, mappings = dict(self.connections), dict(self.mappings)
         if step.operation is Operation.CONNECT_TO:
@@ -54,7 +57,7 @@ class Wired:
         else:
             connections.pop(step.connection, None)
             mappings = {end: name for end, name in mappings.items() if name != step.connection}
-        return Wired(connections=tuple(connections.items()), mappings=tuple(mappings.items()))
+        return ActualState(connections=tuple(connections.items()), mappings=tuple(mappings.items()))
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -98,9 +101,9 @@ def planned_instructions(node: PlannedNode) -> Instructions:
     )
 
 
-def wired(configuration: NodeConfiguration) -> Wired:
+def wired(configuration: NodeConfiguration) -> ActualState:
     """Return what a node says that it has; what it could not make it has not."""
-    return Wired(
+    return ActualState(
         connections=tuple(
             (each.name, each.urls)
             for each in configuration.connections
@@ -114,7 +117,9 @@ def wired(configuration: NodeConfiguration) -> Wired:
     )
 
 
-def steps(wanted: Instructions, has: Wired, *, ours: Collection[str] = ()) -> tuple[Step, ...]:
+def steps(
+    wanted: Instructions, has: ActualState, *, ours: Collection[str] = ()
+) -> tuple[Step, ...]:
     """Return what is missing, in the order in which it is made: make before break.
 
     A connection whose URLs differ cannot be had twice under one name: it alone is broken first.
@@ -161,4 +166,21 @@ def _step(
         connection=connection,
         connections=connections,
         endpoint=endpoint,
+    )
+
+
+def not_wired(subject: str, message: str) -> Finding:
+    """Return it.
+
+    Args:
+        subject: fully qualified node name, or the system's name.
+        message: a whole sentence with the reason.
+    """
+    return run.NOT_WIRED.finding(
+        Outcome.VIOLATED,
+        subject=subject,
+        expected="wired",
+        observed="not wired",
+        message=message,
+        node=run.node_of(subject),
     )

@@ -42,8 +42,11 @@ from lifecycle.plan import (
 from lifecycle.plan.connections.contacts import contacts_of, ports_of
 from lifecycle.plan.negotiation.data_layer import PartyEndpoint
 from lifecycle.plan.negotiation.parties import FAST_DDS, endpoint_of, transports_of
-from lifecycle.supervisor.connections.desired_state import Instructions, planned_instructions
-from lifecycle.supervisor.connections.unwired import not_wired
+from lifecycle.supervisor.connections.desired_state import (
+    Instructions,
+    not_wired,
+    planned_instructions,
+)
 from lifecycle.verify.observation import (
     ConnectionReport,
     EndpointReport,

@@ -27,7 +27,7 @@ from lifecycle.supervisor.run.options import UpOptions
 from lifecycle.verify.verdict import FlowReport, Verdict
 
 if TYPE_CHECKING:
-    from lifecycle.programming.apply import Changes, TargetOptions
+    from lifecycle.programming.apply import TargetChanges, TargetOptions
 
 _T = TypeVar("_T")
 
@@ -52,7 +52,7 @@ _SWEEP_S = 10.0
 class Removes(Protocol):
     """What removes everything of one run from networks."""
 
-    def close(self, *, within_s: float | None) -> tuple[Changes, ...]:
+    def close(self, *, within_s: float | None) -> tuple[TargetChanges, ...]:
         """Remove everything."""
         ...
 
@@ -66,7 +66,7 @@ class Programs(Removes, Protocol):
 
     def update(
         self, flows: Sequence[FlowReport], *, hold: bool, within_s: float | None
-    ) -> tuple[Changes, ...]:
+    ) -> tuple[TargetChanges, ...]:
         """Bring networks up to date."""
         ...
 

@@ -13,7 +13,14 @@ from lifecycle.middleware.process.shared_memory import sweep
 from lifecycle.plan.model import Plan
 from lifecycle.run_directory import RunDirectory, is_held, new_run_id, read_record
 from lifecycle.supervisor.connections.networks import remove_programmed
-from lifecycle.supervisor.control.server import Answer, Ask, Look, Question, ask, strange
+from lifecycle.supervisor.control.server import (
+    Answer,
+    ControlRequest,
+    Question,
+    SupervisorSnapshot,
+    ask,
+    strange,
+)
 from lifecycle.supervisor.control.status import SystemStatus
 from lifecycle.supervisor.processes.orphans import end_run
 
@@ -64,7 +71,7 @@ def status(path: Path) -> SystemStatus:
         UsageError: it runs no more.
         TimeoutError: it does not answer.
     """
-    answer = _asked(path, Question(ask=Ask.STATUS), STATUS_S)
+    answer = _asked(path, Question(ask=ControlRequest.STATUS), STATUS_S)
     if answer is None:
         raise _killed(path)
     if answer.status is None:
@@ -72,14 +79,14 @@ def status(path: Path) -> SystemStatus:
     return answer.status
 
 
-def look(path: Path) -> Look:
+def look(path: Path) -> SupervisorSnapshot:
     """Ask a supervisor for its plan, what it sees and its verdict.
 
     Raises:
         UsageError: it runs no more.
         TimeoutError: it does not answer.
     """
-    answer = _asked(path, Question(ask=Ask.LOOK), STATUS_S)
+    answer = _asked(path, Question(ask=ControlRequest.LOOK), STATUS_S)
     if answer is None:
         raise _killed(path)
     if answer.look is None:
@@ -93,7 +100,7 @@ def differences(path: Path, plan: Plan) -> tuple[str, ...]:
     Returns:
         Nothing where they do not differ, or nobody answers in time: a notice is not worth a wait.
     """
-    question = Question(ask=Ask.DIFFERENCES, plan=plan)
+    question = Question(ask=ControlRequest.DIFFERENCES, plan=plan)
     try:
         answer = _asked(path, question, STATUS_S)
     except TimeoutError:
@@ -152,7 +159,7 @@ def down(path: Path, timeout_s: float) -> ExitCode:
         ProgrammingError: nothing runs, but something of it could not be removed from a network.
     """
     deadline = time.monotonic() + timeout_s
-    answer = _asked(path, Question(ask=Ask.DOWN), timeout_s)
+    answer = _asked(path, Question(ask=ControlRequest.DOWN), timeout_s)
     if answer is not None and answer.exit_code is None:
         raise strange(path / _SOCKET, "it has no exit code")
     if answer is not None and _released(path, deadline):

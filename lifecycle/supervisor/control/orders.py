@@ -20,7 +20,7 @@ from lifecycle.codec import to_plain
 from lifecycle.errors import BringUpError, ExitCode, UsageError
 from lifecycle.manifest.model import DataLayerSource
 from lifecycle.network.medium import Medium
-from lifecycle.plan import Change, Plan, PlannedNode, changes, with_files_of_now
+from lifecycle.plan import Plan, PlanDifference, PlannedNode, changes, with_files_of_now
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.processes.spawn import ProcessState
 from lifecycle.supervisor.run.options import UpOptions, local_processes
@@ -216,7 +216,7 @@ class Revisions:
         assert process is not None
         return process.planned.nodes
 
-    def _refused(self, order: Order, found: Iterable[Change]) -> UsageError:
+    def _refused(self, order: Order, found: Iterable[PlanDifference]) -> UsageError:
         system = self._system.plan.system
         what = order.kind.value
         listed = "\n".join(_lines(found))
@@ -228,7 +228,7 @@ class Revisions:
             f"take the new one: {take}{same}"
         )
 
-    def _check_reload(self, order: Order, plan: Plan, found: tuple[Change, ...]) -> None:
+    def _check_reload(self, order: Order, plan: Plan, found: tuple[PlanDifference, ...]) -> None:
         system, running = self._system, self._system.first
 
         def refuse(why: str, lines: Iterable[str] = ()) -> UsageError:
@@ -255,7 +255,7 @@ class Revisions:
         if order.node:
             self._check_node(order, plan, found)
 
-    def _check_node(self, order: Order, plan: Plan, found: tuple[Change, ...]) -> None:
+    def _check_node(self, order: Order, plan: Plan, found: tuple[PlanDifference, ...]) -> None:
         """Make sure that only the nodes that restart are to change."""
         running = self._system.first
         keys = self._restarted(order)
@@ -281,7 +281,7 @@ class Revisions:
                 )
 
 
-def _lines(found: Iterable[Change]) -> tuple[str, ...]:
+def _lines(found: Iterable[PlanDifference]) -> tuple[str, ...]:
     """Word differences with their places in the new manifest, at most 20 of them."""
     every = tuple(found)
     lines = []

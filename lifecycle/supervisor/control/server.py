@@ -36,7 +36,7 @@ _READ = 2**18
 _ORDERS = {each.value: each for each in OrderKind}
 
 
-class Ask(enum.Enum):
+class ControlRequest(enum.Enum):
     """What a supervisor can be asked."""
 
     STATUS = "status"
@@ -60,14 +60,14 @@ class Question:
         reload: for RESTART, `plan` is to run from now on.
     """
 
-    ask: Ask
+    ask: ControlRequest
     node: str = ""
     plan: Plan | None = None
     reload: bool = False
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Look:
+class SupervisorSnapshot:
     """All that a supervisor knows at one moment.
 
     Attributes:
@@ -97,7 +97,7 @@ class Answer:
     status: SystemStatus | None = None
     exit_code: int | None = None
     error: str = ""
-    look: Look | None = None
+    look: SupervisorSnapshot | None = None
     differences: tuple[str, ...] = ()
 
 
@@ -119,7 +119,7 @@ class ControlServer:
         status: Callable[[], SystemStatus],
         down: Callable[[], None],
         *,
-        look: Callable[[], Look] | None = None,
+        look: Callable[[], SupervisorSnapshot] | None = None,
         order: Callable[[Order], Awaitable[Done]] | None = None,
         differences: Callable[[Plan], tuple[str, ...]] = lambda _: (),
     ) -> None:
@@ -157,10 +157,10 @@ class ControlServer:
         try:
             while line := await reader.readline():
                 question = from_json(line, Question)
-                if question.ask is Ask.DOWN:
+                if question.ask is ControlRequest.DOWN:
                     self._waiting.add(writer)
                     self._down()
-                elif question.ask is Ask.FOLLOW:
+                elif question.ask is ControlRequest.FOLLOW:
                     await self._follow(reader, writer)
                 else:
                     await _say(writer, await self._answer(question))
@@ -178,7 +178,7 @@ class ControlServer:
         self._changed = asyncio.Event()
 
     async def _answer(self, question: Question) -> Answer:
-        if question.ask is Ask.LOOK and self._look is not None:
+        if question.ask is ControlRequest.LOOK and self._look is not None:
             return Answer(look=self._look())
         if self._order is not None and question.ask.value in _ORDERS:
             order = Order(
@@ -189,7 +189,7 @@ class ControlServer:
             )
             done = await self._order(order)
             return Answer(exit_code=done.exit_code, error=done.error)
-        if question.ask is Ask.DIFFERENCES and question.plan is not None:
+        if question.ask is ControlRequest.DIFFERENCES and question.plan is not None:
             return Answer(differences=self._differences(question.plan))
         return Answer(status=self._status())
 
@@ -250,7 +250,7 @@ def ask(path: Path, question: Question, timeout_s: float) -> Answer | None:
         return _answer(path, sock, bytearray(), deadline)
 
 
-def follow(path: Path) -> Iterator[Look]:
+def follow(path: Path) -> Iterator[SupervisorSnapshot]:
     """Yield what the supervisor that listens at `path` knows, now and after each change.
 
     It ends with the supervisor.
@@ -261,7 +261,7 @@ def follow(path: Path) -> Iterator[Look]:
         OSError: nobody listens there.
     """
     with connect(path, _ANSWER_S) as sock:
-        sock.sendall(to_json(Question(ask=Ask.FOLLOW)) + b"\n")
+        sock.sendall(to_json(Question(ask=ControlRequest.FOLLOW)) + b"\n")
         rest = bytearray()
         while (answer := _answer(path, sock, rest, None)) is not None:
             if answer.look is not None:

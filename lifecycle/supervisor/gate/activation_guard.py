@@ -35,7 +35,7 @@ class Seeing(Protocol):
 
 
 class Changing(Protocol):
-    """When it is worth looking again, see verification_loop.Changes."""
+    """When it is worth looking again, see verification_loop.ChangeCounter."""
 
     @property
     def count(self) -> int:

@@ -25,7 +25,7 @@ from lifecycle.supervisor.control.orders import (
 )
 from lifecycle.supervisor.gate.gate import VerificationError
 from lifecycle.supervisor.gate.sequence import GateSequence
-from lifecycle.supervisor.gate.verification_loop import Changes, VerificationLoop
+from lifecycle.supervisor.gate.verification_loop import ChangeCounter, VerificationLoop
 from lifecycle.supervisor.gate.watch import Watch
 from lifecycle.supervisor.health.process_monitor import ProcessMonitor
 from lifecycle.supervisor.nodes.system import System
@@ -54,7 +54,7 @@ class Holding:
         system: System,
         *,
         judge: VerificationLoop,
-        changes: Changes,
+        changes: ChangeCounter,
         gate_sequence: GateSequence,
         revisions: Revisions,
         process_monitor: ProcessMonitor,

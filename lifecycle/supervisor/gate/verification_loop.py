@@ -23,7 +23,7 @@ from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.gate.activation_guard import ActivationGuard
 from lifecycle.supervisor.gate.gate import closes
 from lifecycle.supervisor.health.agreement import Agreement
-from lifecycle.supervisor.health.liveliness import Presence
+from lifecycle.supervisor.health.liveliness import NodeArrivals
 from lifecycle.supervisor.nodes.system import GraphObserver, System
 from lifecycle.supervisor.run.events import Emitter, VerdictChanged
 from lifecycle.supervisor.run.failure import ended
@@ -154,7 +154,7 @@ ASK_AGAIN_AT_MOST_S = 0.5
 """... up to this."""
 
 
-class Changes:
+class ChangeCounter:
     """Counts the moments at which it is worth looking again: the graph's and the nodes'."""
 
     def __init__(self, system: System, observer: GraphObserver) -> None:
@@ -236,7 +236,7 @@ class VerificationLoop:
         self,
         system: System,
         observer: GraphObserver,
-        changes: Changes,
+        changes: ChangeCounter,
         emit: Emitter,
         *,
         strict: bool,
@@ -257,7 +257,7 @@ class VerificationLoop:
         self.latest: Verdict | None = None
         self._mark: tuple[int, int] | None = None
         self.seen = Observation()
-        self._presence = Presence(emit)
+        self._presence = NodeArrivals(emit)
         self._grace_period = GracePeriod()
         self.ahead: frozenset[str] = frozenset()
 

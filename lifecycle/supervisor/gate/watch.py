@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 
-from lifecycle.supervisor.gate.verification_loop import SETTLED_S, Changes, VerificationLoop
+from lifecycle.supervisor.gate.verification_loop import SETTLED_S, ChangeCounter, VerificationLoop
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.process import ManagedProcess
 from lifecycle.supervisor.processes.spawn import ProcessState
@@ -46,7 +46,7 @@ class Watch:
         violated: what was seen violated for longer than a passing moment; empty if nothing was.
     """
 
-    def __init__(self, judge: VerificationLoop, changes: Changes, stage: Stage) -> None:
+    def __init__(self, judge: VerificationLoop, changes: ChangeCounter, stage: Stage) -> None:
         self._judge = judge
         self._changes = changes
         self._stage = stage

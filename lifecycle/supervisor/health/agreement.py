@@ -47,7 +47,7 @@ _MOST = 64
 _logger = logging.getLogger(__name__)
 
 
-class Notices(Protocol):
+class PlanNoticeTopic(Protocol):
     """One PlanNotices of lifecycle.middleware."""
 
     def announce(self, text: str) -> None:
@@ -57,10 +57,10 @@ class Notices(Protocol):
         """Announce and receive nothing any more."""
 
 
-class Air(Protocol):
+class PlanExchange(Protocol):
     """What carries notices, see ObserverParticipant."""
 
-    def plan_notices(self, on_notice: Callable[[str], None]) -> Notices:
+    def plan_notices(self, on_notice: Callable[[str], None]) -> PlanNoticeTopic:
         """Take part in the exchange of plans; the callback comes from any thread."""
 
 
@@ -81,7 +81,7 @@ class Agreement:
         connected: who is there.
     """
 
-    def __init__(self, system: System, air: Air, connected: Connected) -> None:
+    def __init__(self, system: System, air: PlanExchange, connected: Connected) -> None:
         self._system = system
         self._air = air
         self._connected = connected
@@ -92,7 +92,7 @@ class Agreement:
             for machine in dict.fromkeys(each.planned.machine for each in system.nodes.values())
             if machine
         )
-        self._notices: Notices | None = None
+        self._notices: PlanNoticeTopic | None = None
         self._run = os.urandom(8).hex()
         self._known: list[PlanNotice] = []
         self._compared: dict[PlanNotice, tuple[str, ...]] = {}

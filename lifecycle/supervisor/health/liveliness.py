@@ -1,9 +1,9 @@
 """Which nodes are silent: stopped, hung, or out of reach.
 
-Owns: `Liveliness`, which turns what is noticed of processes and machines into events, findings and
-the status of nodes. Nothing here waits or asks: the kernel says that a process was stopped or that
-an executor hangs (middleware/process/busy_timer.py), DDS that a machine is lost. A
-process that ended is not silent but dead, see watch.py. Must not import rclpy.
+Owns: `SilenceMonitor`, which turns what is noticed of processes and machines into events, findings
+and the status of nodes. Nothing here waits or asks: the kernel says that a process was stopped or
+that an executor hangs (middleware/process/busy_timer.py), DDS that a machine is lost. A process
+that ended is not silent but dead, see gate/watch.py. Must not import rclpy.
 """
 
 from __future__ import annotations
@@ -21,10 +21,9 @@ from lifecycle.supervisor.run.events import (
     NodeLeft,
     NodeSilent,
 )
-from lifecycle.verify.hidden import is_hidden_node
-from lifecycle.verify.noise import is_noise_node
 from lifecycle.verify.observation import Observation
 from lifecycle.verify.rules import run
+from lifecycle.verify.tool_filter import is_hidden_node, is_noise_node
 from lifecycle.verify.verdict import Finding, Outcome
 
 if TYPE_CHECKING:
@@ -47,7 +46,7 @@ class _Silence:
     causes: dict[Cause, str]
 
 
-class Liveliness:
+class SilenceMonitor:
     """Knows the silent nodes of a system.
 
     Args:
@@ -180,7 +179,7 @@ class Liveliness:
         )
 
 
-class Presence:
+class NodeArrivals:
     """Reports which nodes joined and left the graph between two observations.
 
     Hidden nodes, whose names begin with an underscore, are left out, as are tools: the one are

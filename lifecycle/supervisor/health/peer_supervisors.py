@@ -29,14 +29,14 @@ SAID_AGAIN_S = (0.1, 0.3)
 """Fast DDS repeats what was lost after up to 3 s: too late for a silence."""
 
 
-class Ear(Protocol):
+class AliveReceiver(Protocol):
     """One AliveSubscription of lifecycle.middleware."""
 
     def destroy(self) -> None:
         """Hear no more."""
 
 
-class Voice(Protocol):
+class AliveSender(Protocol):
     """One AlivePublisher of lifecycle.middleware."""
 
     def tell(self, silent: Mapping[str, str]) -> None:
@@ -46,16 +46,16 @@ class Voice(Protocol):
         """Leave."""
 
 
-class Air(Protocol):
+class AliveExchange(Protocol):
     """What carries voices, see eyes.ObserverParticipant."""
 
-    def announce_machine(self, system: str, machine: str) -> Voice:
+    def announce_machine(self, system: str, machine: str) -> AliveSender:
         """Announce ourselves as the supervisor of a machine."""
 
-    def watch_machine(self, system: str, machine: str, to: Listener) -> Ear:
+    def watch_machine(self, system: str, machine: str, to: Listener) -> AliveReceiver:
         """Watch the supervisor of a machine; callbacks come from any thread."""
 
-    def watch_node(self, node: str, to: Listener) -> Ear:
+    def watch_node(self, node: str, to: Listener) -> AliveReceiver:
         """Watch a node that is attached."""
 
     def call_out(self, addresses: Iterable[str]) -> None:
@@ -103,16 +103,16 @@ class _PeerSupervisor:
 class PeerSupervisors:
     """Hears whom a system depends on; `open` it in a loop and `close` it."""
 
-    def __init__(self, system: System, air: Air) -> None:
+    def __init__(self, system: System, air: AliveExchange) -> None:
         self._system = system
         self._air = air
         self._loop = asyncio.get_running_loop()
         self._closed = False
         self._known: list[_PeerSupervisor] = []
         self._machines: list[_PeerSupervisor] = []
-        self._ears: list[Ear] = []
+        self._ears: list[AliveReceiver] = []
         self._attached: tuple[str, ...] = ()
-        self._voices: list[Voice] = []
+        self._voices: list[AliveSender] = []
         self._said: Mapping[str, str] = {}
         self._missing: dict[str, _PeerSupervisor] = {}
         self._calling: asyncio.Task[None] | None = None

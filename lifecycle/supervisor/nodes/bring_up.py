@@ -19,7 +19,7 @@ from lifecycle.manifest.model import Condition, RunKind
 from lifecycle.node.host.control import HostSpec, Operation
 from lifecycle.plan.model import PlannedNode
 from lifecycle.supervisor.gate.gate import Permit
-from lifecycle.supervisor.nodes.driver import ControlDriver, NodeDriver, Standing
+from lifecycle.supervisor.nodes.driver import ControlDriver, NodeCondition, NodeDriver
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.processes.control_channel import (
     ChannelClosedError,
@@ -273,7 +273,7 @@ class BringUp:
         await self._appears(node.name)
         self._started(node)
 
-    def _started(self, node: NodeRun, standing: Standing | None = None) -> None:
+    def _started(self, node: NodeRun, standing: NodeCondition | None = None) -> None:
         node.doing = ""
         node.advance(Reach.STARTED, standing)
         if node.process is not None:

@@ -27,7 +27,7 @@ FINALIZED = "finalized"
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Standing:
+class NodeCondition:
     """State of a node after an operation.
 
     Attributes:
@@ -44,10 +44,10 @@ class Standing:
 class NodeDriver(Protocol):
     """Drives one managed node. Deadlines are the caller's: every call may be cancelled."""
 
-    async def start(self) -> Standing:
+    async def start(self) -> NodeCondition:
         """Wait until the node can be driven, and return its state."""
 
-    async def perform(self, operation: Operation, permit: Permit | None = None) -> Standing:
+    async def perform(self, operation: Operation, permit: Permit | None = None) -> NodeCondition:
         """Do one operation.
 
         Raises:
@@ -78,18 +78,18 @@ class ControlDriver:
         self._channel = channel
         self._node = node
 
-    async def start(self) -> Standing:
+    async def start(self) -> NodeCondition:
         """Wait for the host's "ready"."""
         await self._channel.ready()
-        return Standing(state=UNCONFIGURED)
+        return NodeCondition(state=UNCONFIGURED)
 
-    async def perform(self, operation: Operation, permit: Permit | None = None) -> Standing:
+    async def perform(self, operation: Operation, permit: Permit | None = None) -> NodeCondition:
         """Send the operation and wait for the reply."""
         reply = await self._channel.request(self._node, operation, permit)
         if not reply.ok:
             reason = reply.error or f"the node is {reply.state or 'in an unknown state'}"
             raise BringUpError(f"cannot {operation.value} {self._node!r}: {reason}")
-        return Standing(
+        return NodeCondition(
             state=reply.state, connected=reply.connected, configuration=reply.configuration
         )
 
@@ -115,7 +115,7 @@ class ControlDriver:
         return reply.configuration
 
 
-class LifecycleServices(Protocol):
+class LifecycleClients(Protocol):
     """Clients of other nodes' services, see lifecycle.middleware.NodeClients."""
 
     async def get_state(self, node: str, *, timeout_s: float) -> str:
@@ -176,17 +176,17 @@ class ServiceDriver:
     A request that was refused or not answered is judged by the state that is read afterwards.
     """
 
-    def __init__(self, services: LifecycleServices, node: PlannedNode) -> None:
+    def __init__(self, services: LifecycleClients, node: PlannedNode) -> None:
         self._services = services
         self._node = node.full_name
         self._timeouts = node.timeouts
         self._hand = ServiceHand(services, node.full_name, node.timeouts.connect_s)
 
-    async def start(self) -> Standing:
+    async def start(self) -> NodeCondition:
         """Wait until the services answer."""
         return await self._told(self._start())
 
-    async def perform(self, operation: Operation, permit: Permit | None = None) -> Standing:
+    async def perform(self, operation: Operation, permit: Permit | None = None) -> NodeCondition:
         """Change the state unless the node is there already."""
         return await self._told(self._perform(operation, permit))
 
@@ -202,10 +202,10 @@ class ServiceDriver:
         """Call the node interface's service, and read what came of it."""
         return await self._hand.wire(step)
 
-    async def _start(self) -> Standing:
+    async def _start(self) -> NodeCondition:
         return _standing(await self._state(self._timeouts.start_s))
 
-    async def _perform(self, operation: Operation, permit: Permit | None) -> Standing:
+    async def _perform(self, operation: Operation, permit: Permit | None) -> NodeCondition:
         limit_s = self._limit_s(operation)
         state = await self._state(limit_s)
         if operation in _NESTED:
@@ -246,7 +246,7 @@ class ServiceDriver:
     async def _state(self, limit_s: float) -> str:
         return await self._services.get_state(self._node, timeout_s=limit_s)
 
-    async def _told(self, doing: Awaitable[Standing]) -> Standing:
+    async def _told(self, doing: Awaitable[NodeCondition]) -> NodeCondition:
         """Turn the middleware's errors into a failed step."""
         try:
             return await doing
@@ -274,7 +274,7 @@ class ServiceHand:
     """
 
     def __init__(
-        self, services: LifecycleServices, node: str, timeout_s: float = _REQUEST_S
+        self, services: LifecycleClients, node: str, timeout_s: float = _REQUEST_S
     ) -> None:
         self._services = services
         self._node = node
@@ -312,5 +312,5 @@ class ServiceHand:
         return await self.interface()
 
 
-def _standing(state: str) -> Standing:
-    return Standing(state=state, connected=state in {INACTIVE, ACTIVE})
+def _standing(state: str) -> NodeCondition:
+    return NodeCondition(state=state, connected=state in {INACTIVE, ACTIVE})

@@ -13,7 +13,7 @@ import asyncio
 from collections.abc import Iterable
 from typing import Protocol
 
-from lifecycle.supervisor.gate.verification_loop import Changes
+from lifecycle.supervisor.gate.verification_loop import ChangeCounter
 from lifecycle.supervisor.nodes.system import GraphObserver, NodeRun, System
 from lifecycle.supervisor.processes.process import ManagedProcess
 from lifecycle.supervisor.processes.spawn import ProcessState
@@ -29,7 +29,7 @@ _ALWAYS = 3
 _PREFIX_DIGITS = 24
 
 
-class Graph(Protocol):
+class ParticipantRegistry(Protocol):
     """Where participants are seen and removed, see ObserverParticipant."""
 
     def participants_of(
@@ -52,7 +52,7 @@ class StaleNodes:
         graph: see above.
     """
 
-    def __init__(self, system: System, graph: Graph) -> None:
+    def __init__(self, system: System, graph: ParticipantRegistry) -> None:
         self._system = system
         self._graph = graph
         self._later: set[asyncio.TimerHandle] = set()
@@ -118,7 +118,7 @@ _LEASE_S = 21.0
 class Sightings:
     """Who is in the graph of one system, as an event to wait for."""
 
-    def __init__(self, system: System, observer: GraphObserver, changes: Changes) -> None:
+    def __init__(self, system: System, observer: GraphObserver, changes: ChangeCounter) -> None:
         self._system = system
         self._observer = observer
         self._changes = changes

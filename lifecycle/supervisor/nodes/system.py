@@ -19,8 +19,8 @@ from lifecycle.node.host.control import Event as HostEvent
 from lifecycle.node.host.control import Operation
 from lifecycle.plan.model import Plan, PlannedNode, PlannedProcess
 from lifecycle.supervisor.gate.gate import Permit
-from lifecycle.supervisor.health.liveliness import Liveliness
-from lifecycle.supervisor.nodes.driver import NodeDriver, Standing
+from lifecycle.supervisor.health.liveliness import SilenceMonitor
+from lifecycle.supervisor.nodes.driver import NodeCondition, NodeDriver
 from lifecycle.supervisor.nodes.remote_nodes import RemoteNode
 from lifecycle.supervisor.processes.logs import LogDirectory
 from lifecycle.supervisor.processes.process import ManagedProcess
@@ -114,7 +114,7 @@ class NodeRun:
             return self.reach is not Reach.WAITING
         return _ORDER.index(self.reach) >= _ORDER.index(_CONDITIONS[condition])
 
-    def advance(self, reach: Reach, standing: Standing | None = None) -> None:
+    def advance(self, reach: Reach, standing: NodeCondition | None = None) -> None:
         """Note that the node came to `reach`, and notify the listeners and who waits for it."""
         self.reach = reach
         if standing is not None:
@@ -137,7 +137,7 @@ class NodeRun:
             self._take(state, connected=connected)
             self._tell()
 
-    async def perform(self, operation: Operation, permit: Permit | None = None) -> Standing:
+    async def perform(self, operation: Operation, permit: Permit | None = None) -> NodeCondition:
         """Send one operation to a managed node.
 
         Raises:
@@ -223,7 +223,7 @@ class System:
         self._by_name = {node.name: node for node in self.nodes.values()}
         self.touched = asyncio.Event()
         self.present: frozenset[str] | None = None
-        self.liveliness = Liveliness(emit, self.touched.set, self._is_there)
+        self.liveliness = SilenceMonitor(emit, self.touched.set, self._is_there)
 
     def _is_there(self, name: str) -> bool:
         """Whether a node has started, and is in the graph as far as that is known."""

@@ -23,8 +23,8 @@ from lifecycle.supervisor.processes.fork_server_protocol import (
     LARGEST_MESSAGE,
     MSG_CMSG_CLOEXEC,
     SERVES,
+    ChildReport,
     ForkRequest,
-    Report,
 )
 from lifecycle.supervisor.processes.orphans import children, descendants
 from lifecycle.supervisor.processes.spawn import ProcessExit, SpawnRequest
@@ -311,7 +311,7 @@ class ForkServer:
             return True  # it died with requests unread; what it had sent before still comes
         if not data:
             return False
-        report = from_json(data, Report)
+        report = from_json(data, ChildReport)
         if report.id == SERVES.id:
             self._serves.set()
         elif report.stopped is not None:
@@ -322,7 +322,7 @@ class ForkServer:
             self._born(report, descriptors)
         return True
 
-    def _born(self, report: Report, descriptors: list[int]) -> None:
+    def _born(self, report: ChildReport, descriptors: list[int]) -> None:
         born, request = self._pending.pop(report.id)
         if report.error:
             if not born.done():

@@ -30,8 +30,8 @@ from lifecycle.supervisor.processes.fork_server_protocol import (
     LARGEST_MESSAGE,
     MSG_CMSG_CLOEXEC,
     SERVES,
+    ChildReport,
     ForkRequest,
-    Report,
 )
 
 GRACE_S = 4.0
@@ -81,7 +81,7 @@ class _ForkServer:
             return False
         request = from_json(data, ForkRequest)
         if request == SERVES:
-            self._tell(Report(id=request.id))
+            self._tell(ChildReport(id=request.id))
             return True
         try:
             with warnings.catch_warnings():
@@ -91,7 +91,7 @@ class _ForkServer:
                 pid = os.fork()
         except OSError as error:
             pid = -1
-            self._tell(Report(id=request.id, error=str(error)))
+            self._tell(ChildReport(id=request.id, error=str(error)))
         if pid == 0:
             self._become(request, descriptors)
         for descriptor in descriptors:
@@ -104,7 +104,7 @@ class _ForkServer:
         pidfd = os.pidfd_open(pid)
         self._children[pid] = (request, pidfd)
         self._selector.register(pidfd, selectors.EVENT_READ, pid)
-        self._tell(Report(id=request, pid=pid), pidfd)
+        self._tell(ChildReport(id=request, pid=pid), pidfd)
 
     def _reap(self, pid: int) -> None:
         if pid not in self._children:
@@ -113,7 +113,7 @@ class _ForkServer:
         self._selector.unregister(pidfd)
         os.close(pidfd)
         _, status = os.waitpid(pid, 0)
-        self._tell(Report(id=request, pid=pid, status=status))
+        self._tell(ChildReport(id=request, pid=pid, status=status))
 
     def _note_stops(self) -> None:
         """Tell which children were stopped or continue."""
@@ -124,7 +124,7 @@ class _ForkServer:
                 if found.si_pid in self._children:
                     request, _ = self._children[found.si_pid]
                     stopped = found.si_code != os.CLD_CONTINUED
-                    self._tell(Report(id=request, pid=found.si_pid, stopped=stopped))
+                    self._tell(ChildReport(id=request, pid=found.si_pid, stopped=stopped))
 
     def _bury_adopted(self) -> None:
         """Reap orphans that have ended, and children where one of them is in between."""
@@ -135,7 +135,7 @@ class _ForkServer:
                 else:
                     os.waitpid(found.si_pid, 0)
 
-    def _tell(self, report: Report, *descriptors: int) -> None:
+    def _tell(self, report: ChildReport, *descriptors: int) -> None:
         # A supervisor that is gone is noticed by the next read.
         with contextlib.suppress(ConnectionError):
             socket.send_fds(self._sock, [to_json(report)], descriptors)

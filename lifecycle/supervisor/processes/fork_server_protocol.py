@@ -35,7 +35,7 @@ SERVES = ForkRequest(id=0, argv=(), environment=(), working_directory="", contro
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Report:
+class ChildReport:
     """Fork server → supervisor: a child was forked (with its pidfd), stopped, continued or ended.
 
     Attributes:

@@ -47,7 +47,7 @@ class _Orphan:
             signal.pidfd_send_signal(self.pidfd, number)
 
 
-class Family(Protocol):
+class ProcessFamily(Protocol):
     """What knows the processes of a run by their descent, see fork_server.ForkServer."""
 
     @property
@@ -59,7 +59,7 @@ class Family(Protocol):
 
 
 def end_strays(
-    run_id: str, fork_server: Family | None = None, grace_s: float = 0.5
+    run_id: str, fork_server: ProcessFamily | None = None, grace_s: float = 0.5
 ) -> tuple[int, ...]:
     """End everything that still belongs to a run, but for this process and the fork server itself.
 

@@ -25,9 +25,9 @@ from lifecycle.supervisor.gate.verification_loop import GracePeriod, with_findin
 from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 from lifecycle.supervisor.run.options import onlooker_connections, own_machines
 from lifecycle.verify import verify
-from lifecycle.verify.noise import tolerating_pattern
 from lifecycle.verify.observation import NodeConfiguration, Observation
 from lifecycle.verify.rules import Heals, rule
+from lifecycle.verify.tool_filter import tolerating_pattern
 from lifecycle.verify.verdict import Outcome, Stage, Verdict
 
 _ASK_AGAIN_S = 0.5
@@ -39,7 +39,7 @@ a node hangs or somebody was reconfigured nobody tells those who stand outside."
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Seen:
+class JudgedSystem:
     """What was seen of a running system, and how it was judged.
 
     Attributes:
@@ -63,7 +63,7 @@ class Seen:
         return "" if somebody else where(self.plan, self.rmw)
 
 
-def judge_running(plan: Plan, *, timeout_s: float, strict: bool) -> Seen:
+def judge_running(plan: Plan, *, timeout_s: float, strict: bool) -> JudgedSystem:
     """Judge what runs against the plan, as an active system.
 
     Args:
@@ -78,7 +78,7 @@ def judge_running(plan: Plan, *, timeout_s: float, strict: bool) -> Seen:
         return asyncio.run(_judge(plan, observer_participant, timeout_s, strict=strict))
 
 
-async def following(plan: Plan, on_look: Callable[[Seen], None]) -> None:
+async def following(plan: Plan, on_look: Callable[[JudgedSystem], None]) -> None:
     """Look at every change and give what was seen and its verdict, until cancelled.
 
     What may pass by itself is given a moment to do so, see grace_period.py.
@@ -105,7 +105,7 @@ def follow_running(plan: Plan, on_verdict: Callable[[Verdict], None]) -> None:
     """Judge what runs and report each verdict that differs from the last, until interrupted."""
     last: Verdict | None = None
 
-    def take(seen: Seen) -> None:
+    def take(seen: JudgedSystem) -> None:
         nonlocal last
         if seen.verdict != last:
             last = seen.verdict
@@ -149,11 +149,11 @@ def _heard(plan: Plan) -> tuple[NodeConfiguration, ...]:
     return tuple(found)
 
 
-async def _see(plan: Plan, observer_participant: ObserverParticipant) -> Seen:
+async def _see(plan: Plan, observer_participant: ObserverParticipant) -> JudgedSystem:
     observation = await observer_participant.observe(plan)
     expected = Expectation.of(plan, observation)
     verdict = verify(expected.plan, observation, stage=Stage.ACTIVE)
-    return Seen(
+    return JudgedSystem(
         plan=expected.plan,
         observation=observation,
         verdict=with_findings(verdict, expected.findings),
@@ -163,7 +163,7 @@ async def _see(plan: Plan, observer_participant: ObserverParticipant) -> Seen:
 
 async def _judge(
     plan: Plan, observer_participant: ObserverParticipant, timeout_s: float, *, strict: bool
-) -> Seen:
+) -> JudgedSystem:
     loop = asyncio.get_running_loop()
     deadline = loop.time() + timeout_s
     while True:
@@ -191,4 +191,4 @@ async def _change(observer_participant: ObserverParticipant, timeout_s: float) -
     return True
 
 
-__all__ = ["Seen", "follow_running", "following", "judge_running", "where"]
+__all__ = ["JudgedSystem", "follow_running", "following", "judge_running", "where"]

@@ -21,25 +21,24 @@ from typing import TYPE_CHECKING, TypeVar
 from lifecycle.errors import MiddlewareError
 from lifecycle.export.captured import CapturedParameter, CapturedSystem, capture
 from lifecycle.export.picture import Picture, Supervised, build_picture
-from lifecycle.graph import Look as GraphLook
-from lifecycle.graph import set_within
+from lifecycle.graph import Look, set_within
 from lifecycle.manifest.model import DiscoveryRange
 from lifecycle.plan.model import Plan
 from lifecycle.run_directory import is_held, run_name, runtime_root
 from lifecycle.supervisor.control.client import look
-from lifecycle.supervisor.control.server import Look, follow
+from lifecycle.supervisor.control.server import SupervisorSnapshot, follow
 from lifecycle.supervisor.control.status import SystemStatus
 from lifecycle.supervisor.processes.spawn import ProcessState
-from lifecycle.supervisor.run.attach import Seen, following, judge_running
+from lifecycle.supervisor.run.attach import JudgedSystem, following, judge_running
 from lifecycle.supervisor.run.events import Reach
 from lifecycle.verify import Stage, verify
-from lifecycle.verify.noise import known_node
 from lifecycle.verify.observation import (
     NodeConfiguration,
     Observation,
     ObservedEndpoint,
     ObservedNode,
 )
+from lifecycle.verify.tool_filter import known_node
 
 if TYPE_CHECKING:
     from lifecycle.graph import Graph
@@ -90,7 +89,7 @@ def attached_pictures(plan: Plan, on_picture: Callable[[Picture], None]) -> None
     """Look from outside and give each picture that differs from the last, for ever."""
     last: Picture | None = None
 
-    def take(seen: Seen) -> None:
+    def take(seen: JudgedSystem) -> None:
         nonlocal last
         picture = build_picture(seen.plan, seen.observation, seen.verdict)
         if picture != last:
@@ -100,7 +99,7 @@ def attached_pictures(plan: Plan, on_picture: Callable[[Picture], None]) -> None
     asyncio.run(following(plan, take))
 
 
-def _drawn(seen: Look) -> Picture:
+def _drawn(seen: SupervisorSnapshot) -> Picture:
     verdict = seen.verdict or verify(seen.plan, seen.observation, stage=Stage.ACTIVE)
     return build_picture(
         seen.plan,
@@ -187,7 +186,7 @@ async def _look(graph: Graph, wait_s: float) -> tuple[Observation, _Parameters, 
     )
     names = [node.full_name for node in nodes]
     graph.state.put_look(
-        GraphLook(
+        Look(
             nodes=nodes,
             endpoints=endpoints,
             answers={

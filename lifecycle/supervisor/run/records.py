@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from lifecycle.middleware.process.shared_memory import Creations, segments_of
 from lifecycle.run_directory import ChildRecord, RunDirectory, start_ticks
 from lifecycle.supervisor.nodes.system import System
-from lifecycle.supervisor.processes.orphans import Family
+from lifecycle.supervisor.processes.orphans import ProcessFamily
 from lifecycle.supervisor.run.events import Emitter, Notice
 from lifecycle.supervisor.run.failure import Worker
 
@@ -33,7 +33,7 @@ class Records:
         self,
         directory: RunDirectory,
         system: System,
-        fork_server: Family,
+        fork_server: ProcessFamily,
         worker: Worker,
         emit: Emitter,
     ) -> None:
@@ -107,7 +107,11 @@ class Records:
 
 @contextlib.contextmanager
 def noting(
-    directory: RunDirectory, system: System, fork_server: Family, worker: Worker, emit: Emitter
+    directory: RunDirectory,
+    system: System,
+    fork_server: ProcessFamily,
+    worker: Worker,
+    emit: Emitter,
 ) -> Iterator[Records]:
     """Keep records that note shared memory once it is made: its owner may be killed at any time.
 

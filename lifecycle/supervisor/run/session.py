@@ -21,13 +21,13 @@ from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.connections.authority import Reaching, authority_of
 from lifecycle.supervisor.connections.networks import Networks
 from lifecycle.supervisor.control.orders import ACTIVE, HELD, PAUSED, Revisions
-from lifecycle.supervisor.control.server import ControlServer, Look
+from lifecycle.supervisor.control.server import ControlServer, SupervisorSnapshot
 from lifecycle.supervisor.control.status import SystemStatus, system_status
 from lifecycle.supervisor.gate.activation_guard import ActivationGuard
 from lifecycle.supervisor.gate.gate import Gate, VerificationError, closes
 from lifecycle.supervisor.gate.hold import Holding
 from lifecycle.supervisor.gate.sequence import GateSequence
-from lifecycle.supervisor.gate.verification_loop import Changes, VerificationLoop
+from lifecycle.supervisor.gate.verification_loop import ChangeCounter, VerificationLoop
 from lifecycle.supervisor.health import agreement, peer_supervisors
 from lifecycle.supervisor.health.agreement import Agreement
 from lifecycle.supervisor.health.peer_supervisors import PeerSupervisors
@@ -38,7 +38,7 @@ from lifecycle.supervisor.nodes.driver import NodeDriver
 from lifecycle.supervisor.nodes.remote_nodes import RemoteNodes
 from lifecycle.supervisor.nodes.stale_nodes import Sightings, StaleNodes
 from lifecycle.supervisor.nodes.system import GraphObserver, System
-from lifecycle.supervisor.processes.orphans import Family, end_strays, reap_adopted
+from lifecycle.supervisor.processes.orphans import ProcessFamily, end_strays, reap_adopted
 from lifecycle.supervisor.processes.spawn import Spawner
 from lifecycle.supervisor.run.events import (
     Emitter,
@@ -80,7 +80,7 @@ class _Stop(Exception):  # noqa: N818 - not an error: it was asked for
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class _End:
+class _RunEnd:
     """What a run comes to, beside its reason: nothing to add, if it is as it was asked for."""
 
     exit_code: ExitCode = ExitCode.OK
@@ -89,7 +89,12 @@ class _End:
 
 
 class SessionParticipant(
-    GraphObserver, peer_supervisors.Air, agreement.Air, Reaching, stale_nodes.Graph, Protocol
+    GraphObserver,
+    peer_supervisors.AliveExchange,
+    agreement.PlanExchange,
+    Reaching,
+    stale_nodes.ParticipantRegistry,
+    Protocol,
 ):
     """What a session needs of its participant in the graph, see nodes/observer_participant.py.
 
@@ -106,7 +111,7 @@ class SessionParticipant(
         """Close connections that nobody answers, so that leaving does not wait for them."""
 
 
-class SessionForkServer(Spawner, Family, Protocol):
+class SessionForkServer(Spawner, ProcessFamily, Protocol):
     """What a session needs of its fork server, see processes/fork_server.py."""
 
     @property
@@ -161,7 +166,7 @@ class Session:
         self._ends = ""
         self._hurry = asyncio.Event()
         self._stop: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._changes = Changes(system, observer_participant)
+        self._changes = ChangeCounter(system, observer_participant)
         self._authority = authority_of(system, emit, observer_participant)
         self._peer_supervisors = PeerSupervisors(system, observer_participant)
         self._agreement = Agreement(system, observer_participant, self._peer_supervisors)
@@ -234,9 +239,9 @@ class Session:
             elapsed_s=self._emit.elapsed_s,
         )
 
-    def look(self) -> Look:
+    def look(self) -> SupervisorSnapshot:
         """Return all that is known now."""
-        return Look(
+        return SupervisorSnapshot(
             plan=self._system.expected,
             status=self.status(),
             observation=self._judge.seen,
@@ -295,7 +300,7 @@ class Session:
     async def _until_over(self) -> UpResult:
         """Run the phases; whatever ends them becomes an exit code and a verdict."""
         reason = stopping = "done"
-        end = _End()
+        end = _RunEnd()
         try:
             end = await self._unless_stopped(self._phases())
         except _Stop as stop:
@@ -306,9 +311,9 @@ class Session:
                 self._emit(each.event())
             reason, stopping = failure.reason, "rolling back"
             verdict = with_failure(self._judge.latest or NOT_JUDGED, failure)
-            end = _End(exit_code=failure.exit_code, verdict=verdict)
+            end = _RunEnd(exit_code=failure.exit_code, verdict=verdict)
         except VerificationError as error:
-            stopping, end = "the verdict keeps the gate closed", _End(exit_code=error.exit_code)
+            stopping, end = "the verdict keeps the gate closed", _RunEnd(exit_code=error.exit_code)
             if error.again:
                 stopping = "the system changed before every node was activated"
             elif self._gate_sequence.phase == "activating":
@@ -329,7 +334,7 @@ class Session:
         verdict = dataclasses.replace(end.verdict or self._judge.latest or NOT_JUDGED, run=run)
         return UpResult(exit_code=end.exit_code, verdict=verdict, plan=self._system.first)
 
-    def _cut_short(self, exit_code: ExitCode) -> _End:
+    def _cut_short(self, exit_code: ExitCode) -> _RunEnd:
         """Return what a run comes to that is asked to end.
 
         It is a success only if the system was verified, is what was asked for, and nothing bound
@@ -340,20 +345,20 @@ class Session:
             exit_code: of a run that is cut short.
         """
         if not self._held:
-            return _End(exit_code=exit_code, why=self._waits())
+            return _RunEnd(exit_code=exit_code, why=self._waits())
         end = self._outcome()
         if exit_code is ExitCode.INTERRUPTED:
             return dataclasses.replace(end, exit_code=exit_code)
         if end.exit_code == ExitCode.VIOLATED and self._hosts_left():
-            end = _End()
+            end = _RunEnd()
         if end.exit_code != ExitCode.OK:
             return end
         if self._options.stop_after_s is not None:
             why = f"it did not hold for the {self._options.stop_after_s:g} s of --stop-after"
-            return _End(exit_code=exit_code, why=why)
+            return _RunEnd(exit_code=exit_code, why=why)
         if self._options.until is Until.ACTIVE and self._gate_sequence.phase not in _KEPT:
             why = f"the system was {self._gate_sequence.phase}, not active"
-            return _End(exit_code=exit_code, why=why)
+            return _RunEnd(exit_code=exit_code, why=why)
         return end
 
     def _hosts_left(self) -> bool:
@@ -361,7 +366,7 @@ class Session:
         latest = self._judge.latest
         return latest is not None and self._agreement.follows_from_shut_down(latest)
 
-    def _outcome(self, meanwhile: str = "") -> _End:
+    def _outcome(self, meanwhile: str = "") -> _RunEnd:
         """Return what the run of a system comes to that was held until now.
 
         Args:
@@ -371,19 +376,19 @@ class Session:
         if deaths:
             failure = deaths[0].joined(deaths[1:])
             verdict = with_failure(self._judge.latest or NOT_JUDGED, failure)
-            return _End(exit_code=failure.exit_code, why=failure.reason, verdict=verdict)
+            return _RunEnd(exit_code=failure.exit_code, why=failure.reason, verdict=verdict)
         latest = self._judge.latest
-        end = _End()
+        end = _RunEnd()
         if self._options.until is Until.CONNECTED or latest is None:
             pass
         elif latest.verdict is Outcome.VIOLATED:
-            end = _End(exit_code=ExitCode.VIOLATED, why=f"violated; {not_ok(latest)}")
+            end = _RunEnd(exit_code=ExitCode.VIOLATED, why=f"violated; {not_ok(latest)}")
         elif meanwhile:
-            end = _End(exit_code=ExitCode.VIOLATED, why=f"violated meanwhile, {meanwhile}")
+            end = _RunEnd(exit_code=ExitCode.VIOLATED, why=f"violated meanwhile, {meanwhile}")
         elif closes(latest, strict=self._options.strict):
-            end = _End(exit_code=ExitCode.UNVERIFIABLE, why=f"unverifiable; {not_ok(latest)}")
+            end = _RunEnd(exit_code=ExitCode.UNVERIFIABLE, why=f"unverifiable; {not_ok(latest)}")
         elif self._gate_sequence.phase == HELD:
-            end = _End(exit_code=ExitCode.VIOLATED, why="held at the gate, and not active")
+            end = _RunEnd(exit_code=ExitCode.VIOLATED, why="held at the gate, and not active")
         return end
 
     def _waits(self) -> str:
@@ -392,7 +397,7 @@ class Session:
         verifies = self._gate_sequence.phase == "verifying" and latest is not None
         return self._bring_up.unfinished() or (missing(latest) if verifies and latest else "")
 
-    async def _phases(self) -> _End:
+    async def _phases(self) -> _RunEnd:
         loop = asyncio.get_running_loop()
         deadline = loop.time() + self._options.timeout_s
         async with self._following():
@@ -425,7 +430,7 @@ class Session:
                     each.result()
             await ended(*followers)
 
-    async def _hold(self, stage: Stage) -> _End:
+    async def _hold(self, stage: Stage) -> _RunEnd:
         """Keep the system for as long as was asked; return what the run comes to."""
         self._held = True
         hold_s = self._options.stop_after_s
@@ -433,7 +438,7 @@ class Session:
             hold_s = 0.0
         return self._outcome(await self._holding.hold(stage, hold_s))
 
-    async def _unless_stopped(self, phases: Coroutine[Any, Any, _End]) -> _End:
+    async def _unless_stopped(self, phases: Coroutine[Any, Any, _RunEnd]) -> _RunEnd:
         running = asyncio.ensure_future(phases)
         try:
             waits: set[asyncio.Future[Any]] = {running, self._stop}

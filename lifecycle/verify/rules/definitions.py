@@ -28,7 +28,7 @@ RULES = (DEFINITION_DIFFERS,)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class _End:
+class _TypedEnd:
     """One end of a topic, service or action.
 
     Attributes:
@@ -52,7 +52,7 @@ def check(view: View) -> Iterator[Finding]:
         _place(each.planned.kind, each.planned.resolved, each.planned.type): each.planned.type_hash
         for each in view.actual
     }
-    unknown: dict[str, list[tuple[_Place, _End]]] = {}
+    unknown: dict[str, list[tuple[_Place, _TypedEnd]]] = {}
     for place, ends in _ends(view).items():
         if place not in installed:
             continue  # nothing of the plan meets there, or its type is wrong: that is said
@@ -87,11 +87,11 @@ def differ(one: str, other: str) -> bool:
     )
 
 
-def _ends(view: View) -> dict[_Place, list[_End]]:
-    found: dict[_Place, list[_End]] = {}
+def _ends(view: View) -> dict[_Place, list[_TypedEnd]]:
+    found: dict[_Place, list[_TypedEnd]] = {}
     for seen in view.seen:
         at = seen.planned.at if seen.planned else None
-        end = _End(kind=seen.kind, node=seen.node, type_hash=seen.type_hash, at=at)
+        end = _TypedEnd(kind=seen.kind, node=seen.node, type_hash=seen.type_hash, at=at)
         found.setdefault(_place(seen.kind, seen.name, seen.type), []).append(end)
     outsiders = (*view.undeclared, *view.foreign, *view.of_tools, *view.unattributed)
     others: list[tuple[ObservedEndpoint, Position | None]] = [
@@ -102,7 +102,7 @@ def _ends(view: View) -> dict[_Place, list[_End]]:
     others += [(each, None) for each in outsiders]
     for each, at in others:
         if not each.kind.is_topic:
-            end = _End(kind=each.kind, node=each.node, type_hash=each.type_hash, at=at)
+            end = _TypedEnd(kind=each.kind, node=each.node, type_hash=each.type_hash, at=at)
             found.setdefault(_place(each.kind, each.name, each.type), []).append(end)
     return found
 
@@ -111,7 +111,7 @@ def _place(kind: EndpointKind, name: str, type_: str) -> _Place:
     return MEETS[kind], name, type_
 
 
-def _differs(place: _Place, end: _End, expected: str, source: str) -> Finding:
+def _differs(place: _Place, end: _TypedEnd, expected: str, source: str) -> Finding:
     what, name, type_ = place
     node = end.node or "an unknown node"
     return DEFINITION_DIFFERS.finding(
@@ -128,7 +128,7 @@ def _differs(place: _Place, end: _End, expected: str, source: str) -> Finding:
     )
 
 
-def _unverifiable(node: str, ends: list[tuple[_Place, _End]]) -> Finding:
+def _unverifiable(node: str, ends: list[tuple[_Place, _TypedEnd]]) -> Finding:
     """One finding for a node: who announces no hash announces none for any of its endpoints."""
     who = node or "an unknown node"
     listed = ", ".join(dict.fromkeys(f"{name} ({end.kind.noun})" for (_, name, _), end in ends))

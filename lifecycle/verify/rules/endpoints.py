@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from lifecycle.manifest.model import EndpointKind, EndpointPolicy
-from lifecycle.verify.noise import OFFERS
 from lifecycle.verify.observation import ObservedEndpoint
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
+from lifecycle.verify.tool_filter import OFFERS
 from lifecycle.verify.verdict import Finding, Outcome
-from lifecycle.verify.view import Actual, Seen, View
+from lifecycle.verify.view import Actual, SeenEndpoint, View
 
 MISSING_ENDPOINT = Rule(
     id="graph.missing-endpoint",
@@ -222,7 +222,7 @@ def _conflicts(view: View) -> Iterator[Finding]:
         place = (MEETS[actual.planned.kind], actual.planned.resolved)
         types.setdefault(place, {})[actual.planned.type] = None
     others = (*view.undeclared, *view.foreign, *view.unattributed)
-    undeclared: tuple[Seen | ObservedEndpoint, ...] = (
+    undeclared: tuple[SeenEndpoint | ObservedEndpoint, ...] = (
         *(each for each in view.seen if each.planned is None),
         *(each for each in others if not each.kind.is_topic),
     )

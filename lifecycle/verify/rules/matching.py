@@ -20,7 +20,7 @@ from lifecycle.manifest.qos import Certainty, QosProfile, incompatibilities
 from lifecycle.verify.observation import EndpointReport
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.verdict import Finding, Outcome
-from lifecycle.verify.view import UNKNOWN_QOS, Actual, FlowView, Seen, View, actual_qos
+from lifecycle.verify.view import UNKNOWN_QOS, Actual, FlowView, SeenEndpoint, View, actual_qos
 
 UNMATCHED_LINK = Rule(
     id="graph.unmatched-link",
@@ -237,7 +237,7 @@ def _end(actual: Actual) -> MatchEnd:
     )
 
 
-def _end_of_graph(seen: Seen) -> MatchEnd:
+def _end_of_graph(seen: SeenEndpoint) -> MatchEnd:
     return MatchEnd(
         kind=seen.kind,
         type=seen.type,

@@ -19,7 +19,7 @@ from lifecycle.manifest.qos import (
 from lifecycle.plan.model import PlannedEndpoint, PlannedNode
 from lifecycle.verify.rules.catalogue import Rule
 from lifecycle.verify.verdict import Finding, Outcome
-from lifecycle.verify.view import UNKNOWN_QOS, Actual, Seen, View, actual_qos
+from lifecycle.verify.view import UNKNOWN_QOS, Actual, SeenEndpoint, View, actual_qos
 
 QOS_DIFFERS = Rule(
     id="graph.qos-differs",
@@ -165,8 +165,8 @@ def spell(profile: QosProfile, policy: str) -> str:
 
 def _pairs(view: View) -> Iterator[Finding]:
     """Every publisher against every subscription of a topic, at least one of them ours."""
-    publishers: dict[str, list[Seen]] = {}
-    subscriptions: dict[str, list[Seen]] = {}
+    publishers: dict[str, list[SeenEndpoint]] = {}
+    subscriptions: dict[str, list[SeenEndpoint]] = {}
     for seen in view.seen:
         side = publishers if seen.kind is EndpointKind.PUBLISHER else subscriptions
         side.setdefault(seen.name, []).append(seen)
@@ -193,7 +193,9 @@ def _pairs(view: View) -> Iterator[Finding]:
                         yield _incompatible(publisher, subscription, each)
 
 
-def _incompatible(publisher: Seen, subscription: Seen, found: Incompatibility) -> Finding:
+def _incompatible(
+    publisher: SeenEndpoint, subscription: SeenEndpoint, found: Incompatibility
+) -> Finding:
     certain = found.severity is Certainty.CERTAIN
     offers, requests = publisher.node or "an unknown node", subscription.node or "an unknown node"
     declared = publisher.planned or subscription.planned

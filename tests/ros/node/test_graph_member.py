@@ -14,8 +14,8 @@ from std_msgs.msg import String
 from lifecycle import LifecycleNode, codec
 from lifecycle.graph.dds import GRAPH_QOS
 from lifecycle.graph.messages import GraphMessage, Heartbeat, decode
-from lifecycle.verify.noise import GRAPH_TOPIC
 from lifecycle.verify.observation import NodeConfiguration
+from lifecycle.verify.tool_filter import GRAPH_TOPIC
 
 Told = Callable[[], list[GraphMessage]]
 

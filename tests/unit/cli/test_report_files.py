@@ -14,7 +14,7 @@ from xml.etree import ElementTree as ET
 import click
 import pytest
 
-from lifecycle.cli.report import Report, open_report
+from lifecycle.cli.report import ReportFile, open_report
 from lifecycle.cli.up_output import output
 from lifecycle.cli.verbs.up import _finished
 from lifecycle.errors import ExitCode, MiddlewareError, UsageError
@@ -40,7 +40,7 @@ def violated() -> Verdict:
 def written(directory: Path, name: str) -> str:
     path = directory / name
     open_report(path)
-    with Report(path) as report:
+    with ReportFile(path) as report:
         report.begin(PLAN)
         report.end(violated())
     text = path.read_text(encoding="utf-8")
@@ -115,7 +115,7 @@ def test_a_full_disk_leaves_a_report_whole_and_red(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     path = tmp_path / "report.txt"
-    with Report(path) as report:
+    with ReportFile(path) as report:
         report.begin(PLAN)
         before = path.read_text()
         monkeypatch.setattr(os, "posix_fallocate", full)
@@ -130,7 +130,7 @@ def test_nothing_old_outlives_a_run_that_is_killed(tmp_path: Path) -> None:
     path.write_text("<testsuites failures='0'/>")
     open_report(path)
     assert path.read_text() == ""
-    Report(path).begin(PLAN)
+    ReportFile(path).begin(PLAN)
     root = ET.parse(path).getroot()
     assert root.get("failures") == "1"
     (failure,) = root.iter("failure")
@@ -142,7 +142,7 @@ def test_a_pipe_is_written_once_in_the_end(tmp_path: Path) -> None:
     os.mkfifo(path)
     reader = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
     open_report(path)
-    with Report(path) as report:
+    with ReportFile(path) as report:
         report.begin(PLAN)
         report.end(violated())
     text = os.read(reader, 1 << 20).decode()
@@ -170,7 +170,7 @@ def test_every_end_is_reported_and_none_of_these_is_a_success(
     path = tmp_path / f"report.{suffix}"
 
     def fail() -> None:
-        with Report(path):
+        with ReportFile(path):
             raise error
 
     with pytest.raises(type(error)):
@@ -209,7 +209,7 @@ def test_an_invalid_manifest_is_reported_with_every_error(tmp_path: Path) -> Non
     path = tmp_path / "report.json"
 
     def fail() -> None:
-        with Report(path):
+        with ReportFile(path):
             raise ManifestError(wrong)
 
     with pytest.raises(ManifestError):
@@ -226,7 +226,7 @@ def test_a_report_that_cannot_be_written_in_the_end_is_no_success(tmp_path: Path
     directory.mkdir()
     path = directory / "report.json"
     open_report(path)
-    with Report(path) as report:
+    with ReportFile(path) as report:
         report.begin(PLAN)
         path.unlink()
         directory.rmdir()
@@ -252,7 +252,7 @@ def test_a_run_that_took_another_manifest_is_reported_by_that_one(tmp_path: Path
     for taken in (dataclasses.replace(result, plan=None), result):
         path = tmp_path / "report.xml"
         open_report(path)
-        with Report(path) as report, output("json") as listener:
+        with ReportFile(path) as report, output("json") as listener:
             report.begin(PLAN)
             assert _finished(taken, listener, report) == ExitCode.UNVERIFIABLE
         failed.append(sum(1 for _ in ET.parse(path).iter("failure")))

@@ -19,8 +19,8 @@ import pytest
 from lifecycle.codec import from_json, to_json
 from lifecycle.export.picture import (
     WRITERS,
-    NodeState,
     Picture,
+    PicturedNodeState,
     Presence,
     Supervised,
     build_picture,
@@ -129,12 +129,14 @@ def test_a_system_as_declared_has_every_flow_with_its_tuple_medium_dscp_and_uniq
 @pytest.mark.parametrize(
     ("supervised", "state"),
     [
-        (Supervised(dead=True), NodeState.DEAD),
-        (Supervised(silent=True), NodeState.SILENT),
-        (Supervised(), NodeState.ACTIVE),
+        (Supervised(dead=True), PicturedNodeState.DEAD),
+        (Supervised(silent=True), PicturedNodeState.SILENT),
+        (Supervised(), PicturedNodeState.ACTIVE),
     ],
 )
-def test_a_supervisor_adds_who_is_dead_or_silent(supervised: Supervised, state: NodeState) -> None:
+def test_a_supervisor_adds_who_is_dead_or_silent(
+    supervised: Supervised, state: PicturedNodeState
+) -> None:
     plan = planned(node("a", publisher("x")), node("b", subscription("x")))
     picture = drawn(plan, perfect(plan, Stage.ACTIVE), supervised={"/a": supervised})
     assert picture.nodes()[0].state is state
@@ -143,17 +145,17 @@ def test_a_supervisor_adds_who_is_dead_or_silent(supervised: Supervised, state: 
 @pytest.mark.parametrize(
     ("told", "managed", "state"),
     [
-        ("inactive", True, NodeState.CONNECTED),
-        ("unconfigured", True, NodeState.UNCONFIGURED),
-        ("finalized", True, NodeState.FINALIZED),
-        ("activating", True, NodeState.CHANGING),
-        (None, False, NodeState.PLAIN),
-        (None, True, NodeState.SILENT),
-        (None, None, NodeState.UNKNOWN),
+        ("inactive", True, PicturedNodeState.CONNECTED),
+        ("unconfigured", True, PicturedNodeState.UNCONFIGURED),
+        ("finalized", True, PicturedNodeState.FINALIZED),
+        ("activating", True, PicturedNodeState.CHANGING),
+        (None, False, PicturedNodeState.PLAIN),
+        (None, True, PicturedNodeState.SILENT),
+        (None, None, PicturedNodeState.UNKNOWN),
     ],
 )
 def test_every_state_of_a_node_has_a_look(
-    told: str | None, managed: bool | None, state: NodeState
+    told: str | None, managed: bool | None, state: PicturedNodeState
 ) -> None:
     plan = planned(node("a", publisher("x")))
     seen = perfect(plan, Stage.ACTIVE)
@@ -383,7 +385,7 @@ def test_a_picture_fits_its_schema_and_one_with_an_unknown_key_does_not(picture:
 
 
 def test_the_schema_names_exactly_the_fields_and_the_values_of_a_picture() -> None:
-    enums = {each.__name__: each for each in (Presence, NodeState, Outcome, LineKind)}
+    enums = {each.__name__: each for each in (Presence, PicturedNodeState, Outcome, LineKind)}
     for name, definition in {**SCHEMA["$defs"], "Picture": SCHEMA}.items():
         if name in enums:
             assert definition["enum"] == [each.value for each in enums[name]]

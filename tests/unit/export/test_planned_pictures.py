@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from lifecycle.export.picture import (
     WRITERS,
-    NodeState,
+    PicturedNodeState,
     Presence,
     picture_to_dot,
     picture_to_html,
@@ -49,10 +49,10 @@ def test_a_plan_is_drawn_as_declared_and_without_a_verdict() -> None:
     assert {each.presence for each in drawn} == {Presence.PLANNED}
     assert {each.outcome for each in picture.flows} == {None}
     assert [each.state for each in picture.nodes()] == [
-        NodeState.MANAGED,
-        NodeState.MANAGED,
-        NodeState.PLAIN,
-        NodeState.MANAGED,
+        PicturedNodeState.MANAGED,
+        PicturedNodeState.MANAGED,
+        PicturedNodeState.PLAIN,
+        PicturedNodeState.MANAGED,
     ]
 
 

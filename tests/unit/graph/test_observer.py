@@ -18,7 +18,6 @@ from lifecycle.manifest.model import (
     RunKind,
 )
 from lifecycle.plan.model import ExpectedParameter, Plan
-from lifecycle.verify.noise import NO_NAMES, DeclaredNames
 from lifecycle.verify.observation import (
     NodeConfiguration,
     NodeParameters,
@@ -27,6 +26,7 @@ from lifecycle.verify.observation import (
     ObservedNode,
     ParameterReport,
 )
+from lifecycle.verify.tool_filter import NO_NAMES, DeclaredNames
 from tests.builders import configuration, plan_of, planned_node
 from tests.unit.supervisor.fakes import run as run_jumping
 

@@ -11,7 +11,12 @@ from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import Timeouts
 from lifecycle.node.lifecycle.controller import Controller
 from lifecycle.node.lifecycle.execution import Result
-from lifecycle.node.lifecycle.machine import NodeState, Outcome, RefusedError, Request
+from lifecycle.node.lifecycle.machine import (
+    CallbackOutcome,
+    NodeState,
+    RefusedError,
+    TransitionRequest,
+)
 
 
 class FakeNode:
@@ -80,39 +85,39 @@ def controller(node: FakeNode) -> Controller:
     return Controller(node, Timeouts(), lambda change: None)
 
 
-def bring(controller: Controller, node: FakeNode, *requests: Request) -> None:
+def bring(controller: Controller, node: FakeNode, *requests: TransitionRequest) -> None:
     for request in requests:
-        assert run(controller.change(request)).outcome is Outcome.SUCCESS
+        assert run(controller.change(request)).outcome is CallbackOutcome.SUCCESS
     node.did.clear()
 
 
-UP = (Request.CONFIGURE, Request.CONNECT, Request.ACTIVATE)
+UP = (TransitionRequest.CONFIGURE, TransitionRequest.CONNECT, TransitionRequest.ACTIVATE)
 
 
 @pytest.mark.parametrize(
     ("path", "request_", "did"),
     [
-        ((), Request.CONFIGURE, ["prepare", "on_configure"]),
-        (UP[:1], Request.CONNECT, ["make", "on_connect"]),
-        (UP[:1], Request.ACTIVATE, ["make", "on_connect", "on_activate"]),
-        (UP[:2], Request.ACTIVATE, ["on_activate"]),
-        (UP, Request.DEACTIVATE, ["on_deactivate"]),
-        (UP[:2], Request.DISCONNECT, ["on_disconnect", "remove"]),
-        (UP[:1], Request.CLEANUP, ["on_cleanup", "unprepare"]),
-        (UP[:2], Request.CLEANUP, ["on_disconnect", "remove", "on_cleanup", "unprepare"]),
-        ((), Request.SHUTDOWN, ["on_shutdown", "remove", "unprepare"]),
-        (UP, Request.SHUTDOWN, ["on_shutdown", "remove", "unprepare"]),
+        ((), TransitionRequest.CONFIGURE, ["prepare", "on_configure"]),
+        (UP[:1], TransitionRequest.CONNECT, ["make", "on_connect"]),
+        (UP[:1], TransitionRequest.ACTIVATE, ["make", "on_connect", "on_activate"]),
+        (UP[:2], TransitionRequest.ACTIVATE, ["on_activate"]),
+        (UP, TransitionRequest.DEACTIVATE, ["on_deactivate"]),
+        (UP[:2], TransitionRequest.DISCONNECT, ["on_disconnect", "remove"]),
+        (UP[:1], TransitionRequest.CLEANUP, ["on_cleanup", "unprepare"]),
+        (UP[:2], TransitionRequest.CLEANUP, ["on_disconnect", "remove", "on_cleanup", "unprepare"]),
+        ((), TransitionRequest.SHUTDOWN, ["on_shutdown", "remove", "unprepare"]),
+        (UP, TransitionRequest.SHUTDOWN, ["on_shutdown", "remove", "unprepare"]),
     ],
 )
 def test_a_transition_does_these_things_in_this_order(
     controller: Controller,
     node: FakeNode,
-    path: tuple[Request, ...],
-    request_: Request,
+    path: tuple[TransitionRequest, ...],
+    request_: TransitionRequest,
     did: list[str],
 ) -> None:
     bring(controller, node, *path)
-    assert run(controller.change(request_)).outcome is Outcome.SUCCESS
+    assert run(controller.change(request_)).outcome is CallbackOutcome.SUCCESS
     assert node.did == did
 
 
@@ -121,43 +126,43 @@ def test_a_transition_does_these_things_in_this_order(
     [
         (
             (),
-            Request.CONFIGURE,
+            TransitionRequest.CONFIGURE,
             "on_configure",
             ["prepare", "on_configure", "unprepare"],
             NodeState.UNCONFIGURED,
         ),
         (
             UP[:1],
-            Request.CONNECT,
+            TransitionRequest.CONNECT,
             "on_connect",
             ["make", "on_connect", "remove"],
             NodeState.INACTIVE_DISCONNECTED,
         ),
         (
             UP[:1],
-            Request.ACTIVATE,
+            TransitionRequest.ACTIVATE,
             "on_activate",
             ["make", "on_connect", "on_activate"],
             NodeState.INACTIVE_CONNECTED,
         ),
         (
             UP[:2],
-            Request.DISCONNECT,
+            TransitionRequest.DISCONNECT,
             "on_disconnect",
             ["on_disconnect"],
             NodeState.INACTIVE_CONNECTED,
         ),
         (
             UP[:2],
-            Request.CLEANUP,
+            TransitionRequest.CLEANUP,
             "on_cleanup",
             ["on_disconnect", "remove", "on_cleanup"],
             NodeState.INACTIVE_DISCONNECTED,
         ),
-        (UP, Request.DEACTIVATE, "on_deactivate", ["on_deactivate"], NodeState.ACTIVE),
+        (UP, TransitionRequest.DEACTIVATE, "on_deactivate", ["on_deactivate"], NodeState.ACTIVE),
         (
             UP,
-            Request.SHUTDOWN,
+            TransitionRequest.SHUTDOWN,
             "on_shutdown",
             ["on_shutdown", "remove", "unprepare"],
             NodeState.FINALIZED,
@@ -167,46 +172,50 @@ def test_a_transition_does_these_things_in_this_order(
 def test_a_failure_undoes_its_own_step_and_no_other(
     controller: Controller,
     node: FakeNode,
-    path: tuple[Request, ...],
-    request_: Request,
+    path: tuple[TransitionRequest, ...],
+    request_: TransitionRequest,
     callback: str,
     did: list[str],
     state: NodeState,
 ) -> None:
     bring(controller, node, *path)
-    node.callbacks[callback] = lambda: Outcome.FAILURE
+    node.callbacks[callback] = lambda: CallbackOutcome.FAILURE
     result = run(controller.change(request_))
-    assert result == Result(outcome=Outcome.FAILURE, error=f"/camera: {callback} returned FAILURE")
+    assert result == Result(
+        outcome=CallbackOutcome.FAILURE, error=f"/camera: {callback} returned FAILURE"
+    )
     assert node.did == did
     assert controller.machine.state is state
 
 
-@pytest.mark.parametrize("answer", [Outcome.SUCCESS, Outcome.FAILURE, Outcome.ERROR])
+@pytest.mark.parametrize(
+    "answer", [CallbackOutcome.SUCCESS, CallbackOutcome.FAILURE, CallbackOutcome.ERROR]
+)
 @pytest.mark.parametrize(("path", "request_"), [((), UP[0]), (UP[:1], UP[1]), (UP[:2], UP[2])])
 def test_an_error_runs_on_error_and_takes_everything_down(
     controller: Controller,
     node: FakeNode,
-    path: tuple[Request, ...],
-    request_: Request,
-    answer: Outcome,
+    path: tuple[TransitionRequest, ...],
+    request_: TransitionRequest,
+    answer: CallbackOutcome,
 ) -> None:
     bring(controller, node, *path)
-    node.callbacks[f"on_{request_.value}"] = lambda: Outcome.ERROR
+    node.callbacks[f"on_{request_.value}"] = lambda: CallbackOutcome.ERROR
     node.callbacks["on_error"] = lambda: answer
     result = run(controller.change(request_))
     assert result.error == f"/camera: on_{request_.value} returned ERROR"
     assert node.did[-3:] == ["on_error", "remove", "unprepare"]
-    ends = NodeState.UNCONFIGURED if answer is Outcome.SUCCESS else NodeState.FINALIZED
+    ends = NodeState.UNCONFIGURED if answer is CallbackOutcome.SUCCESS else NodeState.FINALIZED
     assert controller.machine.state is ends
 
 
 def test_an_endpoint_that_cannot_be_made_fails_the_transition_with_the_reason(
     controller: Controller, node: FakeNode
 ) -> None:
-    bring(controller, node, Request.CONFIGURE)
+    bring(controller, node, TransitionRequest.CONFIGURE)
     node.fail["make"] = LifecycleError("cannot connect publisher 'video': not supported")
-    result = run(controller.change(Request.ACTIVATE))
-    assert result.outcome is Outcome.FAILURE
+    result = run(controller.change(TransitionRequest.ACTIVATE))
+    assert result.outcome is CallbackOutcome.FAILURE
     assert result.error == "cannot connect publisher 'video': not supported"
     assert node.did == ["make"]
     assert controller.machine.state is NodeState.INACTIVE_DISCONNECTED
@@ -216,8 +225,8 @@ def test_a_bug_of_ours_is_an_error_and_not_a_stuck_node(
     controller: Controller, node: FakeNode
 ) -> None:
     node.fail["prepare"] = ZeroDivisionError("ours")
-    result = run(controller.change(Request.CONFIGURE))
-    assert result.outcome is Outcome.ERROR
+    result = run(controller.change(TransitionRequest.CONFIGURE))
+    assert result.outcome is CallbackOutcome.ERROR
     assert result.error == "cannot finish configuring of /camera: ZeroDivisionError('ours')"
     assert controller.machine.state is NodeState.UNCONFIGURED
 
@@ -239,13 +248,13 @@ def test_a_second_request_is_refused_while_one_runs(controller: Controller, node
         await turns
 
     node.callbacks["on_configure"] = on_configure
-    first = controller.change(Request.CONFIGURE)
+    first = controller.change(TransitionRequest.CONFIGURE)
     first.send(None)
-    for request in Request:
+    for request in TransitionRequest:
         with pytest.raises(RefusedError, match="one transition at a time"):
             run(controller.change(request))
     turns.done = True
-    assert run(first).outcome is Outcome.SUCCESS
+    assert run(first).outcome is CallbackOutcome.SUCCESS
     assert node.did == ["prepare", "on_configure", "wake in 10 s", "call off"]
 
 
@@ -254,19 +263,19 @@ def test_shutting_down_cancels_what_runs_first(controller: Controller, node: Fak
         await Turns()
 
     node.callbacks["on_configure"] = on_configure
-    running = controller.change(Request.CONFIGURE)
+    running = controller.change(TransitionRequest.CONFIGURE)
     running.send(None)
     ending = controller.shut_down("the supervisor has gone")
     ending.send(None)
     cancelled = run(running)
     assert cancelled.error == ("cannot go on with /camera: on_configure: the supervisor has gone")
-    assert run(ending).outcome is Outcome.SUCCESS
+    assert run(ending).outcome is CallbackOutcome.SUCCESS
     assert controller.machine.state is NodeState.FINALIZED
 
 
 def test_shutting_down_a_finalized_node_is_done_already(
     controller: Controller, node: FakeNode
 ) -> None:
-    bring(controller, node, Request.SHUTDOWN)
-    assert run(controller.shut_down("again")).outcome is Outcome.SUCCESS
+    bring(controller, node, TransitionRequest.SHUTDOWN)
+    assert run(controller.shut_down("again")).outcome is CallbackOutcome.SUCCESS
     assert node.did == []

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from lifecycle.node.lifecycle.execution import Interruptible, Result, call, judge
-from lifecycle.node.lifecycle.machine import Outcome
+from lifecycle.node.lifecycle.machine import CallbackOutcome
 
 WHAT = "/camera: on_configure"
 
@@ -44,17 +44,17 @@ def drive(
 @pytest.mark.parametrize(
     ("returned", "outcome"),
     [
-        (None, Outcome.SUCCESS),
-        (Outcome.SUCCESS, Outcome.SUCCESS),
-        (Outcome.FAILURE, Outcome.FAILURE),
-        (Outcome.ERROR, Outcome.ERROR),
-        (True, Outcome.ERROR),
-        ("SUCCESS", Outcome.ERROR),
-        (0, Outcome.ERROR),
-        (Exception, Outcome.ERROR),
+        (None, CallbackOutcome.SUCCESS),
+        (CallbackOutcome.SUCCESS, CallbackOutcome.SUCCESS),
+        (CallbackOutcome.FAILURE, CallbackOutcome.FAILURE),
+        (CallbackOutcome.ERROR, CallbackOutcome.ERROR),
+        (True, CallbackOutcome.ERROR),
+        ("SUCCESS", CallbackOutcome.ERROR),
+        (0, CallbackOutcome.ERROR),
+        (Exception, CallbackOutcome.ERROR),
     ],
 )
-def test_what_a_callback_returns_decides(returned: object, outcome: Outcome) -> None:
+def test_what_a_callback_returns_decides(returned: object, outcome: CallbackOutcome) -> None:
     assert drive(lambda: returned).outcome is outcome
 
 
@@ -66,13 +66,13 @@ def test_anything_else_is_an_error_that_quotes_it() -> None:
 
 
 def test_a_failure_says_who_returned_it() -> None:
-    assert drive(lambda: Outcome.FAILURE).error == "/camera: on_configure returned FAILURE"
+    assert drive(lambda: CallbackOutcome.FAILURE).error == "/camera: on_configure returned FAILURE"
 
 
 def test_a_callback_may_take_the_state_or_not() -> None:
     seen: list[object] = []
-    assert drive(lambda: None).outcome is Outcome.SUCCESS
-    assert drive(seen.append).outcome is Outcome.SUCCESS
+    assert drive(lambda: None).outcome is CallbackOutcome.SUCCESS
+    assert drive(seen.append).outcome is CallbackOutcome.SUCCESS
     assert seen == ["state"]
 
 
@@ -81,7 +81,7 @@ def test_an_exception_is_an_error_with_its_traceback() -> None:
         raise OSError("no such camera")
 
     result = drive(on_configure)
-    assert result.outcome is Outcome.ERROR
+    assert result.outcome is CallbackOutcome.ERROR
     assert result.error == "/camera: on_configure raised OSError: no such camera"
     assert 'raise OSError("no such camera")' in result.trace
 
@@ -91,7 +91,7 @@ def test_awaiting_asyncio_says_that_there_is_no_loop_and_what_to_await() -> None
         await asyncio.sleep(0.1)
 
     result = drive(naps)
-    assert result.outcome is Outcome.ERROR
+    assert result.outcome is CallbackOutcome.ERROR
     assert result.error == (
         "/camera: on_configure raised RuntimeError: no running event loop; callbacks run in "
         "rclpy's executor, which has no asyncio loop: await what rclpy gives, as "
@@ -108,11 +108,11 @@ def test_an_async_callback_is_resumed_until_it_returns() -> None:
                 turns.append(turn)
                 yield
 
-    async def on_configure() -> Outcome:
+    async def on_configure() -> CallbackOutcome:
         await Twice()
-        return Outcome.FAILURE
+        return CallbackOutcome.FAILURE
 
-    assert drive(on_configure).outcome is Outcome.FAILURE
+    assert drive(on_configure).outcome is CallbackOutcome.FAILURE
     assert turns == [0, 1]
 
 
@@ -126,7 +126,7 @@ def test_an_async_callback_beyond_its_deadline_is_interrupted_where_it_awaits() 
             ended.append("finally")
 
     result = drive(on_configure, deadline_s=1e-9)
-    assert result.outcome is Outcome.ERROR
+    assert result.outcome is CallbackOutcome.ERROR
     assert result.error == ("cannot finish /camera: on_configure within its deadline of 1e-09 s")
     assert "a calibration service that never answers" in result.trace
     assert ended == ["finally"]
@@ -141,7 +141,7 @@ def test_a_callback_that_swallows_its_interruption_is_ended_all_the_same() -> No
                 continue
 
     result = drive(on_configure, deadline_s=1e-9)
-    assert result.outcome is Outcome.ERROR
+    assert result.outcome is CallbackOutcome.ERROR
     assert "within its deadline" in result.error
 
 
@@ -150,13 +150,13 @@ def test_a_running_callback_can_be_cancelled() -> None:
         await Never()
 
     result = drive(on_activate, started=lambda running: running.cancel("the process ends"))
-    assert result.outcome is Outcome.ERROR
+    assert result.outcome is CallbackOutcome.ERROR
     assert result.error == "cannot go on with /camera: on_configure: the process ends"
 
 
 def test_a_sync_callback_beyond_its_deadline_is_an_error_that_says_what_to_do() -> None:
     result = drive(lambda: None, deadline_s=0.0)
-    assert result.outcome is Outcome.ERROR
+    assert result.outcome is CallbackOutcome.ERROR
     assert result.error == (
         "cannot accept /camera: on_configure: it blocked for 0.0 s, its deadline is 0 s; "
         "make it `async def` so that it can be interrupted"

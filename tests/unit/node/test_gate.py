@@ -10,7 +10,7 @@ import pytest
 
 from lifecycle.errors import LifecycleError
 from lifecycle.node.endpoints.publisher import DeclaredPublisher
-from lifecycle.node.lifecycle.gate import Gate, GatedPublisher, GatedSubscription, GatedTimer
+from lifecycle.node.lifecycle.gate import GatedPublisher, GatedSubscription, GatedTimer, NodeGate
 
 
 class FakePublisher:
@@ -51,7 +51,7 @@ class FakeTimer:
 
 
 def test_a_closed_publisher_drops_and_says_so_once_per_inactive_period() -> None:
-    gate, publisher, warnings = Gate(), FakePublisher(), list[str]()
+    gate, publisher, warnings = NodeGate(), FakePublisher(), list[str]()
     gate.add(publisher, GatedPublisher(publisher, warnings.append))
     publisher.publish(1)
     publisher.publish(2)
@@ -68,14 +68,14 @@ def test_a_closed_publisher_drops_and_says_so_once_per_inactive_period() -> None
 
 
 def test_an_open_publisher_is_the_publisher_itself() -> None:
-    gate, publisher = Gate(), FakePublisher()
+    gate, publisher = NodeGate(), FakePublisher()
     gate.add(publisher, GatedPublisher(publisher, pytest.fail))
     gate.open()
     assert "publish" not in vars(publisher)
 
 
 def test_an_entity_made_while_active_is_open_at_once() -> None:
-    gate, publisher = Gate(), FakePublisher()
+    gate, publisher = NodeGate(), FakePublisher()
     gate.open()
     gate.add(publisher, GatedPublisher(publisher, pytest.fail))
     publisher.publish(1)
@@ -83,7 +83,7 @@ def test_an_entity_made_while_active_is_open_at_once() -> None:
 
 
 def test_a_released_entity_is_open_for_good() -> None:
-    gate, publisher = Gate(), FakePublisher()
+    gate, publisher = NodeGate(), FakePublisher()
     gate.add(publisher, GatedPublisher(publisher, pytest.fail))
     gate.release(publisher)
     gate.close()
@@ -92,7 +92,7 @@ def test_a_released_entity_is_open_for_good() -> None:
 
 
 def test_a_removed_entity_is_left_alone() -> None:
-    gate, timer = Gate(), FakeTimer()
+    gate, timer = NodeGate(), FakeTimer()
     gate.add(timer, GatedTimer(timer, wanted=True))
     gate.remove(timer)
     gate.open()
@@ -101,7 +101,7 @@ def test_a_removed_entity_is_left_alone() -> None:
 
 def test_messages_reach_the_callback_only_while_open() -> None:
     received: list[object] = []
-    gate, subscription = Gate(), FakeSubscription(received.append)
+    gate, subscription = NodeGate(), FakeSubscription(received.append)
     gate.add_subscription(subscription, at_once)
     subscription.callback("early")
     gate.open()
@@ -113,7 +113,7 @@ def test_messages_reach_the_callback_only_while_open() -> None:
 
 def test_gating_a_subscription_twice_keeps_the_users_callback() -> None:
     received: list[object] = []
-    gate, subscription = Gate(), FakeSubscription(received.append)
+    gate, subscription = NodeGate(), FakeSubscription(received.append)
     gate.add_subscription(subscription, at_once)
     gate.add_subscription(subscription, at_once)
     gate.open()
@@ -131,7 +131,7 @@ def test_a_callback_with_message_info_is_replaced_by_one_that_takes_it_too() -> 
 
 def test_the_last_transient_local_samples_wait_for_activation() -> None:
     received: list[object] = []
-    gate = Gate()
+    gate = NodeGate()
     subscription = FakeSubscription(received.append, durability="TRANSIENT_LOCAL", depth=2)
     gate.add_subscription(subscription, at_once)
     for sample in ("map 1", "map 2", "map 3"):
@@ -147,7 +147,7 @@ def test_the_last_transient_local_samples_wait_for_activation() -> None:
 
 def test_kept_samples_wait_on_if_the_gate_closes_before_they_are_delivered() -> None:
     received: list[object] = []
-    gate = Gate()
+    gate = NodeGate()
     subscription = FakeSubscription(received.append, durability="TRANSIENT_LOCAL")
     tasks: list[Callable[[], Coroutine[Any, Any, None]]] = []
     gate.add_subscription(subscription, tasks.append)
@@ -162,7 +162,7 @@ def test_kept_samples_wait_on_if_the_gate_closes_before_they_are_delivered() -> 
 
 
 def test_a_timer_runs_only_while_open() -> None:
-    gate, timer = Gate(), FakeTimer()
+    gate, timer = NodeGate(), FakeTimer()
     gate.add(timer, GatedTimer(timer, wanted=True))
     assert not timer.running
     gate.open()
@@ -172,7 +172,7 @@ def test_a_timer_runs_only_while_open() -> None:
 
 
 def test_a_timer_that_the_user_cancelled_stays_cancelled() -> None:
-    gate, timer = Gate(), FakeTimer()
+    gate, timer = NodeGate(), FakeTimer()
     gate.add(timer, GatedTimer(timer, wanted=True))
     gate.open()
     timer.cancel()
@@ -182,7 +182,7 @@ def test_a_timer_that_the_user_cancelled_stays_cancelled() -> None:
 
 
 def test_a_timer_that_the_user_starts_while_closed_starts_when_open() -> None:
-    gate, timer = Gate(), FakeTimer()
+    gate, timer = NodeGate(), FakeTimer()
     gate.add(timer, GatedTimer(timer, wanted=False))
     gate.open()
     gate.close()
@@ -193,7 +193,7 @@ def test_a_timer_that_the_user_starts_while_closed_starts_when_open() -> None:
 
 
 def test_a_declared_publisher_follows_connect_and_the_gate() -> None:
-    gate, entity, warnings = Gate(), FakePublisher(), list[str]()
+    gate, entity, warnings = NodeGate(), FakePublisher(), list[str]()
     handle = DeclaredPublisher("video", warnings.append)
     handle.publish("before connect")
     handle.attach(entity)

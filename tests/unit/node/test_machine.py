@@ -8,56 +8,81 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 
 from lifecycle.node.lifecycle.machine import (
     TRANSITION_GRAPH,
-    Change,
+    CallbackOutcome,
     LifecycleMachine,
     NodeState,
-    Outcome,
     RefusedError,
-    Request,
+    StateChange,
+    TransitionRequest,
 )
 
-OK, FAILURE, ERROR = Outcome.SUCCESS, Outcome.FAILURE, Outcome.ERROR
+OK, FAILURE, ERROR = CallbackOutcome.SUCCESS, CallbackOutcome.FAILURE, CallbackOutcome.ERROR
 
-PATHS: dict[NodeState, tuple[Request | Outcome, ...]] = {
+PATHS: dict[NodeState, tuple[TransitionRequest | CallbackOutcome, ...]] = {
     NodeState.UNCONFIGURED: (),
-    NodeState.CONFIGURING: (Request.CONFIGURE,),
-    NodeState.INACTIVE_DISCONNECTED: (Request.CONFIGURE, OK),
-    NodeState.CONNECTING: (Request.CONFIGURE, OK, Request.CONNECT),
-    NodeState.INACTIVE_CONNECTED: (Request.CONFIGURE, OK, Request.CONNECT, OK),
-    NodeState.DISCONNECTING: (Request.CONFIGURE, OK, Request.CONNECT, OK, Request.DISCONNECT),
-    NodeState.ACTIVATING_DISCONNECTED: (Request.CONFIGURE, OK, Request.ACTIVATE),
-    NodeState.ACTIVATING_CONNECTED: (Request.CONFIGURE, OK, Request.ACTIVATE, OK),
-    NodeState.ACTIVE: (Request.CONFIGURE, OK, Request.ACTIVATE, OK, OK),
-    NodeState.DEACTIVATING: (Request.CONFIGURE, OK, Request.ACTIVATE, OK, OK, Request.DEACTIVATE),
-    NodeState.CLEANINGUP_CONNECTED: (
-        Request.CONFIGURE,
+    NodeState.CONFIGURING: (TransitionRequest.CONFIGURE,),
+    NodeState.INACTIVE_DISCONNECTED: (TransitionRequest.CONFIGURE, OK),
+    NodeState.CONNECTING: (TransitionRequest.CONFIGURE, OK, TransitionRequest.CONNECT),
+    NodeState.INACTIVE_CONNECTED: (TransitionRequest.CONFIGURE, OK, TransitionRequest.CONNECT, OK),
+    NodeState.DISCONNECTING: (
+        TransitionRequest.CONFIGURE,
         OK,
-        Request.CONNECT,
+        TransitionRequest.CONNECT,
         OK,
-        Request.CLEANUP,
+        TransitionRequest.DISCONNECT,
     ),
-    NodeState.CLEANINGUP_DISCONNECTED: (Request.CONFIGURE, OK, Request.CLEANUP),
-    NodeState.SHUTTINGDOWN: (Request.SHUTDOWN,),
-    NodeState.ERRORPROCESSING: (Request.CONFIGURE, ERROR),
-    NodeState.FINALIZED: (Request.SHUTDOWN, OK),
+    NodeState.ACTIVATING_DISCONNECTED: (
+        TransitionRequest.CONFIGURE,
+        OK,
+        TransitionRequest.ACTIVATE,
+    ),
+    NodeState.ACTIVATING_CONNECTED: (
+        TransitionRequest.CONFIGURE,
+        OK,
+        TransitionRequest.ACTIVATE,
+        OK,
+    ),
+    NodeState.ACTIVE: (TransitionRequest.CONFIGURE, OK, TransitionRequest.ACTIVATE, OK, OK),
+    NodeState.DEACTIVATING: (
+        TransitionRequest.CONFIGURE,
+        OK,
+        TransitionRequest.ACTIVATE,
+        OK,
+        OK,
+        TransitionRequest.DEACTIVATE,
+    ),
+    NodeState.CLEANINGUP_CONNECTED: (
+        TransitionRequest.CONFIGURE,
+        OK,
+        TransitionRequest.CONNECT,
+        OK,
+        TransitionRequest.CLEANUP,
+    ),
+    NodeState.CLEANINGUP_DISCONNECTED: (TransitionRequest.CONFIGURE, OK, TransitionRequest.CLEANUP),
+    NodeState.SHUTTINGDOWN: (TransitionRequest.SHUTDOWN,),
+    NodeState.ERRORPROCESSING: (TransitionRequest.CONFIGURE, ERROR),
+    NodeState.FINALIZED: (TransitionRequest.SHUTDOWN, OK),
 }
 
-TAKEN: dict[tuple[NodeState, Request], NodeState] = {
-    (NodeState.UNCONFIGURED, Request.CONFIGURE): NodeState.CONFIGURING,
-    (NodeState.UNCONFIGURED, Request.SHUTDOWN): NodeState.SHUTTINGDOWN,
-    (NodeState.INACTIVE_DISCONNECTED, Request.CONNECT): NodeState.CONNECTING,
-    (NodeState.INACTIVE_DISCONNECTED, Request.ACTIVATE): NodeState.ACTIVATING_DISCONNECTED,
-    (NodeState.INACTIVE_DISCONNECTED, Request.CLEANUP): NodeState.CLEANINGUP_DISCONNECTED,
-    (NodeState.INACTIVE_DISCONNECTED, Request.SHUTDOWN): NodeState.SHUTTINGDOWN,
-    (NodeState.INACTIVE_CONNECTED, Request.DISCONNECT): NodeState.DISCONNECTING,
-    (NodeState.INACTIVE_CONNECTED, Request.ACTIVATE): NodeState.ACTIVATING_CONNECTED,
-    (NodeState.INACTIVE_CONNECTED, Request.CLEANUP): NodeState.CLEANINGUP_CONNECTED,
-    (NodeState.INACTIVE_CONNECTED, Request.SHUTDOWN): NodeState.SHUTTINGDOWN,
-    (NodeState.ACTIVE, Request.DEACTIVATE): NodeState.DEACTIVATING,
-    (NodeState.ACTIVE, Request.SHUTDOWN): NodeState.SHUTTINGDOWN,
+TAKEN: dict[tuple[NodeState, TransitionRequest], NodeState] = {
+    (NodeState.UNCONFIGURED, TransitionRequest.CONFIGURE): NodeState.CONFIGURING,
+    (NodeState.UNCONFIGURED, TransitionRequest.SHUTDOWN): NodeState.SHUTTINGDOWN,
+    (NodeState.INACTIVE_DISCONNECTED, TransitionRequest.CONNECT): NodeState.CONNECTING,
+    (
+        NodeState.INACTIVE_DISCONNECTED,
+        TransitionRequest.ACTIVATE,
+    ): NodeState.ACTIVATING_DISCONNECTED,
+    (NodeState.INACTIVE_DISCONNECTED, TransitionRequest.CLEANUP): NodeState.CLEANINGUP_DISCONNECTED,
+    (NodeState.INACTIVE_DISCONNECTED, TransitionRequest.SHUTDOWN): NodeState.SHUTTINGDOWN,
+    (NodeState.INACTIVE_CONNECTED, TransitionRequest.DISCONNECT): NodeState.DISCONNECTING,
+    (NodeState.INACTIVE_CONNECTED, TransitionRequest.ACTIVATE): NodeState.ACTIVATING_CONNECTED,
+    (NodeState.INACTIVE_CONNECTED, TransitionRequest.CLEANUP): NodeState.CLEANINGUP_CONNECTED,
+    (NodeState.INACTIVE_CONNECTED, TransitionRequest.SHUTDOWN): NodeState.SHUTTINGDOWN,
+    (NodeState.ACTIVE, TransitionRequest.DEACTIVATE): NodeState.DEACTIVATING,
+    (NodeState.ACTIVE, TransitionRequest.SHUTDOWN): NodeState.SHUTTINGDOWN,
 }
 
-FINISHED: dict[tuple[NodeState, Outcome], NodeState] = {
+FINISHED: dict[tuple[NodeState, CallbackOutcome], NodeState] = {
     (NodeState.CONFIGURING, OK): NodeState.INACTIVE_DISCONNECTED,
     (NodeState.CONFIGURING, FAILURE): NodeState.UNCONFIGURED,
     (NodeState.CONNECTING, OK): NodeState.INACTIVE_CONNECTED,
@@ -82,12 +107,12 @@ FINISHED: dict[tuple[NodeState, Outcome], NodeState] = {
 }
 
 
-def machine_in(state: NodeState, changes: list[Change] | None = None) -> LifecycleMachine:
+def machine_in(state: NodeState, changes: list[StateChange] | None = None) -> LifecycleMachine:
     """Return a machine that was brought to `state`; `changes` hears of what comes after."""
-    heard: list[Change] = []
+    heard: list[StateChange] = []
     machine = LifecycleMachine(heard.append)
     for step in PATHS[state]:
-        if isinstance(step, Request):
+        if isinstance(step, TransitionRequest):
             machine.request(step)
         else:
             machine.finish(step)
@@ -97,10 +122,10 @@ def machine_in(state: NodeState, changes: list[Change] | None = None) -> Lifecyc
     return machine
 
 
-def machine_with(state: NodeState, changes: list[Change]) -> LifecycleMachine:
+def machine_with(state: NodeState, changes: list[StateChange]) -> LifecycleMachine:
     machine = LifecycleMachine(changes.append)
     for step in PATHS[state]:
-        if isinstance(step, Request):
+        if isinstance(step, TransitionRequest):
             machine.request(step)
         else:
             machine.finish(step)
@@ -109,9 +134,9 @@ def machine_with(state: NodeState, changes: list[Change]) -> LifecycleMachine:
 
 
 @pytest.mark.parametrize("state", NodeState)
-@pytest.mark.parametrize("request_", Request)
+@pytest.mark.parametrize("request_", TransitionRequest)
 def test_every_state_takes_or_refuses_every_request_as_the_table_says(
-    state: NodeState, request_: Request
+    state: NodeState, request_: TransitionRequest
 ) -> None:
     machine = machine_in(state)
     goal = TAKEN.get((state, request_))
@@ -125,9 +150,9 @@ def test_every_state_takes_or_refuses_every_request_as_the_table_says(
 
 
 @pytest.mark.parametrize("state", NodeState)
-@pytest.mark.parametrize("outcome", Outcome)
+@pytest.mark.parametrize("outcome", CallbackOutcome)
 def test_every_state_takes_or_refuses_every_outcome_as_the_table_says(
-    state: NodeState, outcome: Outcome
+    state: NodeState, outcome: CallbackOutcome
 ) -> None:
     machine = machine_in(state)
     if state.steady:
@@ -143,7 +168,7 @@ def test_every_state_takes_or_refuses_every_outcome_as_the_table_says(
 def test_a_refusal_says_what_is_allowed() -> None:
     machine = machine_in(NodeState.ACTIVE)
     with pytest.raises(RefusedError) as refused:
-        machine.request(Request.CONFIGURE)
+        machine.request(TransitionRequest.CONFIGURE)
     assert str(refused.value) == (
         "cannot configure in state 'active'; allowed here: deactivate, shutdown"
     )
@@ -152,7 +177,7 @@ def test_a_refusal_says_what_is_allowed() -> None:
 def test_a_refusal_during_a_transition_says_to_wait() -> None:
     machine = machine_in(NodeState.ACTIVATING_CONNECTED)
     with pytest.raises(RefusedError) as refused:
-        machine.request(Request.SHUTDOWN)
+        machine.request(TransitionRequest.SHUTDOWN)
     assert str(refused.value) == (
         "cannot shutdown while the node is 'activating/connected': "
         "one transition at a time; ask again when it has ended"
@@ -160,9 +185,9 @@ def test_a_refusal_during_a_transition_says_to_wait() -> None:
 
 
 def test_connect_and_disconnect_are_announced_once_and_leave_the_seen_state_inactive() -> None:
-    changes: list[Change] = []
+    changes: list[StateChange] = []
     machine = machine_in(NodeState.INACTIVE_DISCONNECTED, changes)
-    for request in (Request.CONNECT, Request.DISCONNECT):
+    for request in (TransitionRequest.CONNECT, TransitionRequest.DISCONNECT):
         machine.request(request)
         machine.finish(OK)
     events = [change.event for change in changes if change.event is not None]
@@ -173,16 +198,16 @@ def test_connect_and_disconnect_are_announced_once_and_leave_the_seen_state_inac
 
 
 def test_a_connect_that_fails_is_not_announced() -> None:
-    changes: list[Change] = []
+    changes: list[StateChange] = []
     machine = machine_in(NodeState.CONNECTING, changes)
     machine.finish(FAILURE)
     assert [change.event for change in changes] == [None]
 
 
 def test_activating_from_disconnected_announces_what_rcl_announces_and_no_more() -> None:
-    changes: list[Change] = []
+    changes: list[StateChange] = []
     machine = machine_in(NodeState.INACTIVE_DISCONNECTED, changes)
-    machine.request(Request.ACTIVATE)
+    machine.request(TransitionRequest.ACTIVATE)
     machine.finish(OK)
     machine.finish(OK)
     events = [change.event for change in changes if change.event is not None]
@@ -193,7 +218,7 @@ def test_activating_from_disconnected_announces_what_rcl_announces_and_no_more()
 
 
 def test_an_error_while_connecting_is_announced_from_inactive() -> None:
-    changes: list[Change] = []
+    changes: list[StateChange] = []
     machine = machine_in(NodeState.CONNECTING, changes)
     machine.finish(ERROR)
     event = changes[-1].event
@@ -224,8 +249,8 @@ def test_available_transitions_are_what_can_be_asked_for_here(
 
 def test_a_label_wins_over_an_id_as_in_rcl() -> None:
     machine = machine_in(NodeState.UNCONFIGURED)
-    assert machine.resolve(1, "shutdown") is Request.SHUTDOWN
-    assert machine.resolve(5, "") is Request.SHUTDOWN
+    assert machine.resolve(1, "shutdown") is TransitionRequest.SHUTDOWN
+    assert machine.resolve(5, "") is TransitionRequest.SHUTDOWN
     assert machine.resolve(1, "no such label") is None
     assert machine.resolve(0) is None
 
@@ -246,11 +271,11 @@ class Walk(RuleBasedStateMachine):
 
     def __init__(self) -> None:
         super().__init__()
-        self.changes: list[Change] = []
+        self.changes: list[StateChange] = []
         self.machine = LifecycleMachine(self.changes.append)
 
-    @rule(request=st.sampled_from(Request))
-    def ask(self, request: Request) -> None:
+    @rule(request=st.sampled_from(TransitionRequest))
+    def ask(self, request: TransitionRequest) -> None:
         before, heard = self.machine.state, len(self.changes)
         try:
             self.machine.request(request)
@@ -262,8 +287,8 @@ class Walk(RuleBasedStateMachine):
             assert self.machine.state is TAKEN[before, request]
 
     @precondition(lambda self: not self.machine.state.steady)
-    @rule(outcome=st.sampled_from(Outcome))
-    def finish(self, outcome: Outcome) -> None:
+    @rule(outcome=st.sampled_from(CallbackOutcome))
+    def finish(self, outcome: CallbackOutcome) -> None:
         before = self.machine.state
         self.machine.finish(outcome)
         assert self.machine.state is FINISHED.get((before, outcome), NodeState.ERRORPROCESSING)

@@ -39,7 +39,7 @@ from lifecycle.plan import (
     terms_of,
     wishes_of,
 )
-from lifecycle.supervisor.connections.desired_state import Wired, planned_instructions, steps
+from lifecycle.supervisor.connections.desired_state import ActualState, planned_instructions, steps
 from lifecycle.supervisor.connections.negotiation import NegotiatedSource, party_of
 from lifecycle.verify.observation import Identity, NodeConfiguration
 from tests.builders import (
@@ -235,7 +235,7 @@ def test_connect_to_topic_of_type_via_protocol_address_port_is_said_in_a_manifes
 def test_iterating_over_the_instructions_is_connect_to_for_each_url_then_map_to_for_each_endpoint(
     instructed: Plan,
 ):
-    told = steps(planned_instructions(instructed.node("n")), Wired())
+    told = steps(planned_instructions(instructed.node("n")), ActualState())
     # Once per connection, whatever is mapped onto it: the name is the handle.
     assert [(each.operation, each.connection, each.endpoint) for each in told] == [
         (Operation.CONNECT_TO, "data", ""),

@@ -20,7 +20,7 @@ from lifecycle.node.host.control import Operation
 from lifecycle.plan.model import Plan, PlannedNode
 from lifecycle.run_directory import RunDirectory, short_path
 from lifecycle.supervisor.connections.networks import Networks
-from lifecycle.supervisor.control.server import Answer, Ask, Question
+from lifecycle.supervisor.control.server import Answer, ControlRequest, Question
 from lifecycle.supervisor.health.peer_supervisors import Listener
 from lifecycle.supervisor.nodes.driver import NodeDriver, ServiceDriver, ServiceHand
 from lifecycle.supervisor.nodes.system import System
@@ -475,7 +475,7 @@ class SessionWorld:
         finally:
             self._directory.release()
 
-    async def order(self, ask: Ask, node: str = "") -> str:
+    async def order(self, ask: ControlRequest, node: str = "") -> str:
         """Order something through the control socket; return the answer, `0` or `4 cannot …`."""
         assert self._directory is not None
         with short_path(self._directory.socket_path) as path:

@@ -12,7 +12,7 @@ from lifecycle.errors import BringUpError
 from lifecycle.manifest.model import Condition, RunKind, Timeouts
 from lifecycle.node.host.control import Operation
 from lifecycle.supervisor.gate.gate import Gate, Permit, VerificationError
-from lifecycle.supervisor.gate.verification_loop import Changes, VerificationLoop
+from lifecycle.supervisor.gate.verification_loop import ChangeCounter, VerificationLoop
 from lifecycle.supervisor.health.process_monitor import ProcessMonitor
 from lifecycle.supervisor.nodes.bring_up import ALSO_S
 from lifecycle.supervisor.processes.spawn import ProcessExit, ProcessState
@@ -154,7 +154,7 @@ class _Judging:
 
     def __init__(self, world: World) -> None:
         self.graph = FakeGraph()
-        self.changes = Changes(world.system, self.graph)
+        self.changes = ChangeCounter(world.system, self.graph)
         self.looks = 0
         self._judge = VerificationLoop(
             world.system, self.graph, self.changes, world.emit, strict=False, verify_=self._verify

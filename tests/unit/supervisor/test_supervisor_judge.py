@@ -15,7 +15,7 @@ from lifecycle.node.host.control import Event
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.gate.verification_loop import (
     PASSING_S,
-    Changes,
+    ChangeCounter,
     VerificationLoop,
     with_findings,
     without,
@@ -23,7 +23,7 @@ from lifecycle.supervisor.gate.verification_loop import (
 )
 from lifecycle.supervisor.gate.watch import Watch, first_death
 from lifecycle.supervisor.health.liveliness import Cause
-from lifecycle.supervisor.nodes.driver import Standing
+from lifecycle.supervisor.nodes.driver import NodeCondition
 from lifecycle.supervisor.nodes.remote_nodes import RemoteNode
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.process import ManagedProcess
@@ -70,7 +70,7 @@ class _Bench:
         self.verdicts = verdicts
         self.looks: list[float] = []
         self.judged: list[dict[str, object]] = []
-        self.changes = Changes(self.world.system, self.graph)
+        self.changes = ChangeCounter(self.world.system, self.graph)
         self.judge = VerificationLoop(
             self.world.system,
             self.graph,
@@ -262,7 +262,7 @@ def test_a_reply_does_not_undo_what_was_told_after_it(tmp_path: Path) -> None:
         assert node.configuration == before
         system.on_host_event(dataclasses.replace(reply, kind="configuration", configuration=after))
         # Who awaited the reply goes on only now.
-        node.advance(Reach.CONNECTED, Standing(state="inactive", configuration=before))
+        node.advance(Reach.CONNECTED, NodeCondition(state="inactive", configuration=before))
         assert node.configuration is not None
         assert node.configuration.endpoints == after.endpoints
 
@@ -588,7 +588,7 @@ def test_an_observer_that_fails_fails_whoever_waits_for_a_change(tmp_path: Path)
 
         bench.graph.wait_change = fail  # type: ignore[method-assign]
         await bench.changes.close()
-        changes = Changes(bench.world.system, bench.graph)
+        changes = ChangeCounter(bench.world.system, bench.graph)
         with pytest.raises(RuntimeError, match="the observer failed"):
             await changes.beyond(0, 1.0) or await changes.beyond(0, 1.0)
         await changes.close()

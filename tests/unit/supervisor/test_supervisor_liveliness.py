@@ -20,7 +20,7 @@ from lifecycle.node.host.control import SIGN_DESCRIPTORS, HostSpec, Operation
 from lifecycle.node.host.control import Event as HostEvent
 from lifecycle.plan.model import Plan, PlannedProcess
 from lifecycle.supervisor.gate.verification_loop import without_nodes
-from lifecycle.supervisor.health.liveliness import Cause, Liveliness, Presence
+from lifecycle.supervisor.health.liveliness import Cause, NodeArrivals, SilenceMonitor
 from lifecycle.supervisor.health.peer_supervisors import CALL_EACH_S, Listener, PeerSupervisors
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.control_channel import ChannelClosedError, ControlChannel
@@ -50,7 +50,7 @@ class Ears:
         self.changes = 0
         emit = Emitter()
         emit.listen(self.events.append)
-        self.liveliness = Liveliness(emit, self._changed)
+        self.liveliness = SilenceMonitor(emit, self._changed)
 
     def _changed(self) -> None:
         self.changes += 1
@@ -151,7 +151,7 @@ def test_nodes_join_and_leave_between_two_looks() -> None:
     ears = Ears()
     emit = Emitter()
     emit.listen(ears.events.append)
-    presence = Presence(emit)
+    presence = NodeArrivals(emit)
     for names in (("/a", "/b"), ("/a", "/b", "/_a_data"), ("/b", "/c", "/ns/_c_flow_0")):
         presence.see(Observation(nodes=tuple(ObservedNode(full_name=each) for each in names)))
     assert ears.events == [

@@ -13,10 +13,10 @@ import pytest
 
 from lifecycle.errors import ExitCode
 from lifecycle.programming.apply import (
-    Change,
     ChangeKind,
-    Changes,
+    FlowChange,
     PrivilegeError,
+    TargetChanges,
     TargetOptions,
 )
 from lifecycle.run_directory import OWN_CHILD, RunDirectory, new_run_id
@@ -45,7 +45,7 @@ class FakePrograms:
 
     def update(
         self, flows: Sequence[FlowReport], *, hold: bool, within_s: float | None
-    ) -> tuple[Changes, ...]:
+    ) -> tuple[TargetChanges, ...]:
         assert hold
         topics = tuple(each.topic for each in flows)
         if topics in self.seen:
@@ -59,13 +59,13 @@ class FakePrograms:
                 hint="run this command as root",
             )
         self.seen.append(topics)
-        change = Change(kind=ChangeKind.CREATE, key="k", what="w")
-        return (Changes(target="fake", changes=(change,)),)
+        change = FlowChange(kind=ChangeKind.CREATE, key="k", what="w")
+        return (TargetChanges(target="fake", changes=(change,)),)
 
     def renew(self, *, within_s: float | None) -> float | None:
         return None
 
-    def close(self, *, within_s: float | None) -> tuple[Changes, ...]:
+    def close(self, *, within_s: float | None) -> tuple[TargetChanges, ...]:
         self.seen.append(("closed",))
         return ()
 

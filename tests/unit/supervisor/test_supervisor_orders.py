@@ -21,7 +21,13 @@ from lifecycle.supervisor.control.orders import (
     OrderKind,
     check_order,
 )
-from lifecycle.supervisor.control.server import Ask, ControlServer, Look, Question, follow
+from lifecycle.supervisor.control.server import (
+    ControlRequest,
+    ControlServer,
+    Question,
+    SupervisorSnapshot,
+    follow,
+)
 from lifecycle.supervisor.gate.gate import Gate
 from lifecycle.supervisor.run.events import Reach
 from lifecycle.supervisor.run.shutdown import TakeDown
@@ -101,7 +107,7 @@ def test_orders_are_carried_out_one_by_one_and_refused_once_all_is_over() -> Non
 
 
 def test_the_control_socket_looks_follows_and_orders(tmp_path: Path) -> None:
-    seen = Look(plan=PLAN, status=STATUS, observation=Observation(), verdict=None)
+    seen = SupervisorSnapshot(plan=PLAN, status=STATUS, observation=Observation(), verdict=None)
     asked: list[Order] = []
 
     async def carry_out(given: Order) -> Done:
@@ -116,12 +122,12 @@ def test_the_control_socket_looks_follows_and_orders(tmp_path: Path) -> None:
         loop = asyncio.get_running_loop()
         assert await loop.run_in_executor(None, look, tmp_path) == seen
         answer = await loop.run_in_executor(
-            None, lambda: order(tmp_path, Question(ask=Ask.RESTART, node="camera"), 5.0)
+            None, lambda: order(tmp_path, Question(ask=ControlRequest.RESTART, node="camera"), 5.0)
         )
         assert (answer.exit_code, answer.error) == (ExitCode.VIOLATED, "cannot activate: no")
         assert asked == [Order(kind=OrderKind.RESTART, node="camera")]
 
-        heard: list[Look] = []
+        heard: list[SupervisorSnapshot] = []
         came = [threading.Event(), threading.Event()]
 
         def listen() -> None:

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from lifecycle.manifest.model import Condition, Timeouts
-from lifecycle.supervisor.control.server import Ask
+from lifecycle.supervisor.control.server import ControlRequest
 from lifecycle.supervisor.run.options import Until
 from tests.builders import plan_of, planned_node
 from tests.unit.supervisor.fakes import run
@@ -786,14 +786,14 @@ def test_a_run_is_a_success_only_if_its_system_is_as_it_was_ordered(
             await world.story.until("[system] active")
             ordered = None
             if phase == "paused":
-                assert await world.order(Ask.PAUSE) == "0"
+                assert await world.order(ControlRequest.PAUSE) == "0"
             elif phase == "held":
                 world.intrude()
-                assert await world.order(Ask.RESTART, "viewer") == f"4 {REFUSED}"
+                assert await world.order(ControlRequest.RESTART, "viewer") == f"4 {REFUSED}"
                 world.retreat()
             else:
                 world.hosts.takes_s["/viewer configure"] = 4.0
-                ordered = asyncio.ensure_future(world.order(Ask.RESTART, "viewer"))
+                ordered = asyncio.ensure_future(world.order(ControlRequest.RESTART, "viewer"))
                 await world.story.until("/viewer configure", 2)
             await asyncio.sleep(1.0)
             signal.raise_signal(signal.SIGTERM)

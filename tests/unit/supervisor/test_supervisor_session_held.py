@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.supervisor.control.server import Ask
+from lifecycle.supervisor.control.server import ControlRequest
 from tests.unit.supervisor.fakes import run
 from tests.unit.supervisor.session_world import (
     ACTIVATED,
@@ -133,13 +133,13 @@ def test_a_paused_system_is_inactive_until_it_is_judged_anew(tmp_path: Path) -> 
 
         async def order() -> None:
             await world.story.until("[system] active")
-            assert await world.order(Ask.RESUME) == (
+            assert await world.order(ControlRequest.RESUME) == (
                 "2 cannot resume 'robot': it is active; only a paused system can be resumed"
             )
-            assert await world.order(Ask.PAUSE) == "0"
+            assert await world.order(ControlRequest.PAUSE) == "0"
             await asyncio.sleep(3.0)
-            assert await world.order(Ask.RESUME) == "0"
-            assert await world.order(Ask.DOWN) == "0"
+            assert await world.order(ControlRequest.RESUME) == "0"
+            assert await world.order(ControlRequest.DOWN) == "0"
 
         await world.run(order())
         assert world.since("[system] active")[1:] == [
@@ -166,12 +166,12 @@ def test_a_system_that_is_wrong_stays_paused_and_can_be_resumed_once_it_is_right
 
         async def order() -> None:
             await world.story.until("[system] active")
-            assert await world.order(Ask.PAUSE) == "0"
+            assert await world.order(ControlRequest.PAUSE) == "0"
             world.intrude()
-            assert await world.order(Ask.RESUME) == f"4 {REFUSED}"
+            assert await world.order(ControlRequest.RESUME) == f"4 {REFUSED}"
             world.retreat()
-            assert await world.order(Ask.RESUME) == "0"
-            assert await world.order(Ask.DOWN) == "0"
+            assert await world.order(ControlRequest.RESUME) == "0"
+            assert await world.order(ControlRequest.DOWN) == "0"
 
         await world.run(order())
         assert world.since("[system] paused")[1:-ENDING] == [
@@ -194,16 +194,16 @@ def test_what_changes_while_a_system_is_resumed_has_it_paused_again(tmp_path: Pa
 
         async def order() -> None:
             await world.story.until("[system] active")
-            assert await world.order(Ask.PAUSE) == "0"
+            assert await world.order(ControlRequest.PAUSE) == "0"
             world.hosts.takes_s["/camera activate"] = 3.0
-            resumed = asyncio.ensure_future(world.order(Ask.RESUME))
+            resumed = asyncio.ensure_future(world.order(ControlRequest.RESUME))
             await world.story.until("/camera activate", 2)
             await asyncio.sleep(1.0)
             world.intrude()
             assert await resumed == f"4 {REFUSED_AGAIN}"
             world.retreat()
-            assert await world.order(Ask.RESUME) == "0"
-            assert await world.order(Ask.DOWN) == "0"
+            assert await world.order(ControlRequest.RESUME) == "0"
+            assert await world.order(ControlRequest.DOWN) == "0"
 
         await world.run(order())
         assert world.since("[gate]", 2)[:7] == [
@@ -231,8 +231,8 @@ def test_one_node_is_restarted_through_the_gate_and_the_others_stay_active(tmp_p
 
         async def order() -> None:
             await world.story.until("[system] active")
-            assert await world.order(Ask.RESTART, "viewer") == "0"
-            assert await world.order(Ask.DOWN) == "0"
+            assert await world.order(ControlRequest.RESTART, "viewer") == "0"
+            assert await world.order(ControlRequest.DOWN) == "0"
 
         await world.run(order())
         assert world.since("[system] active")[1:] == [
@@ -264,7 +264,7 @@ def test_a_restart_waits_until_nobody_takes_the_new_node_for_a_second_one_and_is
 
         async def order() -> None:
             await world.story.until("[system] active")
-            assert await world.order(Ask.RESTART, "viewer") == "0"
+            assert await world.order(ControlRequest.RESTART, "viewer") == "0"
             world.kill("viewer")
 
         await world.run(order())
@@ -297,13 +297,13 @@ def test_an_order_to_a_system_that_is_not_up_is_refused_and_not_kept(tmp_path: P
         async def order() -> None:
             await world.story.until("/camera configure")
             for ask, hint in (
-                (Ask.PAUSE, "only an active system can be paused"),
-                (Ask.RESTART, "only a system that is active or paused can be restarted"),
+                (ControlRequest.PAUSE, "only an active system can be paused"),
+                (ControlRequest.RESTART, "only a system that is active or paused can be restarted"),
             ):
                 assert await world.order(ask) == (
                     f"2 cannot {ask.value} 'robot': it is connecting; {hint}"
                 )
-            assert await world.order(Ask.DOWN) == "6"
+            assert await world.order(ControlRequest.DOWN) == "6"
 
         await world.run(order())
 
@@ -319,11 +319,11 @@ def test_a_restarted_node_stays_inactive_while_the_system_is_wrong_and_can_be_re
         async def order() -> None:
             await world.story.until("[system] active")
             world.intrude()
-            assert await world.order(Ask.RESTART, "viewer") == f"4 {REFUSED}"
+            assert await world.order(ControlRequest.RESTART, "viewer") == f"4 {REFUSED}"
             world.retreat()
             await asyncio.sleep(1.0)
-            assert await world.order(Ask.RESUME) == "0"
-            assert await world.order(Ask.DOWN) == "0"
+            assert await world.order(ControlRequest.RESUME) == "0"
+            assert await world.order(ControlRequest.DOWN) == "0"
 
         await world.run(order())
         assert world.since("[verdict] active violated")[1:-ENDING] == [
@@ -354,10 +354,10 @@ def test_a_restart_that_cannot_begin_leaves_everything_as_it_is(tmp_path: Path) 
         async def order() -> None:
             await world.story.until("[system] active")
             world.hosts.cannot_start = why
-            assert await world.order(Ask.RESTART) == (
+            assert await world.order(ControlRequest.RESTART) == (
                 f"6 cannot restart 'robot': {why}; everything stays as it is"
             )
-            assert await world.order(Ask.DOWN) == "0"
+            assert await world.order(ControlRequest.DOWN) == "0"
 
         await world.run(order())
         assert world.since("[system] active")[1:] == [
@@ -376,7 +376,7 @@ def test_a_restart_in_which_a_step_fails_ends_the_run(tmp_path: Path) -> None:
         async def order() -> None:
             await world.story.until("[system] active")
             world.hosts.ways["/viewer configure"] = "no display"
-            assert await world.order(Ask.RESTART, "/viewer") == (
+            assert await world.order(ControlRequest.RESTART, "/viewer") == (
                 "6 cannot configure '/viewer': no display"
             )
 
@@ -401,9 +401,9 @@ def test_a_paused_system_is_restarted_as_far_as_it_was(tmp_path: Path) -> None:
 
         async def order() -> None:
             await world.story.until("[system] active")
-            assert await world.order(Ask.PAUSE) == "0"
-            assert await world.order(Ask.RESTART) == "0"
-            assert await world.order(Ask.DOWN) == "0"
+            assert await world.order(ControlRequest.PAUSE) == "0"
+            assert await world.order(ControlRequest.RESTART) == "0"
+            assert await world.order(ControlRequest.DOWN) == "0"
 
         await world.run(order())
         assert world.since("[system] paused")[1:] == [
@@ -425,7 +425,7 @@ def test_an_order_that_is_open_when_the_system_is_taken_down_is_answered(tmp_pat
         async def order() -> None:
             await world.story.until("[system] active")
             world.hosts.takes_s["/viewer deactivate"] = 2.0
-            paused = asyncio.ensure_future(world.order(Ask.PAUSE))
+            paused = asyncio.ensure_future(world.order(ControlRequest.PAUSE))
             await world.story.until("/viewer deactivate")
             signal.raise_signal(signal.SIGTERM)
             assert await paused == "6 cannot go on: 'robot' is being taken down"

@@ -11,9 +11,7 @@ import pytest
 
 from lifecycle.errors import BringUpError
 from lifecycle.manifest.model import (
-    Authority as AuthorityKind,
-)
-from lifecycle.manifest.model import (
+    Authority,
     Condition,
     DataLayer,
     DataLayerSource,
@@ -28,11 +26,16 @@ from lifecycle.plan.model import (
     PlannedNode,
     PlannedParticipant,
 )
-from lifecycle.supervisor.connections.authority import TRIES, Authority, Hand, PlannedSource
+from lifecycle.supervisor.connections.authority import (
+    TRIES,
+    ConnectionAuthority,
+    Hand,
+    PlannedSource,
+)
 from lifecycle.supervisor.connections.desired_state import (
+    ActualState,
     Instructions,
     Step,
-    Wired,
     planned_instructions,
     steps,
     wired,
@@ -62,7 +65,7 @@ def wired_node(key: str, *, after: Mapping[str, Condition] = {}) -> PlannedNode:
     )
     return dataclasses.replace(
         planned_node(key, after=after),
-        authority=AuthorityKind.SUPERVISOR,
+        authority=Authority.SUPERVISOR,
         endpoints=endpoints,
         participants=(
             PlannedParticipant(
@@ -75,7 +78,7 @@ def wired_node(key: str, *, after: Mapping[str, Condition] = {}) -> PlannedNode:
 def wired_plan(*nodes: PlannedNode, **layer: object) -> Plan:
     return dataclasses.replace(
         plan_of(*nodes),
-        data_layer=DataLayer(authority=AuthorityKind.SUPERVISOR, **layer),  # type: ignore[arg-type]
+        data_layer=DataLayer(authority=Authority.SUPERVISOR, **layer),  # type: ignore[arg-type]
     )
 
 
@@ -123,7 +126,7 @@ class Wiring:
         self.world = World(plan, directory)
         self.source = ChangingSource(plan)
         self.hands: dict[str, FakeHand] = {}
-        self.authority = Authority(
+        self.authority = ConnectionAuthority(
             self.world.system, self.source, self.world.emit, hand_of=self._hand
         )
         self.world.bring_up = BringUp(
@@ -457,7 +460,7 @@ def test_steps_make_before_they_break_and_spare_what_is_not_ours() -> None:
         connections=(("new", NET),),
         mappings=(("publishers/out", "new"), ("subscriptions/in", "")),
     )
-    has = Wired(
+    has = ActualState(
         connections=(("old", (URL,)), ("own", (URL,))),
         mappings=(("publishers/out", "old"), ("subscriptions/in", "")),
     )
@@ -476,7 +479,7 @@ def test_a_connection_whose_urls_changed_is_made_anew_with_all_that_is_on_it() -
     wanted = Instructions(
         node="/a", connections=(("net", NET),), mappings=(("publishers/out", "net"),)
     )
-    has = Wired(
+    has = ActualState(
         connections=(("net", ("udpv4://127.0.0.1:9",)),), mappings=(("publishers/out", "net"),)
     )
     assert [each.operation for each in steps(wanted, has)] == [DISCONNECT, CONNECT, MAP]

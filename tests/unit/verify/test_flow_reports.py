@@ -15,7 +15,7 @@ from lifecycle.network.nfe import (
 from lifecycle.plan import Plan, build_plan
 from lifecycle.verify import Finding, FlowReport, Outcome, Stage, verify
 from lifecycle.verify.judge import flow_reports
-from lifecycle.verify.layout import lay_out
+from lifecycle.verify.matcher import lay_out
 from tests.builders import at, node, planned, publisher, subscription, teleop
 from tests.unit.verify.edits import (
     Edit,

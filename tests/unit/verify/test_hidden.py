@@ -7,8 +7,8 @@ import dataclasses
 import pytest
 
 from lifecycle.plan.model import PlannedParticipant
-from lifecycle.verify.hidden import Owners, is_hidden_node
 from lifecycle.verify.observation import ConnectionReport, NodeConfiguration
+from lifecycle.verify.tool_filter import Owners, is_hidden_node
 from tests.builders import configuration, node, planned, publisher
 
 PLAN = planned(

@@ -18,9 +18,9 @@ from lifecycle.verify import (
     ObservedEndpoint,
     Stage,
 )
-from lifecycle.verify.layout import lay_out
+from lifecycle.verify.matcher import lay_out
 from lifecycle.verify.observation import NodeParameters
-from lifecycle.verify.view import Actual, Seen, View
+from lifecycle.verify.view import Actual, SeenEndpoint, View
 from tests.builders import (
     at,
     endpoint,
@@ -524,7 +524,7 @@ def test_an_endpoint_that_discovery_need_not_show_is_as_its_node_says() -> None:
         type_hash="RIHS01_aa",
     )
     (seen,) = (each for each in view_after(edit, plan).seen if each.kind is PUB)
-    assert seen == Seen(
+    assert seen == SeenEndpoint(
         kind=PUB,
         node="/one",
         name="/a",
@@ -570,7 +570,7 @@ def test_who_is_beyond_reach_counts_among_what_is_seen_as_it_is_planned() -> Non
     plan = connected("shm://")
     view = lay_out(plan, Observation(), Stage.CONNECTED, machines=frozenset({"m1"}))
     assert view.seen == tuple(
-        Seen(
+        SeenEndpoint(
             kind=SUB,
             node="/two",
             name=each.resolved,

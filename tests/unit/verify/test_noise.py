@@ -16,7 +16,7 @@ from lifecycle.verify import (
     our_nodes,
     without_noise,
 )
-from lifecycle.verify.noise import DeclaredNames, known_node, tolerating_pattern
+from lifecycle.verify.tool_filter import DeclaredNames, known_node, tolerating_pattern
 from tests.builders import endpoint, node, planned, publisher, subscription
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION

@@ -8,7 +8,7 @@ from lifecycle.manifest.model import EndpointKind
 from lifecycle.network.nfe import InternetProtocol, NetworkFlowEndpoint, TransportProtocol
 from lifecycle.plan import Plan
 from lifecycle.verify import Identity, Stage
-from lifecycle.verify.layout import lay_out
+from lifecycle.verify.matcher import lay_out
 from lifecycle.verify.uniqueness import Uniqueness
 from lifecycle.verify.view import Actual
 from tests.builders import endpoint, node, planned, publisher, subscription

@@ -16,10 +16,10 @@ from lifecycle.plan.model import (
     StaticParticipant,
 )
 from lifecycle.verify import Observation, ObservedEndpoint, Stage
-from lifecycle.verify.layout import lay_out
+from lifecycle.verify.matcher import lay_out
 from lifecycle.verify.view import (
     UNKNOWN_QOS,
-    Seen,
+    SeenEndpoint,
     View,
     actual_qos,
     connection_of,
@@ -112,7 +112,7 @@ def test_publishers_and_subscriptions_of_tools_are_seen_as_they_are_announced() 
     seen = dataclasses.replace(seen, endpoints=(*seen.endpoints, shown))
     seen = add_endpoint(CLIENT, "/rviz2", "/ask", type="a/srv/B")(seen)
     assert view_of(seen).seen_of_tools == (
-        Seen(
+        SeenEndpoint(
             kind=SUB,
             node="/rviz2",
             name="/a",

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from lifecycle.programming.apply.changes import Change, ChangeKind, Changes
+from lifecycle.programming.apply.changes import ChangeKind, FlowChange, TargetChanges
 from lifecycle.programming.apply.errors import ProgrammingError
-from lifecycle.programming.apply.tool import Output
+from lifecycle.programming.apply.tool import ToolOutput
 from lifecycle.programming.rules.rules import FlowRule
 
 
@@ -20,18 +20,18 @@ class FakeTarget:
         self.fails = ""
         self.due_s: float | None = None
 
-    def plan(self, rules: Sequence[FlowRule]) -> Changes:
+    def plan(self, rules: Sequence[FlowRule]) -> TargetChanges:
         before = {each.key: each for each in self.rules}
         changes = []
         for each in rules:
             old = before.pop(each.key, None)
             kind = ChangeKind.CREATE if old is None else ChangeKind.UPDATE
             kind = ChangeKind.KEEP if old == each else kind
-            changes.append(Change(kind=kind, key=each.key, what=each.describe()))
-        changes += [Change(kind=ChangeKind.DELETE, key=key, what="") for key in before]
-        return Changes(target=self.name, changes=tuple(changes))
+            changes.append(FlowChange(kind=kind, key=each.key, what=each.describe()))
+        changes += [FlowChange(kind=ChangeKind.DELETE, key=key, what="") for key in before]
+        return TargetChanges(target=self.name, changes=tuple(changes))
 
-    def apply(self, rules: Sequence[FlowRule]) -> Changes:
+    def apply(self, rules: Sequence[FlowRule]) -> TargetChanges:
         self.applied += 1
         if self.fails:
             raise ProgrammingError(self.fails)
@@ -41,7 +41,7 @@ class FakeTarget:
     def dry_run(self, rules: Sequence[FlowRule]) -> str:
         return "".join(f"{each.describe()}\n" for each in rules)
 
-    def remove(self) -> Changes:
+    def remove(self) -> TargetChanges:
         return self.apply(())
 
     def renew(self) -> float | None:
@@ -56,19 +56,19 @@ class FakeTool:
         lines: every command line, joined by spaces.
     """
 
-    def __init__(self, *answers: tuple[str, Output | Callable[[], Output]]) -> None:
+    def __init__(self, *answers: tuple[str, ToolOutput | Callable[[], ToolOutput]]) -> None:
         self.answers = dict(answers)
         self.lines: list[str] = []
 
-    def run(self, argv: Sequence[str], *, stdin: str = "") -> Output:
+    def run(self, argv: Sequence[str], *, stdin: str = "") -> ToolOutput:
         line = " ".join(argv)
         self.lines.append(line)
         for begins, answer in self.answers.items():
             if line.startswith(begins):
-                return answer if isinstance(answer, Output) else answer()
-        return Output(returncode=0, stdout="", stderr="")
+                return answer if isinstance(answer, ToolOutput) else answer()
+        return ToolOutput(returncode=0, stdout="", stderr="")
 
 
-def failed(stderr: str, returncode: int = 1) -> Output:
+def failed(stderr: str, returncode: int = 1) -> ToolOutput:
     """What a program that failed leaves."""
-    return Output(returncode=returncode, stdout="", stderr=stderr)
+    return ToolOutput(returncode=returncode, stdout="", stderr=stderr)

@@ -12,7 +12,7 @@ import pytest
 
 from lifecycle.errors import UsageError
 from lifecycle.programming.apply import ledger as ledger_module
-from lifecycle.programming.apply.changes import Change, ChangeKind, Changes
+from lifecycle.programming.apply.changes import ChangeKind, FlowChange, TargetChanges
 from lifecycle.programming.apply.errors import PartlyError, ProgrammingError
 from lifecycle.programming.apply.ledger import (
     Entry,
@@ -294,21 +294,21 @@ class FakePrograms:
 
     def update(
         self, flows: Sequence[FlowReport], *, hold: bool, within_s: float | None
-    ) -> tuple[Changes, ...]:
+    ) -> tuple[TargetChanges, ...]:
         assert hold
         self.seen.append(tuple(each.topic for each in flows))
         if self.fail:
             self.fail -= 1
             raise ProgrammingError("cannot just now")
         self.loop.call_soon_threadsafe(self.done.set)
-        change = Change(kind=ChangeKind.CREATE, key="k", what="w")
-        return (Changes(target="fake", changes=(change,)),)
+        change = FlowChange(kind=ChangeKind.CREATE, key="k", what="w")
+        return (TargetChanges(target="fake", changes=(change,)),)
 
     def renew(self, *, within_s: float | None) -> float | None:
         self.renewed += 1
         return self.due_s
 
-    def close(self, *, within_s: float | None) -> tuple[Changes, ...]:
+    def close(self, *, within_s: float | None) -> tuple[TargetChanges, ...]:
         self.seen.append(("closed",))
         return ()
 

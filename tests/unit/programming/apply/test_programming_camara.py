@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.programming.apply.changes import Change, Changes, Target
+from lifecycle.programming.apply.changes import FlowChange, Target, TargetChanges
 from lifecycle.programming.apply.errors import PartlyError
 from lifecycle.programming.apply.ledger import EntryState, Ledger
 from lifecycle.programming.apply.targets import TargetOptions, Targets
@@ -52,7 +52,7 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
         targets.close()
 
 
-def only(changes: Changes) -> Change:
+def only(changes: TargetChanges) -> FlowChange:
     (change,) = changes.changes
     return change
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.programming.apply.changes import ChangeKind, Changes, Target
+from lifecycle.programming.apply.changes import ChangeKind, Target, TargetChanges
 from lifecycle.programming.apply.errors import PartlyError
 from lifecycle.programming.apply.ledger import EntryState, Ledger
 from lifecycle.programming.apply.targets import TargetOptions, Targets
@@ -57,7 +57,7 @@ def _bench(tmp_path: Path, server: NefServer, **settings: object) -> Iterator[Be
     targets.close()
 
 
-def kinds(changes: Changes) -> list[str]:
+def kinds(changes: TargetChanges) -> list[str]:
     return [each.kind.value for each in changes.changes]
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.programming.apply.changes import Change, ChangeKind, Changes
+from lifecycle.programming.apply.changes import ChangeKind, FlowChange, TargetChanges
 from lifecycle.programming.apply.errors import (
     MissingFeatureError,
     PrivilegeError,
@@ -16,7 +16,7 @@ from lifecycle.programming.apply.errors import (
 )
 from lifecycle.programming.apply.nft import NftTarget
 from lifecycle.programming.apply.tc import parse_queue, parse_rate, probe_features
-from lifecycle.programming.apply.tool import HostTool, Output, demand
+from lifecycle.programming.apply.tool import HostTool, ToolOutput, demand
 from tests.unit.programming.apply.fakes import FakeTool, failed
 from tests.unit.programming.apply.samples import ledger_in, rule
 
@@ -83,7 +83,7 @@ def test_programs_read_stdin_and_speak_english() -> None:
 
 
 def test_people_are_warned_where_marks_alone_change_nothing(tmp_path: Path) -> None:
-    listed = Output(returncode=0, stdout=json.dumps(QDISCS), stderr="")
+    listed = ToolOutput(returncode=0, stdout=json.dumps(QDISCS), stderr="")
     tool = FakeTool(("nft list", NO_TABLE), ("tc -j qdisc show", listed))
 
     changes = NftTarget("robot", ledger_in(tmp_path), tool).plan([rule()])
@@ -101,7 +101,7 @@ def test_people_are_warned_where_marks_alone_change_nothing(tmp_path: Path) -> N
 
 
 def test_a_machine_without_tc_is_marked_without_a_warning(tmp_path: Path) -> None:
-    def missing() -> Output:
+    def missing() -> ToolOutput:
         raise MissingFeatureError("cannot run 'tc'")
 
     tool = FakeTool(("nft list", NO_TABLE), ("tc", missing))
@@ -193,13 +193,13 @@ def test_what_is_no_rate_is_refused(text: str) -> None:
 
 
 def test_changes_read_as_a_list_with_their_counts() -> None:
-    changes = Changes(
+    changes = TargetChanges(
         target="tc on eth0",
         changes=(
-            Change(kind=ChangeKind.CREATE, key="/a", what="udp x"),
-            Change(kind=ChangeKind.UPDATE, key="/b", what="udp y", detail="moved"),
-            Change(kind=ChangeKind.DELETE, key="/c", what=""),
-            Change(kind=ChangeKind.KEEP, key="/d", what="udp z"),
+            FlowChange(kind=ChangeKind.CREATE, key="/a", what="udp x"),
+            FlowChange(kind=ChangeKind.UPDATE, key="/b", what="udp y", detail="moved"),
+            FlowChange(kind=ChangeKind.DELETE, key="/c", what=""),
+            FlowChange(kind=ChangeKind.KEEP, key="/d", what="udp z"),
         ),
         left_out=("/e: why",),
         warnings=("look out",),

@@ -11,15 +11,6 @@ from collections.abc import Collection, Iterable, Sequence
 
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedFlow, PlannedNode
-from lifecycle.verify.hidden import Owners
-from lifecycle.verify.noise import (
-    DeclaredNames,
-    action_part,
-    fold_actions,
-    is_noise_endpoint,
-    known_node,
-    tolerating_pattern,
-)
 from lifecycle.verify.observation import (
     EndpointReport,
     NodeConfiguration,
@@ -27,11 +18,20 @@ from lifecycle.verify.observation import (
     ObservedEndpoint,
     ObservedNode,
 )
+from lifecycle.verify.tool_filter import (
+    DeclaredNames,
+    Owners,
+    action_part,
+    fold_actions,
+    is_noise_endpoint,
+    known_node,
+    tolerating_pattern,
+)
 from lifecycle.verify.verdict import Stage
 from lifecycle.verify.view import (
     Actual,
     FlowView,
-    Seen,
+    SeenEndpoint,
     View,
     actual_qos,
     may_hide,
@@ -351,12 +351,12 @@ def _graph_nodes(
 def _seen(
     endpoints: Iterable[ObservedEndpoint],
     actual: Sequence[Actual],
-) -> tuple[Seen, ...]:
+) -> tuple[SeenEndpoint, ...]:
     """Collect publishers and subscriptions with all that is known of them."""
     known = {id(each.observed): each for each in actual if each.observed is not None}
     # Nobody here can see those, but who hears them counts them.
     found = [
-        Seen(
+        SeenEndpoint(
             kind=each.planned.kind,
             node=each.node.full_name,
             name=each.planned.resolved,
@@ -374,7 +374,7 @@ def _seen(
         match = known.get(id(endpoint))
         report = match.report if match else None
         found.append(
-            Seen(
+            SeenEndpoint(
                 kind=endpoint.kind,
                 node=endpoint.node,
                 name=endpoint.name,
