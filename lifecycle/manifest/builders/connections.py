@@ -11,15 +11,10 @@ import ipaddress
 from lifecycle.manifest.builders.cursor import Cursor
 from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.model import (
-    Authority,
     ConnectionDeclaration,
     DataLayer,
-    DataLayerSource,
     Discovery,
-    DiscoveryMode,
-    DiscoveryRange,
     EndpointKind,
-    FlowTransport,
     Interface,
 )
 from lifecycle.manifest.yaml.document import error
@@ -32,18 +27,7 @@ _KINDS = {kind.value: kind for kind in EndpointKind}
 def build_discovery(root: Cursor) -> Discovery:
     """Build what a document says of discovery; the defaults where it says nothing."""
     cursor = root.get("discovery")
-    if cursor is None:
-        return Discovery()
-    first_port = cursor.integer("first_port")
-    return Discovery(
-        domain_id=cursor.integer("domain_id"),
-        mode=cursor.choice("mode", DiscoveryMode, DiscoveryMode.DYNAMIC),
-        range=cursor.choice("range", DiscoveryRange, DiscoveryRange.SYSTEM_DEFAULT),
-        transport=cursor.choice("transport", FlowTransport, FlowTransport.ANY),
-        first_port=Discovery().first_port if first_port is None else first_port,
-        server_machine=cursor.text("server_machine"),
-        at=cursor.key_at,
-    )
+    return Discovery() if cursor is None else cursor.build(Discovery, at=cursor.key_at)
 
 
 def build_data_layer(root: Cursor, found: list[Diagnostic]) -> DataLayer:
@@ -59,13 +43,7 @@ def build_data_layer(root: Cursor, found: list[Diagnostic]) -> DataLayer:
         hint = "239.255.0.0 to 239.255.255.255 stay within an organisation (RFC 2365)"
         found.append(error("manifest.multicast-group", at, message, hint))
         group = default.multicast_group
-    return DataLayer(
-        authority=cursor.choice("authority", Authority, default.authority),
-        source=cursor.choice("source", DataLayerSource, default.source),
-        events=cursor.flag("events", default=default.events),
-        multicast_group=group,
-        at=cursor.key_at,
-    )
+    return cursor.build(DataLayer, multicast_group=group, at=cursor.key_at)
 
 
 def section_positions(root: Cursor) -> tuple[tuple[str, Position], ...]:

@@ -8,13 +8,20 @@ from __future__ import annotations
 
 import dataclasses
 import enum
+import functools
 from collections.abc import Iterator, Mapping
-from typing import TypeVar
+from typing import Any, TypeVar, get_type_hints
+
+import msgspec
 
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.yaml.document import Document, Place, Scalar, Value
 
 E = TypeVar("E", bound=enum.Enum)
+T = TypeVar("T")
+
+_EXACT = 2**53
+"""Above, a float says nothing of an integer."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,28 +85,46 @@ class Cursor:
         cursor = self.get(key)
         return default if cursor is None else cursor.value.text
 
-    def flag(self, key: str, *, default: bool) -> bool:
-        """Return a boolean."""
-        cursor = self.get(key)
-        if cursor is None:
-            return default
-        assert isinstance(cursor.scalar, bool)
-        return cursor.scalar
-
     def integer(self, key: str) -> int | None:
         """Return an integer; None where the key is missing. JSON Schema counts 5.0 as one."""
-        number = self.number(key)
-        return None if number is None else int(number)
-
-    def number(self, key: str) -> int | float | None:
-        """Return a number; None where the key is missing."""
         cursor = self.get(key)
         if cursor is None:
             return None
         assert isinstance(cursor.scalar, (int, float))
-        return cursor.scalar
+        return int(cursor.scalar)
 
     def choice(self, key: str, type_: type[E], default: E) -> E:
         """Return an enum by its value."""
         cursor = self.get(key)
         return default if cursor is None else type_(cursor.scalar)
+
+    def build(self, type_: type[T], /, **computed: Any) -> T:
+        """Return a dataclass whose fields are keys of this mapping.
+
+        Args:
+            type_: its fields have the keys' names; what is not written keeps its default. A text is
+                what was written, whatever scalar it is read as.
+            computed: fields that are more than the value of their key.
+        """
+        known: type = type_
+        for name, hint in _hints(known).items():
+            value = None if name in computed else self.document.find((*self.place, name))
+            if value is not None:
+                computed[name] = _converted(value, hint)
+        return type_(**computed)
+
+
+@functools.lru_cache(maxsize=32)
+def _hints(type_: type) -> Mapping[str, Any]:
+    return get_type_hints(type_)
+
+
+def _converted(value: Value, hint: Any) -> Any:
+    if hint is str:
+        return value.text
+    if isinstance(value.data, tuple):
+        return tuple(each.text for each in value.data)
+    number = value.data
+    if isinstance(number, float) and number.is_integer() and abs(number) < _EXACT:
+        number = int(number)  # JSON Schema counts 5.0 as an integer
+    return msgspec.convert(number, hint)

@@ -6,7 +6,6 @@ interface holds is `build_interface`'s. Pure but for reading interfaces by refer
 
 from __future__ import annotations
 
-import dataclasses
 import os
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -19,9 +18,7 @@ from lifecycle.manifest.model import (
     Condition,
     Endpoint,
     EndpointKind,
-    EndpointPolicy,
     FlowNeed,
-    FlowTransport,
     Interface,
     Node,
     ParameterDeclaration,
@@ -46,7 +43,6 @@ from lifecycle.manifest.qos import (
 from lifecycle.manifest.yaml.document import Scalar, error, warning
 from lifecycle.manifest.yaml.yaml_parser import YAML_1_1_BOOLEANS, has_leading_zero, quote
 from lifecycle.network.dscp import parse_dscp
-from lifecycle.network.nfe import UniqueRequirement
 
 Findings = list[Diagnostic]
 """Findings in the order in which they turn up; every builder appends and goes on."""
@@ -167,12 +163,10 @@ def _duration(cursor: Cursor, key: str, default: int | None) -> int | None:
 def _declaration(name: str, cursor: Cursor, found: Findings) -> ParameterDeclaration:
     type_ = cursor.text("type")
     default = cursor.get("default_value")
-    return ParameterDeclaration(
+    return cursor.build(
+        ParameterDeclaration,
         name=name,
-        type=type_,
         default=None if default is None else _default(default, type_, found),
-        description=cursor.text("description"),
-        read_only=cursor.flag("read_only", default=False),
         at=cursor.key_at,
     )
 
@@ -257,14 +251,13 @@ def build_node(
     namespace = cursor.text("namespace").strip("/")
     parameters = _parameters(cursor, found)
     interface = build_interface(cursor, base=base, environment=environment, found=found)
-    return Node(
+    return cursor.build(
+        Node,
         key=key,
         name=cursor.text("name", key),
         namespace=f"/{namespace}",
         machine=cursor.text("machine", machine),
         run=_run(cursor, base, found),
-        managed=cursor.flag("managed", default=True),
-        process=cursor.text("process"),
         parameters=tuple((name, value) for name, (value, _) in parameters.items()),
         parameter_files=tuple(
             absolute(base, each.value.text) for each in cursor.items("parameter_files")
@@ -277,9 +270,7 @@ def build_node(
         timeouts=_timeouts(cursor),
         interface=interface,
         flows=tuple(_flows(cursor)),
-        endpoints=cursor.choice("endpoints", EndpointPolicy, EndpointPolicy.DECLARED),
         connections=build_connections(cursor, interface, found),
-        log_level=cursor.text("log_level"),
         positions=(
             *_positions(cursor),
             *connection_positions(cursor),
@@ -311,12 +302,9 @@ def _run(node: Cursor, base: Path, found: Findings) -> Run:
                 message = f"cannot set {name} of a node that somebody else starts"
                 found.append(error("manifest.attach", at, message, "remove it"))
     folder = cursor.text("working_directory")
-    return Run(
+    return cursor.build(
+        Run,
         kind=kind,
-        python=cursor.text("python"),
-        command=tuple(each.value.text for each in cursor.items("command")),
-        package=cursor.text("package"),
-        executable=cursor.text("executable"),
         environment=tuple((name, each.value.text) for name, each in cursor.entries("environment")),
         working_directory=absolute(base, folder) if folder else "",
     )
@@ -361,10 +349,7 @@ def _parameter(name: str, cursor: Cursor, found: Findings) -> ParameterValue | N
 
 def _timeouts(node: Cursor) -> Timeouts:
     cursor = node.get("timeouts")
-    if cursor is None:
-        return Timeouts()
-    given = {key: float(cursor.number(key) or 0) for key, _ in cursor.entries()}
-    return dataclasses.replace(Timeouts(), **given)
+    return Timeouts() if cursor is None else cursor.build(Timeouts)
 
 
 def _flows(node: Cursor) -> list[FlowNeed]:
@@ -374,25 +359,14 @@ def _flows(node: Cursor) -> list[FlowNeed]:
             dscp = cursor.get("dscp")
             auto = cursor.text("five_qi") == "auto"
             needs.append(
-                FlowNeed(
+                cursor.build(
+                    FlowNeed,
                     kind=kind,
                     name=name,
-                    unique=cursor.choice(
-                        "unique", UniqueRequirement, UniqueRequirement.NOT_REQUIRED
-                    ),
                     # A number may stand as 46.0 or 0x2e: the scalar counts, not its text.
                     dscp=None if dscp is None else parse_dscp(_dscp_word(dscp)),
-                    transport_priority=cursor.integer("transport_priority"),
-                    enforce=cursor.flag("enforce", default=True),
                     five_qi=None if auto else cursor.integer("five_qi"),
                     five_qi_auto=auto,
-                    max_delay_ms=_float(cursor, "max_delay_ms"),
-                    loss=_float(cursor, "loss"),
-                    rate_hz=_float(cursor, "rate_hz"),
-                    max_message_size=cursor.integer("max_message_size"),
-                    transport=cursor.choice("transport", FlowTransport, FlowTransport.ANY),
-                    non_blocking_send=cursor.flag("non_blocking_send", default=False),
-                    lossy=cursor.flag("lossy", default=False) if "lossy" in cursor else None,
                     quantities=quantities(cursor),
                     at=cursor.key_at,
                 )
@@ -415,11 +389,6 @@ def quantities(cursor: Cursor) -> tuple[Quantity, ...]:
         if value is not None and isinstance(value.scalar, (int, float)):
             found.append(Quantity(name=name, value=value.scalar, at=value.at))
     return tuple(found)
-
-
-def _float(cursor: Cursor, key: str) -> float | None:
-    number = cursor.number(key)
-    return None if number is None else float(number)
 
 
 def _dscp_word(cursor: Cursor) -> str | int:

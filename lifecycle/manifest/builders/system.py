@@ -19,17 +19,12 @@ from lifecycle.manifest.builders.cursor import Cursor
 from lifecycle.manifest.builders.node import Findings, build_node, quantities
 from lifecycle.manifest.diagnostics import Diagnostic, Severity
 from lifecycle.manifest.model import (
-    TOLERATED_NODES,
-    EndpointPolicy,
-    FlowIdentification,
-    FlowTransport,
     Link,
     Machine,
     Manifest,
     Network,
     Node,
     Policy,
-    UniqueHow,
 )
 from lifecycle.manifest.yaml.document import Place, error
 from lifecycle.manifest.yaml.yaml_parser import quote
@@ -50,13 +45,10 @@ def build_network(root: Cursor, *, base: Path, found: list[Diagnostic]) -> Netwo
     cursor = root.get("network")
     if cursor is None:
         return Network()
-    return Network(
-        flow_identification=cursor.choice(
-            "flow_identification", FlowIdentification, FlowIdentification.PARTICIPANT
-        ),
+    return cursor.build(
+        Network,
         transport_priority_mapping=_priority_mapping(cursor, found),
         five_qi_dscp=_dscp_mapping(cursor, base, found),
-        max_datagram_bytes=cursor.integer("max_datagram_bytes"),
         at=cursor.key_at,
     )
 
@@ -65,13 +57,8 @@ def _priority_mapping(network: Cursor, found: list[Diagnostic]) -> TransportPrio
     cursor = network.get("transport_priority_mapping")
     if cursor is None:
         return None
-    low, high = cursor.integer("low"), cursor.integer("high")
     try:
-        return TransportPriorityMapping(
-            mask=cursor.integer("mask") or 0,
-            low=0 if low is None else low,
-            high=0xFF if high is None else high,
-        )
+        return cursor.build(TransportPriorityMapping)
     except ValueError as problem:
         message, _, hint = str(problem).partition("; ")
         found.append(error("manifest.transport-priority", cursor.at, message, hint))
@@ -181,11 +168,8 @@ def _policy(root: Cursor) -> Policy:
     cursor = root.get("policy")
     if cursor is None:
         return Policy()
-    return Policy(
-        undeclared_nodes=cursor.choice("undeclared_nodes", EndpointPolicy, EndpointPolicy.DECLARED),
-        tolerated_nodes=tuple(each.value.text for each in cursor.items("tolerated_nodes"))
-        if "tolerated_nodes" in cursor
-        else TOLERATED_NODES,
+    return cursor.build(
+        Policy,
         unverifiable_blocks=cursor.text("unverifiable") == "block",
         unpublished=_SEVERITIES[cursor.text("unpublished", "error")],
         unheard=_SEVERITIES[cursor.text("unheard", "warning")],
@@ -193,14 +177,10 @@ def _policy(root: Cursor) -> Policy:
 
 
 def _link(cursor: Cursor) -> Link:
-    delay = cursor.number("max_delay_ms")
-    return Link(
-        topic=cursor.text("topic"),
+    return cursor.build(
+        Link,
         from_node=cursor.text("from"),
         to_node=cursor.text("to"),
-        unique=cursor.choice("unique", UniqueHow, UniqueHow.NOT),
-        max_delay_ms=None if delay is None else float(delay),
-        transport=cursor.choice("transport", FlowTransport, FlowTransport.ANY),
         quantities=quantities(cursor),
         at=cursor.at,
     )
