@@ -1,7 +1,7 @@
 """The frozen manifest: what a document says once it is valid, arguments and includes resolved.
 
 Owns: the types that cross from this room into plan/: the system, and of each node how it runs, its
-interface, its flows and its connections. Closed sets of words are in choices.py. Nothing here knows
+interface, its flows and its connections. Nothing here knows
 YAML. Pure.
 """
 
