@@ -19,8 +19,7 @@ from typing import Protocol
 from lifecycle.errors import MiddlewareError
 from lifecycle.graph.events import GraphEvents
 from lifecycle.graph.messages import GraphMessage, Heartbeat
-from lifecycle.graph.parameters import Clients as ParameterClients
-from lifecycle.graph.parameters import ParameterReadings
+from lifecycle.graph.parameters import ParameterReadings, ParameterServices
 from lifecycle.graph.scheduler import Remove, set_within
 from lifecycle.graph.state import Answer, GraphState, Look
 from lifecycle.plan.model import Plan
@@ -55,7 +54,7 @@ _TOGETHER_S = 0.05
 """Changes of discovery come in bursts; who follows them looks once for all within so long."""
 
 
-class Discovery(Protocol):
+class DiscoveredGraph(Protocol):
     """What discovery shows, see lifecycle.middleware.GraphObserver."""
 
     def snapshot(
@@ -76,7 +75,7 @@ class Discovery(Protocol):
         """Leave the graph."""
 
 
-class Clients(ParameterClients, Protocol):
+class NodeServices(ParameterServices, Protocol):
     """Nodes' services, see lifecycle.middleware.NodeClients."""
 
     async def get_state(self, node: str, *, timeout_s: float) -> str:
@@ -134,8 +133,8 @@ class Observer:
 
     def __init__(
         self,
-        discovery: Discovery,
-        clients: Clients,
+        discovery: DiscoveredGraph,
+        clients: NodeServices,
         events: GraphEvents,
         *,
         quiet_s: float = QUIET_S,

@@ -38,7 +38,7 @@ _NONE = "serves no parameters"
 _NO_ANSWER = f"did not answer its parameter services within {ANSWER_S:g} s"
 
 
-class Clients(Protocol):
+class ParameterServices(Protocol):
     """Nodes' parameter services, see lifecycle.middleware.NodeClients."""
 
     def serves_parameters(self, node: str) -> bool | None:
@@ -61,7 +61,7 @@ class ParameterReadings:
         wake: called, in any thread, when they are others than before.
     """
 
-    def __init__(self, clients: Clients, wake: Callable[[], None]) -> None:
+    def __init__(self, clients: ParameterServices, wake: Callable[[], None]) -> None:
         self._clients = clients
         self._wake = wake
         self._nodes: dict[str, _Node] = {}
@@ -146,7 +146,7 @@ class _Node:
     """The parameters of one node, read again and again by a task."""
 
     def __init__(
-        self, name: str, names: frozenset[str], clients: Clients, wake: Callable[[], None]
+        self, name: str, names: frozenset[str], clients: ParameterServices, wake: Callable[[], None]
     ) -> None:
         self.names = names
         self.latest: NodeParameters | None = None

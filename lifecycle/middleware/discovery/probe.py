@@ -36,7 +36,7 @@ from lifecycle.middleware.fastdds.url_profile import (
     DISCOVERY_GROUP,
     LOCALHOST_PEERS_RANGE,
     LOOPBACK,
-    Family,
+    UrlTransport,
     families,
     leaves_discovery_open,
 )
@@ -397,7 +397,7 @@ def _doors_around(
     return tuple(doors)
 
 
-def _bound(family: Family) -> dict[str, tuple[str, ...]]:
+def _bound(family: UrlTransport) -> dict[str, tuple[str, ...]]:
     """Return this host's addresses that a family of URLs is bound to, by interface."""
     here = addresses_of(family.kind, loopback=True)
     if family.interfaces:
@@ -410,7 +410,7 @@ def _bound(family: Family) -> dict[str, tuple[str, ...]]:
 
 
 def _doors_of_peers(
-    domain_id: int, family: Family, here: Mapping[str, tuple[str, ...]]
+    domain_id: int, family: UrlTransport, here: Mapping[str, tuple[str, ...]]
 ) -> tuple[Door, ...]:
     doors: list[Door] = []
     for peer in dict.fromkeys(peer for url in family.urls for peer in url.peers):
@@ -423,7 +423,7 @@ def _doors_of_peers(
     return tuple(doors)
 
 
-def _knock_at_peers(domain_id: int, family: Family) -> Knock:
+def _knock_at_peers(domain_id: int, family: UrlTransport) -> Knock:
     here = _bound(family)
     doors = _doors_of_peers(domain_id, family, here)
     addresses = tuple(each for found in here.values() for each in found)

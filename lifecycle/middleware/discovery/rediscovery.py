@@ -38,7 +38,7 @@ from lifecycle.middleware.discovery.probe import (
 )
 from lifecycle.middleware.fastdds.url_profile import (
     DISCOVERY_GROUP,
-    Family,
+    UrlTransport,
     families,
     leaves_discovery_open,
 )
@@ -103,7 +103,7 @@ def _call_around(domain_id: int, kind: Medium, peers: Sequence[str]) -> None:
         send(sender, calls[0], doors)
 
 
-def _call_listed(domain_id: int, family: Family) -> None:
+def _call_listed(domain_id: int, family: UrlTransport) -> None:
     """Call the listed peers of other hosts, in the name of those of this one."""
     here = {a for found in addresses_of(family.kind, loopback=True).values() for a in found}
     listed = dict.fromkeys(peer for url in family.urls for peer in url.peers)

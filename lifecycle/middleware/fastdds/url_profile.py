@@ -35,7 +35,7 @@ LOOPBACK = {Medium.UDPV4: "127.0.0.1", Medium.UDPV6: "::1"}
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Family:
+class UrlTransport:
     """One transport of a participant: all URLs that it serves.
 
     Attributes:
@@ -64,7 +64,7 @@ class Family:
         return tuple(url for url in self.urls if url.transport is Medium.UDPM)
 
 
-def families(urls: Sequence[ConnectionUrl]) -> tuple[Family, ...]:
+def families(urls: Sequence[ConnectionUrl]) -> tuple[UrlTransport, ...]:
     """Return the transports that a participant of these URLs has, in the order of the URLs.
 
     Raises:
@@ -74,7 +74,7 @@ def families(urls: Sequence[ConnectionUrl]) -> tuple[Family, ...]:
     for url in urls:
         by_kind.setdefault(transport_of(url), []).append(url)
     found = tuple(
-        Family(kind=kind, urls=tuple(each), interfaces=_interfaces(each))
+        UrlTransport(kind=kind, urls=tuple(each), interfaces=_interfaces(each))
         for kind, each in by_kind.items()
     )
     _check(found, urls)
@@ -130,7 +130,7 @@ def _bound_to(url: ConnectionUrl) -> tuple[str, ...]:
     return (url.address,)
 
 
-def _check(found: Sequence[Family], urls: Sequence[ConnectionUrl]) -> None:
+def _check(found: Sequence[UrlTransport], urls: Sequence[ConnectionUrl]) -> None:
     for family in found:
         for option in ("ttl", "output_port", "metatraffic_port"):
             values = {getattr(url, option): url for url in family.urls}
@@ -191,7 +191,7 @@ _REPLACED = (
 
 def add_discovery(
     builtin: ET.Element,
-    found: Sequence[Family],
+    found: Sequence[UrlTransport],
     urls: Sequence[ConnectionUrl],
     *,
     domain_id: int,
@@ -233,7 +233,7 @@ def add_discovery(
 
 
 def _add_metatraffic(
-    builtin: ET.Element, found: Sequence[Family], domain_id: int, *, multicast: bool
+    builtin: ET.Element, found: Sequence[UrlTransport], domain_id: int, *, multicast: bool
 ) -> None:
     """Say where discovery arrives, if Fast DDS would not do as asked by itself."""
     fixed = any(url.metatraffic_port for family in found for url in family.urls)
@@ -261,7 +261,7 @@ def _add_metatraffic(
 
 def _add_peers(
     builtin: ET.Element,
-    found: Sequence[Family],
+    found: Sequence[UrlTransport],
     *,
     extra: Sequence[Peer] = (),
     loopback: bool = False,
@@ -321,7 +321,7 @@ def _counted(prefix: str, index: int) -> str:
     return ".".join(octets)
 
 
-def _all_ports_fixed(found: Sequence[Family]) -> bool:
+def _all_ports_fixed(found: Sequence[UrlTransport]) -> bool:
     # Shared memory has ports of its own, which must stay free to move.
     return all(
         family.udp
@@ -346,7 +346,7 @@ __all__ = [
     "LOCALHOST_PEERS_RANGE",
     "LOOPBACK",
     "TYPES",
-    "Family",
+    "UrlTransport",
     "add_urls",
     "families",
     "leaves_discovery_open",
@@ -414,7 +414,9 @@ def add_urls(
     )
 
 
-def _descriptor(name: str, family: Family, *, non_blocking: bool, open_peers: bool) -> ET.Element:
+def _descriptor(
+    name: str, family: UrlTransport, *, non_blocking: bool, open_peers: bool
+) -> ET.Element:
     descriptor = ET.Element("transport_descriptor")
     _text(descriptor, "transport_id", f"{name}_{family.kind}")
     _text(descriptor, "type", TYPES[family.kind])
@@ -461,7 +463,7 @@ def _keep_dialling_whole(descriptor: ET.Element) -> None:
         _text(ET.SubElement(descriptor, tag), "scheduling_policy", str(policy))
 
 
-def _add_user_traffic(rtps: ET.Element, found: Sequence[Family], domain_id: int) -> None:
+def _add_user_traffic(rtps: ET.Element, found: Sequence[UrlTransport], domain_id: int) -> None:
     """Say where data arrives, if any of it is fixed: then Fast DDS adds nothing by itself."""
     groups = [(family, url) for family in found for url in family.groups]
     ports = any(url.port for family in found if family.udp for url in family.unicast)

@@ -18,7 +18,7 @@ from pathlib import Path
 import psutil
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.fastdds.url_profile import Family, families
+from lifecycle.middleware.fastdds.url_profile import UrlTransport, families
 from lifecycle.network.connection_url import ConnectionUrl
 from lifecycle.network.medium import Medium
 
@@ -158,7 +158,7 @@ def _taken(url: ConnectionUrl, what: str, port: int) -> MiddlewareError:
     )
 
 
-def _ports(family: Family) -> Iterator[tuple[ConnectionUrl, str, int]]:
+def _ports(family: UrlTransport) -> Iterator[tuple[ConnectionUrl, str, int]]:
     protocol = "TCP" if family.kind.is_tcp else "UDP"
     for url in family.urls:
         for attribute in ("port", "metatraffic_port", "output_port"):

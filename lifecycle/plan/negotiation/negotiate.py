@@ -352,7 +352,7 @@ def negotiate(
     """
     pairs = tuple(_pairs(sorted(parties, key=lambda each: each.key), wishes))
     chosen, problems = _choose(pairs, terms)
-    made = _Carriers(chosen, fixed=terms.fixed)
+    made = _PairCarriers(chosen, fixed=terms.fixed)
     problems += made.problems
     flows = {
         NegotiatedFlow(
@@ -465,7 +465,7 @@ def _token(pair: Pair, medium: str) -> str:
     return f"{medium}@{pair.writer.resolved}" if medium == Medium.UDPM else medium
 
 
-class _Carriers:
+class _PairCarriers:
     """Which endpoints leave their own participant, and for what.
 
     An endpoint moves only when a pair of its gets another medium than was chosen: the publisher

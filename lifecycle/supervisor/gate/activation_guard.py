@@ -10,12 +10,12 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 from collections.abc import Iterable
-from typing import Protocol
 
 from lifecycle.errors import BringUpError
 from lifecycle.node.host.control import Operation
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.nodes.driver import ACTIVE
+from lifecycle.supervisor.nodes.remote_nodes import ChangeSource, ObservationSource
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.run.events import Notice, Reach
 from lifecycle.supervisor.run.failure import ended
@@ -25,24 +25,6 @@ from lifecycle.verify.verdict import Finding, Outcome
 
 TRIES = 5
 """A node that is activated again and again is not deactivated for ever: its finding stays."""
-
-
-class Seeing(Protocol):
-    """Sees the graph, see lifecycle.graph.Graph."""
-
-    async def observe(self, plan: Plan) -> Observation:
-        """Return what the graph holds now, the states of planned nodes included."""
-
-
-class Changing(Protocol):
-    """When it is worth looking again, see verification_loop.ChangeCounter."""
-
-    @property
-    def count(self) -> int:
-        """Changes so far."""
-
-    async def beyond(self, count: int, timeout_s: float | None) -> bool:
-        """Wait for a change after `count`."""
 
 
 class ActivationGuard:
@@ -77,7 +59,7 @@ class ActivationGuard:
             if node.name in self._deactivating
         )
 
-    async def follow(self, observer: Seeing, changes: Changing) -> None:
+    async def follow(self, observer: ObservationSource, changes: ChangeSource) -> None:
         """Look at every change, for as long as nobody judges: until this is cancelled."""
         while True:
             count = changes.count

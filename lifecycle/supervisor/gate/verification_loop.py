@@ -24,7 +24,7 @@ from lifecycle.supervisor.gate.activation_guard import ActivationGuard
 from lifecycle.supervisor.gate.gate import closes
 from lifecycle.supervisor.health.agreement import Agreement
 from lifecycle.supervisor.health.liveliness import NodeArrivals
-from lifecycle.supervisor.nodes.system import GraphObserver, System
+from lifecycle.supervisor.nodes.system import ObservedGraph, System
 from lifecycle.supervisor.run.events import Emitter, VerdictChanged
 from lifecycle.supervisor.run.failure import ended
 from lifecycle.verify import verify
@@ -157,7 +157,7 @@ ASK_AGAIN_AT_MOST_S = 0.5
 class ChangeCounter:
     """Counts the moments at which it is worth looking again: the graph's and the nodes'."""
 
-    def __init__(self, system: System, observer: GraphObserver) -> None:
+    def __init__(self, system: System, observer: ObservedGraph) -> None:
         self._system = system
         self._observer = observer
         self._count = 0
@@ -235,7 +235,7 @@ class VerificationLoop:
     def __init__(
         self,
         system: System,
-        observer: GraphObserver,
+        observer: ObservedGraph,
         changes: ChangeCounter,
         emit: Emitter,
         *,

@@ -22,15 +22,15 @@ ASK_AGAIN_S = 0.2
 its announcer may not be matched yet."""
 
 
-class Seeing(Protocol):
+class ObservationSource(Protocol):
     """What a supervisor sees of the graph, see lifecycle.graph.Graph."""
 
     async def observe(self, plan: Plan) -> Observation:
         """Return what the graph holds now, nodes' own reports included."""
 
 
-class Changing(Protocol):
-    """When it is worth looking again, see verification_loop.Changes."""
+class ChangeSource(Protocol):
+    """When it is worth looking again, see verification_loop.ChangeCounter."""
 
     @property
     def count(self) -> int:
@@ -75,7 +75,11 @@ class RemoteNodes:
     """Looks at remote nodes while anybody may wait for them."""
 
     def __init__(
-        self, plan: Plan, nodes: Iterable[RemoteNode], observer: Seeing, changes: Changing
+        self,
+        plan: Plan,
+        nodes: Iterable[RemoteNode],
+        observer: ObservationSource,
+        changes: ChangeSource,
     ) -> None:
         self._nodes = tuple(nodes)
         # Ours report by themselves: only these have to be asked.

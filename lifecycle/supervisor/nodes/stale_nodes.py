@@ -14,7 +14,7 @@ from collections.abc import Iterable
 from typing import Protocol
 
 from lifecycle.supervisor.gate.verification_loop import ChangeCounter
-from lifecycle.supervisor.nodes.system import GraphObserver, NodeRun, System
+from lifecycle.supervisor.nodes.system import NodeRun, ObservedGraph, System
 from lifecycle.supervisor.processes.process import ManagedProcess
 from lifecycle.supervisor.processes.spawn import ProcessState
 from lifecycle.supervisor.run.events import Event, ProcessChanged
@@ -118,7 +118,7 @@ _LEASE_S = 21.0
 class Sightings:
     """Who is in the graph of one system, as an event to wait for."""
 
-    def __init__(self, system: System, observer: GraphObserver, changes: ChangeCounter) -> None:
+    def __init__(self, system: System, observer: ObservedGraph, changes: ChangeCounter) -> None:
         self._system = system
         self._observer = observer
         self._changes = changes

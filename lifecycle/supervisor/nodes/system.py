@@ -40,7 +40,7 @@ _REFRESH_S = 1.0
 """A host answers from its executor within a millisecond; this long it is busy or hung."""
 
 
-class GraphObserver(Protocol):
+class ObservedGraph(Protocol):
     """What a supervisor sees of the graph, see lifecycle.graph.Graph."""
 
     async def observe(self, plan: Plan) -> Observation:
@@ -353,7 +353,7 @@ class System:
             if any(after.node == key for after in node.planned.after)
         )
 
-    async def refresh(self, observer: GraphObserver) -> None:
+    async def refresh(self, observer: ObservedGraph) -> None:
         """Read the configuration of every reachable node and give it to the observer.
 
         One whose host reports every change by itself is not asked. A node that does not answer

@@ -37,7 +37,7 @@ from lifecycle.supervisor.nodes.bring_up import BringUp
 from lifecycle.supervisor.nodes.driver import NodeDriver
 from lifecycle.supervisor.nodes.remote_nodes import RemoteNodes
 from lifecycle.supervisor.nodes.stale_nodes import Sightings, StaleNodes
-from lifecycle.supervisor.nodes.system import GraphObserver, System
+from lifecycle.supervisor.nodes.system import ObservedGraph, System
 from lifecycle.supervisor.processes.orphans import ProcessFamily, end_strays, reap_adopted
 from lifecycle.supervisor.processes.spawn import Spawner
 from lifecycle.supervisor.run.events import (
@@ -89,7 +89,7 @@ class _RunEnd:
 
 
 class SessionParticipant(
-    GraphObserver,
+    ObservedGraph,
     peer_supervisors.AliveExchange,
     agreement.PlanExchange,
     Reaching,
