@@ -85,7 +85,7 @@ docs: $(VENV)/.docs
 	@echo "read build/site/index.html"
 
 schemas: $(STAMP)
-	$(BIN)/python schemas/generate.py
+	$(BIN)/python -m tests.result_schemas
 
 clean:
 	rm -rf mutants mutants.log $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

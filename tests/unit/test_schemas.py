@@ -2,30 +2,16 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
-import sys
 from pathlib import Path
-from types import ModuleType
 
 import jsonschema
 import pytest
 
+from tests import result_schemas
+
 FOLDER = Path(__file__).parents[2] / "schemas"
 FILES = {each.name.removesuffix(".v1.schema.json"): each for each in FOLDER.glob("*.schema.json")}
-
-
-def _generator() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("schemas_generate", FOLDER / "generate.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # where dataclasses look their annotations up
-    spec.loader.exec_module(module)
-    return module
-
-
-GENERATOR = _generator()
 
 
 def test_each_schema_is_generated_or_written_by_hand_for_a_reason() -> None:
@@ -33,13 +19,15 @@ def test_each_schema_is_generated_or_written_by_hand_for_a_reason() -> None:
         "manifest": "it is what users write; the types are made from it",
         "graph_message": "version and kind stand beside the fields of each message",
     }
-    assert by_hand == GENERATOR.BY_HAND
-    assert {*FILES} == {*GENERATOR.RESULTS, *by_hand}
+    assert by_hand == result_schemas.BY_HAND
+    assert {*FILES} == {*result_schemas.RESULTS, *by_hand}
 
 
-@pytest.mark.parametrize("name", sorted(GENERATOR.RESULTS))
+@pytest.mark.parametrize("name", sorted(result_schemas.RESULTS))
 def test_a_committed_schema_is_what_its_type_says(name: str) -> None:
-    assert FILES[name].read_text(encoding="utf-8") == GENERATOR.generate(name), "run `make schemas`"
+    assert FILES[name].read_text(encoding="utf-8") == result_schemas.generate(name), (
+        "run `make schemas`"
+    )
 
 
 @pytest.mark.parametrize("name", sorted(FILES))

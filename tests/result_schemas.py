@@ -23,7 +23,7 @@ from lifecycle.plan.model import Plan
 from lifecycle.verify.observation import NodeConfiguration
 from lifecycle.verify.verdict import Verdict
 
-FOLDER = Path(__file__).parent
+FOLDER = Path(__file__).parents[1] / "schemas"
 BY_HAND = {
     "manifest": "it is what users write; the types are made from it",
     "graph_message": "version and kind stand beside the fields of each message",
