@@ -191,8 +191,7 @@ def planned_processes(
         environment: where AMENT_PREFIX_PATH is looked up.
 
     Raises:
-        PlanError: nodes of one process disagree about machine, kind, folder or a variable; two
-            executables want one process; an executable cannot be found.
+        PlanError: an executable cannot be found.
     """
     groups: dict[str, list[Node]] = {}
     for node in nodes:
@@ -217,9 +216,8 @@ def _process(
     graph_variables: tuple[tuple[str, str], ...],
     environment: Mapping[str, str],
 ) -> PlannedProcess:
+    """Plan one process; that its nodes can share it is `manifest.checks`' to say."""
     first = nodes[0]
-    for node in nodes[1:]:
-        _must_agree(name, first, node)
     is_command = first.run.kind is RunKind.COMMAND
     return PlannedProcess(
         name=name,
@@ -227,50 +225,8 @@ def _process(
         run=first.run,
         nodes=tuple(node.key for node in nodes),
         argv=command_line(first, environment) if is_command else (),
-        environment=_variables(name, nodes, graph_variables),
+        environment=tuple({**dict(graph_variables), **dict(first.run.environment)}.items()),
     )
-
-
-def _must_agree(process: str, first: Node, node: Node) -> None:
-    """Raise PlanError unless `node` can live in the process of `first`."""
-    where = f"cannot put nodes {first.key!r} and {node.key!r} into one process {process!r}"
-    if node.machine != first.machine:
-        raise PlanError(
-            f"{where}: they stand on machines {first.machine!r} and {node.machine!r}", at=node.at
-        )
-    if node.run.kind is not first.run.kind:
-        raise PlanError(
-            f"{where}: one is run by {first.run.kind.value}, the other by {node.run.kind.value}",
-            at=node.at,
-        )
-    if node.run.kind is RunKind.COMMAND:
-        raise PlanError(
-            f"{where}: a command is a process of its own; only python nodes share one", at=node.at
-        )
-    if node.run.working_directory != first.run.working_directory:
-        raise PlanError(
-            f"{where}: they want working directories {first.run.working_directory!r}"
-            f" and {node.run.working_directory!r}",
-            at=node.at,
-        )
-
-
-def _variables(
-    process: str, nodes: Sequence[Node], graph_variables: tuple[tuple[str, str], ...]
-) -> tuple[tuple[str, str], ...]:
-    """Merge the nodes' variables over those that place the process in the graph."""
-    merged: dict[str, tuple[str, str]] = {}
-    for node in nodes:
-        for name, value in node.run.environment:
-            known, owner = merged.setdefault(name, (value, node.key))
-            if known != value:
-                raise PlanError(
-                    f"cannot set {name} of process {process!r} to {value!r} for node {node.key!r}:"
-                    f" node {owner!r} sets it to {known!r}",
-                    at=node.at,
-                )
-    own = {name: value for name, (value, _) in merged.items()}
-    return tuple({**dict(graph_variables), **own}.items())
 
 
 def build_plan(manifest: Manifest, *, environment: Mapping[str, str] | None = None) -> Plan:

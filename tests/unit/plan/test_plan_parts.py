@@ -197,53 +197,6 @@ def test_a_process_is_told_its_domain_its_range_and_its_nodes_variables():
     )
 
 
-COMMAND = Run(kind=RunKind.COMMAND, command=("talker",))
-DISAGREE = {
-    "machines": (
-        (node("a", process="p", machine="m"), node("b", process="p", machine="n")),
-        "they stand on machines 'm' and 'n'",
-    ),
-    "kinds": (
-        (node("a", process="p"), node("b", process="p", run=COMMAND)),
-        "one is run by python, the other by command",
-    ),
-    "commands": (
-        (node("a", process="p", run=COMMAND), node("b", process="p", run=COMMAND)),
-        "a command is a process of its own; only python nodes share one",
-    ),
-    "folders": (
-        (
-            node("a", process="p"),
-            node(
-                "b",
-                process="p",
-                run=Run(kind=RunKind.PYTHON, python="m:C", working_directory="/tmp"),
-            ),
-        ),
-        "they want working directories '' and '/tmp'",
-    ),
-}
-
-
-@pytest.mark.parametrize("case", DISAGREE)
-def test_nodes_that_disagree_cannot_share_a_process(case: str):
-    nodes, reason = DISAGREE[case]
-    with pytest.raises(PlanError) as error:
-        processes(*nodes)
-    assert error.value.message == (f"cannot put nodes 'a' and 'b' into one process 'p': {reason}")
-
-
-def test_nodes_of_one_process_must_agree_on_a_variable():
-    def run(value: str) -> Run:
-        return Run(kind=RunKind.PYTHON, python="m:C", environment=(("A", value),))
-
-    with pytest.raises(PlanError) as error:
-        processes(node("a", process="p", run=run("1")), node("b", process="p", run=run("2")))
-    assert error.value.message == (
-        "cannot set A of process 'p' to '2' for node 'b': node 'a' sets it to '1'"
-    )
-
-
 # --- command lines
 
 
