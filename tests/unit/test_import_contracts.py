@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import graphlib
 import importlib
 import subprocess
 import sys
@@ -88,3 +89,36 @@ def _bound(path: Path) -> set[str]:
         elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
             bound.add(node.target.id)
     return bound
+
+
+def test_no_module_imports_itself_by_way_of_others_not_even_for_types() -> None:
+    graphlib.TopologicalSorter(_imports()).prepare()
+
+
+def _imports() -> dict[str, set[str]]:
+    """What each module imports when it is loaded, or for its types."""
+    files = {
+        ".".join(each.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): each
+        for each in (ROOT / "lifecycle").rglob("*.py")
+    }
+    found: dict[str, set[str]] = {}
+    for name, path in files.items():
+        tree = ast.parse(path.read_text())
+        late = {
+            id(each)
+            for function in ast.walk(tree)
+            if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef)
+            for each in ast.walk(function)
+        }
+        modules: set[str] = set()
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and node.module and id(node) not in late:
+                for each in node.names:
+                    inner = f"{node.module}.{each.name}"
+                    modules.add(inner if inner in files else node.module)
+        # A room's door loads its names on first use, and is no part of a circle.
+        found[name] = {each for each in modules if each in files and each != name}
+    return {
+        name: {each for each in modules if files[each].name != "__init__.py"}
+        for name, modules in found.items()
+    }

@@ -21,11 +21,10 @@ from rclpy.utilities import get_rmw_implementation_identifier
 from lifecycle.middleware.rcl.graph_changes import on_graph_change
 
 if TYPE_CHECKING:
+    from rclpy.action import ActionClient
     from rclpy.node import Node
 
-    from lifecycle.middleware.services.actions import GoalClient
-
-    AnyClient: TypeAlias = Client | GoalClient
+    AnyClient: TypeAlias = Client | ActionClient
 
 _TELLING = ("rmw_fastrtps_cpp", "rmw_fastrtps_dynamic_cpp")
 """Others answer from the graph alone, or were not looked at."""

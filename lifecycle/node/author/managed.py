@@ -10,7 +10,7 @@ Owns: knowing them, so that the node configuration can tell of them.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.exceptions import InvalidHandle
@@ -45,9 +45,6 @@ from lifecycle.node.reporting.configuration import ConfigurationChanges
 from lifecycle.node.reporting.graph_member import GraphMember
 from lifecycle.plan.model import PlannedNode
 from lifecycle.verify.observation import NodeConfiguration
-
-if TYPE_CHECKING:
-    from lifecycle.node.author.node import LifecycleNode
 
 
 class Undeclared:
@@ -111,7 +108,7 @@ class Managed:
 
     def __init__(
         self,
-        node: LifecycleNode,
+        node: Node,
         spec: PlannedNode,
         mode: Mode,
         gate: NodeGate,
@@ -128,7 +125,7 @@ class Managed:
         self._infrastructure = ReentrantCallbackGroup()
         self._turns = Turns(node, self._infrastructure)
         self.call_soon = self._turns.call_soon
-        self._listeners: list[Callable[[LifecycleNode], None]] = []
+        self._listeners: list[Callable[[Node], None]] = []
         self._method_timers: list[Timer] = []
         self._member: GraphMember | None = None
         self.connection_events = ConnectionEvents(self.call_soon)
@@ -181,7 +178,7 @@ class Managed:
         """The state, nested ones told apart; `state.seen` is what other tools see."""
         return self._controller.machine.state
 
-    def add_listener(self, listener: Callable[[LifecycleNode], None]) -> None:
+    def add_listener(self, listener: Callable[[Node], None]) -> None:
         """Call `listener(node)` after every change of state, whoever caused it."""
         self._listeners.append(listener)
 
