@@ -1,4 +1,4 @@
-"""The graph transport of ROS systems: one topic, one JSON message each.
+"""The graph transport over DDS: one ROS topic, one JSON message each.
 
 Owns: the topic's name, type and QoS, and a steady timer for heartbeats. Everything happens on a
 node that the caller has and spins; ordinary ROS tools can listen (`ros2 topic echo

@@ -1,9 +1,9 @@
-"""Layer 2 of the graph interface: what happens in the graph, and who is notified of it.
+"""Graph events, layer 2 of the graph interface: nodes join, leave, restart; who is notified.
 
-Owns: who is a member of the graph: joining, leaving and restarting; and the subscribers by what
-they ask for. Duplicates are dropped, messages that come too early wait, and what stays missing
-becomes a GAP: read that node again. A node that sends nothing any more is SILENT, and ALIVE again
-afterwards. What is held of each member is membership.py's.
+Owns: which nodes are members of the graph: joining, leaving and restarting; and the subscribers, by
+what they ask for. Duplicates are dropped, messages that arrive too early wait, and what stays
+missing becomes a GAP: read that node again. A node that no longer sends anything is SILENT, and
+ALIVE again afterwards. What is held of each member is membership.py's.
 
 Threads: everything runs in the scheduler. Subscribers are called there, one after another, each
 event to all of them before the next; so they must be quick, and may call any method here. Every
@@ -273,7 +273,7 @@ class GraphEvents:
             return tuple(each.member for each in self._senders.values() if each.present)
 
     def reports(self, node: str) -> bool:
-        """Tell whether a node is part of the graph now and sends messages."""
+        """Return whether a node is part of the graph now and sends messages."""
         with self.lock:
             sender = self._senders.get(node)
             return sender is not None and sender.present and bool(sender.incarnation)
@@ -308,7 +308,7 @@ class GraphEvents:
         self.scheduler.post(functools.partial(self._vanished, node, reason))
 
     def configuration_read(self, node: str, endpoints: Iterable[EndpointReport]) -> EndpointChange:
-        """Take what a node's configuration says of its endpoints, and notify of what is new.
+        """Take the endpoints of a node's configuration, and notify of what is new.
 
         To be called in the scheduler. A node that is not a member has no endpoints.
         """
@@ -389,7 +389,7 @@ class GraphEvents:
             sender.cancel_wait()
 
     def _has(self, node: str) -> bool:
-        """Tell whether a node is part of the graph now."""
+        """Return whether a node is part of the graph now."""
         with self.lock:
             sender = self._senders.get(node)
             return sender is not None and sender.present

@@ -1,4 +1,4 @@
-"""The graph on real DDS: the three layers of the graph interface put together.
+"""The ROS graph on real DDS: the three layers of the graph interface put together.
 
 Owns: `Graph`, for programs that follow a ROS graph and for the supervisor that judges one. Both
 have the same state: fed by graph messages, by the configurations that nodes serve or that are put
@@ -131,7 +131,7 @@ class Graph:
         Args:
             domain_id: 0–232.
             connections: how the participant is connected; None leaves it to the RMW.
-            messages: receive what nodes say of themselves; a change is worth another look.
+            messages: receive what nodes report about themselves; a change is worth another look.
             guests: also ask nodes that are not planned, as far as they have our node interface.
             quiet_s: a burst of changes is over when nothing changed for so long, ≥ 0.
             burst_s: a burst is cut off after so long, ≥ quiet_s.
@@ -153,7 +153,7 @@ class Graph:
     def observation(self, plan: Plan) -> Observation:
         """Return what there is of `plan` now and what there is besides, for `lifecycle.verify`.
 
-        Planned nodes are asked anew for their state and their configuration, which takes up to a
+        Planned nodes are asked again for their state and their configuration, which takes up to a
         second for each that does not answer, all at once. Just after the graph was made it waits
         until discovery is complete, up to 3.5 s. Not to be called in a callback, nor with
         `in_loop`: there, `observe`.

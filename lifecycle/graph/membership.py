@@ -1,4 +1,4 @@
-"""What is held of one member of the graph, and what members report of each other.
+"""State of one member of the graph: message order, incarnation, liveliness as members report it.
 
 Owns: the order in which the messages of a node count, what is a duplicate and what is missing;
 which of two instances is the current one; its state and its troubles; and which members report
@@ -140,7 +140,7 @@ class Sender:
             self.departed.append(self.incarnation)
 
     def is_next(self, message: GraphMessage) -> bool:
-        """Tell whether a message of another instance, or of one that left, begins the next one.
+        """Whether a message of another instance, or of one that left, begins the next one.
 
         The later incarnation wins. An earlier one is taken only when the later has fallen
         silent: then the wall clock was set back between the two.
@@ -155,7 +155,7 @@ class Sender:
         return self.liveliness is NodeLiveliness.SILENT
 
     def learn(self, message: GraphMessage) -> None:
-        """Keep what a message, in its turn, says of state and checksum."""
+        """Keep the state and checksum of a message whose turn it is."""
         if isinstance(message, Joined | Heartbeat | StateChanged):
             self._state, self._connected = message.state, message.connected
         if isinstance(message, Joined | Heartbeat | ConfigurationChanged):
@@ -164,13 +164,13 @@ class Sender:
     def trouble(
         self, source: str, liveliness: NodeLiveliness, reason: str, *, again: bool = False
     ) -> bool:
-        """Hold what `source` says of us; ALIVE takes it back. Return whether our state changed.
+        """Hold what `source` reports of us; ALIVE takes it back. Return whether our state changed.
 
         Args:
-            source: the node that says so.
-            liveliness: what it says.
+            source: the node that reports it.
+            liveliness: what it reports.
             reason: for people.
-            again: it has said so before: then it counts only if no message of ours came meanwhile.
+            again: it repeats a report: then it counts only if no message of ours came meanwhile.
         """
         before = self.liveliness
         if again and source in self._overruled and liveliness is NodeLiveliness.SILENT:
@@ -200,7 +200,7 @@ class Sender:
 
     @property
     def liveliness(self) -> NodeLiveliness:
-        """The worst that is said of it."""
+        """The worst that is reported of it."""
         if not self._troubles:
             return NodeLiveliness.ALIVE
         held = {liveliness for liveliness, _ in self._troubles.values()}
@@ -254,7 +254,7 @@ class Notices:
         *,
         again: bool = False,
     ) -> list[GraphEvent]:
-        """Hold what `source` says of `node`, as `Sender.trouble`; return what that changes."""
+        """Hold what `source` reports of `node`, as `Sender.trouble`; return what that changes."""
         sender = self._senders.get(node)
         if sender is None or not sender.present:
             return []
@@ -285,7 +285,7 @@ class Notices:
         return events
 
     def end(self, source: str) -> list[GraphEvent]:
-        """Take back all that a member said of others."""
+        """Take back all that a member reported of others."""
         events: list[GraphEvent] = []
         for about in sorted(self._given.pop(source, ())):
             events += self.hold(about, source, NodeLiveliness.ALIVE, "")

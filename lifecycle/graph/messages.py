@@ -1,7 +1,7 @@
-"""Graph messages: what participants of the graph send to all others.
+"""Graph messages: what participants of the graph send to all others, and their JSON.
 
 Owns: the message types, their JSON (schema: schemas/graph_message.v1.schema.json) and which of two
-incarnations is the later one. How messages travel is `transport`'s. Pure.
+incarnations is the later one. How messages travel is transport.py's. Pure.
 
 The kinds are those of *Topological Discovery and Communication Negotiation* ("A Fork in the
 Features", "Graph Interface"). Every message but a heartbeat takes the next sequence number of its

@@ -1,7 +1,7 @@
-"""What the graph interface gives out: events, members, views of nodes, links, and what changes.
+"""Types of the graph interface: events, members, node views, links, changes; the endpoint index.
 
-Owns: the types of layers 2 and 3; who has which endpoint, an index whose changes cost work in
-proportion to the node's endpoints and whose queries in proportion to their answer; how a message
+Owns: the types of layers 2 and 3; which node has which endpoint, an index whose changes cost work
+in proportion to the node's endpoints and whose queries in proportion to their answer; how a message
 about a connection or a mapping alters a node configuration until it is read again; and the link of
 a publisher with a subscription. Whether two are matched is judged as `lifecycle.verify` judges it
 (`verify/rules/matching.py`). Pure; the index is not thread-safe.
@@ -127,7 +127,7 @@ class Owned:
 
 
 _Key = tuple[EndpointKind, str, str, str, int]
-"""Kind, resolved name, type, declared name; a number tells equal ones of one node apart."""
+"""Kind, resolved name, type, declared name; a number distinguishes equal ones of one node."""
 
 
 class EndpointIndex:
@@ -472,7 +472,7 @@ def match_ends(ends: Sequence[End]) -> tuple[MatchEnd, ...]:
 
 
 def _missing(end: End) -> str:
-    """Return why an end cannot be connected to anybody; empty if it can."""
+    """Return why an end cannot be connected at all; empty if it can."""
     if end.node.liveliness is NodeLiveliness.SILENT:
         return f"{end.node.name} is silent"
     if end.endpoint.error:

@@ -1,4 +1,4 @@
-"""The graph's state brought up to date out of discovery, nodes' services and parameters.
+"""Updates the graph's state from discovery, nodes' services and parameters.
 
 Owns: what is asked of which node, and when; which of discovery's nodes are members of the graph,
 and what counts as the configuration of one that serves none; when a change is worth another look.
@@ -48,7 +48,7 @@ _ASK_S = 1.0
 """A node that answers at all answers within milliseconds."""
 
 _READ_S = 3.0
-"""Nobody waits for a reading, and a node that has just begun may still be on its way."""
+"""No caller waits for a reading, and a node that has just begun may still be on its way."""
 
 _TOGETHER_S = 0.05
 """Changes of discovery come in bursts; who follows them looks once for all within so long."""
@@ -66,7 +66,7 @@ class DiscoveredGraph(Protocol):
         """Return for how long the last snapshot may miss who is there; 0 if it cannot."""
 
     def offers(self, node: str, service: str) -> bool:
-        """Tell whether discovery shows a service on a node."""
+        """Return whether discovery shows a service on a node."""
 
     def on_change(self, callback: Callable[[], None]) -> Remove:
         """Call `callback` from any thread after each change; return what takes it away."""
@@ -172,8 +172,8 @@ class Observer:
     async def observe(self, plan: Plan) -> Observation:
         """Return what is there now, as the state has it then.
 
-        Waits until everybody who was there before us is seen, which takes a moment at first: an
-        observation that misses a participant would prove nothing about undeclared nodes.
+        Waits until every participant that was there before us is seen, which takes a moment at
+        first: an observation that misses one would prove nothing about undeclared nodes.
 
         Planned nodes whose configuration was not put into the state are asked for their state and
         their configuration; what they do not answer within a second stays unknown. Those that
@@ -333,7 +333,7 @@ class Observer:
             self.state.reread(name)
 
     def _wake(self) -> None:
-        # Before the first use there is no loop, and nobody who waits.
+        # Before the first use there is no loop, and no waiter.
         if self._loop is not None:
             with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
                 self._loop.call_soon_threadsafe(self._note)
@@ -345,7 +345,7 @@ class Observer:
         self._changed.set()
 
     def _message_came(self, message: GraphMessage) -> None:
-        """Take it as a change, unless it says of a node only what is known of it.
+        """Take it as a change, unless it reports only what is known of its node.
 
         A node whose configuration is put into the state reports its changes that way; a heartbeat
         is one if its checksum is new.
@@ -468,6 +468,6 @@ class Observer:
 
 
 def _counts(name: str) -> bool:
-    """Tell whether a node is part of a system: no tool's, no hidden one, and its name is known."""
+    """Whether a node is part of a system: no tool's, no hidden one, and its name is known."""
     hidden = name.rpartition("/")[2].startswith("_")
     return bool(known_node(name)) and not hidden and not is_noise_node(name)

@@ -1,4 +1,4 @@
-"""The sending side of one node: what it reports of itself to the graph.
+"""The sending side of one node: what it reports about itself to the graph.
 
 Owns: a node's incarnation, its sequence numbers, and what its heartbeats repeat. Imports no ROS:
 the transport and the timer are given.

@@ -1,4 +1,4 @@
-"""Time and threads for the graph interface: one place where everything runs.
+"""Schedulers, deadlines and timers of the graph interface: one place for all that runs.
 
 Owns: the Scheduler Protocol and its three kinds, many deadlines of equal length with one timer, and
 a wait for an event that loses no cancellation. Whatever a layer does, and every callback that it
@@ -241,7 +241,7 @@ class Deadlines:
         self._cancel: Remove | None = None
 
     def touch(self, name: str) -> None:
-        """Begin the deadline of `name` anew."""
+        """Restart the deadline of `name`."""
         self._touched_s[name] = self._scheduler.now_s()
         self._touched_s.move_to_end(name)
         self._arm()

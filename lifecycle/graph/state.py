@@ -1,4 +1,4 @@
-"""Layer 3 of the graph interface: the state of the graph, and what may be asked of it.
+"""State of the ROS graph and its queries: layer 3 of the graph interface.
 
 Owns: what is known of every node, kept true by events, and re-read from a node only when the
 checksum that it announces is not the one that is held, or when messages of it were lost. One change
@@ -322,7 +322,7 @@ class GraphState:
         """Give what was learnt of a node in another way, over a control channel say.
 
         A node that sends no messages becomes a member by it. For `observation` it is what the node
-        says of itself until a newer one is put, the node leaves the graph or it is dropped.
+        reports until a newer one is put, the node leaves the graph or it is dropped.
         """
         name = configuration.name
         with self._lock:

@@ -1,4 +1,4 @@
-"""Layer 1 of the graph interface: sending to the graph and receiving from it.
+"""Graph transports, layer 1 of the graph interface: sending to the graph and receiving from it.
 
 Owns: the Protocol that every graph transport fulfils, and the one inside a process: a network that
 can lose, double, delay, reorder and part, all from one seed, so that a run repeats exactly. All

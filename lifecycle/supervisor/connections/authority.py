@@ -1,12 +1,12 @@
-"""The authority: makes every node's connections and mappings, and keeps them made.
+"""Reconciles every node's connections and mappings with their desired state: the authority.
 
-Owns: when nodes are wired and how often again. What each node must have comes from a `Source`
-(the plan, or a negotiation); what is missing from desired_state.py; how a node is told from
-driver.py. Everything is level-triggered: each look compares what must be with what is, so that a
-lost connection, a new endpoint and the first wiring are one case. Must not import rclpy.
+Owns: when nodes are wired and how often again, and which nodes are configured before any node is
+connected. What each node must have comes from a `Source` (the plan, or a negotiation), what is
+missing from desired_state.py; requests to a node are driver.py's. Must not import rclpy.
 
-Which nodes are configured before any node is connected. Owns: that question, which a
-negotiation asks before it waits: what it waits for must not in turn wait for a connection.
+Everything is level-triggered: each look compares desired with observed state, so that a lost
+connection, a new endpoint and the first wiring are one case. Which nodes are configured first is
+what a negotiation asks before it waits: what it waits for must not in turn wait for a connection.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ class Source(Protocol):
 
 
 class Hand(Protocol):
-    """How one node is told, see driver.NodeDriver."""
+    """How one node is instructed, see nodes/driver.py."""
 
     async def interface(self) -> NodeConfiguration | None:
         """Read what the node can be wired by; None where it has no node interface."""
@@ -138,7 +138,7 @@ class PlannedSource:
         self.replan(plan, ())
 
     def replan(self, plan: Plan, names: Collection[str]) -> None:
-        """Take the plan's word, for every node."""
+        """Take the plan, for every node."""
         del names
         self.expected = plan
         self._instructions = {
@@ -171,7 +171,7 @@ class ConnectionAuthority:
         system: whose nodes.
         source: what they must have.
         emit: where events go.
-        hand_of: the hand on a node that is not declared, by full name.
+        hand_of: the interface to a node that is not declared, by full name.
     """
 
     def __init__(
@@ -222,14 +222,14 @@ class ConnectionAuthority:
         await self._make(wiring, node.driver, steps(wanted, wiring.told), node)
 
     def replan(self, plan: Plan, names: Collection[str]) -> None:
-        """Forget what these nodes were told: they are started again, by this plan."""
+        """Forget what these nodes were instructed: they are started again, by this plan."""
         self._source.replan(plan, names)
         for name in names:
             self._wirings.pop(name, None)
         self._instructions = {}
 
     async def ready(self, node: NodeRun) -> None:
-        """Wait until everybody is configured whose interface this node's wiring may depend on."""
+        """Wait until every node is configured on whose interface this one's wiring may depend."""
         for key in self._early:
             other = self._system.nodes[key]
             while not other.has_reached(Condition.CONFIGURED):

@@ -1,10 +1,8 @@
 """Desired state of one node's connections and mappings, and the steps that it still lacks.
 
 Owns: `Instructions`, the connections and mappings that a node must have; `ActualState`, those that
-it has; and `steps`, the difference in the order in which it is made. Comparing what must be with
-what is makes one and the same thing of the first wiring, of a change and of making again what was
-lost.
-Pure.
+it has; and `steps`, the difference in the order in which it is made. Comparing the two makes one
+case of the first wiring, of a change and of making again what was lost. Pure.
 """
 
 from __future__ import annotations
@@ -71,7 +69,7 @@ class Step:
     endpoint: str = ""
 
     def __str__(self) -> str:
-        """Return the step in words, as it follows "cannot"."""
+        """Return the step as text, as it follows "cannot"."""
         if self.operation is Operation.CONNECT_TO:
             urls = ", ".join(self.connections.urls) or "no URL"
             return f"connect {self.node!r} to {self.connection!r} ({urls})"
@@ -82,10 +80,10 @@ class Step:
 
 
 def planned_instructions(node: PlannedNode) -> Instructions:
-    """Return what the plan has a node told.
+    """Return what the plan instructs a node to do.
 
-    A participant that is no connection, made only to tell a publisher's flow apart, is the node's
-    own to make: for its publisher, the node's own participant stands for it.
+    A participant that is no connection, made only to distinguish a publisher's flow, is the
+    node's own to make: for its publisher, the node's own participant is named in its place.
     """
     named = {each.name: each for each in node.participants if each.connection}
     return Instructions(

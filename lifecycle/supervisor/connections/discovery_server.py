@@ -28,7 +28,7 @@ START_S = 10.0
 """It listens within 50 ms; a loaded machine takes longer."""
 
 KNOCK_S = 0.02
-"""Between two looks whether it listens: a process that is not ours to change tells nobody."""
+"""Between two looks whether it listens: a process that is not ours to change does not notify us."""
 
 
 async def begin(system: System, spawner: Spawner, *, ours: bool) -> None:
@@ -49,7 +49,7 @@ async def begin(system: System, spawner: Spawner, *, ours: bool) -> None:
         await _heard(planned, None)
         return
     if discovery_server_listens(planned):
-        # Fast DDS's server goes on without the port, and whoever has it seems to be the server.
+        # Fast DDS's server goes on without the port, and its owner seems to be the server.
         raise StepFailedError(
             f"cannot start the discovery server at {_where(planned)}: that port is not free on "
             "this host; end who has it (`ss -lnp`), or choose another 'discovery: first_port'",
@@ -92,10 +92,10 @@ async def end(system: System, hurry: asyncio.Event) -> None:
 
 
 def findings(system: System) -> tuple[Finding, ...]:
-    """Return that it died; until the system is started again nobody new is found.
+    """Return that it died; until the system is started again no new node is found.
 
-    Another one in its place does not mend that: Fast DDS 2.14 does not tell super clients, as our
-    observer is one, of anybody who comes after it (0 of 4 tries; other clients 10 of 12).
+    Another one in its place does not mend that: Fast DDS 2.14 does not notify super clients, as our
+    observer is one, of participants that join after it (0 of 4 tries; other clients 10 of 12).
     """
     server = system.server
     if server is None or server.state is not ProcessState.EXITED:
@@ -106,7 +106,7 @@ def findings(system: System) -> tuple[Finding, ...]:
 async def _heard(planned: PlannedServer, process: ManagedProcess | None) -> None:
     """Wait until it listens.
 
-    Over UDP nothing tells that from another machine: then there is nothing to wait for.
+    Over UDP nothing shows that from another machine: then there is nothing to wait for.
     """
     looking = _answering(planned) if process is None else _listening(planned, process.pid)
     listening = asyncio.ensure_future(looking)
@@ -140,7 +140,7 @@ async def _heard(planned: PlannedServer, process: ManagedProcess | None) -> None
 
 
 async def _listening(planned: PlannedServer, pid: int) -> None:
-    """Wait until its port is open, as the kernel says; it has no way to tell us."""
+    """Wait until its port is open, as the kernel says; it has no way to notify us."""
     while not discovery_server_listens(planned, pid):  # noqa: ASYNC110 - there is no event
         await asyncio.sleep(KNOCK_S)
 

@@ -1,16 +1,13 @@
-"""Desired state that is negotiated from what nodes report, and the plan that follows from it.
+"""Negotiates connections from node configurations: the parties, desired state, the expected plan.
 
 Owns: `NegotiatedSource`: which nodes take part, on which host each is, and how the outcome reaches
-nodes and the verifier. The rules of negotiation are lifecycle.plan's. Pure.
+nodes and the verifier; `party_of`: a node as a party, from its configuration, under what its
+manifest declares; and `Expectation`: the desired state of a negotiated system, for an observer that
+decides nothing. The rules of negotiation are lifecycle.plan's. Pure.
 
-What must be of a system whose connections are negotiated, for an observer that decides nothing.
-Owns:
-`Expectation`. What the authority of such a system decided is in no manifest, but negotiation is
-a pure function: whoever knows the same node configurations comes to the same data layer graph,
-but for ports and groups that were given out earlier, and those are in the nodes' reports.
-
-Node configurations as parties of a negotiation. Owns: `party_of`: what a node says of itself,
-under what its manifest says of it.
+What the authority of such a system decided is in no manifest, but negotiation is a pure function:
+the same node configurations always result in the same data layer graph, but for ports and groups
+that were given out earlier, and those are in the nodes' reports.
 """
 
 from __future__ import annotations
@@ -65,7 +62,7 @@ def party_of(
     planned: PlannedNode | None = None,
     negotiated: Collection[str] = (),
 ) -> Party:
-    """Return a node as a party, from what it says of itself.
+    """Return a node as a party, from its node configuration.
 
     What `planned` asks for an endpoint wins over the node's own hints. Endpoints that were made in
     code take part under their resolved names.
@@ -75,7 +72,7 @@ def party_of(
         host: its host, see `lifecycle.plan.connections.hosts`.
         planned: the node as the manifest declares it; None if it does not.
         negotiated: names of connections that a negotiation made before: it may unmake them. Others
-            are somebody else's, and what is mapped onto them stays there.
+            are not its own, and what is mapped onto them stays there.
     """
     known = configuration.rmw.startswith(FAST_DDS)
     own_urls = planned.connections.urls if planned else ()
@@ -152,11 +149,11 @@ class NegotiatedSource:
     """Negotiates the data layer graph from node configurations, again whenever one changes.
 
     A planned node that has not reported yet takes part with what its manifest declares. A node
-    that nobody declared takes part where `policy.undeclared_nodes` is open.
+    that is not declared takes part where `policy.undeclared_nodes` is open.
 
     Args:
         plan: what is declared.
-        before: what was negotiated already; see renegotiation.py for who only looks on.
+        before: what was negotiated already; see `Expectation` for an observer.
 
     Attributes:
         graph: what was negotiated last.
@@ -209,7 +206,7 @@ class NegotiatedSource:
         return told
 
     def replan(self, plan: Plan, names: Collection[str]) -> None:
-        """Negotiate anew for nodes that are started again, and never the TCP ports they had.
+        """Negotiate again for nodes that are started again, and never the TCP ports they had.
 
         Fast DDS would not find them there (see lifecycle.plan.restart).
         """
@@ -254,7 +251,7 @@ class NegotiatedSource:
         return frozenset(each.name for each in self.graph.connections if each.node == key)
 
     def _places(self, known: Mapping[str, NodeConfiguration]) -> _Places:
-        """Learn from the planned nodes which host a machine id stands for."""
+        """Learn from the planned nodes which host a machine id means."""
         return _Places(
             {
                 each.identity.machine_id: self._hosts.host(self._planned[name].machine)
@@ -264,7 +261,7 @@ class NegotiatedSource:
         )
 
     def _declared(self, problems: Iterable[NegotiationProblem]) -> Iterable[NegotiationProblem]:
-        """Leave out what concerns a node that nobody declared: the system does without it."""
+        """Leave out what concerns an undeclared node: the system does without it."""
         keys = {each.key for each in self._plan.nodes}
         return (each for each in problems if {each.publisher, each.subscription} <= keys)
 
@@ -335,7 +332,7 @@ def _with_flows(plan: Plan, graph: DataLayerGraph) -> Plan:
 def _guest_instructions(
     configuration: NodeConfiguration, graph: DataLayerGraph, before: DataLayerGraph
 ) -> Instructions:
-    """Tell a node that nobody declared what concerns the system, and leave the rest to it."""
+    """Instruct an undeclared node in what concerns the system, and leave the rest to it."""
     name = configuration.name
     mine = [each for each in graph.connections if each.node == name]
     mapped = {label: each.name for each in mine for label in each.map}
@@ -370,7 +367,7 @@ def is_negotiated(plan: Plan) -> bool:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Expectation:
-    """What must be, as far as an onlooker can know.
+    """Desired state, as far as an outside observer can know it.
 
     Attributes:
         plan: with the connections and the endpoints made in code that must be seen now.
@@ -384,7 +381,7 @@ class Expectation:
     def of(cls, plan: Plan, observation: Observation) -> Expectation:
         """Negotiate again from what was seen; what is not negotiated is expected as it is planned.
 
-        A connection that no negotiation would have made, because somebody else called connect_to,
+        A connection that no negotiation would have made, because another client called connect_to,
         is not expected, and what is mapped onto it is mapped wrongly. The URLs of one that fits
         are not judged: only its authority knows which ports it gave out.
         """
@@ -399,9 +396,9 @@ class Expectation:
 
 
 def _negotiated_again(plan: Plan, known: Mapping[str, NodeConfiguration]) -> NegotiatedSource:
-    """Find those of the reported connections that a negotiation comes to, and what it comes to.
+    """Find the reported connections that a negotiation would make, and negotiate with them.
 
-    It begins with all of them, and each round leaves out those that nobody would have made; an
+    It begins with all of them, and each round leaves out those that none would have made; an
     endpoint on one of these stays there, which may make another superfluous.
     """
     before = DataLayerGraph(connections=tuple(_reported(plan, known)))

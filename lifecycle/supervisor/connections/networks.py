@@ -157,7 +157,7 @@ class Keeper:
         loop = asyncio.get_running_loop()
 
         def say(text: str) -> None:
-            # At once: whoever is cancelled meanwhile has changed the networks all the same.
+            # At once: a task that is cancelled meanwhile has changed the networks all the same.
             loop.call_soon_threadsafe(self._tell, text)
 
         async with self._one_at_a_time:

@@ -98,7 +98,7 @@ def differences(path: Path, plan: Plan) -> tuple[str, ...]:
     """Ask a supervisor how `plan` differs from what it runs, one line each.
 
     Returns:
-        Nothing where they do not differ, or nobody answers in time: a notice is not worth a wait.
+        Nothing where they do not differ, or no answer comes in time: a notice is not worth a wait.
     """
     question = Question(ask=ControlRequest.DIFFERENCES, plan=plan)
     try:
@@ -109,7 +109,7 @@ def differences(path: Path, plan: Plan) -> tuple[str, ...]:
 
 
 _ANSWERED = frozenset(ExitCode) - {ExitCode.INTERNAL}
-"""Exit codes that may be passed on; of an error of its own a supervisor tells no client."""
+"""Exit codes that may be passed on; a supervisor reports an error of its own to no client."""
 
 
 def order(path: Path, question: Question, timeout_s: float) -> Answer:

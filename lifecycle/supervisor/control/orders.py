@@ -1,12 +1,10 @@
-"""Orders to a supervisor that holds a system: pause, resume, restart.
+"""Orders to a supervisor that holds a system (pause, resume, restart), and reload of its manifest.
 
 Owns: `Order`, which orders fit which phase, and the mailbox that gives them to the session one by
-one. How they are carried out is sequence.py's. Must not import rclpy.
-
-Whether a manifest is still the one that runs, and whether a running system can take a new one.
-Owns: `Revisions`: an order that comes with a plan is refused where that plan is not the one
-that runs, unless it says to reload it; and what cannot be reloaded while the supervisor runs,
-with the reason. What differs is `plan.comparison`'s to say. Must not import rclpy.
+one; and `Revisions`: whether a manifest is still the one that runs, and whether the running system
+can take a new one. An order with a plan that is not the one that runs is refused unless it says to
+reload it, and so is, with the reason, what cannot be reloaded while the supervisor runs. How orders
+are carried out is gate/sequence.py's, what differs `plan.comparison`'s. Must not import rclpy.
 """
 
 from __future__ import annotations
@@ -45,7 +43,7 @@ class Order:
 
     Attributes:
         node: for RESTART, manifest key or fully qualified name; empty for the whole system.
-        plan: what the manifest that the order names comes to now; None if it names none.
+        plan: the plan of the manifest that the order names, as it is now; None if it names none.
         reload: for RESTART, `plan` is to run from now on.
     """
 
@@ -166,7 +164,7 @@ class Mailbox:
 
 _MOST = 20
 _RELOADED = ("nodes.", "links.", "policy.")
-"""Parts of a manifest that a running supervisor can take anew: the rest made the supervisor's own
+"""Parts of a manifest that a running supervisor can reload: the rest made the supervisor's own
 participant, its authority and the networks that it programs."""
 
 
@@ -190,7 +188,7 @@ class Revisions:
         )
 
     def check(self, order: Order) -> None:
-        """Make sure that nothing but the manifest that the order means comes to run.
+        """Make sure that nothing but the manifest that the order means will run.
 
         Raises:
             UsageError: the manifest has changed since the start, or cannot be reloaded.
@@ -282,7 +280,7 @@ class Revisions:
 
 
 def _lines(found: Iterable[PlanDifference]) -> tuple[str, ...]:
-    """Word differences with their places in the new manifest, at most 20 of them."""
+    """Phrase differences with their places in the new manifest, at most 20 of them."""
     every = tuple(found)
     lines = []
     for each in every[:_MOST]:

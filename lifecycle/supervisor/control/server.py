@@ -55,7 +55,7 @@ class Question:
 
     Attributes:
         node: for RESTART, manifest key or fully qualified name; empty for the whole system.
-        plan: for DIFFERENCES and orders, what the manifest that the client was given comes to now;
+        plan: for DIFFERENCES and orders, the plan of the client's manifest as it is now;
             None if it was given none.
         reload: for RESTART, `plan` is to run from now on.
     """
@@ -203,7 +203,7 @@ class ControlServer:
                 waiting = asyncio.ensure_future(changed.wait())
                 await asyncio.wait({gone, waiting}, return_when=asyncio.FIRST_COMPLETED)
                 waiting.cancel()
-                # Changes come in bursts; nobody reads pictures faster than this.
+                # Changes come in bursts; nothing reads pictures faster than this.
                 await asyncio.wait({gone}, timeout=_BURST_S)
         finally:
             gone.cancel()
@@ -242,7 +242,7 @@ def ask(path: Path, question: Question, timeout_s: float) -> Answer | None:
     Raises:
         TimeoutError: no whole answer within `timeout_s`.
         UsageError: what answers is no supervisor of this version.
-        OSError: nobody listens there.
+        OSError: no supervisor listens there.
     """
     deadline = time.monotonic() + timeout_s
     with connect(path, timeout_s) as sock:
@@ -258,7 +258,7 @@ def follow(path: Path) -> Iterator[SupervisorSnapshot]:
     Raises:
         TimeoutError: an answer was begun, and does not end.
         UsageError: what answers is no supervisor of this version.
-        OSError: nobody listens there.
+        OSError: no supervisor listens there.
     """
     with connect(path, _ANSWER_S) as sock:
         sock.sendall(to_json(Question(ask=ControlRequest.FOLLOW)) + b"\n")

@@ -117,7 +117,7 @@ def node_status(node: NodeRun, verdict: Verdict | None, silent: str = "") -> Nod
 
 
 def _died(node: NodeRun) -> str:
-    """Say how a node's process ended that nobody asked to end; empty if it has not."""
+    """Say how a node's process ended without being asked to; empty if it has not."""
     process = node.process
     if process is None or not process.died or not process.ended.done():
         return ""

@@ -2,7 +2,7 @@
 
 Owns: `ActivationGuard`: which active nodes were not asked to be, how often they are deactivated
 again, and the finding that keeps the gate closed until they are inactive. Nodes in our hosts refuse
-by themselves (node/author/managed.py); others do what anybody asks of them. Must not import rclpy.
+by themselves (node/author/managed.py); others obey every client. Must not import rclpy.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class ActivationGuard:
         )
 
     async def follow(self, observer: ObservationSource, changes: ChangeSource) -> None:
-        """Look at every change, for as long as nobody judges: until this is cancelled."""
+        """Look at every change, for as long as no verdict is made: until this is cancelled."""
         while True:
             count = changes.count
             foreign = _foreign(self._system.plan, self._system.nodes.values())
@@ -85,7 +85,7 @@ class ActivationGuard:
             text += f"it is deactivated for the last time, after {tries} times in vain"
         self._system.emit(Notice(message=text))
         self._deactivating[node.name] = asyncio.ensure_future(self._ask(node))
-        # No verdict of before holds: whoever has a permit asks again.
+        # No earlier verdict is valid: holders of a permit ask again.
         self._system.touched.set()
 
     async def _ask(self, node: NodeRun) -> None:

@@ -110,7 +110,7 @@ class Permit:
     async def renewed(self) -> None:
         """Return once the verdict is that of the present moment.
 
-        Everybody who waits for it shares one judgement. It does not wait where nothing changed.
+        All who wait for it share one judgement. It does not wait where nothing changed.
 
         Raises:
             VerificationError: as for `check`; the gate is closed for all that were not sent.
@@ -120,7 +120,7 @@ class Permit:
         while not self._gate.is_current(self.verdict):
             if self._renewal is None or self._renewal.done():
                 self._renewal = asyncio.ensure_future(self._renew())
-                # Whoever waited for it may be gone.
+                # Its waiters may be gone.
                 self._renewal.add_done_callback(lambda done: done.cancelled() or done.exception())
             renewal = self._renewal
             await asyncio.wait({renewal})

@@ -1,7 +1,7 @@
 """Holds a system that is up: watches it, and carries out orders (pause, resume, restart).
 
-Owns: `Holding`: for how long, what ends it, and how orders (pause, resume, restart) come in and are
-answered. What an order does is sequence.py's.
+Owns: `Holding`: for how long, what ends it, and how orders are received and answered. What an order
+does is sequence.py's.
 """
 
 from __future__ import annotations
@@ -78,8 +78,8 @@ class Holding:
         """Keep the system as it is, or as it is ordered; return what was violated, else nothing.
 
         Args:
-            stage: what it has come to; a violation counts only of an active system, and only if it
-                stood for longer than a passing moment.
+            stage: what it has reached; a violation counts only of an active system, and only if it
+                lasted for longer than a passing moment.
             hold_s: seconds, ≥ 0; None for ever.
 
         Raises:
@@ -119,7 +119,7 @@ class Holding:
         self._mailbox.close(reason)
 
     async def _carry_out(self, pending: Pending) -> None:
-        """Carry an order out and tell who gave it; what ends the run is raised."""
+        """Carry an order out and report to its client; what ends the run is raised."""
         try:
             # Another order may have come first.
             self._check(pending.order)

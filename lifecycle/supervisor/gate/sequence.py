@@ -1,18 +1,17 @@
-"""The gate sequence, and the orders that go through it: pause, resume, restart.
+"""The gate sequence up to activation, and the orders that go through it: pause, resume, restart.
 
 Owns: the one way from a connected to an active system: judge, permit, networks, activate, judge
-again; and the steps of each order. What is active stays so only as long as the gate that let it
-through; nothing is activated again before a new verdict opens it again. Must not import rclpy.
+again; the steps of each order; and `undiscovered`, which reads from a verdict which node was not
+discovered over TCP although it runs, and is to be started again on a fresh port. What is active
+stays so only as long as the gate that let it through; nothing is activated again before a new
+verdict opens it again. Must not import rclpy.
 
-Who was not discovered over TCP although it is there, and is to be started again on a fresh
-port. Owns: `undiscovered`, which reads that from a verdict. Starting again is sequence.py's.
-
-Fast DDS 2.14 sometimes never uses a connection that it has dialled: if the answer to what it
-said first comes before the port inside the connection was noted, which happens when the thread
-that dials loses its processor in between, the answer is passed over (BIND_CONNECTION_RESPONSE
-in RTCPMessageManager::processRTCPMessage). Then nothing is sent that way for as long as the two
-live, and who was dialled takes no other connection from the same port. A participant on another
-port meets everybody anew.
+Fast DDS 2.14 sometimes never uses a TCP connection that it has dialled: if the answer to its first
+message arrives before the port inside the connection was noted, which happens when the dialling
+thread loses its processor in between, the answer is ignored (BIND_CONNECTION_RESPONSE in
+RTCPMessageManager::processRTCPMessage). Then nothing is sent that way for as long as both
+participants live, and the dialled one takes no other connection from the same port. A participant
+on another port is discovered by all from the beginning.
 """
 
 from __future__ import annotations
@@ -99,14 +98,14 @@ class GateSequence:
     Args:
         alive: see above.
         leaves: called with the names of processes that end because we want it, and `comes_back`
-            once they are started anew.
+            once they are started again.
         forget: drops what a node reported before it was restarted.
         vanishes: waits, bounded, until the graph shows no node of this name.
         replanned: called with the names of nodes that the plan connects otherwise from now on.
         program: programs networks with the flows of a verdict within seconds, done when it returns.
         following: keeps looking at the nodes of others, and at ours that others may drive, for the
             length of its block.
-        spawner: must be able to start processes before any is ended to be started anew.
+        spawner: must be able to start processes before any is ended to be started again.
         timeout_s: for bringing up again what an order took down.
 
     Attributes:
@@ -375,7 +374,7 @@ class GateSequence:
         self._reached(ACTIVE)
 
     async def _through_the_gate(self) -> None:
-        """Judge the system as it stands, and activate what is not active."""
+        """Judge the system as it is, and activate what is not active."""
         deadline = asyncio.get_running_loop().time() + self._timeout_s
         before = PAUSED if self.phase == PAUSED else HELD
         try:

@@ -1,12 +1,10 @@
-"""Verifies the running system at every change: level-triggered, debounced, until it is clear.
+"""Verifies the running system at every change: level-triggered, debounced, with a grace period.
 
-Owns: when `verify` is called again and how long a verdict that closes the gate is waited out.
-Nothing is polled: the graph, or a node over its control channel, says when to look again. Must not
-import rclpy.
-
-What is wrong for a passing moment only, because the facts of one change arrive one by one.
-Owns: `GracePeriod`: which findings may pass by themselves while a system is watched, and for
-how long a verdict that is worse by these alone is kept back. The gate knows no such patience.
+Owns: when `verify` is called again, how long a verdict that closes the gate is waited out, and
+`GracePeriod`: which findings may pass by themselves while a system is watched, because the facts of
+one change arrive one by one, and for how long a verdict that is worse by these alone is kept back.
+The gate itself has no grace period. Nothing is polled: the graph, or a node over its control
+channel, notifies when to verify again. Must not import rclpy.
 """
 
 from __future__ import annotations
@@ -341,7 +339,7 @@ class VerificationLoop:
         """Judge until the gate may open, a finding that cannot heal persists, or time is up.
 
         Args:
-            stage: what the system has come to.
+            stage: what the system has reached.
             timeout_s: seconds, for all of it.
             unchanged_s: seconds after which findings count that have not changed, even if they
                 could heal; None waits for these until time is up.
@@ -376,7 +374,7 @@ class VerificationLoop:
                 await self.quiet()
 
     def _waits_for_match(self, verdict: Verdict) -> bool:
-        """Whether a match is missing that nobody would tell us of: hosts tell of theirs."""
+        """Whether a match is missing that no node would report: hosts report theirs."""
         telling = {each.name for each in self._system.nodes.values() if each.tells}
         return any(
             each.outcome is Outcome.VIOLATED
@@ -386,7 +384,7 @@ class VerificationLoop:
         )
 
     def _waits_for_others(self, verdict: Verdict) -> bool:
-        """Whether a node that another supervisor brings up has a step to go: nobody tells us."""
+        """Whether a node that another supervisor brings up has a step to go: no report comes."""
         others = {each.name for each in self._system.remote.values()}
         return any(
             rule(each.rule).about is About.PROGRESS and each.node in others
@@ -435,7 +433,7 @@ def without(observation: Observation, dead: frozenset[str]) -> Observation:
 
 
 def without_nodes(plan: Plan, silent: Collection[str]) -> Plan:
-    """Return `plan` without the nodes that would not answer, so that nobody waits for them."""
+    """Return `plan` without the nodes that would not answer, so that they are not waited for."""
     if not silent:
         return plan
     nodes = tuple(each for each in plan.nodes if each.full_name not in silent)
@@ -443,7 +441,7 @@ def without_nodes(plan: Plan, silent: Collection[str]) -> Plan:
 
 
 def _patience(verdict: Verdict) -> float | None:
-    """How long the findings of `verdict` may stand unchanged; None for as long as there is time."""
+    """How long the findings of `verdict` may stay unchanged; None for as long as there is time."""
     violated = [rule(each.rule) for each in verdict.findings if each.outcome is Outcome.VIOLATED]
     if any(each.heals is not Heals.WITH_TIME for each in violated):
         return SETTLED_S

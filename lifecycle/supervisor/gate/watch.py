@@ -1,6 +1,6 @@
 """Watches a system that is up: verified again at every change, dead processes noticed at once.
 
-Owns: the hold phase. What follows from what it sees is session.py's. Must not import rclpy.
+Owns: the hold phase. What follows from what it sees is hold.py's. Must not import rclpy.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from lifecycle.verify.verdict import Outcome, Stage
 
 
 async def first_death(system: System, known: set[str]) -> ManagedProcess:
-    """Wait until a process ends that nobody asked to end.
+    """Wait until a process ends that was not asked to.
 
     Args:
         system: whose processes.
@@ -62,4 +62,4 @@ class Watch:
             if await self._changes.beyond(count, wait_s):
                 await self._judge.quiet()
             elif again_s is None:
-                self.violated = not_ok(verdict) or verdict.verdict.value  # nothing moved: it stands
+                self.violated = not_ok(verdict) or verdict.verdict.value  # no change: it lasts

@@ -23,7 +23,7 @@ from lifecycle.supervisor.run.events import MachineConnection
 from lifecycle.supervisor.run.failure import ended
 
 CALL_EACH_S = 0.25
-"""While somebody is missing."""
+"""While a peer is missing."""
 
 SAID_AGAIN_S = (0.1, 0.3)
 """Fast DDS repeats what was lost after up to 3 s: too late for a silence."""
@@ -33,7 +33,7 @@ class AliveReceiver(Protocol):
     """One AliveSubscription of lifecycle.middleware."""
 
     def destroy(self) -> None:
-        """Hear no more."""
+        """Stop receiving."""
 
 
 class AliveSender(Protocol):
@@ -47,7 +47,7 @@ class AliveSender(Protocol):
 
 
 class AliveExchange(Protocol):
-    """What carries voices, see eyes.ObserverParticipant."""
+    """What carries announcements, see nodes/observer_participant.py."""
 
     def announce_machine(self, system: str, machine: str) -> AliveSender:
         """Announce ourselves as the supervisor of a machine."""
@@ -59,23 +59,23 @@ class AliveExchange(Protocol):
         """Watch a node that is attached."""
 
     def call_out(self, addresses: Iterable[str]) -> None:
-        """Make everybody announce themselves; a few datagrams."""
+        """Make all peers announce themselves; a few datagrams."""
 
     def send_again_soon(self) -> None:
         """Have what waits for a link to come back be sent soon when it does."""
 
     def tell_names(self) -> None:
-        """Tell the graph anew that we are here."""
+        """Announce our names to the graph again."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Listener:
-    """What an ear calls, from any thread.
+    """What an AliveReceiver calls, from any thread.
 
     Attributes:
-        heard: with True when it is heard, with False when not any more.
+        heard: with True when the peer is alive, with False when not any more.
         left: it left properly.
-        told: what it says of silent nodes.
+        told: what it reports of silent nodes.
     """
 
     heard: Callable[[bool], None]
@@ -85,7 +85,7 @@ class Listener:
 
 @dataclasses.dataclass(slots=True)
 class _PeerSupervisor:
-    """One who should be heard.
+    """One peer that should be alive.
 
     Attributes:
         what: for messages, "the supervisor of machine 'robot'".
@@ -101,7 +101,7 @@ class _PeerSupervisor:
 
 
 class PeerSupervisors:
-    """Hears whom a system depends on; `open` it in a loop and `close` it."""
+    """Watches the peers that a system depends on; `open` it in a loop and `close` it."""
 
     def __init__(self, system: System, air: AliveExchange) -> None:
         self._system = system
@@ -119,7 +119,7 @@ class PeerSupervisors:
         self._tasks: set[asyncio.Task[None]] = set()
 
     def open(self) -> None:
-        """Begin to hear, and to be heard where there is somebody to hear us."""
+        """Begin to watch, and to announce ourselves where a peer may watch us."""
         plan = self._system.plan
         remote: dict[str, list[str]] = {}
         for each in self._system.remote.values():
@@ -150,7 +150,7 @@ class PeerSupervisors:
         self._machines.clear()
         self._missing.clear()
         for neighbour in self._known:
-            # Of who is not planned any more nobody tells that it came back.
+            # The return of one that is no longer planned is never reported.
             for cause in (Cause.LOST, Cause.TOLD):
                 self._system.liveliness.came_back(neighbour.nodes, cause)
         self._known.clear()
@@ -169,7 +169,7 @@ class PeerSupervisors:
         return frozenset(each.machine for each in self._machines if each.heard)
 
     async def close(self) -> None:
-        """Leave, and hear no more."""
+        """Leave, and stop watching."""
         self._closed = True
         tasks = [*self._tasks, *([self._calling] if self._calling else [])]
         await ended(*tasks)
@@ -183,7 +183,7 @@ class PeerSupervisors:
 
         def soon(do: Callable[..., None]) -> Callable[..., None]:
             def in_loop(*arguments: object) -> None:
-                # An ear that was destroyed may have had its say on the way here.
+                # A receiver that was destroyed may have had a callback on its way.
                 if any(each is neighbour for each in self._known):
                     do(neighbour, *arguments)
 
@@ -270,7 +270,7 @@ class PeerSupervisors:
                 await asyncio.sleep(pause_s)
 
     async def _call(self) -> None:
-        """Call out until nobody is missing."""
+        """Call out until no peer is missing."""
         machines = {each.name: each.address for each in self._system.plan.machines}
         while self._missing:
             names = (each.machine for each in self._missing.values())

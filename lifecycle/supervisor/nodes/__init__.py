@@ -1,1 +1,1 @@
-"""The nodes of a system: how far each has come, how it is driven there, and who sees it."""
+"""The nodes of a system: how far each is brought up, how it is driven there, and who sees it."""

@@ -264,8 +264,8 @@ class BringUp:
             )
             self._started(node)
         else:
-            # A plain node says nothing of itself. Whoever stands on it waits until it is in the
-            # graph; if it never is, verification says so.
+            # A plain node reports nothing. Its dependents wait until it is in the graph; if it
+            # never is, verification says so.
             node.doing = "waiting to appear in the graph"
             self._appearing.append(asyncio.ensure_future(self._appear(node)))
 
@@ -334,7 +334,7 @@ class BringUp:
         node.advance(reach, standing)
 
     async def _start(self, node: NodeRun) -> None:
-        """Have the node's process started, or for a node of somebody else's, find it."""
+        """Have the node's process started, or find a node that others start."""
         process = node.process
         if process is None:
             await self._hold_start(node)
@@ -408,7 +408,7 @@ class BringUp:
             own_s = _OWN_S if rule is TRANSITION_FAILED else 0.0
             await asyncio.wait(waits, timeout=limit_s + own_s, return_when=asyncio.FIRST_COMPLETED)
             if node.process is not None and node.process.ended.done() and not step.done():
-                # Its last words may still be on the way.
+                # Its last output may still be on the way.
                 await asyncio.wait({step}, timeout=_WORDS_S)
             if step.done():
                 return step.result()
@@ -510,6 +510,6 @@ def _is(doing: str) -> str:
 
 
 def _process_of(node: NodeRun) -> dict[str, str]:
-    """Return what a failure says of the process of its node."""
+    """Return what a failure reports of the process of its node."""
     process = node.process
     return {} if process is None else {"process": process.name, "log": str(process.log.path)}

@@ -152,7 +152,7 @@ class ObserverParticipant:
         send_again_soon()
 
     def tell_names(self) -> None:
-        """Announce our node to the graph anew."""
+        """Announce our node to the graph again."""
         from lifecycle.middleware.discovery.rediscovery import tell_names
 
         tell_names([self._node])

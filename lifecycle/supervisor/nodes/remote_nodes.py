@@ -1,8 +1,8 @@
 """Nodes of the plan that another supervisor brings up, on another machine.
 
-Owns: `RemoteNode`, how far such a node has come as far as the graph and its own report show, and
-`RemoteNodes`, which keeps that up to date. Nothing here is driven: each supervisor activates its
-own. Must not import rclpy.
+Owns: `RemoteNode`, how far such a node is brought up as far as the graph and its own report show,
+and `RemoteNodes`, which keeps that up to date. Nothing here is driven: each supervisor activates
+its own. Must not import rclpy.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class RemoteNode:
 
 
 class RemoteNodes:
-    """Looks at remote nodes while anybody may wait for them."""
+    """Looks at remote nodes while a node may wait for them."""
 
     def __init__(
         self,
@@ -94,7 +94,7 @@ class RemoteNodes:
             observation = await self._observer.observe(self._plan)
             for each in self._nodes:
                 each.see(observation)
-            # Whoever was not there at all announces itself.
+            # One that was not there at all announces itself.
             there = any(each.reached for each in self._nodes)
             await self._changes.beyond(count, ASK_AGAIN_S if there else None)
 

@@ -1,10 +1,9 @@
-"""Takes dead processes out of the ROS graph at once, before the DDS lease of their nodes ends.
+"""Removes dead processes from the ROS graph before their DDS lease ends; waits for nodes to appear.
 
-Owns: `StaleNodes`: which participants were a process's, and when everybody is made to forget them.
-How is lifecycle.middleware.discovery.dead_peers'. Must not import rclpy.
-
-Waiting until discovery shows a node, or no longer does. Owns: `Sightings`. Looked at again
-whenever anything changes, and never otherwise.
+Owns: `StaleNodes`: which participants were a process's, and when all others are made to forget
+them; and `Sightings`: waiting until discovery shows a node, or no longer does, checked whenever
+anything changes and never otherwise. How participants are forgotten is
+lifecycle.middleware.discovery.dead_peers'. Must not import rclpy.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ class ParticipantRegistry(Protocol):
         """Return the GUID prefixes of the participants that discovery shows of a process."""
 
     def remove_participants(self, prefixes: Iterable[str], pids: Iterable[int]) -> None:
-        """Have everybody forget participants whose process is dead."""
+        """Have all others forget participants whose process is dead."""
 
 
 class StaleNodes:
@@ -112,7 +111,7 @@ def _reported(node: NodeRun) -> Iterable[str]:
 
 
 _LEASE_S = 21.0
-"""Fast DDS forgets a participant that left without a word after 20 s, by default."""
+"""Fast DDS forgets a participant that left without notice after 20 s, by default."""
 
 
 class Sightings:

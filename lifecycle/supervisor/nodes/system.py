@@ -1,7 +1,7 @@
-"""The running system: its processes and nodes, and how far each has come.
+"""The running system: its processes and nodes, and how far each has been brought up.
 
-Owns: `System`, `NodeRun` and the waits on "this node has reached that condition". What is done
-with them is bring_up.py's, watch.py's and shutdown.py's. Must not import rclpy.
+Owns: `System`, `NodeRun` and the waits on "this node has reached that condition". What is done with
+them is bring_up.py's, gate/watch.py's and run/shutdown.py's. Must not import rclpy.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class NodeRun:
     Attributes:
         driver: None for a node that is not managed.
         process: None for a node that this supervisor does not start.
-        reach: how far it has come.
+        reach: how far it is brought up.
         doing: what it does or waits for at this moment, for messages; empty when nothing.
         undo: what has to be undone, oldest first.
         stuck: an operation on it was given up: a polite request would wait behind it.
@@ -88,7 +88,7 @@ class NodeRun:
         self._emit = emit
 
     def renew(self, process: ManagedProcess | None) -> None:
-        """Begin anew, in a new process, after the node was taken down."""
+        """Begin again, in a new process, after the node was taken down."""
         self.driver = None
         self.process = process
         self.configuration = None
@@ -115,7 +115,7 @@ class NodeRun:
         return _ORDER.index(self.reach) >= _ORDER.index(_CONDITIONS[condition])
 
     def advance(self, reach: Reach, standing: NodeCondition | None = None) -> None:
-        """Note that the node came to `reach`, and notify the listeners and who waits for it."""
+        """Note that the node reached `reach`, and notify its listeners and waiters."""
         self.reach = reach
         if standing is not None:
             self._take(standing.state, connected=standing.connected)
@@ -326,7 +326,7 @@ class System:
         self.touched.set()
 
     async def reached(self, node: NodeRun, condition: Condition, step: str) -> None:
-        """Wait until everything that holds `step` of `node` has come to `condition`.
+        """Wait until everything that holds `step` of `node` has reached `condition`.
 
         The wait has no deadline of its own: the nodes waited for have theirs, and so has the
         whole bring-up.

@@ -49,7 +49,7 @@ class ControlChannel:
 
     Args:
         spec: what it hosts.
-        on_state: called with what it says of its nodes unasked, and with each reply that has a
+        on_state: called with what it reports of its nodes unasked, and with each reply that has a
             configuration.
         on_hang: called with why its executor is busy for too long, with None when it came back.
 
@@ -71,7 +71,7 @@ class ControlChannel:
         self._next = 0
         self._replies: dict[int, asyncio.Future[Event]] = {}
         self._ready: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        # The host may end before anybody waits for "ready".
+        # The host may end before a caller waits for "ready".
         self._ready.add_done_callback(lambda done: done.cancelled() or done.exception())
         self._writer: asyncio.StreamWriter | None = None
         self._task: asyncio.Task[None] | None = None
@@ -102,7 +102,7 @@ class ControlChannel:
 
         Raises:
             HostFailedError: construction failed; with the host's reason.
-            ChannelClosedError: the host ended without a word.
+            ChannelClosedError: the host ended without a reason.
         """
         await asyncio.shield(self._ready)
 

@@ -125,12 +125,12 @@ class ForkServerChild:
         try:
             os.killpg(self.pid, number)
         except ProcessLookupError:
-            # It has not reached setsid yet, or only its pidfd still stands for it.
+            # It has not reached setsid yet, or only its pidfd is left of it.
             with contextlib.suppress(ProcessLookupError):
                 signal.pidfd_send_signal(self._pidfd, number)
 
     def _ended(self) -> None:
-        """The pidfd is readable: it ended. The fork server tells how, unless it is gone itself."""
+        """The pidfd is readable: it ended. The fork server reports how, unless it is gone."""
         assert self._pidfd is not None
         self._loop.remove_reader(self._pidfd)
         self._has_ended = True
@@ -158,7 +158,7 @@ class ForkServerChild:
                 self.on_stop(found.si_code != os.CLD_CONTINUED)
 
     def settle(self, raw: int | None) -> None:
-        """Take the status word, or find it ourselves."""
+        """Take the wait status, or find it ourselves."""
         if self.exited.done():
             return
         assert self._pidfd is not None
@@ -203,7 +203,7 @@ class ForkServer:
 
     @property
     def waited_for(self) -> tuple[int, ...]:
-        """Processes whose ends are learned here: nobody else may bury them."""
+        """Processes whose ends are learned here: no other code may reap them."""
         return (self.pid, *(each.pid for each in self._children.values()))
 
     def family(self) -> frozenset[int]:
@@ -332,7 +332,7 @@ class ForkServer:
         self._children[report.id] = child
         child.exited.add_done_callback(lambda _: self._children.pop(report.id, None))
         if born.cancelled():
-            # Whoever asked has given up; a process that nobody knows of must not live.
+            # The caller has given up; a process that no caller knows must not live.
             child.signal(signal.SIGKILL)
         else:
             born.set_result(child)

@@ -1,12 +1,11 @@
 """The fork server's own process: forks the processes of a system, and guards them.
 
 Owns: what runs in `python -m lifecycle.supervisor.processes.fork_server_main SOCKET_FD [--preload]
-[--again]`. It stays
-single-threaded and never calls rclpy.init, so that forking is safe and every child is a
-participant of its own; with `--preload` a forked host skips ~130 ms of imports. Each child leads a
-session of its own. It adopts what its children leave behind (PR_SET_CHILD_SUBREAPER), so as long as
-it lives, what descends from it is what the run started. If the supervisor vanishes it ends what is
-left of its children, bounded, and of those of a fork server before it that was killed.
+[--again]`. It stays single-threaded and never calls rclpy.init, so that forking is safe and every
+child is a participant of its own; with `--preload` a forked host skips ~130 ms of imports. Each
+child leads a session of its own. It adopts what its children leave behind (PR_SET_CHILD_SUBREAPER),
+so as long as it lives, what descends from it is what the run started. If the supervisor vanishes it
+ends what is left of its children, bounded, and of those of a fork server before it that was killed.
 """
 
 from __future__ import annotations
@@ -50,7 +49,7 @@ class _ForkServer:
         self._selector = selectors.DefaultSelector()
         self._selector.register(sock, selectors.EVENT_READ, None)
         self._children: dict[int, tuple[int, int]] = {}  # pid → (request id, pidfd)
-        # A parent is told by SIGCHLD that a child was stopped; nothing else tells of that.
+        # SIGCHLD notifies a parent that a child was stopped; nothing else does.
         self._signals = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
         signal.signal(signal.SIGCHLD, _arrived)
         signal.set_wakeup_fd(self._signals[1], warn_on_full_buffer=False)
@@ -116,7 +115,7 @@ class _ForkServer:
         self._tell(ChildReport(id=request, pid=pid, status=status))
 
     def _note_stops(self) -> None:
-        """Tell which children were stopped or continue."""
+        """Report which children were stopped or continue."""
         with contextlib.suppress(BlockingIOError):
             os.read(self._signals[0], _PIPE_BYTES)
         with contextlib.suppress(ChildProcessError):
@@ -177,7 +176,7 @@ class _ForkServer:
             for _, pidfd in self._children.values():
                 os.close(pidfd)
             # A host takes them itself, once there is something to shut down; until then it ends
-            # at once, and without a KeyboardInterrupt in the middle of somebody's import.
+            # at once, and without a KeyboardInterrupt in the middle of an import.
             signal.signal(signal.SIGINT, signal.SIG_DFL)
             signal.signal(signal.SIGTERM, signal.SIG_DFL)
             _take_streams(descriptors[0], descriptors[1])
@@ -198,7 +197,7 @@ class _ForkServer:
 
 
 def _arrived(number: int, frame: object) -> None:
-    """Replace the default, which tells nobody; the wake-up descriptor ends the select."""
+    """Replace the default, which notifies nothing; the wake-up descriptor ends the select."""
 
 
 def _take_streams(stdout: int, stderr: int) -> None:
@@ -226,7 +225,7 @@ def _run(argv: tuple[str, ...], control: int | None) -> int:
     if control is not None:
         os.set_inheritable(control, True)
         argv = tuple(word.replace("{control}", str(control)) for word in argv)
-    for number in (signal.SIGPIPE, signal.SIGXFSZ):  # which Python ignores, and exec would hand on
+    for number in (signal.SIGPIPE, signal.SIGXFSZ):  # which Python ignores, and exec would keep so
         signal.signal(number, signal.SIG_DFL)
     try:
         os.execvp(argv[0], argv)  # noqa: S606 - what a spawner is for

@@ -41,9 +41,9 @@ class ChildReport:
     Attributes:
         id: of the ForkRequest.
         pid: of the child; 0 if it could not be forked.
-        status: waitpid(2) word; None while it runs.
+        status: waitpid(2) status; None while it runs.
         error: why it could not be forked.
-        stopped: a signal stopped it (True) or made it continue (False); None says nothing of that.
+        stopped: a signal stopped it (True) or made it continue (False); None reports neither.
     """
 
     id: int

@@ -109,9 +109,9 @@ class LineReader:
         self._on_line(line.rstrip(b"\r").decode("utf-8", errors="replace"))
 
     def close(self) -> None:
-        """Read what is there, give up the descriptor and hand out an unfinished last line.
+        """Read what is there, give up the descriptor and emit an unfinished last line.
 
-        No more than a pipe holds: somebody who was left behind may write faster than we read.
+        No more than a pipe holds: a process left behind may write faster than we read.
         """
         if not self._open:
             return

@@ -65,7 +65,7 @@ def end_strays(
 
     Args:
         run_id: of the run; empty for none.
-        fork_server: what this process started them by; None if only the run's id tells.
+        fork_server: what this process started them by; None if only the run's id shows it.
         grace_s: seconds between SIGTERM and SIGKILL.
 
     Returns:

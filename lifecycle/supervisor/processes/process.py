@@ -1,7 +1,7 @@
 """One process of a system: its state, its output, and its bounded end.
 
-Owns: `ManagedProcess`. How it is forked is spawn.py's, what the whole system does is system.py's.
-Must not import rclpy.
+Owns: `ManagedProcess`. How it is forked is fork_server.py's, what the whole system does is
+nodes/system.py's. Must not import rclpy.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class ManagedProcess:
     """An operating system process of the plan.
 
     Attributes:
-        planned: what the plan says of it.
+        planned: what the plan declares of it.
         state: see spawn.py.
         channel: to our host; None for a foreign command.
         child: None before it was spawned.

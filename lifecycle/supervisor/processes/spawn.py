@@ -1,10 +1,8 @@
-"""Interface for starting operating system processes: the request, the child, the Protocols.
+"""Interface for starting operating system processes, and process states with their legal changes.
 
-Owns: `SpawnRequest`, `Child`, `Spawner`. The real ones live in fork_server.py; tests bring their
-own. Must not import rclpy.
-
-Process states and their legal changes. Owns: `ProcessState`, `ProcessExit` and the table of
-changes. The words are not node states: only nodes are "active".
+Owns: `SpawnRequest`, `Child`, `Spawner`, `ProcessState`, `ProcessExit` and the table of changes.
+The names of process states are not those of node states: only nodes are "active". The real spawner
+and child live in fork_server.py; tests bring their own. Must not import rclpy.
 """
 
 from __future__ import annotations
@@ -68,7 +66,7 @@ class ProcessExit:
 
     @classmethod
     def from_wait(cls, raw: int) -> ProcessExit:
-        """Decode the status word of waitpid(2)."""
+        """Decode the status of waitpid(2)."""
         code = os.waitstatus_to_exitcode(raw)
         return cls(status=code) if code >= 0 else cls(signal=-code)
 
@@ -84,7 +82,7 @@ class ProcessExit:
 
 
 def _ignore(is_stopped: bool) -> None:
-    """Nobody wants to know."""
+    """Ignore that it stopped or continues."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

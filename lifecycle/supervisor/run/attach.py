@@ -34,8 +34,8 @@ _ASK_AGAIN_S = 0.5
 """Nodes are asked again so long after: their matched counts change without a graph change ..."""
 
 _ASK_AT_MOST_S = 8.0
-"""... a moment after one, so whoever only looks on asks half as often each time, down to this: that
-a node hangs or somebody was reconfigured nobody tells those who stand outside."""
+"""... a moment after one, so an outside observer asks half as often each time, down to this: it is
+not notified that a node hangs or was reconfigured."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -81,7 +81,7 @@ def judge_running(plan: Plan, *, timeout_s: float, strict: bool) -> JudgedSystem
 async def following(plan: Plan, on_look: Callable[[JudgedSystem], None]) -> None:
     """Look at every change and give what was seen and its verdict, until cancelled.
 
-    What may pass by itself is given a moment to do so, see grace_period.py.
+    What may pass by itself is given a moment to do so, see `GracePeriod`.
     """
     grace_period = GracePeriod()
     last: Verdict | None = None
@@ -123,7 +123,7 @@ def where(plan: Plan, rmw: str) -> str:
 
 
 def _looking(plan: Plan) -> ObserverParticipant:
-    """Open the eyes on a plan's domain; also on guests, where they are negotiated with."""
+    """Observe a plan's domain; also guests, where they are negotiated with."""
     os.environ["ROS_DOMAIN_ID"] = str(plan.domain_id)
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = plan.discovery_range.name
     hosts = reached_hosts(plan, own_machines(plan, ""))
@@ -137,7 +137,7 @@ def _looking(plan: Plan) -> ObserverParticipant:
 
 
 def _heard(plan: Plan) -> tuple[NodeConfiguration, ...]:
-    """Return what the supervisors of the system on this host hear of its nodes."""
+    """Return what the supervisors of the system on this host know of its nodes."""
     root = runtime_root(os.environ)
     wanted = run_name(plan, "")
     found: list[NodeConfiguration] = []
@@ -175,7 +175,7 @@ async def _judge(
 
 
 def _worth_waiting(verdict: Verdict, *, strict: bool) -> bool:
-    """Whether another look may change the result: what nobody measures stays so."""
+    """Whether another look may change the result: what is not measured stays so."""
     heals = [rule(each.rule).heals is not Heals.NEVER for each in verdict.findings]
     if verdict.verdict is Outcome.UNVERIFIABLE and closes(verdict, strict=strict):
         return all(heals)

@@ -20,7 +20,7 @@ from lifecycle.verify.verdict import Stage, Verdict
 
 
 class Reach(enum.Enum):
-    """How far one node has come; ordered, and one word per step of bring-up."""
+    """How far one node is brought up; ordered, one value per step of bring-up."""
 
     WAITING = "waiting"
     STARTED = "started"

@@ -1,11 +1,8 @@
-"""A step of bring-up that failed, and the finding it becomes.
+"""A failed step of bring-up as a finding; concurrent tasks of which the first failure ends all.
 
-Owns: `StepFailedError`, the ids of the `run.*` rules and how failures join a verdict, so that
-every run ends in one verdict that names each cause once. Pure.
-
-Running things side by side so that the first failure ends them all. Owns: `together`, what
-asyncio.TaskGroup does, which Python 3.10 does not have, `ended`, and `Worker`, a thread for
-what blocks.
+Owns: `StepFailedError`, the ids of the `run.*` rules and how failures join a verdict, so that every
+run ends in one verdict that names each cause once; `together`, what asyncio.TaskGroup does, which
+Python 3.10 does not have; `ended`; and `Worker`, a thread for what blocks.
 """
 
 from __future__ import annotations
@@ -32,7 +29,7 @@ NOT_WIRED = run.NOT_WIRED.id
 
 
 class StepFailedError(BringUpError):
-    """A step of bring-up failed, or a process ended that nobody asked to end.
+    """A step of bring-up failed, or a process ended that was not asked to.
 
     Attributes:
         rule: one of the ids above.

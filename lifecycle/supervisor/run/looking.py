@@ -1,11 +1,9 @@
-"""Pictures of a system that runs: through its supervisor, or from outside where it has none.
+"""Pictures and captures of a running system, through its supervisor or from outside.
 
-Owns: where the observation of a picture comes from and when the next picture is due. What is drawn
-is export's. Must not import rclpy.
-
-Looking at a running system of anybody's nodes until nothing new turns up. Owns:
-`capture_running`: when discovery has settled, and what each node is asked. Must not import
-rclpy at module level.
+Owns: where the observation of a picture comes from and when the next picture is due; and
+`capture_running`, which looks at a system of any nodes until nothing new is discovered: when
+discovery has settled, and what each node is asked. What is drawn is export's. Must not import rclpy
+at module level.
 """
 
 from __future__ import annotations
@@ -65,7 +63,7 @@ def supervised_pictures(path: Path) -> Iterator[Picture]:
     """Yield what a supervisor sees, again whenever it differs, until the supervisor ends.
 
     Raises:
-        OSError: nobody listens there.
+        OSError: no supervisor listens there.
     """
     last: Picture | None = None
     for seen in follow(path / "control"):

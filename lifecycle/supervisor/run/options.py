@@ -119,9 +119,9 @@ def local_processes(plan: Plan, machine: str) -> tuple[PlannedProcess, ...]:
 
 
 def observer_connections(plan: Plan, machine: str = "") -> ParticipantConnections:
-    """Return how the participant of a supervisor, or of an onlooker, is connected here.
+    """Return how the participant of a supervisor, or of an outside observer, is connected here.
 
-    Fast DDS discovers nobody by shared memory once a participant has another transport too
+    Fast DDS discovers none by shared memory once a participant has another transport too
     (NetworkFactory::getDefaultMetatrafficMulticastLocators). Where nodes have nothing else, neither
     has the observer: it sees them, and their reports prove what is on their connections.
 
@@ -144,14 +144,14 @@ def _connected_to(url: str) -> ParticipantConnections:
 def onlooker_connections(
     plan: Plan, heard: Iterable[NodeConfiguration] = ()
 ) -> ParticipantConnections:
-    """Return how an onlooker beside the supervisor of this host is connected.
+    """Return how an observer beside the supervisor of this host is connected.
 
-    As that one is, but on ports that are free: whom it asks answers to wherever it asks from. By
-    TCP nodes dial the supervisor, and nobody dials an onlooker: it dials everybody who listens.
+    As that one is, but on ports that are free: replies go to wherever it asks from. By TCP nodes
+    dial the supervisor, and none dials an observer beside it: it dials all that listen.
 
     Args:
         plan: of the system.
-        heard: what nodes say of themselves: one that was restarted listens elsewhere than planned.
+        heard: what nodes report: one that was restarted listens elsewhere than planned.
     """
     connections = observer_connections(plan)
     planned = [url for node in plan.nodes for url in urls_of(node)]

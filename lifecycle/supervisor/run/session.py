@@ -69,7 +69,7 @@ class _Stop(Exception):  # noqa: N818 - not an error: it was asked for
     """The run was asked to end.
 
     Attributes:
-        reason: in words.
+        reason: as text.
         exit_code: of a run that was cut short by it.
     """
 
@@ -81,7 +81,7 @@ class _Stop(Exception):  # noqa: N818 - not an error: it was asked for
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class _RunEnd:
-    """What a run comes to, beside its reason: nothing to add, if it is as it was asked for."""
+    """Result of a run, beside its reason: nothing to add, if it is as it was asked for."""
 
     exit_code: ExitCode = ExitCode.OK
     why: str = ""
@@ -108,7 +108,7 @@ class SessionParticipant(
         """Forget what a node reported whose process ended."""
 
     def prepare_to_leave(self) -> None:
-        """Close connections that nobody answers, so that leaving does not wait for them."""
+        """Close connections that are not answered, so that leaving does not wait for them."""
 
 
 class SessionForkServer(Spawner, ProcessFamily, Protocol):
@@ -116,7 +116,7 @@ class SessionForkServer(Spawner, ProcessFamily, Protocol):
 
     @property
     def waited_for(self) -> tuple[int, ...]:
-        """Pids of processes whose ends the fork server reads: nobody else may reap them."""
+        """Pids of processes whose ends the fork server reads: no other code may reap them."""
 
     def note_stops(self) -> None:
         """Look, after SIGCHLD, which children were stopped or continue."""
@@ -252,7 +252,7 @@ class Session:
         """Ask the run to end; once it ends, an interrupt asks it to hurry.
 
         Args:
-            reason: in words.
+            reason: as text.
             exit_code: of the run, if this cuts it short.
         """
         if self._stop.done() or self._gate_sequence.phase == _STOPPING:
@@ -335,7 +335,7 @@ class Session:
         return UpResult(exit_code=end.exit_code, verdict=verdict, plan=self._system.first)
 
     def _cut_short(self, exit_code: ExitCode) -> _RunEnd:
-        """Return what a run comes to that is asked to end.
+        """Return the result of a run that is asked to end.
 
         It is a success only if the system was verified, is what was asked for, and nothing bound
         it to stay; an interrupt (Ctrl-C) never is. That other machines of the system were shut down
@@ -367,7 +367,7 @@ class Session:
         return latest is not None and self._agreement.follows_from_shut_down(latest)
 
     def _outcome(self, meanwhile: str = "") -> _RunEnd:
-        """Return what the run of a system comes to that was held until now.
+        """Return the result of the run of a system that was held until now.
 
         Args:
             meanwhile: what was violated while it was held; empty if nothing was.
@@ -431,7 +431,7 @@ class Session:
             await ended(*followers)
 
     async def _hold(self, stage: Stage) -> _RunEnd:
-        """Keep the system for as long as was asked; return what the run comes to."""
+        """Keep the system for as long as was asked; return the result of the run."""
         self._held = True
         hold_s = self._options.stop_after_s
         if hold_s is None and self._options.until is not Until.ACTIVE:
@@ -506,7 +506,7 @@ class Session:
 
 
 def _hurried(result: UpResult) -> UpResult:
-    """Return what a run comes to that was interrupted while it was taken down: not cleanly."""
+    """Return the result of a run that was interrupted while it was taken down: not cleanly."""
     run = result.verdict.run
     assert run is not None
     reason = f"{run.reason}; interrupted while it was taken down"

@@ -57,7 +57,7 @@ class TakeDown:
         if nodes is not None:
             self._nodes = {each.planned.key: each for each in nodes}
             for key in system.nodes.keys() - self._nodes.keys():
-                self._polite[key].set()  # nobody waits for what stays
+                self._polite[key].set()  # what stays is not waited for
 
     async def run(self) -> None:
         """Take everything down; afterwards none of the processes runs."""
@@ -71,7 +71,7 @@ class TakeDown:
         )
 
     async def _node(self, key: str, node: NodeRun) -> None:
-        """Undo what was done to one node once all that stand on it are down."""
+        """Undo what was done to one node once all its dependents are down."""
         try:
             for dependent in self._system.dependents(key):
                 await self._polite[dependent.planned.key].wait()
@@ -95,7 +95,7 @@ class TakeDown:
         if self._system.liveliness.is_out_of_reach(node.name):
             node.stuck = True
         operations = [_UNDO[each] for each in reversed(node.undo)]
-        # A node that somebody else started is theirs to end.
+        # A node that others started is theirs to end.
         if node.process is not None and node.reach is not Reach.WAITING:
             operations.append(Operation.SHUTDOWN)
         for operation in operations:

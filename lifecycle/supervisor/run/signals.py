@@ -2,8 +2,8 @@
 
 Owns: `Ending`, which no SIGINT, SIGTERM or SIGHUP escapes. By default SIGTERM would kill a
 supervisor whose participant already has files in /dev/shm, and a KeyboardInterrupt that is raised
-in a destructor or while a module is imported is printed and forgotten. Imports next to nothing:
-it comes before the imports of everything else.
+in a destructor or while a module is imported is printed and forgotten. Imports next to nothing: it
+is imported before everything else.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Ended(KeyboardInterrupt):
 
     @property
     def reason(self) -> str:
-        """Of the end, in words."""
+        """Of the end, as text."""
         return ENDED_BY[self.number][0]
 
     @property
@@ -75,7 +75,7 @@ class Ending:
 
     @property
     def numbers(self) -> tuple[int, ...]:
-        """The signals that end a run: those that nobody had ignored."""
+        """The signals that end a run: those that were not ignored before."""
         return tuple(self._found)
 
     def check(self) -> None:
@@ -89,7 +89,7 @@ class Ending:
 
     @contextlib.contextmanager
     def noted(self) -> Iterator[None]:
-        """Within, a signal is only noted: what is being made or taken down must come to its end."""
+        """Within, a signal is only noted: what is being made or taken down must be finished."""
         raises, self._raises = self._raises, False
         try:
             yield

@@ -53,7 +53,7 @@ from lifecycle.supervisor.run.signals import Ending
 from lifecycle.verify.verdict import NOT_JUDGED
 
 LEAVE_S = 10.0
-"""A participant leaves within 0.2 s, over connections that nobody answers within 4 s.
+"""A participant leaves within 0.2 s, over connections that are not answered within 4 s.
 
 Where it is made, Fast DDS may wait for ever for threads that it cannot have."""
 
@@ -306,7 +306,7 @@ def _serves(plan: Plan, options: UpOptions) -> bool:
 def _observer_participant(plan: Plan, options: UpOptions, emit: Emitter) -> ObserverParticipant:
     """Make the supervisor's participant; on another port if a discovery server is not reached.
 
-    Fast DDS may never use the first connection to it (middleware/discovery/dead_connections.py).
+    Fast DDS may never use the first connection to it (middleware/discovery/dead_peers.py).
     """
     layer = plan.data_layer
     dynamic = layer.source is DataLayerSource.DYNAMIC
@@ -374,7 +374,7 @@ def _enter_graph(plan: Plan, options: UpOptions, directory: RunDirectory) -> Non
 
 
 def _graph_variables(environment: Mapping[str, str]) -> tuple[tuple[str, str], ...]:
-    """What a fork server that was started before `_enter_graph` has to hand on."""
+    """What a fork server that was started before `_enter_graph` has to pass on."""
     return tuple((name, environment[name]) for name in _GRAPH_VARIABLES if name in environment)
 
 
