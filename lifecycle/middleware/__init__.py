@@ -1,7 +1,7 @@
-"""The only room that knows rcl, rmw and Fast DDS: endpoints, flows, graph, shared memory.
+"""rcl, rmw and Fast DDS, used by this package alone: endpoints, participants, graph, shared memory.
 
 Owns: every use of ctypes and of private rclpy names. Names load on first use, so that a verb that
-only asks for the /dev/shm sweep or for process control does not pay for importing rclpy.
+only needs the /dev/shm sweep or process control does not pay for importing rclpy.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""LifecycleNode: what people subclass, its state machine, and how it is run.
+"""LifecycleNode: the class to derive from, its state machine, and how it is run.
 
 Owns: the node's side of everything. Names load on first use, so that the control channel's types
 can be imported where there is no ROS.

@@ -1,15 +1,12 @@
-"""The goals that an action server's handler works on: from acceptance to the answer, or to its end.
+"""Action goals of a node: from acceptance through the handler to the result, abort or cancel.
 
-Owns: what a handler's return value or exception makes of its goal, and how a goal that can be
-worked on no longer is taken from its handler. Which goals are accepted when is making.py's.
+Owns: what a handler's return value or exception makes of its goal; running the handler's coroutine
+step by step, so that it can be stopped where it awaits, and how a goal that can be worked on no
+longer is taken from it; and an action's name in the graph. Which goals are accepted when is
+making.py's.
 
-One handler at work on one goal of an action, and how it is stopped. Owns: driving the handler
-by hand, so that it can be stopped where it awaits.
-
-What an action is called in the graph, as rcl resolves it for a running node. Owns: the rule
-that rcl of ROS 2 Jazzy remaps an action's hidden topics and services one by one and never the
-action, so that its name is what is left of theirs. `manifest.names.resolve` is the same without
-ROS.
+rcl of ROS 2 Jazzy remaps an action's hidden topics and services one by one and never the action, so
+that its name is what is left of theirs. `manifest.names.resolve` is the same without ROS.
 """
 
 from __future__ import annotations
@@ -37,8 +34,8 @@ if TYPE_CHECKING:
 class GoalInterruptedError(LifecycleError):
     """Raised in the handler of an action where it awaits: its goal cannot be worked on any longer.
 
-    A handler may catch it to leave things as they should be, and may still say what its goal came
-    to and return a result; it must not await anything any more.
+    A handler may catch it to leave things as they should be, and may still set its goal's final
+    state and return a result; it must not await anything any more.
     """
 
 
@@ -160,11 +157,11 @@ class Goals:
     Args:
         handler: the author's methods.
         action_type: the action class.
-        words: for messages.
+        words: names for messages.
         is_open: the node is active.
 
     Attributes:
-        server: set by who makes it, before it can have a goal.
+        server: set by its maker, before it can have a goal.
     """
 
     def __init__(
@@ -184,7 +181,7 @@ class Goals:
         self.server: GoalServer | None = None
 
     def open(self) -> None:
-        """Goals come by themselves."""
+        """Goals arrive by themselves."""
 
     def close(self) -> None:
         """End what is left: the node is no longer active."""

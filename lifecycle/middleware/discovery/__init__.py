@@ -1,1 +1,1 @@
-"""Who finds whom: ranges, servers, probes, liveliness, and finding each other again."""
+"""DDS discovery: range, discovery server, probes, liveliness, rediscovery, dead participants."""

@@ -1,27 +1,24 @@
-"""TCP connections of this process that carry nothing: not answered any more, or never used.
+"""Dead TCP connections of Fast DDS, and removing the DDS participants of a killed process at once.
 
-Owns: which count as dead, and which as unused, asked of the kernel (TCP_INFO of tcp(7)). Must not
-import rclpy.
+Owns: which TCP connections of this process count as dead (not answered any more) and which as
+unused, read from the kernel (TCP_INFO of tcp(7)); and the RTPS message by which a participant
+leaves (DDSI-RTPS 2.3 §8.5.3.3.2, §9.6.3.4, §9.6.3.9), written for one whose process was killed and
+cannot write it, and where it is sent. Must not import rclpy.
 
-Fast DDS 2.14 never comes out of the destruction of a participant whose connection is cut: it waits
-for the thread that reads from it, which waits for the other end (TCPChannelResourceBasic::
-disconnect; measured: 5 of 5). Shutting the socket down wakes that thread.
+Fast DDS 2.14 never returns from the destruction of a participant whose connection is cut: it waits
+for the thread that reads from it, which waits for the other end
+(TCPChannelResourceBasic::disconnect; measured: 5 of 5). Shutting the socket down wakes that thread.
 
-It also never uses a connection whose first answer came before the thread that dialled had noted
-what to ask for next (BIND_CONNECTION_RESPONSE in RTCPMessageManager::processRTCPMessage; seen in
+It also never uses a connection whose first answer arrived before the connecting thread had noted
+what to request next (BIND_CONNECTION_RESPONSE in RTCPMessageManager::processRTCPMessage; seen in
 packets: the request, its answer, and nothing more). Only another participant, on another port,
 helps then.
 
-Removing the DDS participants of a dead process from the graph at once, before their lease ends.
-Owns: the RTPS message by which a participant leaves (DDSI-RTPS 2.3 §8.5.3.3.2, §9.6.3.4,
-§9.6.3.9), written for one whose process was killed and cannot write it, and where it is sent.
-Must not import rclpy.
-
-Whoever knew the participant forgets it and all of its endpoints as if it had left properly
-(Fast DDS 2.14: PDPListener::onNewCacheChangeAdded; measured: within a millisecond). Without it,
-peers and observers show a killed process until its lease has run out, 20 s by default. There is
-no way to check in the message who wrote it, so callers must know that the process is dead, and
-that the participant was that process's.
+Every participant that had discovered the dead one drops it and all of its endpoints as if it had
+left properly (Fast DDS 2.14: PDPListener::onNewCacheChangeAdded; measured: within a millisecond).
+Without the message, peers and observers show a killed process until its lease has run out, 20 s by
+default. A receiver cannot check who wrote the message, so callers must know that the process is
+dead, and that the participant was that process's.
 """
 
 from __future__ import annotations
@@ -41,7 +38,7 @@ from lifecycle.network.connection_url import ConnectionUrl
 from lifecycle.network.medium import Medium
 
 _UNANSWERED = 2
-"""Retransmissions in a row after which a connection is dead for whoever is leaving: the kernel
+"""Retransmissions in a row after which a connection is dead for a leaving process: the kernel
 sends again after 0.2 s and 0.6 s at the earliest, and participants send something each 0.5 s."""
 
 _SYN_SENT = 2  # tcp_states.h
@@ -58,7 +55,7 @@ machine with both processors busy within 0.1 s."""
 
 
 def give_up_dead_connections() -> int:
-    """Shut down every TCP connection of this process that nobody answers; return how many.
+    """Shut down every TCP connection of this process that is not answered; return how many.
 
     For a process that is about to end: an accepted connection that is shut down is not made again.
     """
@@ -73,10 +70,10 @@ def give_up_dead_connections() -> int:
 
 
 def is_used(address: str, port: int) -> bool | None:
-    """Tell whether the connection that this process dialled is used by Fast DDS.
+    """Return whether the connection that this process dialled is used by Fast DDS.
 
     Args:
-        address: IPv4, whom it was dialled to.
+        address: IPv4, of the other end.
         port: likewise.
 
     Returns:
@@ -94,7 +91,7 @@ def is_used(address: str, port: int) -> bool | None:
 
 def _is_used(info: bytes) -> bool | None:
     if len(info) < _BYTES_RECEIVED + 8:
-        return True  # before Linux 4.2 it cannot be told
+        return True  # before Linux 4.2 it cannot be known
     (idle_ms,) = struct.unpack_from("=I", info, _LAST_RECEIVED_MS)
     acked, received = struct.unpack_from("=QQ", info, _BYTES_ACKED)
     if acked >= _FIRST_REQUEST:
@@ -127,7 +124,7 @@ its own behind them (GuidPrefix_t::create); all participants of a process share 
 
 
 def is_of_process(prefix: str, pid: int, like: str) -> bool:
-    """Tell whether a participant may be one of a process of this host, by its GUID prefix.
+    """Return whether a participant may be one of a process of this host, by its GUID prefix.
 
     Fast DDS keeps the lower 16 bits of a pid: False is certain, True is not.
 
@@ -172,18 +169,18 @@ def remove_participants(
     environment: Mapping[str, str],
     pids: Iterable[int] = (),
 ) -> None:
-    """Have everybody forget participants whose process is dead.
+    """Make all peers drop participants whose process is dead.
 
-    It is sent to whom an observer with these URLs could meet by UDP, and to the UDP sockets of some
-    processes, whose participants may be connected by ports that only they know. Nothing is said to
-    those who are reached over shared memory or TCP alone: for them the lease has to run out. Our
+    It is sent to all that an observer with these URLs could find by UDP, and to the UDP sockets of
+    some processes, whose participants may be connected by ports that only they know. Nothing is
+    sent to those reached over shared memory or TCP alone: for them the lease has to run out. Our
     own observer does not count what is dead (`StaleNodeFilter.ignore`).
 
     Args:
         prefixes: GUID prefixes, 24 hex digits each.
         domain_id: 0–232.
         urls: of this process's observer.
-        environment: see `doors.knock_for`.
+        environment: see `probe.knock_for`.
         pids: of processes on this host that must forget them too.
     """
     messages = [disposal(each) for each in prefixes]

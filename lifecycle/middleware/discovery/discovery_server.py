@@ -1,4 +1,4 @@
-"""Fast DDS's discovery server: how it is started, and when it listens.
+"""Fast DDS discovery server: command line, environment, and whether it listens.
 
 Owns: the command line and environment of `fast-discovery-server`, and the readiness test. Starting,
 watching and ending it is supervisor/'s. Must not import rclpy.

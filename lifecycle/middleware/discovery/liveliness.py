@@ -1,17 +1,16 @@
-"""Being heard, and noticing who is not heard any more.
+"""Liveliness (MANUAL_BY_TOPIC): assert that a process is alive, and detect when its lease expires.
 
-Owns: the topics by which participants assert that they are there. A thread of ours asserts the
-liveliness of a MANUAL_BY_TOPIC writer: it ends with SIGSTOP and SIGKILL, and does not arrive over a
-link that is cut. The reader's lease says how long it may stay unheard (DDS 1.4 §2.2.3.11), so many
-assertions may be lost between. A callback that keeps the interpreter's lock for longer is not heard
-either.
+Owns: the topics by which participants assert their liveliness. A thread of ours asserts that of a
+MANUAL_BY_TOPIC writer: it ends with SIGSTOP and SIGKILL, and does not arrive over a link that is
+cut. The reader's lease is the longest allowed time between assertions (DDS 1.4 §2.2.3.11), so many
+of them may be lost between. A callback that holds the interpreter's lock for longer expires it too.
 
 Fast DDS 2.14 does not repeat an assertion that was lost on the way (measured: with one each 0.2 s,
 30 % loss and a lease of 0.9 s, five false alarms a minute), so it is asserted this often. It would
 assert an AUTOMATIC writer by itself, and hangs with it: its event thread then waits for the
-discovery's mutex, which who takes a leaving peer's writer away holds while waiting for the event
-thread (WLP::automatic_liveliness_assertion, WriterProxy::stop; seen in 1 of about 80 take-downs of
-two hosts with six nodes each).
+discovery's mutex, which the thread that removes a leaving peer's writer holds while waiting for the
+event thread (WLP::automatic_liveliness_assertion, WriterProxy::stop; seen in 1 of about 80
+take-downs of two hosts with six nodes each).
 """
 
 from __future__ import annotations
@@ -40,27 +39,28 @@ from std_msgs.msg import Empty, String
 from lifecycle.codec import from_json
 
 UNHEARD_S = 0.85
-"""Who was not heard for so long is lost: within a second with all that follows."""
+"""A participant whose liveliness was not asserted for so long is lost: within a second with all
+that follows."""
 
 ASSERTED_EACH_S = 0.06
 """Fourteen fit into UNHEARD_S. At 30 % loss all of them are lost once in thousands of runs of ten
-minutes; one takes about 150 bytes to each participant that knows us."""
+minutes; one takes about 150 bytes to each participant that has discovered us."""
 
 _LONGEST_NOTICE = 1 << 16
 """Characters of a notice; a line for each silent node."""
 
 _logger = logging.getLogger(__name__)
 _PULSE = "_pulse"
-"""Ends the name of the topic that is asserted; the other one says what there is to say."""
+"""Ends the name of the topic that is asserted; the other one carries messages."""
 
 
 def machine_topic(system: str, machine: str) -> str:
-    """Return the hidden topic by which the supervisor of a machine is heard."""
+    """Return the hidden topic on which the supervisor of a machine asserts its liveliness."""
     return f"/_lifecycle/{system.replace('-', '_')}/{machine}/alive"
 
 
 def node_topic(full_name: str) -> str:
-    """Return the hidden topic by which a node is heard that has no supervisor."""
+    """Return the hidden topic on which a node without a supervisor asserts its liveliness."""
     return f"{full_name}/_alive"
 
 
@@ -84,14 +84,14 @@ _no_subscription_events = functools.partial(SubscriptionEventCallbacks, use_defa
 
 @typing.final
 class AlivePublisher:
-    """Makes the participant of `node` heard, for as long as it lives, by whoever listens.
+    """Asserts the liveliness of the participant of `node` to its subscribers while it lives.
 
-    Nothing is asserted while nobody listens.
+    Nothing is asserted while there is no subscriber.
 
     Args:
         node: an executor spins it.
-        topic: its own; nobody else publishes it.
-        on_listener: called in the executor's thread when somebody begins to listen.
+        topic: its own; published by nothing else.
+        on_listener: called in the executor's thread when a subscriber is matched.
     """
 
     def __init__(
@@ -111,15 +111,15 @@ class AlivePublisher:
         )
 
     def tell(self, silent: Mapping[str, str]) -> None:
-        """Say which of our nodes are silent, and why each is; from any thread.
+        """Publish which of our nodes are silent, and why each is; from any thread.
 
-        It is said to whoever listens now or later. A message may be lost for some seconds: say it
-        again.
+        Present and later subscribers receive it. A message may be lost for some seconds: publish
+        it again.
         """
         self._publisher.publish(String(data=json.dumps(dict(silent))))
 
     def destroy(self) -> None:
-        """Leave, which is heard and is not a loss."""
+        """Leave properly, which peers see and do not count as a loss."""
         self._pulse.end()
         Node.destroy_publisher(self._node, self._publisher)
 
@@ -161,7 +161,7 @@ class _Pulse:
                 self._changed.notify()
 
     def still(self) -> None:
-        """Leave, which is heard and is not a loss; harmless if it has not begun."""
+        """Leave properly, which peers do not count as a loss; harmless if it has not begun."""
         with self._changed:
             publisher, self._publisher = self._publisher, None
             if publisher is not None:
@@ -186,14 +186,14 @@ class _Pulse:
 
 @typing.final
 class AliveSubscription:
-    """Hears one AlivePublisher.
+    """Follows one AlivePublisher.
 
     Args:
-        node: an executor spins it; callbacks come in that executor's thread.
+        node: an executor spins it; callbacks run in that executor's thread.
         topic: of the publisher.
-        on_heard: told True when it is heard, False when it is not any more.
-        on_left: told that it left properly.
-        on_told: told what `AlivePublisher.tell` said.
+        on_heard: called with True when it is alive, False when its lease has expired.
+        on_left: called when it left properly.
+        on_told: called with what `AlivePublisher.tell` published.
     """
 
     def __init__(
@@ -217,7 +217,7 @@ class AliveSubscription:
             try:
                 on_told(from_json(message.data, dict[str, str], longest=_LONGEST_NOTICE))
             except ValueError as error:
-                # Anybody may write the topic, and no executor thread may end by it.
+                # Any participant may write the topic, and no executor thread may end by it.
                 _logger.warning("cannot read what is silent: %s", error)
 
         self._node = node
@@ -235,7 +235,7 @@ class AliveSubscription:
         )
 
     def destroy(self) -> None:
-        """Hear no more."""
+        """Destroy the subscriptions."""
         for each in self._subscriptions:
             self._node.destroy_subscription(each)
 

@@ -1,8 +1,8 @@
-"""The topic on which supervisors of one domain announce what they planned.
+"""The topic on which supervisors of one domain publish their plans, to detect conflicts.
 
-Owns: `PlanNotices`. The name of the topic holds no system: who was started with another manifest
-must be noticed too. The last notice of each is kept for those who come later. What it says is text
-here, see lifecycle.plan.comparison.
+Owns: `PlanNotices`. The name of the topic holds no system: a supervisor that was started with
+another manifest must be noticed too. The last notice of each is kept for late joiners. Its content
+is text here, see lifecycle.plan.comparison.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class PlanNotices:
     """Announces our plan and receives those of others; `destroy` it.
 
     Args:
-        node: an executor spins it; callbacks come in that executor's thread.
+        node: an executor spins it; callbacks run in that executor's thread.
         on_notice: called with each text that arrives, our own too.
     """
 
@@ -56,7 +56,7 @@ class PlanNotices:
         )
 
     def announce(self, text: str) -> None:
-        """Announce `text` to all who are there and who come later; from any thread."""
+        """Publish `text` to present and later subscribers; from any thread."""
         self._text = text
         self._publisher.publish(String(data=text))
 

@@ -1,19 +1,16 @@
-"""Asking who is there: one discovery announcement, answered by every participant that hears it.
+"""Discovery probe: an announcement that makes every reachable DDS participant answer at once.
 
 Owns: the announcement of a participant that does not exist, as DDSI-RTPS 2.3 writes it (§8.3.5,
-§9.4, §9.6.2.2), and the list of those who answered. Must not import rclpy.
+§9.4, §9.6.2.2); the participants that answered; and which participants' discovery ports it is sent
+to, for the discovery settings in the environment and for connection URLs. Shared memory, TCP and a
+discovery server cannot be probed, and nothing is sent where the system's own discovery would send
+nothing. Must not import rclpy.
 
 Why: Fast DDS 2.14 sends a new participant's first announcement before it listens, so an answer on
-the same host comes too early and is lost; the one who answered stays quiet for its next 3 s
-(measured: in about half of all tries). A gate that opens meanwhile has not seen that participant.
-An announcement sent once we do listen, under a name of its own, is answered to our participant's
-port, and to a socket of ours that counts who is there.
-
-Where to knock for everybody that an observer could meet. Owns: which participants' discovery
-ports are asked, for what the environment says of discovery and for connection URLs, and where
-that is impossible: nobody can be asked over shared memory or TCP, nor behind a discovery
-server. Nothing is sent where the system's own discovery would send nothing. Must not import
-rclpy.
+the same host arrives too early and is lost; the participant that answered stays quiet for its next
+3 s (measured: in about half of all tries). A gate that opens meanwhile has not seen that
+participant. An announcement sent once we do listen, under a GUID prefix of its own, is answered to
+our participant's port, and to a socket of ours that counts the participants.
 """
 
 from __future__ import annotations
@@ -49,17 +46,17 @@ from lifecycle.network.ports import DG, PARTICIPANTS_PER_DOMAIN, participant_por
 RANGE_VARIABLE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 
 _LEASE_S = 0.5
-"""Whoever answered forgets the participant that does not exist after so long."""
+"""Peers that answered drop the participant that does not exist after so long."""
 
 _PREFIX_BYTES = 12
-HEADER = b"RTPS\x02\x03\x01\x0f"  # protocol 2.3, vendor eProsima: who else would be answered?
+HEADER = b"RTPS\x02\x03\x01\x0f"  # protocol 2.3, vendor eProsima: would others be answered?
 _UDPV4, _UDPV6 = 1, 2
 """LOCATOR_KIND_UDPv4 and LOCATOR_KIND_UDPv6 (DDSI-RTPS 9.3.1)."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Door:
-    """Where to knock: a discovery port of one participant, or a group that several hear.
+    """Where a probe is sent: the discovery port of one participant, or a multicast group.
 
     Attributes:
         address: IPv4 or IPv6.
@@ -76,15 +73,15 @@ class Knock:
     """One announcement and its answers; close it when they are not needed any more.
 
     Args:
-        doors: where it is sent, all IPv4 or all IPv6.
+        doors: where to send it, all IPv4 or all IPv6.
         addresses: own ones of that family, at which answers arrive.
-        receiver_ports: UDP ports on which our participant hears discovery, see `discovery_ports`.
+        receiver_ports: UDP ports where our participant receives discovery, see `discovery_ports`.
         output_port: the fixed source port of all that our participant sends, if it has one. Then
             nothing may come from or go to any other: it is sent by the participant's own socket,
             and answers are not counted.
 
     Attributes:
-        counts: whether `answered` says who answered.
+        counts: whether `answered` lists the participants that answered.
     """
 
     def __init__(
@@ -107,7 +104,7 @@ class Knock:
             self._socket = own_udp_socket(family, output_port)
         else:
             self._socket = socket.socket(family, socket.SOCK_DGRAM)
-            self._socket.bind(("", 0))  # answers come to every address we name
+            self._socket.bind(("", 0))  # answers arrive at every address we name
             own = (self._socket.getsockname()[1],)
         self._send((*own, *self._receivers))
         if not self.counts:
@@ -116,12 +113,12 @@ class Knock:
     def ask_again(self, *, to_count: bool) -> None:
         """Send one more announcement, of another participant that does not exist.
 
-        Not everybody answers to each address that an announcement has: Cyclone DDS chooses one, and
+        Not every RMW answers to each address that an announcement has: Cyclone DDS chooses one, and
         does not announce itself again for 8 s and more.
 
         Args:
-            to_count: it is answered to us alone, so that it is known where everybody is; else to
-                our participant alone, so that it discovers who was only counted so far.
+            to_count: it is answered to us alone, so that all addresses are known; else to
+                our participant alone, so that it discovers those only counted so far.
         """
         if self._socket is not None:
             self._send((self._socket.getsockname()[1],) if to_count else self._receivers)
@@ -149,14 +146,14 @@ class Knock:
         return dict(self._answers)
 
     def close(self) -> None:
-        """Hear no more answers."""
+        """Receive no more answers."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
 
 
 def send(sender: socket.socket, message: bytes, doors: Iterable[Door]) -> None:
-    """Send a datagram to each door, without waiting.
+    """Send a datagram to each destination, without waiting.
 
     A full buffer or an interface without a route costs one listener, not the sender.
     """
@@ -206,7 +203,7 @@ def announcement(locators: Iterable[tuple[str, int]]) -> bytes:
 
 
 def discovery_ports(domain_id: int, kind: Medium = Medium.UDPV4) -> tuple[int, ...]:
-    """Return the UDP ports of this process on which participants hear discovery.
+    """Return the UDP ports of this process on which participants receive discovery.
 
     Read from the kernel, never inferred: a taken port moves a participant to another one.
 
@@ -241,17 +238,17 @@ _FAMILIES = {Medium.UDPV4: socket.AF_INET, Medium.UDPV6: socket.AF_INET6}
 def knock_for(
     domain_id: int, urls: Sequence[ConnectionUrl], environment: Mapping[str, str]
 ) -> tuple[Knock, ...]:
-    """Ask everybody whom an observer with these URLs could meet; close what is returned.
+    """Probe every participant that an observer with these URLs could find; close the result.
 
     Args:
         domain_id: 0–232.
         urls: the observer's; none for what the RMW does by itself. Its participant listens already.
         environment: where ROS_AUTOMATIC_DISCOVERY_RANGE is looked up, for URLs that leave discovery
-            open. OFF asks nobody, SUBNET (the default) asks this host, by multicast, and those of
+            open. OFF probes nothing, SUBNET (the default) this host, by multicast, and those of
             ROS_STATIC_PEERS, everything else this host only.
 
     Returns:
-        One per address family; none where it is impossible to ask.
+        One per address family; none where probing is impossible.
     """
     found = families(urls)
     if not all(family.udp for family in found) or any(url.server for url in urls):
@@ -270,7 +267,7 @@ def knock_for(
 def doors_of(
     domain_id: int, urls: Sequence[ConnectionUrl], environment: Mapping[str, str]
 ) -> tuple[tuple[str, tuple[Door, ...]], ...]:
-    """Return where everybody is reached by UDP whom an observer with these URLs could meet.
+    """Return the UDP destinations of all participants that an observer with these URLs could find.
 
     Args:
         domain_id: 0–232.
@@ -278,7 +275,7 @@ def doors_of(
         environment: as for `knock_for`.
 
     Returns:
-        UDPV4 or UDPV6 and the doors of that family; nothing where discovery allows no UDP.
+        UDPV4 or UDPV6 and the destinations of that family; nothing where discovery allows no UDP.
     """
     if any(url.server for url in urls) or (not urls and chosen_otherwise(environment)):
         return ()
@@ -302,8 +299,8 @@ def _range(environment: Mapping[str, str]) -> str:
 def chosen_otherwise(environment: Mapping[str, str]) -> bool:
     """Whether the user's own settings of Fast DDS say how participants without URLs are found.
 
-    A discovery server, transports, or where to look for others: then nobody may be asked over UDP,
-    which those settings may have ruled out.
+    A discovery server, transports, or where to look for others: then nothing may be probed over
+    UDP, which those settings may have ruled out.
     """
     if environment.get("ROS_DISCOVERY_SERVER") or not _has_udpv4(environment):
         return True
@@ -334,7 +331,7 @@ def peers_environment(hosts: Iterable[str], environment: Mapping[str, str]) -> M
     """Return ROS_STATIC_PEERS with these hosts beside those of the user's; rmw reads it.
 
     It looks at the first four participants of each, and only with the range SUBNET. Participants
-    without UDP over IPv4 would look for nobody else then, so where the user's settings take it
+    without UDP over IPv4 would look for no others then, so where the user's settings take it
     away, nothing is added.
 
     Args:

@@ -1,16 +1,16 @@
-"""Finding each other again, soon after a link has come back.
+"""Rediscovery after a link is back: announcements, node names in the graph, TCP retransmission.
 
-Owns: what is sent while somebody is out of reach, and what makes node names whole again. Two
-participants that lost each other for longer than their lease (20 s) forget one another, and then
-each announces itself once in 3 s. `call_out` makes both sides announce themselves at once: whoever
-hears the announcement of a participant that does not exist answers to where it seems to be (see
-probe.py). And rmw_dds_common keeps the name of a node that was forgotten out of the graph until
-its participant tells its entities anew, which `tell_names` makes it do.
+Owns: what is sent while a peer is unreachable, what makes node names complete again, and how long
+the kernel waits at most before it retransmits over TCP.
 
-TCP connections over a link that is down, tried often enough to heal with it. Owns: how long the
-kernel waits at most before it sends again what nobody acknowledged: it waits twice as long each
-time, up to 120 s, so that after an outage nothing passes for about as long again (RFC 6298
-§5.5). Must not import rclpy.
+Two participants that lost each other for longer than their lease (20 s) drop one another, and then
+each announces itself once in 3 s. `call_out` makes both sides announce themselves at once: a
+participant that receives the announcement of one that does not exist answers to where it seems to
+be (see probe.py). rmw_dds_common keeps the name of a node that was dropped out of the graph until
+its participant publishes its entities anew, which `tell_names` makes it do.
+
+The kernel doubles the time between TCP retransmissions each time, up to 120 s, so that after an
+outage nothing passes for about as long again (RFC 6298 §5.5).
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ from lifecycle.network.medium import Medium
 from lifecycle.network.ports import participant_ports
 
 _PARTICIPANTS = 32
-"""Of a host whose address is known; who has more of them is reached by multicast."""
+"""Of a host whose address is known; further participants are reached by multicast."""
 
 _ANSWERED_AT = 32
 """Participants of this host that an announcement names; each is 56 bytes of one datagram."""
@@ -71,7 +71,7 @@ def call_out(
     Args:
         domain_id: 0–232.
         urls: our participant's; none for what the RMW does by itself.
-        peers: addresses of the hosts that are out of reach, where nothing lists participants.
+        peers: addresses of the unreachable hosts, where nothing lists participants.
         environment: where ROS_AUTOMATIC_DISCOVERY_RANGE and settings of Fast DDS are looked up.
     """
     if any(url.server for url in urls) or (not urls and chosen_otherwise(environment)):
@@ -82,7 +82,7 @@ def call_out(
             _call_listed(domain_id, family)
         return
     if environment.get(RANGE_VARIABLE, "").upper() in ("LOCALHOST", "OFF"):
-        return  # nobody is looked for on another host
+        return  # nothing is looked for on another host
     kinds = tuple(family.kind for family in found) if urls else (Medium.UDPV4,)
     for kind in kinds:
         ipv6 = kind is Medium.UDPV6
@@ -131,13 +131,13 @@ def _call_listed(domain_id: int, family: UrlTransport) -> None:
 
 
 def tell_names(nodes: Iterable[Node]) -> None:
-    """Have the participants of `nodes` tell anew which nodes and endpoints they have.
+    """Make the participants of `nodes` publish anew which nodes and endpoints they have.
 
-    rmw_fastrtps does so whenever an entity is made or unmade. Take one node of each participant.
+    rmw_fastrtps does so whenever an entity is made or destroyed. Take one node of each participant.
     """
     for node in nodes:
         # Every node publishes parameter events: a second publisher of them, for a moment, is
-        # nothing new to anybody.
+        # nothing new to any peer.
         publisher = Node.create_publisher(
             node,
             ParameterEvent,
@@ -159,9 +159,9 @@ _TCP_RTO_MAX_MS = 44  # linux/tcp.h, since Linux 6.15
 
 
 def send_again_soon() -> int:
-    """Have every TCP connection of this process send again within `AT_MOST_S`, for good.
+    """Make every TCP connection of this process retransmit within `AT_MOST_S`, for good.
 
-    What is dialled later waits as long as ever; who is accepted by a socket that listens now does
+    What is dialled later waits as long as ever; those accepted by a socket that listens now do
     not.
 
     Returns:

@@ -1,1 +1,1 @@
-"""Fast DDS participants with settings of their own: profiles, URLs, flows."""
+"""Fast DDS participants with their own settings: XML profiles, connection URLs, network flows."""

@@ -3,7 +3,7 @@
 Owns: the few C++ functions of libfastrtps 2.14 that no environment variable replaces: profiles are
 read from the environment once per process, and rmw_fastrtps gives every participant the factory's
 default QoS. All of it is called by mangled name through ctypes; the DomainParticipantQos objects
-stay opaque, made and unmade by their own constructor and destructor.
+stay opaque, made and destroyed by their own constructor and destructor.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ def load_profile(name: str, xml: str) -> None:
 def default_participant(name: str) -> Iterator[None]:
     """Have participants that are created inside the block made from a loaded profile.
 
-    The default QoS before it is put back exactly, whoever set it. One block at a time: other
+    The default QoS before it is put back exactly, whatever set it. One block at a time: other
     threads that use this function wait; participants that they create otherwise meanwhile get this
     profile too.
 
@@ -162,7 +162,7 @@ def endpoint_profiles(xml: str) -> Iterator[None]:
 
     rmw_fastrtps looks for a profile by an endpoint's topic, and Fast DDS keeps the first that it
     was given for good: so all profiles are forgotten, and those of the environment's files loaded
-    again, before and after. Profiles that somebody else loaded from the program are lost. Other
+    again, before and after. Profiles that other code loaded from the program are lost. Other
     threads must not create endpoints meanwhile; those of this function wait.
 
     Raises:

@@ -1,13 +1,13 @@
-"""A DDS participant of its own: for a network flow of its own, or for a connection.
+"""An extra DDS participant for one network flow or connection: its DSCP, ports and shared memory.
 
-Owns: the hidden node in its own rclpy context that such endpoints live on. Fast DDS opens sockets
-per participant, so a publisher is told apart on the network by getting a participant; see *Unique
-Network Flows*, "Alternatives". A connection (`connect_to` of *Topological Discovery and
-Communication Negotiation*) is one as well, made from connection URLs. One costs about 2.5 MB,
-7 threads, 6 sockets and 6–10 ms.
+Owns: the hidden node in its own rclpy context that such endpoints live on; and what a participant's
+URLs request and what of that it has got: its one DSCP, the sockets on the ports that its URLs name,
+and whether it has shared memory.
 
-What a participant was asked for by its URLs, and what of that it has got. Owns: the one DSCP of
-a participant, the sockets on ports that its URLs name, and whether it has shared memory.
+Fast DDS opens sockets per participant, so a publisher becomes distinguishable on the network by
+getting a participant; see *Unique Network Flows*, "Alternatives". A connection (`connect_to` of
+*Topological Discovery and Communication Negotiation*) is one as well, made from connection URLs.
+One costs about 2.5 MB, 7 threads, 6 sockets and 6–10 ms.
 """
 
 from __future__ import annotations
@@ -53,10 +53,10 @@ _UDP_ALONE = "only UDP sockets can be marked"
 
 
 def one_dscp(dscp: int | None, settings: ParticipantSettings) -> int | None:
-    """Return the DSCP that is asked for, by whoever asks.
+    """Return the requested DSCP, from whichever source.
 
     Fast DDS opens TCP connections whenever it has something to send and lists none of them, so
-    whoever would mark them comes too late (ip(7): a connection is marked by its own socket).
+    marking them is always too late (ip(7): a connection is marked by its own socket).
 
     Raises:
         MiddlewareError: by several, and differently; or for what has no UDP socket.
@@ -90,7 +90,7 @@ def fixed_sockets(settings: ParticipantSettings) -> set[int]:
 
 
 def uses_shared_memory(node: Node, settings: ParticipantSettings) -> bool:
-    """Tell whether it has the transport, without a probe that static discovery would not allow."""
+    """Return if it has the transport, without a probe that static discovery would not allow."""
     if settings.urls:
         return any(url.transport is Medium.SHM for url in settings.urls)
     return has_shared_memory(node)
@@ -129,7 +129,7 @@ class FlowParticipant:
             resolved and must not be remapped again.
         connections: what it is connected to and by; then `transports` must be empty.
         served: the node whose executor runs the callbacks of subscriptions, services and clients
-            made here, gated by its callback groups; None leaves them to whoever spins `node`.
+            made here, gated by its callback groups; None leaves them to the executor of `node`.
 
     Raises:
         ConnectionUrlError: a URL that is none.
@@ -175,7 +175,7 @@ class FlowParticipant:
         self._fixed = fixed_sockets(settings) - before
         try:
             # Every publisher of a participant lists the same sender sockets; rclpy's parameter
-            # event publisher tells them before there is any publisher of the user's.
+            # event publisher lists them before there is any publisher of the user's.
             probe = next(iter(self.node.publishers))
             self._nfes = get_network_flow_endpoints(probe)
             if dscp is not None:
@@ -240,7 +240,7 @@ class FlowParticipant:
     ) -> Subscription:
         """Create a subscription on this participant; `topic` should be fully qualified.
 
-        Its callback runs in the executor of the node served, else of whoever spins `self.node`.
+        Its callback runs in the executor of the node served, else in that of `self.node`.
         Its port is given back when the participant is destroyed, which is never for a unique
         subscription on a node that stays (see `create_subscription` of this room).
         """
@@ -340,11 +340,11 @@ class FlowParticipant:
             self._guests.remove(entity)
 
     def ensure_dscp(self) -> None:
-        """Mark sender sockets that came, or lost their mark, since the participant was made.
+        """Mark sender sockets that were opened, or lost their mark, since the participant was made.
 
         Half a millisecond. It is called before a publisher or subscription is handed out, and by
         no reading: what reads and marks at once finds every mark in place. No socket of Fast DDS
-        2.14 is known to come later (see `lifecycle.middleware.sockets.dscp`).
+        2.14 is known to open later (see `lifecycle.middleware.sockets.dscp`).
 
         Raises:
             MiddlewareError: the mark cannot be set.
@@ -371,7 +371,7 @@ class FlowParticipant:
         return min(others, default=self._dscp)
 
     def _look_at_sockets(self) -> bool:
-        """List the sender sockets anew, as far as a publisher tells them; whether they changed."""
+        """List the sender sockets anew, as far as a publisher lists them; whether they changed."""
         publisher = next(iter(self.node.publishers), None)
         if self._context is None or publisher is None:
             return False  # those that were there when it was made
@@ -394,7 +394,7 @@ class FlowParticipant:
         When it returns, its fixed ports are free, if no callback blocks the executor that waits
         for its endpoints.
         """
-        self._nfes = ()  # its ports may belong to somebody else from now on
+        self._nfes = ()  # its ports may belong to another process from now on
         for entity in tuple(self._guests):
             self.destroy_endpoint(entity)
         forget_hidden(self.node)

@@ -1,15 +1,15 @@
-"""The Fast DDS profile of one participant that must differ from the process's default.
+"""The Fast DDS XML profile of one participant, and static endpoint discovery (STATIC EDP).
 
-Owns: the XML, made from what the participant needs, from the default participant profile that is in
-force anyway (the user's own, or our quick discovery) and from the discovery that rmw_fastrtps would
-have set up. Nothing of a profile of the user's is changed or lost; where it already chooses
-transports, it is refused to choose others. Must not import rclpy; nothing is applied here.
+Owns: the XML of a participant that must differ from the process's default, made from what the
+participant needs, from the default participant profile that is in force anyway (the user's own, or
+our quick discovery) and from the discovery that rmw_fastrtps would have set up; and, for endpoints
+that participants know without announcing them, the table of all participants' endpoints and the
+endpoint profiles that tie an endpoint to its line of the table. Must not import rclpy; nothing is
+applied here.
 
-Endpoints that participants know of each other without announcing them (Fast DDS STATIC EDP).
-Owns: the table of all participants' endpoints and the endpoint profiles that tie an endpoint to
-its line of the table. Participants still announce themselves, and in that which lines of the
-table exist: who they are and where is announced, what they publish is not. Must not import
-rclpy.
+Nothing of a user's profile is changed or lost; where it already chooses transports, choosing others
+is refused. With static endpoints, participants still announce themselves, and in that which lines
+of the table exist: who they are and where is announced, what they publish is not.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def endpoint_table(participants: Sequence[StaticParticipant]) -> str:
     """Return the table as XML, <staticdiscovery>.
 
     Raises:
-        MiddlewareError: an id is out of range or stands twice.
+        MiddlewareError: an id is out of range or occurs twice.
     """
     seen: dict[int, str] = {}
     root = ET.Element("staticdiscovery")
@@ -107,7 +107,7 @@ def find_endpoint(
         type_name: DDS name of its type.
 
     Raises:
-        MiddlewareError: the table has none like it: nobody would ever find this endpoint.
+        MiddlewareError: the table has none like it: no participant would ever find this endpoint.
     """
     for each in endpoints:
         if (each.writer, each.profile, each.type) == (writer, profile, type_name):
@@ -157,7 +157,7 @@ class ParticipantSettings:
         non_blocking_send: a send that finds the socket's buffer full drops the datagram instead of
             waiting: a reliable writer sends it again, a best effort one has lost it.
         urls: what it is connected to and by; then `transports` must be empty.
-        super_client: as a client of a discovery server, be told of everything.
+        super_client: as a client of a discovery server, receive everything.
         static_participants: whose endpoints are known without being announced, its own too.
         static_name: its own name among them; its context must have it as its enclave.
 
@@ -259,7 +259,7 @@ class DefaultProfile:
     """A participant profile that every participant of the process gets.
 
     Attributes:
-        file: where it stands.
+        file: that holds it.
         name: its `profile_name`.
         element: <participant>, without namespaces.
     """

@@ -1,12 +1,12 @@
-"""Fast DDS participant profiles that are applied through the environment.
+"""Fast DDS participant profiles applied through the environment, and the XML elements of profiles.
 
-Owns: the quick discovery profile. Fast DDS announces a new participant five times at 100 ms and
-then once each 3 s; when those five are lost or come too early, discovery stalls in steps of 3 s.
-Forty announcements at 50 ms remove the stall. The environment is used, not Fast DDS's C++ API: the
-children of a supervisor, whatever they are written in, inherit it. Must not import rclpy.
+Owns: the quick discovery profile, and text elements and locators as Fast DDS 2.14's XML parser
+reads them. Must not import rclpy.
 
-The few shapes of elements that Fast DDS profiles are made of. Owns: text elements and locators,
-as Fast DDS 2.14's XML parser reads them. Must not import rclpy.
+Fast DDS announces a new participant five times at 100 ms and then once each 3 s; when those five
+are lost or arrive too early, discovery stalls in steps of 3 s. Forty announcements at 50 ms remove
+the stall. The environment is used, not Fast DDS's C++ API: the children of a supervisor, whatever
+they are written in, inherit it.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def discovery_profile(
     Args:
         announcements: how often a new participant announces itself at once, > 0.
         period_ms: between two of them, 1–999.
-        peers: IP address and UDP port of whom it is announced to; all of them, because they replace
+        peers: IP addresses and UDP ports that it is announced to; all of them, because they replace
             the groups by which Fast DDS otherwise does.
 
     Raises:
@@ -138,7 +138,7 @@ def tcp_locator(
         parent: the list.
         address: empty for any.
         physical: the port that is listened on; None for the transport's.
-        logical: the port inside the connection, which Fast DDS tells traffic apart by; None for
+        logical: the port inside the connection, which Fast DDS separates traffic by; None for
             the well-known ones.
     """
     element = ET.SubElement(ET.SubElement(parent, "locator"), Medium.TCPV4.value)

@@ -1,14 +1,14 @@
-"""Settings of a participant, applied to the one that a context is about to get.
+"""Participant settings and discovery range of an rclpy context, applied while rmw makes it.
 
-Owns: bringing a ParticipantSettings into force at the only moment there is: while rmw_fastrtps
-makes the participant, which is when the first node of a context is constructed.
+Owns: applying a ParticipantSettings at the only moment there is: while rmw_fastrtps makes the
+participant, which is when the first node of a context is constructed; and reading how far that
+participant looks for others (the discovery range that rmw gets), and taking it away from
+rmw_fastrtps.
 
-How far a context's participant looks for others, as rmw will be told when it makes it. Owns:
-reading that, and taking it out of rmw_fastrtps's hands. For LOCALHOST it adds a shared memory
-and a UDP transport to whatever a profile says (create_participant of rmw_fastrtps_shared_cpp),
-so a participant without shared memory has to bring the same discovery in its own profile; for
-SUBNET it adds a multicast group as soon as there is a static peer. Layouts are those of rmw 7:
-rmw/{init,init_options,discovery_options}.h.
+For LOCALHOST it adds a shared memory and a UDP transport to whatever a profile says
+(create_participant of rmw_fastrtps_shared_cpp), so a participant without shared memory has to bring
+the same discovery in its own profile; for SUBNET it adds a multicast group as soon as there is a
+static peer. Layouts are those of rmw 7: rmw/{init,init_options,discovery_options}.h.
 """
 
 from __future__ import annotations
@@ -170,7 +170,7 @@ def participant_settings(context: Context, settings: ParticipantSettings) -> Ite
     Participants that other contexts get inside the block have the settings as well.
 
     Args:
-        context: initialised, without a node yet; otherwise nothing comes of it.
+        context: initialised, without a node yet; otherwise it has no effect.
         settings: empty ones change nothing, and need no Fast DDS.
 
     Raises:
@@ -212,7 +212,7 @@ def participant_settings(context: Context, settings: ParticipantSettings) -> Ite
         if not settings.urls:
             yield
             return
-        # Under the lock of the default profile: no participant of ours comes in between.
+        # Under the lock of the default profile: no participant of ours is made in between.
         check_free(settings.urls)
         before = {each.inode for each in open_sockets()}
         yield

@@ -34,7 +34,7 @@ def move(entity: Guest, maker: Node, host: Node) -> None:
     """
     if isinstance(entity, Waitable):
         maker.remove_waitable(entity)
-        entity._node = host  # noqa: SLF001 - whose executor works on goals, and who forgets it
+        entity._node = host  # noqa: SLF001 - whose executor works on goals, and which removes it
         host.add_waitable(entity)
         return
     name = _LISTS[type(entity)]
@@ -48,7 +48,7 @@ def move(entity: Guest, maker: Node, host: Node) -> None:
 
 
 def is_guest(entity: object) -> bool:
-    """Whether an endpoint stands on a node whose participant is not its own."""
+    """Whether an endpoint is on a node whose participant is not its own."""
     return entity in _guests
 
 

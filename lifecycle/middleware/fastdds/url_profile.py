@@ -1,16 +1,12 @@
-"""What connection URLs become in a Fast DDS participant profile.
+"""Connection URLs as a Fast DDS participant profile: transports, locators and discovery.
 
-Owns: a participant's transports and where its data arrives. Who is grouped into which transport is
-`url_families`, discovery is `url_discovery`. Must not import rclpy; reads no environment.
+Owns: a participant's transports and where its data arrives; where its discovery arrives, where it
+is sent to, discovery servers, and how often the participant announces itself; the grouping of URLs
+into Fast DDS transports, and which URLs one participant cannot have together. Must not import
+rclpy; reads no environment.
 
-How a participant of connection URLs finds others and is found, in its Fast DDS profile. Owns:
-where discovery arrives, whom it is sent to, discovery servers, and how often a participant
-announces itself. Must not import rclpy; reads no environment.
-
-The transports that connection URLs make, and which URLs one participant cannot have together.
-Owns: the grouping of URLs into Fast DDS transports. Two URLs of one family (IPv4 UDP and a
-group over IPv4) share one transport: Fast DDS would send everything twice by two of a kind.
-Must not import rclpy; reads no environment.
+Two URLs of one family (IPv4 UDP and a group over IPv4) share one transport: with two of a kind Fast
+DDS would send everything twice.
 """
 
 from __future__ import annotations
@@ -170,7 +166,7 @@ DISCOVERY_GROUP = {Medium.UDPV4: "239.255.0.1", Medium.UDPV6: "ff1e::ffff:efff:1
 """Where Fast DDS 2.14 announces participants by multicast."""
 
 ANNOUNCED_S = 0.5
-"""A participant announces itself each so many seconds where nobody can ask it to.
+"""A participant announces itself each so many seconds where it cannot be probed.
 
 Over TCP Fast DDS 2.14 sends nothing while a connection or a port in it is being agreed on, and
 dials again only when there is something to send: what gets lost so comes with the next
@@ -205,7 +201,7 @@ def add_discovery(
         found: the transports of the URLs.
         urls: at least one.
         domain_id: 0–232, for TCP's logical ports.
-        super_client: be told of everything by the discovery server, not only of what matches.
+        super_client: receive everything from the discovery server, not only of what matches.
         localhost_peers: look for others on this host and on these only; for URLs that leave
             discovery open.
     """
@@ -228,7 +224,7 @@ def add_discovery(
     if not all(family.udp for family in found):
         _announce_each(builtin, ANNOUNCED_S)
     if _all_ports_fixed(found):
-        # Else Fast DDS would take other ports for busy ones, and nobody would look there.
+        # Else Fast DDS would take other ports for busy ones, and no peer would look there.
         _text(builtin, "mutation_tries", "0")
 
 
@@ -377,7 +373,7 @@ def add_urls(
         rtps: the participant's; what it said of locators and discovery is replaced.
         urls: at least one.
         domain_id: 0–232, for TCP's logical ports.
-        super_client: be told of everything by the discovery server, not only of what matches.
+        super_client: receive everything from the discovery server, not only of what matches.
         non_blocking_send: on every UDP transport, whatever its URLs say.
         localhost_peers: look for others on this host and on these only; for URLs that leave
             discovery open.

@@ -1,1 +1,1 @@
-"""The process itself: timers, threads, shared memory, and the way out of DDS."""
+"""The process itself: timers, threads, shared memory, and leaving DDS at exit."""

@@ -1,10 +1,10 @@
-"""A sign that says since when one process is busy, and a kernel timer that wakes who watches it.
+"""Hang detection between two processes: a shared busy-since page and a timerfd for the watcher.
 
 Owns: the page of memory and the timerfd(2) that the two processes share. The busy one writes the
 time of day into the page, which costs less than a microsecond and no system call; it arms the timer
-no more than once per limit. The watcher sleeps until the timer fires and then looks at the page. So
-while the one is idle nobody wakes up, and neither the lock of an interpreter, nor a blocked thread,
-nor SIGSTOP keeps the other from noticing. Must not import rclpy.
+no more than once per limit. The watcher sleeps until the timer fires and then reads the page. So an
+idle process causes no wake-ups, and neither the lock of an interpreter, nor a blocked thread, nor
+SIGSTOP keeps the other from noticing. Must not import rclpy.
 
 Time during which the thread could have run and got no processor is not its own: on an overloaded
 machine a callback of milliseconds takes seconds. The kernel counts it for each thread (run_delay of
@@ -134,7 +134,7 @@ class BusySign:
         """Be busy from now on."""
         words = self._words
         words[_SINCE] = time.monotonic_ns()
-        # Read anew, after the page says busy: whoever wakes when the timer fires must see it.
+        # Read anew, after the page says busy: a watcher that the timer wakes must see it.
         now = time.monotonic_ns()
         if now >= self._armed_until:
             limit = words[_LIMIT]

@@ -1,9 +1,8 @@
-"""Process control that Python's standard library lacks.
+"""Linux process control through ctypes: prctl(2), the deadman timer, and the C library.
 
-Owns: prctl(2), the deadman timer of timer_create(2), both through ctypes, and whether threads can
-be started. Linux only. Must not import rclpy: a fork server uses it before rclpy is loaded.
-
-The C library, for what Python does not wrap. Owns: loading it, and timers' arguments.
+Owns: prctl(2), the deadman timer of timer_create(2), loading the C library and its timers'
+arguments, and whether threads can be started: what Python's standard library lacks. Linux only.
+Must not import rclpy: a fork server uses it before rclpy is loaded.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ class TimerSpec(ctypes.Structure):
 
 @functools.lru_cache(maxsize=1)
 def libc() -> ctypes.CDLL:
-    """Return it; `ctypes.get_errno()` tells what failed."""
+    """Return it; `ctypes.get_errno()` says what failed."""
     return ctypes.CDLL(None, use_errno=True)
 
 
@@ -51,7 +50,7 @@ _SIGEV_SIGNAL = 0
 _SIGEV_THREAD = 2
 
 _KILLED_S = 0.5
-"""Between the end by `_exit` and that by SIGKILL, which comes where no thread can be started."""
+"""Between the end by `_exit` and that by SIGKILL, which is used where no thread can be started."""
 
 
 class _SignalEvent(ctypes.Structure):
@@ -69,7 +68,7 @@ class _SignalEvent(ctypes.Structure):
 def adopt_orphans() -> None:
     """Become the parent of every descendant whose own parent dies (PR_SET_CHILD_SUBREAPER).
 
-    They then can be found, signalled and waited for, also after a crash of what stood between.
+    They then can be found, signalled and waited for, also after a crash of what was between.
 
     Raises:
         MiddlewareError: the kernel refused.

@@ -1,8 +1,7 @@
-"""Fast DDS's shared memory files that nobody uses any more.
+"""Remove stale Fast DDS shared memory files from /dev/shm.
 
-Owns: who owns which of them in /dev/shm, and removing what a killed process left: one segment of
-some 540 kB per participant and the files of its ports, which Fast DDS never reclaims. Must not
-import rclpy.
+Owns: which of them are in use, and removing what a killed process left: one segment of some 540 kB
+per participant and the files of its ports, which Fast DDS never reclaims. Must not import rclpy.
 
 A file belongs to a group, `fastrtps_<segment>` or `fastrtps_port<number>`, each with a lock file
 (`_el` exclusive, `_sl` shared) that the owner keeps open and locked, and a port with a named
@@ -133,7 +132,7 @@ def check_room() -> None:
     """Make sure that there is some room in /dev/shm at all.
 
     Raises:
-        MiddlewareError: there is so little that the kernel would end who uses it with SIGBUS.
+        MiddlewareError: there is so little that the kernel would end its users with SIGBUS.
     """
     with contextlib.suppress(OSError):
         there = os.statvfs(_DIRECTORY)
@@ -192,11 +191,11 @@ def _claimed(files: Collection[_SharedFile]) -> Iterator[bool]:
     locked = any(file.is_lock for file in files)
     with contextlib.ExitStack() as claims:
         try:
-            # The semaphore first: who opens the port after this waits until we are done.
+            # The semaphore first: opening the port after this waits until we are done.
             for file in sorted(files, key=lambda each: not each.is_mutex):
                 if file.is_lock or file.is_port or not locked:
                     claims.enter_context(_claim(file))
-            # What came meanwhile belongs to a process that just opens it.
+            # What was made meanwhile belongs to a process that just opens it.
             same = set(_files(next(iter(files)).group)) == set(files)
         except OSError:
             same = False
@@ -208,7 +207,7 @@ def _claim(file: _SharedFile) -> Iterator[None]:
     """Hold one file.
 
     Raises:
-        OSError: another process uses it, or the kernel cannot tell.
+        OSError: another process uses it, or the kernel does not know.
     """
     mode = os.O_RDONLY if file.is_lock else os.O_RDWR
     flags = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK

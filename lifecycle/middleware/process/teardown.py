@@ -1,6 +1,6 @@
-"""The quick and clean way out of a process that had DDS participants.
+"""Clean, bounded exit of a process that had DDS participants.
 
-Owns: leaving in the order that lets peers know at once and leaves nothing in /dev/shm, within a
+Owns: leaving in the order that notifies peers at once and leaves nothing in /dev/shm, within a
 bound. A normal exit sleeps 100 ms in Fast DDS; `os._exit` alone leaves a ghost in the graph for the
 whole lease (20 s) and shared memory files for ever.
 """
@@ -49,8 +49,8 @@ def leave_and_exit(
     """Destroy what is given, flush the standard streams and end the process; never returns.
 
     Executors must have stopped spinning. Destroying a participant can hang in Fast DDS with the
-    GIL held: at the deadline the process ends with the same code all the same, and whoever
-    supervises it sweeps /dev/shm (`lifecycle.middleware.process.shared_memory`).
+    GIL held: at the deadline the process ends with the same code all the same, and its
+    supervisor sweeps /dev/shm (`lifecycle.middleware.process.shared_memory`).
 
     Args:
         code: exit code, 0–255.
@@ -96,5 +96,5 @@ def _attempt(step: Callable[[], None]) -> None:
     try:
         step()
     except Exception:
-        # The others must still be told; the process ends in any case.
+        # The others must still be destroyed; the process ends in any case.
         _logger.exception("cannot destroy %r while leaving", step)

@@ -1,4 +1,4 @@
-"""The C ABI of rcl, rmw and rcutils that rclpy does not expose, seen through ctypes.
+"""The C ABI of rcl, rmw and rcutils that rclpy does not expose, through ctypes.
 
 Owns: the struct layouts, the function signatures, and the check that the loaded libraries are the
 ones these layouts were written for. Layouts are those of rcl 9 and rmw 7 (ROS 2 Jazzy); headers

@@ -1,7 +1,7 @@
-"""The ROS graph as discovery shows it, read in one go and watched without polling.
+"""ROS graph observer: snapshots of nodes and endpoints as discovery shows them, without polling.
 
-Owns: the observer's participant, and the translation of graph queries into observation
-types. What tools bring along is left out by `lifecycle.verify.tool_filter`.
+Owns: the observer's participant, and the translation of graph queries into observation types.
+Entities that tools add are left out by `lifecycle.verify.tool_filter`.
 """
 
 from __future__ import annotations
@@ -56,7 +56,8 @@ They announce themselves each 0.5 s, and TCP may lose the first of it (measured:
 """
 
 _UNCOUNTED_S = 0.6
-"""Within so long who is asked is seen, if its answer may not come to us (measured: up to 0.3 s)."""
+"""Within so long a probed participant is discovered, if we may not receive its answer (measured: up
+to 0.3 s)."""
 
 _TOLD_S = 2.5
 """Within so long a discovery server has announced all (measured: up to 1.6 s)."""
@@ -88,7 +89,7 @@ class GraphObserver:
 
     Attributes:
         urls: of its connections; none where the RMW chooses.
-        owns_node: the node is its own, and nobody else spins or destroys it.
+        owns_node: the node is its own, and is spun and destroyed by nothing else.
 
     Raises:
         ConnectionUrlError: a URL that is none.
@@ -136,8 +137,8 @@ class GraphObserver:
     def on(cls, node: Node) -> GraphObserver:
         """Look through a node that others spin, and destroy after this.
 
-        How its participant is connected is not known here, so that nobody can be asked to announce
-        itself: for the first 3.5 s a look may miss who is there (`settling_s`).
+        How its participant is connected is not known here, so that no participant can be asked to
+        announce itself: for the first 3.5 s a snapshot may miss some (`settling_s`).
 
         Raises:
             MiddlewareError: rcl's graph guard condition could not be waited on.
@@ -147,7 +148,7 @@ class GraphObserver:
     def on_change(self, callback: Callable[[], None]) -> Callable[[], None]:
         """Have `callback` called in the guard's thread after each change of the graph.
 
-        It says that something changed, not what; changes that come together come as one. It must
+        It says that something changed, not what; simultaneous changes are reported as one. It must
         be quick and must not destroy the observer.
 
         Returns:
@@ -168,12 +169,12 @@ class GraphObserver:
         """Return the nodes and the endpoints that discovery shows now, in a stable order.
 
         All but its own node. The housekeeping of client libraries is left out. Services are known
-        by their nodes, so those of nobody known are looked for by name.
+        by their nodes, so those of no known node are looked for by name.
 
         Args:
             declared: fully qualified names of nodes that are looked for.
-            names: of topics, services and actions that are looked for: whoever offers one of them
-                and is not `declared` is shown, whatever it looks like.
+            names: of topics, services and actions that are looked for: a node that offers one of
+                them and is not `declared` is shown, whatever it looks like.
 
         Raises:
             MiddlewareError: the graph is no longer watched; the message says why.
@@ -202,11 +203,11 @@ class GraphObserver:
         return tuple(nodes), tuple(sorted(kept, key=_order))
 
     def settling_s(self) -> float:
-        """Return for how many seconds a look may still miss who is there; 0 once it cannot.
+        """Return for how many seconds a snapshot may still miss nodes; 0 once it cannot.
 
-        A participant that answered our knock and whose node is not known is on its way into the
-        graph. Fast DDS needs 3 s at most for what it lost; who then still has no node has none.
-        Judged by the last `snapshot`. Where nobody can be asked, it is a time.
+        A participant that answered our probe and whose node is not known is on its way into the
+        graph. Fast DDS needs 3 s at most for what it lost; a participant without a node by
+        then has none. Judged by the last `snapshot`. Where probing is impossible, it is a time.
         """
         age_s = time.monotonic() - self._made_s
         if not self._knocks:
@@ -225,7 +226,7 @@ class GraphObserver:
         return max(0.0, PATIENCE_S - age_s)
 
     def offers(self, node: str, service: str) -> bool:
-        """Tell whether discovery shows `service` (a fully qualified name) on `node`."""
+        """Return whether discovery shows `service` (a fully qualified name) on `node`."""
         return service in self.services_of(node)
 
     def services_of(self, node: str) -> frozenset[str]:
@@ -284,7 +285,7 @@ class GraphObserver:
     def remove_participants(self, prefixes: Iterable[str], pids: Iterable[int]) -> None:
         """Have all participants forget participants whose process is known to be dead.
 
-        Others learn of it over UDP only, see `discovery/dead_participants.py`; here they do
+        Others learn of it over UDP only, see `discovery/dead_peers.py`; here they do
         not count any more, whatever discovery shows until their lease has run out.
 
         Args:
@@ -344,7 +345,7 @@ class GraphObserver:
     def _services_of_others(
         self, names: DeclaredNames, untold: Collection[str]
     ) -> Iterator[ObservedEndpoint]:
-        """Yield who offers or asks for declared services and is a node that rcl does not show.
+        """Yield the endpoints of declared services on nodes that rcl does not show.
 
         A node that is about to be known has them too; a plain DDS program never is one, and no rcl
         shows a node whose name it would not give.
@@ -379,7 +380,7 @@ class GraphObserver:
                     )
 
     def _located(self, endpoints: Iterable[ObservedEndpoint]) -> Iterator[ObservedEndpoint]:
-        """Add where the participants of endpoints are that nobody is known to have.
+        """Add the addresses of endpoints' participants that belong to no known node.
 
         One whose address is not known is asked for it: it answers within a moment, and the next
         look has it.
@@ -413,7 +414,7 @@ class GraphObserver:
 
 
 def _managed(node: str, services: Iterable[ObservedEndpoint] | None) -> bool | None:
-    """Tell whether a node offers the services by which a managed node is driven."""
+    """Return whether a node offers the services by which a managed node is driven."""
     if services is None:
         return None
     offered = {

@@ -1,8 +1,8 @@
-"""Waiting for graph changes without polling, however many follow one participant.
+"""Graph change events by rcl's graph guard condition, without polling, for any number of followers.
 
 Owns: a thread that sleeps on rcl's graph guard condition, which rclpy does not expose, and on one
 guard condition of its own by which it is stopped: a change wakes it within a millisecond; and the
-one guard of each participant, which is there only while it is followed.
+one guard of each participant, which exists only while it is followed.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _logger = logging.getLogger(__name__)
 _FOR_EVER = -1
 _AGAIN_NS = tuple(round(each * 1e9) for each in (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0))
 """Pauses after a change, while a callback says that what it waits for may follow: discovery shows
-an endpoint a moment before it is matched (measured: 0.4 ms), and no event comes of the match."""
+an endpoint a moment before it is matched (measured: 0.4 ms), and no event reports the match."""
 _STOP = 1
 _GUARDS = 2
 
@@ -33,8 +33,8 @@ _GUARDS = 2
 class GraphGuard:
     """Calls `on_change` in its own thread whenever discovery changes the graph that `node` sees.
 
-    Changes that come while `on_change` runs are folded into one further call: level-triggered.
-    A participant has one such condition, and who is woken by it resets it: two guards on it take
+    Changes that happen while `on_change` runs are folded into one further call: level-triggered.
+    A participant has one such condition, and waking by it resets it: two guards on it take
     the changes from each other. Where several may follow one, use `on_graph_change`.
 
     Args:
@@ -123,7 +123,7 @@ class GraphGuard:
 def on_graph_change(node: Node, callback: Callable[[], bool | None]) -> Callable[[], None]:
     """Have `callback` called after each change of the graph that `node` sees.
 
-    It costs a thread that sleeps, one for all who follow the same participant.
+    It costs a thread that sleeps, one for all that follow the same participant.
 
     Args:
         node: take the callback away before it is destroyed.
@@ -145,7 +145,7 @@ def on_graph_change(node: Node, callback: Callable[[], bool | None]) -> Callable
 
 
 class _Followers:
-    """All who follow the graph of one participant."""
+    """All that follow the graph of one participant."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -176,7 +176,7 @@ class _Followers:
             self._stop()
             if nodes:
                 self._guard, self._node = GraphGuard(nodes[0], self._changed), nodes[0]
-                self._changed()  # of what came in between no callback knows
+                self._changed()  # changes in between were not reported
 
     def _stop(self) -> None:
         if self._guard is not None:

@@ -1,10 +1,10 @@
 r"""What rclpy's graph queries return, of any name that a DDS participant may choose.
 
-Owns: the questions of who is in the graph, asked of rcl and rmw as C has them. rclpy's own raise
-as soon as one name is outside ROS's alphabet: a topic that cannot be expanded (ValueError), a name
-that is no UTF-8 (UnicodeDecodeError, for all names together), a node name that rcl cannot validate
-(RCLError), an empty one (RCLError of rcl_get_node_names, for all nodes together). Any participant
-of the domain can announce such names, so none may hide what else is there.
+Owns: the graph queries of rcl and rmw, called as C has them. rclpy's own raise as soon as one name
+is outside ROS's alphabet: a topic that cannot be expanded (ValueError), a name that is no
+UTF-8 (UnicodeDecodeError, for all names together), a node name that rcl cannot validate (RCLError),
+an empty one (RCLError of rcl_get_node_names, for all nodes together). Any participant of the domain
+can announce such names, so none may hide what else is there.
 
 Bytes that are no UTF-8 are written as `\xff`; everything else is left as it is announced.
 """
@@ -102,7 +102,7 @@ class EndpointInfo:
 def node_names(node: Node) -> list[str]:
     """Return the fully qualified names of all nodes that `node` sees, as often as there are.
 
-    A node whose name is not known yet has a placeholder's, see `verify.noise.known_node`.
+    A node whose name is not known yet has a placeholder's, see `verify.tool_filter.known_node`.
 
     Raises:
         MiddlewareError: the graph cannot be read; all functions here.
@@ -143,7 +143,7 @@ def endpoints_of(
     """Return the publishers or the subscriptions of a topic that `node` sees.
 
     Args:
-        node: who looks.
+        node: that queries.
         kind: PUBLISHER or SUBSCRIPTION.
         topic: fully qualified.
         no_mangle: it is a name of DDS, `rq/resetRequest`, and types are to be DDS's own too.

@@ -1,8 +1,7 @@
-"""Hidden nodes: a participant of its own with nothing on it that the user did not ask for.
+"""Hidden nodes: a DDS participant with nothing on it but what was requested, and their spin thread.
 
-Owns: how such a node and its context are made, and which of them this process has.
-
-A thread that spins a node of our own, beside whatever loop the program has.
+Owns: how such a node and its context are made, which of them this process has, and the thread that
+spins one beside the program's own loop.
 """
 
 from __future__ import annotations
@@ -99,7 +98,7 @@ class Spinner:
     """Spins one node in a thread, from now until `stop` or the end of its context.
 
     Args:
-        node: an observer's, which nobody else spins.
+        node: an observer's, spun by nothing else.
         thread: its name.
     """
 

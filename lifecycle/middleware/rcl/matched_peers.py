@@ -2,9 +2,9 @@
 
 Owns: the question that rmw has no function for: `rmw_*_count_matched_*` gives a number, and the
 matched event the number's changes. Fast DDS itself answers it for one peer at a time
-(RTPSWriter::matched_reader_is_matched, RTPSReader::matched_writer_is_matched), so every endpoint of
-the other side that the participant has discovered is asked for. Both are called by mangled name
-through ctypes, on objects that are found by GUID and recognised by GUID and vtable before.
+(RTPSWriter::matched_reader_is_matched, RTPSReader::matched_writer_is_matched), so it is queried for
+every endpoint of the other side that the participant has discovered. Both are called by mangled
+name through ctypes, on objects that are found by GUID and recognised by GUID and vtable before.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _MATCHES = (
 
 
 def guid_of(entity: Publisher | Subscription) -> str:
-    """Return the GUID of a publisher or subscription in hex; empty where it cannot be told.
+    """Return the GUID of a publisher or subscription in hex; empty where it is unknown.
 
     Raises:
         rclpy.exceptions.InvalidHandle: the entity was destroyed.
@@ -69,7 +69,7 @@ def matched_with(
         candidates: GUIDs in hex, 32 digits, of endpoints of the other side of its topic.
 
     Returns:
-        None where this cannot be told: another RMW, another Fast DDS.
+        None where this is unknown: another RMW, another Fast DDS.
 
     Raises:
         rclpy.exceptions.InvalidHandle: the entity was destroyed.

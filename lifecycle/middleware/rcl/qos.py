@@ -1,11 +1,11 @@
-"""QoS profiles between the manifest's words and rclpy's objects.
+"""QoS profiles and message, service and action types: the manifest's names as rclpy's objects.
 
-Owns: the conversion both ways. Policies go by name: both sides use rmw's. Infinite durations are
-None on our side; rmw spells them RMW_DURATION_UNSPECIFIED (0, what a default profile holds) or
-RMW_DURATION_INFINITE (what discovery shows), which mean the same on Fast DDS.
+Owns: the conversion of QoS both ways; from `package/msg/Type` to the Python class, and the message
+that says what is wrong with a name.
 
-Message, service and action classes by their ROS name. Owns: `package/msg/Type` → Python class,
-and the message that says what is wrong with a name.
+Policies go by name: both sides use rmw's. Infinite durations are None on our side; rmw spells them
+RMW_DURATION_UNSPECIFIED (0, what a default profile holds) or RMW_DURATION_INFINITE (what discovery
+shows), which mean the same on Fast DDS.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""RMW_IMPLEMENTATION: whether what it names can be loaded, found out before rcl is.
+"""RMW_IMPLEMENTATION: whether the RMW that it names can be loaded, checked before rcl is.
 
-Owns: that question. rcl compares the variable with what it was linked to, or what could be loaded,
-while it is loaded itself, and ends the process with 102: nobody can catch that. Must not import
+Owns: that check. rcl compares the variable with what it was linked to, or what could be loaded,
+while it is loaded itself, and ends the process with 102, which cannot be caught. Must not import
 rclpy.
 """
 

@@ -1,10 +1,10 @@
-"""Which nodes are in the graph, without the ghosts that rmw_dds_common keeps.
+"""Node names in the ROS graph without the stale ones that rmw_dds_common keeps.
 
-Owns: `StaleNodeFilter`. rmw_dds_common learns node names from one topic and who has left from
-discovery, in two threads: what a leaving participant said last may be read after it was removed,
-and then its names stay for good (GraphCache::update_participant_entities enters it anew; measured:
-1 of 792 leavings on a loaded machine, still there long after the lease of 20 s). A gate would take
-a node that comes again for two.
+Owns: `StaleNodeFilter`. rmw_dds_common learns node names from one topic and which participants left
+from discovery, in two threads: the last message of a leaving participant may be read after it was
+removed, and then its names stay for good (GraphCache::update_participant_entities enters it anew;
+measured: 1 of 792 leavings on a loaded machine, still there long after the lease of 20 s). A gate
+would take a restarted node for two.
 """
 
 from __future__ import annotations

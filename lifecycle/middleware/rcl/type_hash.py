@@ -28,7 +28,7 @@ def with_service_hashes(
     all others, `rq/NAMERequest` and `rr/NAMEReply`, whose endpoints announce the hashes.
 
     Args:
-        node: who looks.
+        node: that queries.
         endpoints: topics, servers and clients; the parts of actions not yet folded.
     """
     seen: dict[str, _Service] = {}

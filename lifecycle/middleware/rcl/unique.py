@@ -42,7 +42,7 @@ class UniqueFlowNotFeasible(MiddlewareError):  # noqa: N818 - states a fact, not
 
     Attributes:
         topic: fully qualified.
-        reason: the RMW's own words.
+        reason: the RMW's own message.
     """
 
     def __init__(self, message: str, *, topic: str, reason: str, hint: str = "") -> None:

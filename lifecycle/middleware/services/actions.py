@@ -1,11 +1,9 @@
-"""rclpy's action client, whose waiting callers learn that it is gone and that they must not block.
+"""Action client and server on rclpy's that never wait for ever: goals can be ended from outside.
 
-Owns: the private names of `rclpy.action.client` that this takes. Import it late: rclpy.action
-imports numpy, 100 ms.
-
-rclpy's action server, whose goals can be ended from outside and whose answers are sent at once.
-Owns: the private names of `rclpy.action.server` that this takes. What works on a goal, and when
-one has to end, is `lifecycle.node`'s. Import it late: rclpy.action imports numpy, 100 ms.
+Owns: the private names of `rclpy.action.client` and `rclpy.action.server` that this takes. Callers
+that wait for a client's answer learn that it is gone, and that they must not block; a server's
+answers are sent at once. What works on a goal, and when one has to end, is `lifecycle.node`'s.
+Import it late: rclpy.action imports numpy, 100 ms.
 """
 
 from __future__ import annotations
@@ -30,12 +28,12 @@ if TYPE_CHECKING:
 
 
 class ActionClientGoneError(MiddlewareError):
-    """An answer that was awaited will not come: the action client it was asked with is gone."""
+    """An awaited answer will not arrive: the action client it was asked with is gone."""
 
 
 @typing.final
 class GoalClient(ActionClient):  # type: ignore[misc]  # rclpy is not typed
-    """An action client that leaves nobody waiting for ever.
+    """An action client whose callers never wait for ever.
 
     Args:
         node: whose participant it is on.
@@ -46,7 +44,7 @@ class GoalClient(ActionClient):  # type: ignore[misc]  # rclpy is not typed
             where that would wait for ever.
 
     Attributes:
-        action_name: fully qualified, set by who made it; empty while unknown.
+        action_name: fully qualified, set by its maker; empty while unknown.
     """
 
     def __init__(
@@ -109,7 +107,7 @@ class GoalClient(ActionClient):  # type: ignore[misc]  # rclpy is not typed
         return held
 
     def destroy(self) -> None:
-        """As rclpy's; whoever awaits an answer gets an ActionClientGoneError. Again is harmless."""
+        """As rclpy's; pending answers raise ActionClientGoneError. Again is harmless."""
         if self._destroyed:
             return
         with self._lock:
@@ -172,7 +170,7 @@ class _Held:
 
 @typing.final
 class GoalServer(ActionServer):  # type: ignore[misc]  # rclpy is not typed
-    """An action server that tells what it works on and can be made to stop.
+    """An action server that lists the goals it works on and can be made to stop.
 
     Args:
         node: whose participant it is on.
@@ -184,7 +182,7 @@ class GoalServer(ActionServer):  # type: ignore[misc]  # rclpy is not typed
         group: callback group of its requests.
 
     Attributes:
-        action_name: fully qualified, set by who made it; empty while unknown.
+        action_name: fully qualified, set by its maker; empty while unknown.
     """
 
     def __init__(
@@ -212,14 +210,14 @@ class GoalServer(ActionServer):  # type: ignore[misc]  # rclpy is not typed
 
     @property
     def goals(self) -> tuple[ServerGoalHandle, ...]:
-        """The goals that were accepted and have not come to an end."""
+        """The goals that were accepted and have not ended."""
         return tuple(each for each in self._goal_handles.values() if each.is_active)
 
     def finish(self, goal: ServerGoalHandle, result: Any | None) -> None:
-        """Answer everybody who waits for a goal, now; the first answer counts.
+        """Answer all that wait for a goal, now; the first answer counts.
 
         Args:
-            goal: aborted, if it has not come to an end.
+            goal: aborted, if it has not ended.
             result: of the action's result class; None for an empty one.
         """
         future = self._result_futures.get(bytes(goal.goal_id.uuid))

@@ -1,6 +1,6 @@
-"""The lifecycle services and the node configuration of other processes' nodes.
+"""Clients of the lifecycle services and the node configuration of other processes' nodes.
 
-Owns: what is asked of a managed node that we reach only through its services, ours or foreign, and
+Owns: the requests to a managed node that we reach only through its services, ours or foreign, and
 how an unanswered request is understood: a change_state without a reply is not a failed transition,
 so the state is read again (rcl_lifecycle, lifecycle_msgs/srv/*).
 """
@@ -135,7 +135,7 @@ class NodeClients:
             while not reply.done():
                 await asyncio.wait((reply,), timeout=_REREAD_S)
                 if not reply.done() and await self._reached(node, transition):
-                    # A reply that is under way comes before the next state would be read.
+                    # A reply that is under way arrives before the next state would be read.
                     await asyncio.wait((reply,), timeout=_REREAD_S)
                     return bool(reply.result().success) if reply.done() else True
             return bool(reply.result().success)
@@ -202,7 +202,7 @@ class NodeClients:
         return await report_parameters(self._calls, node, names, timeout_s=timeout_s)
 
     def serves_parameters(self, node: str) -> bool | None:
-        """Tell whether `node` has parameter services; None while discovery may not show them yet.
+        """Return whether `node` has parameter services; None while discovery may not show them yet.
 
         Client libraries make them before the type description service, and discovery shows one
         participant's services in order: where it shows the latter alone, there are none.
@@ -260,7 +260,7 @@ class NodeClients:
         await self._set(node, "map_to", endpoint, connection, timeout_s)
 
     async def disconnect(self, node: str, connection: str, *, timeout_s: float = TIMEOUT_S) -> None:
-        """Have a node unmake a connection."""
+        """Make a node remove a connection."""
         await self._set(node, "disconnect", connection, "", timeout_s)
 
     async def remap(

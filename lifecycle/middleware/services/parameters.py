@@ -1,6 +1,6 @@
-"""The parameters of other processes' nodes, through their parameter services.
+"""Parameters of other processes' nodes, read and set through their parameter services.
 
-Owns: what is asked of rcl_interfaces' services and how its types become ours, those of a node in
+Owns: the requests to rcl_interfaces' services and how its types become ours, those of a node in
 this process too. Nodes that serve no parameters have none of these services.
 """
 
@@ -33,7 +33,7 @@ _TYPES = {
     ParameterType.PARAMETER_DOUBLE_ARRAY: ("double_array", "double_array_value"),
     ParameterType.PARAMETER_STRING_ARRAY: ("string_array", "string_array_value"),
 }
-"""rcl_interfaces/msg/ParameterType → our word, and where ParameterValue holds the value."""
+"""rcl_interfaces/msg/ParameterType → our type name, and where ParameterValue holds the value."""
 
 
 async def read_parameters(
@@ -109,7 +109,7 @@ async def _read(
 
 
 def type_word(type_: int) -> str:
-    """Return our word for a rcl_interfaces/msg/ParameterType; empty for one that is not set."""
+    """Return our name of a rcl_interfaces/msg/ParameterType; empty for one that is not set."""
     return _TYPES[type_][0] if type_ in _TYPES else ""
 
 

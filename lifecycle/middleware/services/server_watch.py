@@ -1,9 +1,9 @@
-"""Whether the server of a service or action client is matched, and being told when that changes.
+"""Whether the server of a service or action client is matched, and a callback when that changes.
 
 Owns: what may be taken for a match. rmw_fastrtps counts a client's server only while its request
-writer has matched as many readers as its response reader has matched writers, at least one, and
-the graph knows as many servers by either (rmw_service_server_is_available.cpp); an action's server
-is that for all three services, and a publisher of feedback (rcl_action_server_is_available).
+writer has matched as many readers as its response reader has matched writers, at least one, and the
+graph knows as many servers by either (rmw_service_server_is_available.cpp); an action's server is
+that for all three services, and a publisher of feedback (rcl_action_server_is_available).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _TELLING = ("rmw_fastrtps_cpp", "rmw_fastrtps_dynamic_cpp")
 
 
 def is_server_matched(client: AnyClient) -> bool | None:
-    """Tell whether a server is matched with a client both ways; None where the RMW cannot tell."""
+    """Return whether a server is matched with a client both ways; None if the RMW cannot say."""
     return _is_ready(client) if get_rmw_implementation_identifier() in _TELLING else None
 
 
@@ -39,7 +39,7 @@ def is_server_matched(client: AnyClient) -> bool | None:
 class ServerWatch:
     """Calls back when the server of a client was matched, or is no longer.
 
-    No event tells of that, but each match follows a change of the graph within a moment: it is
+    No event reports that, but each match follows a change of the graph within a moment: it is
     looked at then, for some seconds if need be, and not in between.
 
     Args:

@@ -1,4 +1,4 @@
-"""Calling ROS services from asyncio.
+"""Call ROS services from asyncio, with a deadline and retries.
 
 Owns: one executor thread on the observer's node where that is its own, the bridge from rclpy's
 futures to asyncio's, and the rule for requests that stay unanswered. rmw_fastrtps drops a reply

@@ -1,16 +1,15 @@
-"""DSCP marks on the sockets that a participant sends from: data, and what its readers acknowledge.
+"""DSCP of a participant's sockets: IP_TOS and IPV6_TCLASS on those that its NFEs list.
 
-Owns: their IP_TOS and IPV6_TCLASS options (ip(7), ipv6(7), RFC 2474). Fast DDS 2.14 has no DSCP
-setting and always lists 0 in its NFEs; the socket option is what the kernel puts into packets. It
-needs no privilege.
+Owns: these options (ip(7), ipv6(7), RFC 2474) on the sockets that a participant sends from: data,
+and what its readers acknowledge; finding the sockets of this process by a network flow endpoint's
+protocol, address and port among its descriptors (proc(5)), and reading them.
 
-A participant's UDP sender sockets are all there before its first publisher is: Fast DDS looks for
+Fast DDS 2.14 has no DSCP setting, always lists 0 in its NFEs and exposes no socket; the socket
+option is what the kernel puts into packets. It needs no privilege.
+
+A participant's UDP sender sockets all exist before its first publisher does: Fast DDS looks for
 interfaces once, and opens none for one that appears later (measured: neither a new interface nor a
-new peer changes them). TCP connections come later, are in no NFE list, and are not marked.
-
-The sockets of this process that network flow endpoints stand for. Owns: finding them by
-protocol, address and port among the process's descriptors (proc(5)), and what they say of
-themselves. Fast DDS shows its sockets to nobody.
+new peer changes them). TCP connections are opened later, are in no NFE list, and are not marked.
 """
 
 from __future__ import annotations
@@ -114,7 +113,7 @@ def _key(each: socket.socket) -> tuple[int, int, str, int]:
 
 def _address(text: str) -> str:
     try:
-        # A scope (fe80::1%eth0) tells interfaces apart; rmw leaves it out.
+        # A scope (fe80::1%eth0) distinguishes interfaces; rmw leaves it out.
         return str(ipaddress.ip_address(text.partition("%")[0]))
     except ValueError:
         return text

@@ -36,10 +36,10 @@ SHARED_MEMORY = NetworkFlowEndpoint(
 
 
 class NetworkFlowEndpointsUnsupported(MiddlewareError):  # noqa: N818 - states a fact, not a fault
-    """The RMW cannot tell network flow endpoints.
+    """The RMW cannot report network flow endpoints.
 
     Attributes:
-        reason: the RMW's own words.
+        reason: the RMW's own message.
     """
 
     def __init__(self, message: str, *, reason: str, hint: str = "") -> None:
@@ -70,7 +70,7 @@ def get_network_flow_endpoints(
 def has_shared_memory(node: Node) -> bool:
     """Return whether the participant of `node` has a shared memory transport.
 
-    Every subscription of a participant listens on all its transports, so one tells for the
+    Every subscription of a participant listens on all its transports, so one shows it for the
     publishers as well. Where the node has none, one is made for a moment, on /parameter_events.
 
     Raises:

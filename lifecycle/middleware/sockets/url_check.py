@@ -1,8 +1,8 @@
-"""What a host must have for a connection URL, and what a participant must have got of it.
+"""Check a connection URL: addresses, interfaces and free ports before, open sockets afterwards.
 
-Owns: addresses and interfaces before a participant is made, and its sockets afterwards. Fast DDS
-says nothing when a fixed port is taken or a whitelist matches nothing: the participant is there and
-deaf. Linux: sockets are read from proc(5). Must not import rclpy.
+Owns: what a host must have before a participant is made, and what its sockets must be afterwards.
+Fast DDS says nothing when a fixed port is taken or a whitelist matches nothing: the participant
+exists and receives nothing. Linux: sockets are read from proc(5). Must not import rclpy.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class OpenSocket:
     """A bound UDP or listening TCP socket of a process.
 
     Attributes:
-        inode: tells it apart for as long as it is open.
+        inode: identifies it for as long as it is open.
         kind: UDPV4, UDPV6 or TCPV4.
         address: what it is bound to.
         port: 1–65535.
@@ -76,7 +76,7 @@ def check_host(urls: Sequence[ConnectionUrl]) -> None:
 
 
 def check_free(urls: Sequence[ConnectionUrl]) -> None:
-    """Refuse URLs with a port that somebody has, before a participant is made of them.
+    """Refuse URLs with a port that is taken, before a participant is made of them.
 
     Fast DDS 2.14 hangs for ever in the destruction of a participant that could not listen on its
     TCP port, so that must not be found out afterwards.
@@ -104,7 +104,7 @@ def check_sockets(urls: Sequence[ConnectionUrl], opened: Sequence[OpenSocket]) -
         opened: the sockets that were opened for it.
 
     Raises:
-        MiddlewareError: names the URL and the port that somebody else has.
+        MiddlewareError: names the URL and the port that another process has.
     """
     for family in families(urls):
         mine = [each for each in opened if each.kind == family.kind]
@@ -188,7 +188,7 @@ def _bound_sockets() -> Iterator[OpenSocket]:
 
 
 def _address(family: int, text: str) -> str:
-    """Spell an address of /proc/net, which stands there in words of the host's byte order."""
+    """Spell an address of /proc/net, written there as 32-bit integers in the host's byte order."""
     words = [int(text[at : at + 8], 16) for at in range(0, len(text), 8)]
     return socket.inet_ntop(family, struct.pack(f"={len(words)}I", *words))
 

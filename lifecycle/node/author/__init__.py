@@ -1,1 +1,1 @@
-"""What people subclass and write: LifecycleNode, handlers, declarations in code."""
+"""The API for node authors: LifecycleNode, handlers, declarations in code, parameters."""

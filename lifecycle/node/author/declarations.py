@@ -1,7 +1,7 @@
-"""Endpoints declared in code: the `declare_…` methods of a LifecycleNode, and hints on endpoints.
+"""The `declare_…` methods of a LifecycleNode: endpoints declared in code, and hints on them.
 
-Owns: their signatures, and the file and line that a declaration is known by. What becomes of one
-is declaring.py's to say.
+Owns: their signatures, and the file and line that a declaration is known by. What becomes of one is
+up to declaring.py.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ class Declarations(Node):  # type: ignore[misc]  # rclpy is not typed
     def hint(
         self, endpoint: str, *, lossy: bool | None = None, size_bytes: int | None = None
     ) -> None:
-        """Tell negotiation something about a declared endpoint; the manifest's `flows:` win.
+        """Give negotiation a hint on a declared endpoint; the manifest's `flows:` win.
 
         Args:
             endpoint: `video`, or `publishers/video` where another kind has the name too.

@@ -1,8 +1,8 @@
-"""Endpoints declared in code: the interface of a node that has no manifest.
+"""The interface of a node without a manifest, built from its `declare_…` calls.
 
-Owns: turning `declare_publisher("count", Int32, 10)` into the same PlannedEndpoint that a
-manifest gives, so that everything after it is one path; when that is allowed; and what code alone
-can say of an endpoint: its handler and hints.
+Owns: turning `declare_publisher("count", Int32, 10)` into the same PlannedEndpoint that a manifest
+gives, so that everything after it is one path; when that is allowed; and what only code can say of
+an endpoint: its handler and hints.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def add(
     qos: QosProfile | None,
     at: Position,
 ) -> PlannedNode:
-    """Return `spec` with one more endpoint; what a manifest says of the same name stands.
+    """Return `spec` with one more endpoint; what a manifest says of the same name is kept.
 
     The same line may declare the same again: on_activate runs more than once.
 

@@ -1,10 +1,9 @@
-"""What makes an rclpy node a managed one: everything that `LifecycleNode` has and does not show.
+"""The managed half of a LifecycleNode (`node.lifecycle`): controller, gate, data layer, services.
 
-Owns: putting controller, gate, data layer, parameters, timers and services of one node together.
-It is reached as `node.lifecycle`, so that authors have every other attribute name to themselves.
-
-Endpoints that code makes with rclpy's own factories: on no interface, and yet of the node.
-Owns: knowing them, so that the node configuration can tell of them.
+Owns: putting controller, gate, data layer, parameters, timers and services of one node together;
+and the endpoints that code makes with rclpy's own factories, which are on no interface, so that the
+node configuration can report them. It is reached as `node.lifecycle`, so that authors have every
+other attribute name to themselves.
 """
 
 from __future__ import annotations
@@ -51,7 +50,7 @@ class Undeclared:
     """The endpoints that the code of one node made by itself.
 
     Args:
-        changed: told when one comes or goes.
+        changed: called when one is made or destroyed.
     """
 
     def __init__(self, changed: Callable[[], None]) -> None:
@@ -69,7 +68,7 @@ class Undeclared:
             self._changed()
 
     def beside(self, declared: Collection[Any]) -> tuple[tuple[EndpointKind, Any], ...]:
-        """Return (kind, rclpy object) of those that stand for nothing declared."""
+        """Return (kind, rclpy object) of those that belong to no declared endpoint."""
         known = {id(each) for each in declared}
         found = []
         for key, (kind, entity) in tuple(self._made.items()):
@@ -85,7 +84,7 @@ class Undeclared:
 
 
 _WITHOUT_DATA_LAYER = (NodeState.INACTIVE_DISCONNECTED, NodeState.UNCONFIGURED, NodeState.FINALIZED)
-"""A node that comes to one of these is not the one that was verified any more."""
+"""A node that enters one of these is not the one that was verified any more."""
 
 BRING_UP = (TransitionRequest.CONFIGURE, TransitionRequest.CONNECT, TransitionRequest.ACTIVATE)
 
@@ -94,13 +93,13 @@ class Managed:
     """The managed half of one node.
 
     Attributes:
-        mode: who drives the transitions.
+        mode: what drives the transitions.
         gate: holds back what the node was made to send, receive and time.
         data_layer: its endpoints.
         declared: what its manifest and its code say of them.
         interface: what may be asked of its data layer.
         connection_events: what becomes of its connections and mappings.
-        configuration_changes: tells of each change of its configuration.
+        configuration_changes: notifies of each change of its configuration.
         undeclared: endpoints that its code made with rclpy's factories.
         client_group: reentrant callback group of its clients.
         call_soon: runs a function, sync or async, in its executor; returns whether there is one.
@@ -116,11 +115,11 @@ class Managed:
     ) -> None:
         self._node = node
         self._supervisor = supervisor
-        # By its supervisor, through the gate; a node without one needs nobody's leave.
+        # By its supervisor, through the gate; a node without one needs no permission.
         self._let_through = not supervisor
         self.mode = mode
         self.gate = gate
-        # Reentrant: others may ask, and answers come in, while a transition's callback runs.
+        # Reentrant: others may ask, and answers arrive, while a transition's callback runs.
         self.client_group = ReentrantCallbackGroup()
         self._infrastructure = ReentrantCallbackGroup()
         self._turns = Turns(node, self._infrastructure)
@@ -175,11 +174,11 @@ class Managed:
 
     @property
     def state(self) -> NodeState:
-        """The state, nested ones told apart; `state.seen` is what other tools see."""
+        """The state, nested ones distinguished; `state.seen` is what other tools see."""
         return self._controller.machine.state
 
     def add_listener(self, listener: Callable[[Node], None]) -> None:
-        """Call `listener(node)` after every change of state, whoever caused it."""
+        """Call `listener(node)` after every change of state, whatever caused it."""
         self._listeners.append(listener)
 
     async def change(self, request: TransitionRequest | str) -> Result:
@@ -195,9 +194,9 @@ class Managed:
     async def change_for_supervisor(self, request: TransitionRequest | str) -> Result:
         """Run a transition that the supervisor asked for; its activate is the gate's permit.
 
-        Whoever it lets through may be deactivated and activated again by anybody, until the
+        A node that it lets through may be deactivated and activated again by any client, until the
         supervisor deactivates it or its data layer goes, which is what was verified. A node that
-        somebody else has deactivated already is where the supervisor wants it.
+        another client has deactivated already is where the supervisor wants it.
 
         Raises:
             RefusedError: as for `change`.
@@ -255,7 +254,7 @@ class Managed:
         return any(each.dscp is not None for each in self.spec.endpoints)
 
     def get_configuration(self) -> NodeConfiguration:
-        """Return who this node is and what its endpoints really are."""
+        """Return this node's identity and its endpoints as they are."""
         undeclared: tuple[tuple[EndpointKind, Any], ...] = ()
         if self.spec.endpoint_policy is EndpointPolicy.OPEN:
             undeclared = self.undeclared.beside(self.data_layer.entities)
@@ -345,7 +344,7 @@ class Managed:
         return result.outcome is CallbackOutcome.SUCCESS
 
     def _changed(self, change: StateChange) -> None:
-        """Follow a change of the machine: the gate first, then tell the world."""
+        """Follow a change of the machine: the gate first, then notify the others."""
         if change.goal is NodeState.ACTIVE:
             self.gate.open()
         elif change.start is NodeState.ACTIVE:

@@ -1,20 +1,16 @@
-"""LifecycleNode: what people subclass.
+"""LifecycleNode: the base class of managed nodes, its node interface and gated rclpy factories.
 
 Owns: the node as its author sees it: how it is constructed, its callbacks, and access to what is
-declared. Declaring in code is in declarations.py; what all of it does is put together in
-managed.py.
+declared; the node interface's signatures for a node's own code (remote_interface.py is the same for
+others, data_layer.py does the work; see *Topological Discovery and Communication Negotiation*,
+"Node Interface"); which of rclpy's factories are overridden, so that what they make is known and
+sends and receives only while active; and the guard that makes a blocking call of a service or
+action that would wait for ever an error at once. Declaring in code is in declarations.py; what all
+of it does is put together in managed.py.
 
-rclpy's factories, gated: what a node's own code makes sends and receives only while active.
-Owns: which of rclpy's factories are overridden, and that what they make is known.
-
-The node interface as a node's own code uses it; remote_interface.py is the same for others.
-Owns: the signatures. What they do is in data_layer.py. See *Topological Discovery and
-Communication Negotiation*, "Node Interface".
-
-A call of a service or action that would wait for ever is an error at once. Owns: the guard
-around rclpy's blocking `Client.call` and its like. Called from a callback, it waits for an
-answer that only the executor can bring, and the executor waits for the callback (rclcpp#2213
-and its like are the oldest trap of lifecycle callbacks).
+rclpy's blocking `Client.call` and its like, called from a callback, wait for an answer that only
+the executor can bring, and the executor waits for the callback (rclcpp#2213 and its like are the
+oldest trap of lifecycle callbacks).
 """
 
 from __future__ import annotations
@@ -100,7 +96,7 @@ def refuse_to_block(what: str, instead: str) -> None:
 
 
 def _in_executor() -> bool:
-    """Tell whether this thread is inside a single-threaded executor's turn.
+    """Return whether this thread is inside a single-threaded executor's turn.
 
     A multi-threaded one runs callbacks in other threads than the one that spins.
     """
@@ -459,7 +455,7 @@ class LifecycleNode(Declarations, LocalInterface, GatedFactories):
         return self.lifecycle.sleep(seconds)
 
     def undeclare_parameter(self, name: str) -> None:
-        """As rclpy's, which tells nobody; the node's configuration has changed."""
+        """As rclpy's, which notifies nothing; the node's configuration has changed."""
         super().undeclare_parameter(name)
         self.lifecycle.configuration_changes.touch()
 
@@ -492,4 +488,4 @@ class LifecycleNode(Declarations, LocalInterface, GatedFactories):
         """The last call, from any state; endpoints are removed after it."""
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """A callback came to ERROR: SUCCESS says the node is as new, FAILURE finalizes it."""
+        """A callback ended in ERROR: SUCCESS says the node is as new, FAILURE finalizes it."""

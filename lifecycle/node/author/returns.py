@@ -1,4 +1,7 @@
-"""What a transition callback returns. Owns: short names for rclpy's TransitionCallbackReturn."""
+"""What a transition callback returns: SUCCESS, FAILURE, ERROR.
+
+Owns: short names for rclpy's TransitionCallbackReturn.
+"""
 
 from __future__ import annotations
 

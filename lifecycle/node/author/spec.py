@@ -1,10 +1,9 @@
-"""What a node is told about itself before it is built: its PlannedNode, and where it lives.
+"""The plan of a node before it is constructed: its PlannedNode, remappings and `module:Class`.
 
 Owns: the construction context through which a host hands a class its part of the plan, so that
-`Camera()` works under the supervisor, alone with a manifest, and alone without one; and the plan
-of a node that has no manifest, filled by its own `declare_…` calls. Imports no rclpy.
-
-From `module:Class` to a node object. Owns: finding the class, and saying why it cannot be.
+`Camera()` works under the supervisor, alone with a manifest, and alone without one; the plan of a
+node that has no manifest, filled by its own `declare_…` calls; and finding a class by
+`module:Class`, or saying why it cannot be found. Imports no rclpy.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ if TYPE_CHECKING:
 class Mode(enum.Enum):
     """Who drives a node's transitions."""
 
-    MANUAL = "manual"  # somebody else: a supervisor, `ros2 lifecycle`, launch_ros, nav2
+    MANUAL = "manual"  # driven from outside: a supervisor, `ros2 lifecycle`, launch_ros, nav2
     AUTO = "auto"  # it configures, connects and activates itself
 
 
@@ -46,7 +45,7 @@ class Construction:
 
     Attributes:
         spec: the node's part of the plan; None for a node without a manifest.
-        mode: who drives it; None leaves that to the node's own code. A host that says something
+        mode: what drives it; None leaves that to the node's own code. A host that says something
             also does it: the node does not bring itself up.
         context: the rclpy context to live in; None for the default one.
         use_global_arguments: take remaps from the process's own --ros-args.
@@ -112,7 +111,7 @@ def calling_position(*, depth: int) -> Position:
 
 
 def plan_without_manifest(node_class: type, *, name: str, namespace: str) -> PlannedNode:
-    """Return the plan of a node that nobody planned: no endpoints yet, default deadlines."""
+    """Return the plan of an unplanned node: no endpoints yet, default deadlines."""
     module = sys.modules.get(node_class.__module__)
     at = Position(file=getattr(module, "__file__", None) or "<code>", line=1, column=1)
     return PlannedNode(

@@ -1,10 +1,8 @@
-"""How connections and mappings stand: which have peers, which are established, and telling so.
+"""Status of connections and mappings: which have peers, which are established, and its events.
 
-Owns: the rules by which a connection counts as established or lost, and every connection event.
-
-What becomes of a node's connections and mappings, told as events. Owns: the event type, who is
-called with it and when: in the node's executor, in order, after the callback in which it
-happened. See *Topological Discovery and Communication Negotiation*, "Node Interface"
+Owns: the rules by which a connection counts as established or lost, every connection event and its
+type, and which listener is called when: in the node's executor, in order, after the callback in
+which it happened. See *Topological Discovery and Communication Negotiation*, "Node Interface"
 (introspection by notification).
 """
 
@@ -40,16 +38,16 @@ class ConnectionEvent:
     """One thing that became of a connection or of a mapping.
 
     A connection is *established* when it was made, and again when every topic endpoint on it has a
-    matched peer after that was not so; *lost* when one has lost its last peer, or it was unmade. A
+    matched peer after that was not so; *lost* when one has lost its last peer, or it was removed. A
     mapping is *established* when it was made and with each peer that is matched, *lost* with each
-    peer that is no longer, and when it was unmade.
+    peer that is no longer, and when it was removed.
 
     Attributes:
         connection: name; empty for the node's own participant.
         urls: of the connection, as text.
         endpoint: `publishers/video` for the two kinds of mapping events; else empty.
         peers: matched endpoints after it; None for a mapping without a count (services, actions),
-            for connections, and for what was unmade.
+            for connections, and for what was removed.
         unmade: it was taken away on purpose: it does not exist any more.
     """
 
@@ -103,12 +101,12 @@ class ConnectionEvents:
 
 
 class ConnectionStatus:
-    """The standing of one node's connections and mappings.
+    """The status of one node's connections and mappings.
 
     Args:
         connections: of the node.
         mappings: every declared endpoint, as it is at any time.
-        tell: given each event.
+        tell: called with each event.
     """
 
     def __init__(
@@ -132,7 +130,7 @@ class ConnectionStatus:
         )
 
     def established(self, connection: Connection) -> bool:
-        """Tell whether a connection exists and every topic endpoint on it has a peer."""
+        """Return whether a connection exists and every topic endpoint on it has a peer."""
         topics = (each for each in self.on(connection) if each.endpoint.kind.is_topic)
         return not connection.error and all(each.peers for each in topics)
 
@@ -141,7 +139,7 @@ class ConnectionStatus:
         self._judge(connection, lost=False)
 
     def closed(self, connection: Connection) -> None:
-        """A connection with a name was unmade."""
+        """A connection with a name was removed."""
         self._established.discard(connection)
         self._tell(
             ConnectionEvent(
@@ -172,7 +170,7 @@ class ConnectionStatus:
         )
 
     def matched(self, mapping: Mapping) -> None:
-        """Count the peers of a mapping again, and tell if they are more or fewer."""
+        """Count the peers of a mapping again, and notify if they are more or fewer."""
         before = mapping.peers or 0
         self._count(mapping)
         now = mapping.peers or 0
@@ -206,9 +204,9 @@ class ConnectionStatus:
         )
 
     def _judge(self, connection: Connection, *, lost: bool) -> None:
-        """Tell of a connection that it is established, or no longer.
+        """Notify that a connection is established, or no longer.
 
-        What is mapped onto it and has no peer yet is no loss, and is not told.
+        What is mapped onto it and has no peer yet is no loss, and is not reported.
         """
         known = self._known(connection)
         is_own_and_empty = known is self._connections.own and not self.on(known)

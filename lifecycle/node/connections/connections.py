@@ -1,6 +1,6 @@
-"""The connections of one node: participants that its endpoints can be mapped onto.
+"""The connections of one node: extra participants that its endpoints can be mapped onto.
 
-Owns: making and unmaking participants beside the node's own, their names, and having their
+Owns: making and destroying participants beside the node's own, their names, and having their
 callbacks run where the node's own run. `connect_to` of *Topological Discovery and Communication
 Negotiation*; which endpoint is on which connection is data_layer.py's.
 """
@@ -40,10 +40,10 @@ class Connection:
     Attributes:
         name: as `connect_to` named it; empty for the node's own participant, and for one that only
             gives a publisher its own flow.
-        urls: what it was told, as text; empty if the RMW chose.
+        urls: what it was made from, as text; empty if the RMW chose.
         node_name: base name of the hidden node that owns the participant; empty for the node's own.
         participant: None for the node's own, and once disconnected.
-        has_shared_memory: it has that transport; None where the RMW cannot tell.
+        has_shared_memory: it has that transport; None where the RMW cannot report it.
         warning: what of it could not be made as asked, while the rest was; empty otherwise.
         error: why it could not be made; empty if it was.
     """
@@ -191,7 +191,7 @@ class Connections:
         try:
             self.own.has_shared_memory = has_shared_memory(self._node)
         except MiddlewareError:
-            # "the RMW cannot tell" is a value here, and the verifier's to judge.
+            # "unknown to the RMW" is a value here, and the verifier's to judge.
             self.own.has_shared_memory = None
 
     def _unplanned(self, name: str) -> PlannedParticipant:

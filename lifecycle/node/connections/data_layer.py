@@ -1,14 +1,13 @@
-"""The data layer of one node: declared endpoints, and which connection each is mapped onto.
+"""The node interface (connect_to, map_to, disconnect, remap, alias) and the data layer behind it.
 
-Owns: the order in which connections and mappings are made and unmade, and what is told of it.
-*configure* declares endpoints, *connect* maps those that nobody has mapped yet onto the connection
+Owns: which connection each declared endpoint is mapped onto, the order in which connections and
+mappings are made and removed, when that is allowed, and what is notified of it: one implementation
+behind the local API, the ROS services and the control channel.
+
+*configure* declares endpoints, *connect* maps those that are not mapped yet onto the connection
 that the plan says, *disconnect* takes everything away. In between `connect_to`, `map_to`,
 `disconnect_from`, `remap` and `alias` change single ones. See *Topological Discovery and
 Communication Negotiation*, "Node Interface".
-
-The node interface: connect_to, map_to, disconnect, remap, alias, and when they are allowed.
-Owns: the one implementation behind the local API, the ROS services and the control channel. See
-*Topological Discovery and Communication Negotiation*, "Node Interface".
 """
 
 from __future__ import annotations
@@ -48,12 +47,12 @@ class NodeDataLayer:
     Args:
         node: whose endpoints these are.
         gate: holds back its publishers and subscriptions.
-        client_group: reentrant, so that an answer can come in while a callback awaits it.
-        event_group: reentrant, of the events that tell of peers.
+        client_group: reentrant, so that an answer can arrive while a callback awaits it.
+        event_group: reentrant, of matched events.
         later: runs a coroutine function in the node's executor.
         after: calls back once in the node's executor.
-        changed: told that the node configuration is another now, match counts included.
-        tell: given what becomes of connections and mappings.
+        changed: called when the node configuration has changed, match counts included.
+        tell: called with each connection event.
 
     Attributes:
         endpoints: what is declared.
@@ -106,7 +105,7 @@ class NodeDataLayer:
 
     @property
     def entities(self) -> tuple[Any, ...]:
-        """Every rclpy object that stands for a declared endpoint."""
+        """Every rclpy object of a declared endpoint."""
         return self._mapper.entities
 
     # Declarations.
@@ -144,7 +143,7 @@ class NodeDataLayer:
             raise
 
     def undeclare(self) -> None:
-        """Forget the declarations, and unmake what was mapped before a connect."""
+        """Forget the declarations, and unmap what was mapped before a connect."""
         self.disconnect()
         for mapping in tuple(self.endpoints.mappings.values()):
             self.endpoints.remove(mapping)
@@ -159,7 +158,7 @@ class NodeDataLayer:
 
         Raises:
             ConnectError: the first endpoint that could not be made, with the RMW's reason; or all
-                that nobody mapped.
+                that are not mapped.
         """
         for mapping in self.endpoints.mappings.values():
             mapping.error = ""
@@ -272,7 +271,7 @@ class NodeDataLayer:
         """Give an endpoint these further names, instead of those that it has.
 
         A publisher publishes on all of them, a subscription's or service server's handler is given
-        what comes on any.
+        what arrives on any.
 
         Raises:
             UnknownEndpointError: no such declaration.
@@ -309,7 +308,7 @@ CONFIGURED = frozenset(
         NodeState.DEACTIVATING,
     }
 )
-"""Where endpoints are declared and nobody is taking them away."""
+"""Where endpoints are declared and not being taken away."""
 
 
 class NotConfiguredError(LifecycleError):

@@ -1,4 +1,4 @@
-"""The node interface for everybody else: five services of a standard type.
+"""The node interface as ROS services: connect_to, map_to, disconnect, remap, alias from outside.
 
 Owns: translation between rcl_interfaces/srv/SetParameters and data_layer.py, nothing else. A
 request is a list of names and values, the answer says of each whether it succeeded and why not:
@@ -31,7 +31,7 @@ class RemoteInterface:
     Args:
         node: that has it.
         interface: does it.
-        log: told what is a fault of ours, with its traceback.
+        log: called with a fault of ours and its traceback.
         group: reentrant, so that others can ask while a transition runs or a handover lasts.
     """
 

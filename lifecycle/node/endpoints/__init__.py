@@ -1,1 +1,1 @@
-"""Declared endpoints: the entities that stand for them, and where these are."""
+"""Declared endpoints: their rclpy entities, and the connections that these are on."""

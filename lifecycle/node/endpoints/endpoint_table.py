@@ -1,10 +1,8 @@
-"""The declared endpoints of one node, by kind and name.
+"""The declared endpoints of one node, by kind and name, and where the plan maps them.
 
-Owns: what is declared, the handles that authors publish by, and finding an endpoint by what people
-call it. Where an endpoint is mapped is not its business.
-
-Where the plan wants the endpoints of a node. Owns: which connection a planned endpoint belongs
-on, and mapping all of them there, or none.
+Owns: what is declared, the handles that authors publish by, and finding an endpoint by the name it
+is requested with; which connection a planned endpoint belongs on, and mapping all of them there, or
+none. Where an endpoint is mapped now is not its business.
 """
 
 from __future__ import annotations
@@ -36,7 +34,7 @@ class EndpointTable:
     Args:
         node: whose endpoints these are.
         gate: holds back its publishers.
-        changed: told that the node configuration is another now.
+        changed: called when the node configuration has changed.
 
     Attributes:
         mappings: every declared endpoint, in the order of declaration.
@@ -144,7 +142,7 @@ class PlannedPlaces:
         mappings: every declared endpoint, as it is at any time.
         connections: of the node.
         mapper: maps single endpoints.
-        standing: is told of connections.
+        standing: notified of connections.
 
     Attributes:
         spec: what the node was planned to be; None before anything is declared.

@@ -1,4 +1,4 @@
-"""From a declared endpoint to the rclpy entity that stands for it on a connection, and back.
+"""Make and destroy the rclpy entity of a declared endpoint on a connection.
 
 Owns: which factory makes which kind, with which QoS, callback group and gate. It keeps nothing:
 what exists where is data_layer.py's.
@@ -32,12 +32,12 @@ _ACTIONS = frozenset({EndpointKind.ACTION_SERVER, EndpointKind.ACTION_CLIENT})
 
 
 class Maker:
-    """Makes and unmakes the entities of one node.
+    """Makes and destroys the entities of one node.
 
     Args:
         node: whose endpoints they are, and whose executor runs their callbacks.
         gate: holds subscriptions back; publishers are held back by their handles.
-        client_group: reentrant, so that an answer can come in while a callback awaits it.
+        client_group: reentrant, so that an answer can arrive while a callback awaits it.
         later: runs a coroutine function in the node's executor.
     """
 
@@ -316,7 +316,7 @@ class Maker:
         return action
 
     def _survive_late_answers(self, service: Any, endpoint: PlannedEndpoint) -> None:
-        """Let an answer that comes after its server was unmade be lost, not end the process."""
+        """Let an answer after its server was destroyed be lost, not end the process."""
         send = service.send_response
         warn = self._node.get_logger().warning
 
@@ -334,7 +334,7 @@ class Maker:
 
 
 def wire_name(entity: Any) -> str:
-    """Return an entity's name on the wire, as rcl resolved it; empty if it does not tell."""
+    """Return an entity's name on the wire, as rcl resolved it; empty if it is unknown."""
     for attribute in ("topic_name", "service_name", "action_name"):
         name = getattr(entity, attribute, None)
         if name is not None:

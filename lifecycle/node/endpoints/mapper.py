@@ -1,7 +1,7 @@
-"""Which endpoint is on which connection, and how it comes and goes.
+"""Map, unmap, hand over and rename the endpoints of a node between its connections.
 
-Owns: mapping, unmapping, handing over and renaming of single endpoints, and the handovers that are
-under way. Where an endpoint belongs is data_layer.py's to say.
+Owns: these changes of single endpoints, and the handovers that are under way. Where an endpoint
+belongs is up to data_layer.py.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ class Mapper:
 
     Args:
         node: whose endpoints they are.
-        placer: makes and unmakes what stands for them.
+        placer: makes and destroys their entities.
         mappings: every declared endpoint, as it is at any time.
         handles: of its publishers, likewise.
         connections: of the node.
-        standing: is told.
+        standing: notified of each change.
         after: calls back once in the node's executor.
-        changed: told that the node configuration is another now.
+        changed: called when the node configuration has changed.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class Mapper:
 
     @property
     def entities(self) -> tuple[Any, ...]:
-        """Every rclpy object that stands for a declared endpoint."""
+        """Every rclpy object of a declared endpoint."""
         placements = [each.placement for each in self._mappings.values()]
         placements += [old for _, old in self._handovers.values()]
         return tuple(entity for each in placements if each for entity in each.entities)
@@ -175,7 +175,7 @@ class Mapper:
             running[0].end()
 
     def _hand_over(self, mapping: Mapping, old: Placement, connection: Connection) -> Future:
-        """Make an endpoint anew, live on both sides for a while, then unmake the old one."""
+        """Make an endpoint anew, live on both sides for a while, then destroy the old one."""
         peers = mapping.peers
         new = self._place(mapping, connection)
         handle = self._handle(mapping)
@@ -214,7 +214,7 @@ class Mapper:
     def _match(self, mapping: Mapping) -> None:
         """Some entity of a mapping has been matched or unmatched."""
         if mapping.endpoint.kind in CLIENTS:
-            self._changed()  # nobody counts their peers
+            self._changed()  # their peers are not counted
             return
         self._standing.matched(mapping)
         running = self._handovers.get(mapping.key)

@@ -1,11 +1,9 @@
-"""One declared endpoint and what stands for it now. Owns: the type, no behaviour of its own.
+"""One declared endpoint and its entities now: its mapping, its spellings, its matched peers.
 
-Told when the peers of a topic endpoint change. Owns: rclpy's matched events on our executor.
-The event is handled in a group of the framework's: an author's callback that awaits something
-must not hold back the news that a peer has come or gone.
-
-How endpoints are called in requests and messages: `video`, or `publishers/video`. Owns: what a
-spelling means, and what is said when a spelling names nothing or too much.
+Owns: the types of a mapping, without behaviour of their own; the meaning of a spelling in requests
+and messages (`video`, or `publishers/video`), and the error when it names nothing or too much;
+rclpy's matched events on our executor. Such an event is handled in a group of the framework's: an
+author's callback that awaits something must not delay the event of a peer that appeared or left.
 """
 
 from __future__ import annotations
@@ -99,7 +97,7 @@ class MatchWatch:
     """Calls back with the number of matched peers each time it has changed.
 
     Args:
-        node: whose executor calls; the endpoint may stand on another participant.
+        node: whose executor calls; the endpoint may be on another participant.
         entity: what to watch.
         group: reentrant.
         changed: takes the number of matched peers, >= 0.
@@ -129,7 +127,7 @@ class MatchWatch:
                 callback_group=group, callback=matched, event_type=event, parent_impl=entity.handle
             )
         except UnsupportedEventTypeError:
-            return  # an RMW without the event: counts are then read when somebody asks
+            return  # an RMW without the event: counts are then read on request
         node.add_waitable(self._handler)
 
     def stop(self) -> None:
@@ -147,7 +145,7 @@ class Part:
     Attributes:
         name: fully qualified; empty for the one of the declared name.
         entity: the rclpy object.
-        watch: tells of its peers or its server; None for service and action servers.
+        watch: notifies of its peers or its server; None for service and action servers.
     """
 
     name: str
@@ -157,7 +155,7 @@ class Part:
 
 @dataclasses.dataclass(slots=True, kw_only=True, eq=False)
 class Placement:
-    """What stands for an endpoint on one connection.
+    """The entities of an endpoint on one connection.
 
     Attributes:
         parts: the one of its own name first.
@@ -179,7 +177,7 @@ class Placement:
 
 @dataclasses.dataclass(slots=True, kw_only=True, eq=False)
 class Mapping:
-    """One declared endpoint and what stands for it now.
+    """One declared endpoint and its entities now.
 
     Attributes:
         interface: the message, service or action class.

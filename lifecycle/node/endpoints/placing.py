@@ -1,12 +1,11 @@
-"""All that stands for one endpoint on one connection: its entity, its aliases', their watches.
+"""Placements: the entities of one endpoint on one connection, and handover (make before break).
 
-Owns: that a placement is made whole or not at all, that a strictly unique flow is not shared, and
-how a new placement takes over from an old one.
+Owns: that a placement (its entity, its aliases' entities, their watches) is made whole or not at
+all; that a strictly unique flow is not shared; how a new placement takes over from an old one, how
+long both live side by side, and that nothing is delivered twice meanwhile.
 
-From one connection to another without a gap: make before break. Owns: how long both placements
-of an endpoint live side by side, and that nothing is delivered twice meanwhile. Both ends of a
-flow learn of each other at different moments, so a match seen here does not prove that the
-other side has seen it: the old placement stays a little longer than that.
+Both ends of a flow learn of each other at different moments, so a match seen here does not prove
+that the other side has seen it: the old placement stays a little longer than that.
 """
 
 from __future__ import annotations
@@ -62,7 +61,7 @@ class Handover:
     Args:
         peers_before: how many peers the old placement had.
         after: the timer.
-        finish: unmakes the old placement; called exactly once.
+        finish: destroys the old placement; called exactly once.
     """
 
     def __init__(self, *, peers_before: int, after: After, finish: Callable[[], None]) -> None:
@@ -91,7 +90,7 @@ class Handover:
 
 @typing.final
 class Overlap:
-    """Hands each sample on once, in order, while two subscriptions of one endpoint receive.
+    """Delivers each sample once, in order, while two subscriptions of one endpoint receive.
 
     The new one may be faster than the old one, so what it receives waits until the old one has
     given everything. A sample is known by its writer's time stamp and sequence number
@@ -121,10 +120,10 @@ class Overlap:
         self._waiting.append((message, info))
 
     def release(self, give: Callable[[Any], Any] | None) -> None:
-        """Hand on what was kept and the old subscription has not received.
+        """Deliver what was kept and the old subscription has not received.
 
         Args:
-            give: given what an async handler returns, to be awaited by somebody; None lets go of
+            give: called with what an async handler returns, to have it awaited; None lets go of
                 what was kept, because the gate is closed.
         """
         self._known = frozenset(self._seen)
@@ -153,11 +152,11 @@ class Overlap:
 
 
 def drain(subscription: Subscription, give: Callable[[Any], Any], *, at_most: int) -> None:
-    """Take what a subscription has received and nobody has taken, before it is destroyed.
+    """Take what a subscription has received and was not taken yet, before it is destroyed.
 
     Args:
         subscription: its callback takes message and info.
-        give: given what an async callback returns, to be awaited by somebody.
+        give: called with what an async callback returns, to have it awaited.
         at_most: bound, so that a fast publisher cannot hold us here.
     """
     for _ in range(at_most):
@@ -187,7 +186,7 @@ class Placer:
         node: whose executor runs the callbacks.
         maker: makes single entities.
         gate: holds subscriptions back.
-        event_group: reentrant, of the events that tell of peers.
+        event_group: reentrant, of matched events.
         later: runs a function in the node's executor.
         after: calls back once in the node's executor.
     """
@@ -217,13 +216,13 @@ class Placer:
         beside: Iterable[Mapping],
         matched: Callable[[Mapping], None],
     ) -> Placement:
-        """Make everything that stands for an endpoint on a connection, or nothing.
+        """Make all entities of an endpoint on a connection, or none.
 
         Args:
             mapping: the endpoint; where it is now is left alone.
             connection: where it shall be.
             beside: every endpoint of the node.
-            matched: told when the peers of this placement, or its server, change.
+            matched: called when the peers of this placement, or its server, change.
 
         Raises:
             LifecycleError: it cannot be made so.
@@ -282,7 +281,7 @@ class Placer:
     def switch(
         self, mapping: Mapping, old: Placement, new: Placement, overlap: Overlap | None
     ) -> None:
-        """Let the new placement do what the old one did until now, which is about to be unmade."""
+        """Let the new placement do what the old one did until now, which is destroyed next."""
         if mapping.endpoint.kind is EndpointKind.PUBLISHER:
             qos = mapping.endpoint.qos
             if qos is None or qos.reliability.name != "BEST_EFFORT":
@@ -297,7 +296,7 @@ class Placer:
             self._after(STRAGGLE_S, lambda: self._hand_back(mapping, new, overlap))
 
     def _hand_back(self, mapping: Mapping, placement: Placement, overlap: Overlap) -> None:
-        """Let rclpy call the handler itself again, unless something else has come meanwhile."""
+        """Let rclpy call the handler itself again, unless it was replaced meanwhile."""
         assert mapping.handler is not None
         for entity in placement.entities:
             if self._gate.callback_of(entity) == overlap.alone:

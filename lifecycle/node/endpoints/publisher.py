@@ -1,11 +1,10 @@
-"""The publisher a node's code holds: one object per declared name, whatever the data layer does.
+"""The publisher handle of a declared endpoint, and its TRANSIENT_LOCAL history across connections.
 
-Owns: the handle that `self.publisher("video")` returns. It exists from configure until cleanup;
-the rclpy publisher behind it comes with connect and goes with disconnect.
-
-What a TRANSIENT_LOCAL publisher has said, so that it goes along from connection to connection.
-Owns: `Kept`. DDS keeps such a history in the writer, for subscriptions that come later, and
-each connection has a writer of its own (DDS 1.4, 2.2.3.4).
+Owns: the handle that `self.publisher("video")` returns, one object per declared name. It exists
+from configure until cleanup; the rclpy publisher behind it is made by connect and destroyed by
+disconnect. And `Kept`, the messages of a TRANSIENT_LOCAL publisher: DDS keeps such a history in the
+writer, for late-joining subscriptions, and each connection has a writer of its own (DDS 1.4,
+2.2.3.4).
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ _SYSTEM_DEFAULT_DEPTH = 1
 
 @typing.final
 class Kept:
-    """The last messages of one publisher, serialized, and who has them.
+    """The last messages of one publisher, serialized, and which writers have them.
 
     Args:
         depth: how many, > 0.
@@ -106,7 +105,7 @@ class DeclaredPublisher:
 
     Args:
         name: as declared.
-        warn: told what is dropped.
+        warn: called with what is dropped.
         kept: keeps what is sent; None where nothing is kept.
 
     Attributes:
@@ -145,7 +144,7 @@ class DeclaredPublisher:
         return self._entity.get_subscription_count() if self._entity is not None else 0
 
     def prepare(self, entities: Sequence[Publisher]) -> None:
-        """Give entities that this will stand for what was sent, before anybody is matched.
+        """Give entities that this will publish by what was sent, before any peer is matched.
 
         Not while the gate is closed: what is inactive stays silent until it is opened.
         """
@@ -153,7 +152,7 @@ class DeclaredPublisher:
             self._kept.catch_up(entities)
 
     def attach(self, entity: Publisher, further: Sequence[Publisher] = ()) -> None:
-        """Stand for `entity`, and for those of its aliases, from now on."""
+        """Publish by `entity`, and by those of its aliases, from now on."""
         self._entity = entity
         self._further = tuple(further)
         self._warned = False
@@ -167,7 +166,7 @@ class DeclaredPublisher:
         self.publish = self._drop
 
     def forget(self) -> None:
-        """Whoever comes later is not told what was sent so far."""
+        """Later subscriptions do not receive what was sent so far."""
         if self._kept is not None:
             self._kept.forget()
 

@@ -1,4 +1,4 @@
-"""How a host makes the nodes that it is told to host: contexts, participants, construction.
+"""Construct the nodes of a host process: rclpy contexts, participants, node classes.
 
 Owns: which nodes of a process share a participant, and what a class must be to be hosted.
 """
@@ -71,7 +71,7 @@ class Participants:
         if self._made:
             context = Context()
             context.init(args=[], domain_id=self._default.get_domain_id())
-        # The participant comes into being with the context's first node.
+        # The participant is made with the context's first node.
         with participant_settings(context, settings):
             yield context
         self._made[settings] = context

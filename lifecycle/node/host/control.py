@@ -1,11 +1,11 @@
-"""The control channel between a supervisor and the processes that host our nodes.
+"""The control channel between a supervisor and its host processes: messages and the host's end.
 
-Owns: the messages, one JSON object per line over an inherited AF_UNIX stream socket. It carries
-what the lifecycle services and `~/get_configuration` carry, without waiting for discovery; both
-ways drive the same state machine. End of file from the supervisor makes a host shut down. Pure.
+Owns: the messages, one JSON object per line over an inherited AF_UNIX stream socket; reading and
+writing these lines in a host, and the descriptors that arrive beside the first byte.
 
-A host's end of the control channel (control.py). Owns: reading and writing its lines, and the
-descriptors that come beside the first byte.
+It carries what the lifecycle services and `~/get_configuration` carry, without waiting for
+discovery; both ways drive the same state machine. End of file from the supervisor makes a host shut
+down. Imports no rclpy.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from lifecycle.plan.model import ParticipantConnections, PlannedNode
 from lifecycle.verify.observation import NodeConfiguration
 
 SIGN_DESCRIPTORS = 2
-"""Beside the first byte of the HostSpec come the two descriptors of the busy sign, by which the
+"""Beside the first byte of the HostSpec are the two descriptors of the busy sign, by which the
 host's executor is watched (SCM_RIGHTS, unix(7)); a host that gets none is not watched."""
 
 
@@ -49,8 +49,8 @@ class Operation(enum.Enum):
     CONNECT_TO = "connect_to"  # connection, urls
     MAP_TO = "map_to"  # endpoint, connection
     DISCONNECT_FROM = "disconnect_from"  # connection
-    # Of the whole process: a link is down, and send again soon what nobody acknowledged; and tell
-    # the graph anew which nodes are here.
+    # Of the whole process: a link is down, and retransmit soon what was not acknowledged; and
+    # announce to the graph anew which nodes are here.
     SEND_AGAIN_SOON = "send_again_soon"
     TELL_NAMES = "tell_names"
 
@@ -92,7 +92,7 @@ class Event:
     Attributes:
         kind: "ready" (all nodes constructed, executor spinning), "failed" (construction failed;
             `error` says why, the process exits), "state" (a node's state changed), "reply",
-            "beat" (the executor has come back from a callback that took too long),
+            "beat" (the executor has returned from a callback that took too long),
             "configuration" (it changed: endpoints, connections, mappings or matches).
         id: the Command's id, for "reply".
         ok: the operation succeeded, for "reply".
@@ -121,7 +121,7 @@ class HostChannel:
     """JSON lines both ways; written from two threads, read from one.
 
     Attributes:
-        descriptors: of the busy sign, beside the first byte; none if nobody watches.
+        descriptors: of the busy sign, beside the first byte; none if it is not watched.
     """
 
     def __init__(self, control: socket.socket) -> None:

@@ -1,8 +1,8 @@
-"""A process that hosts nodes for a supervisor: told what to host, and what to do, by a socket.
+"""Entry point of a process that hosts nodes for a supervisor, over the control channel.
 
 Owns: the way in: read the HostSpec (control.py), then let hosting.py construct and run the nodes.
-Importing this module has no side effects and is cheap to fork from: `preload()` imports what a
-node needs, and nothing here calls rclpy.init before `serve`.
+Importing this module has no side effects and is cheap to fork from: `preload()` imports what a node
+needs, and nothing here calls rclpy.init before `serve`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def serve(control: socket.socket) -> NoReturn:
     """Host what the first line of `control` says until it ends; never returns.
 
     Exit codes: 0 after end of file, SIGTERM or SIGINT and a shutdown in time; 1 if the nodes
-    could not be constructed (the supervisor was told why) or a callback raised an exception.
+    could not be constructed (the supervisor was notified why) or a callback raised an exception.
     """
     channel = HostChannel(control)
     line = channel.read()
@@ -44,7 +44,7 @@ def serve(control: socket.socket) -> NoReturn:
         from lifecycle.node.host.hosting import Host
 
         context = process_context(spec)
-    except Exception as error:  # noqa: BLE001 - told to the supervisor
+    except Exception as error:  # noqa: BLE001 - reported to the supervisor
         give_up(channel, "", error)
     Host(spec, context, channel).run()
 

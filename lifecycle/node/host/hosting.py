@@ -1,12 +1,10 @@
-"""The nodes of one process and the supervisor that is told of them and commands them.
+"""Run the nodes of a host process: carry out the supervisor's commands and report back to it.
 
 Owns: the order of a host's life: construct every node, say "ready", obey, and at end of file shut
-down and leave; and what is told unasked. It holds no state of its nodes. While the user's modules
-are imported there is nothing to shut down: then it ends at once, and silently.
-
-What a supervisor's commands do to the nodes of a process. Owns: each Operation of control.py,
-and that each command is answered exactly once. They drive the same state machines that the
-lifecycle services do.
+down and leave; what is reported without a request; what each Operation of control.py does to the
+nodes, by the same state machines that the lifecycle services drive, and that each command is
+answered exactly once. It holds no state of its nodes. While the user's modules are imported there
+is nothing to shut down: then it ends at once, and silently.
 """
 
 from __future__ import annotations
@@ -102,7 +100,7 @@ class HostCommands:
         state = node.lifecycle.state
         carries = describe and (
             command.operation not in _ANSWERED_WITHOUT_CONFIGURATION
-            # Of its sockets nobody tells: what its callback did to them is read when it has ended.
+            # No event reports its sockets: what its callback did to them is read when it has ended.
             or (command.operation is Operation.ACTIVATE and node.lifecycle.is_marked)
         )
         return Event(
@@ -187,7 +185,7 @@ class Host:
         raise AssertionError("spin_and_exit returned")
 
     def _import(self, planned: PlannedNode) -> type[Node]:
-        """Import a node's class; whoever ends the process meanwhile need not wait."""
+        """Import a node's class; ending the process meanwhile need not wait for it."""
         with self._importing():
             return class_of(planned, alone=len(self._spec.nodes) == 1)
 
@@ -214,7 +212,7 @@ class Host:
         for planned in self._spec.nodes[index + 1 :]:
             try:
                 self._import(planned)
-            except Exception as another:  # noqa: BLE001, PERF203 - told to the supervisor
+            except Exception as another:  # noqa: BLE001, PERF203 - reported to the supervisor
                 report_failure(self._channel, planned.full_name, another)
         self._leave(1)
 

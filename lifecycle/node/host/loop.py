@@ -1,14 +1,15 @@
-"""Spins the nodes of one process and ends them well: in a host and in a terminal alike.
+"""Spin the nodes of one process, shut them down within a bound, and detect hanging callbacks.
 
 Owns: the executor's thread, signals, and the bounded way down (shutdown transitions, then leaving
-DDS). rclpy's own signal handlers are not used: they end the context under the nodes' feet, and
-nothing could be said or done after that.
+DDS), in a host and in a terminal alike; and what counts as hanging.
 
-Says when the executor of this process hangs in a callback. Owns: what counts as hanging. An
-executor that waits is idle, whatever it waits for; a callback of a transition has a deadline of
-its own; everything else may take as long as the nodes' `silent_s`. Who notices is at the other
-end of the busy sign (middleware/process/busy_timer.py): it need not be this process, whose
-interpreter may be locked by the very callback that hangs.
+rclpy's own signal handlers are not used: they end the context while the nodes still need it, and
+nothing could be reported or done after that.
+
+An executor that waits is idle, whatever it waits for; a callback of a transition has a deadline of
+its own; everything else may take as long as the nodes' `silent_s`. What notices is at the other end
+of the busy sign (middleware/process/busy_timer.py): it need not be this process, whose interpreter
+may be locked by the very callback that hangs.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ class Watchdog:
 
     Args:
         sign: this process's side.
-        on_overlong: told how many seconds a callback took that came back after all.
+        on_overlong: called with the seconds that a callback took which returned after all.
     """
 
     def __init__(self, sign: BusySign, on_overlong: Callable[[float], None]) -> None:
@@ -95,7 +96,7 @@ class NodeLoop:
 
     Args:
         context: of the executor; nodes may have others.
-        watchdog: told when a callback begins and ends.
+        watchdog: notified when a callback begins and ends.
 
     Example:
         >>> loop = NodeLoop(context)
@@ -127,7 +128,7 @@ class NodeLoop:
         self._executor.add_node(node)
 
     def tell_names(self) -> None:
-        """Have every participant of this process tell anew which nodes and endpoints it has."""
+        """Make every participant of this process publish anew which nodes and endpoints it has."""
         by_context = {id(node.context): node for node in self._nodes}
         tell_names((*by_context.values(), *hidden_nodes()))
 

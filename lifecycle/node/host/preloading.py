@@ -1,6 +1,6 @@
-"""What a process imports once, before it forks hosts.
+"""Imports that a process does once, before it forks hosts.
 
-Owns: the list of it. Must not make a participant, nor open a socket: neither survives a fork.
+Owns: the list of them. Must not make a participant, nor open a socket: neither survives a fork.
 """
 
 from __future__ import annotations

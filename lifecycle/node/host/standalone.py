@@ -1,13 +1,12 @@
 """Run one node in a terminal, without a supervisor: with a manifest's part of a plan, or without.
 
 Owns: what happens between the shell and the node: rclpy.init with the command line's --ros-args,
-the drive up in auto mode, one printed line per change of state, and the way out.
+the drive up in auto mode, one printed line per change of state, the way out; and what such a node
+reports of its liveliness, which a supervisor that attaches to it still sees.
 
-A node that nobody supervises is heard all the same by a supervisor that attaches to it. Owns:
-what such a node tells of its liveliness. DDS asserts that its process runs; that its executor
-hangs is noticed by a thread of its own, which sleeps until then. A callback that also holds the
-lock of the interpreter keeps that thread from telling, and only a supervisor of its own would
-see.
+DDS asserts that its process runs; that its executor hangs is noticed by a thread of its own, which
+sleeps until then. A callback that also holds the lock of the interpreter keeps that thread from
+reporting, and only a supervisor of its own would see.
 """
 
 from __future__ import annotations
@@ -62,11 +61,11 @@ class Heard:
         self.watchdog = Watchdog(self._sign, lambda _: self._tell(""))
 
     def open(self, node: LifecycleNode, tell_names: Callable[[], None]) -> None:
-        """Be heard from now on.
+        """Assert its liveliness from now on.
 
         Args:
             node: whose name it has.
-            tell_names: called when somebody begins to listen, who may have forgotten the names.
+            tell_names: called when a subscriber is matched, which may have dropped the names.
         """
         self._name = node.lifecycle.full_name
         self._publisher = AlivePublisher(node, node_topic(self._name), on_listener=tell_names)
@@ -125,7 +124,7 @@ def run(
         spec: the node's part of a plan; None for a node that declares its endpoints in code.
         domain_id: 0–232; None takes ROS_DOMAIN_ID, else 0.
         arguments: command line with --ros-args; None takes the process's own.
-        say: told each step; None prints to standard output.
+        say: called with each step; None prints to standard output.
         interrupted: exit code after Ctrl-C; OK as for other ROS nodes, since launch calls a node
             that exits otherwise died.
 
@@ -197,7 +196,7 @@ def _state(node: LifecycleNode) -> str:
 
 
 def _tell(say: Callable[[str], None], line: str) -> None:
-    """Say `line` if anybody still listens: a closed pipe does not end a node."""
+    """Print `line` if it is still read: a closed pipe does not end a node."""
     with contextlib.suppress(BrokenPipeError):
         say(line)
 

@@ -1,4 +1,4 @@
-"""Drives one node through its transitions: which step runs in which state, and what undoes it.
+"""Drives one node through its lifecycle transitions: steps, deadlines, and what undoes a step.
 
 Owns: the order of things inside a transition (the framework's half and the user's callback), the
 deadline of each, and one transition at a time. The state itself lives in the machine alone.

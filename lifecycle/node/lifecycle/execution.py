@@ -30,7 +30,7 @@ class CancelledError(LifecycleError):
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Result:
-    """What a step came to.
+    """The result of a step.
 
     Attributes:
         error: why not SUCCESS, one line for people; empty on SUCCESS.
@@ -51,8 +51,8 @@ class Interruptible:
     """Awaits a coroutine inside rclpy's executor and can be made to stop.
 
     rclpy has no running asyncio loop: an awaiting task is resumed each time its executor wakes.
-    This drives the inner coroutine by hand and looks at its deadline on every resumption, so
-    somebody must wake the executor at the deadline (the node keeps a timer for that).
+    This steps the inner coroutine itself and looks at its deadline on every resumption, so
+    something must wake the executor at the deadline (the node keeps a timer for that).
     """
 
     def __init__(
@@ -100,7 +100,7 @@ async def call(
     deadline_s: float,
     started: Callable[[Interruptible], None],
 ) -> Result:
-    """Run a transition callback and say what it came to; never raises for what the user did.
+    """Run a transition callback and return its result; never raises for what the user did.
 
     Args:
         callback: sync or async; may take fewer arguments than given (`on_configure(self)`).
@@ -137,7 +137,7 @@ async def call(
 
 
 def hint(error: Exception) -> str:
-    """Return what to do about an exception whose text does not tell; empty if there is nothing.
+    """Return what to do about an exception whose text does not say it; empty if there is nothing.
 
     asyncio says `no running event loop` of whatever is awaited of it, `asyncio.sleep` first of all.
     """

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 Later = Callable[[Callable[[], Coroutine[Any, Any, None] | None]], object]
-"""Runs a function, sync or async, in the node's executor, soon; false if nobody spins the node."""
+"""Runs a function, sync or async, in the node's executor, soon; false if the node is not spun."""
 
 
 class Gated(Protocol):
@@ -55,7 +55,7 @@ class NodeGate:
             gated.close()
 
     def add_worker(self, entity: object, worker: Gated) -> None:
-        """Put `worker` in charge of `entity`; it is closed first, so that its last words pass."""
+        """Put `worker` in charge of `entity`; it is closed first: its last messages pass."""
         self._workers[id(entity)] = worker
 
     def add_subscription(self, subscription: Subscription, later: Later) -> None:
@@ -70,14 +70,14 @@ class NodeGate:
             gated.hand_to(callback)
 
     def callback_of(self, subscription: Subscription) -> Callable[..., Any] | None:
-        """Return who has a gated subscription's messages while the gate is open."""
+        """Return what receives a gated subscription's messages while the gate is open."""
         gated = self._entities.get(id(subscription))
         if not isinstance(gated, GatedSubscription):
             return None
         return gated.callback
 
     def release(self, entity: object) -> None:
-        """Ungate an entity: something else stands in front of it."""
+        """Ungate an entity: something else gates it."""
         gated = self._entities.pop(id(entity), None)
         if gated is not None:
             gated.open()
@@ -129,8 +129,8 @@ class GatedPublisher:
 class GatedSubscription:
     """Takes and drops messages while closed, so that old ones do not wait for activation.
 
-    A TRANSIENT_LOCAL sample is state, not news: its publisher, activated before us, sends it once.
-    So the last `depth` of those are kept while closed and given to the callback when opened.
+    A TRANSIENT_LOCAL sample is state, not an event: its publisher, activated before us, sends it
+    once. So the last `depth` of those are kept while closed and given to the callback when opened.
     """
 
     def __init__(self, subscription: Subscription, later: Later) -> None:
@@ -159,7 +159,7 @@ class GatedSubscription:
             self._later(self._deliver)
 
     def close(self) -> None:
-        """Give messages to nobody."""
+        """Drop messages."""
         self._subscription.callback = self._drop
 
     def hand_to(self, callback: Callable[..., Any]) -> None:
@@ -225,7 +225,7 @@ class GatedTimer:
 
 
 def takes_one(callback: Callable[..., Any]) -> bool:
-    """Tell whether rclpy gives a subscription's callback the message alone."""
+    """Return whether rclpy gives a subscription's callback the message alone."""
     try:
         inspect.signature(callback).bind(object())
     except TypeError:

@@ -114,7 +114,7 @@ _STEADY = frozenset(
 
 
 class CallbackOutcome(enum.Enum):
-    """What a transition callback came to; values are rcl_lifecycle's transition labels."""
+    """The outcome of a transition callback; values are rcl_lifecycle's transition labels."""
 
     SUCCESS = "transition_success"
     FAILURE = "transition_failure"
@@ -234,7 +234,7 @@ class StateChange:
     """One change of the machine.
 
     Attributes:
-        event: the edge that other tools must hear of as a lifecycle_msgs/TransitionEvent; None
+        event: the edge that other tools must receive as a lifecycle_msgs/TransitionEvent; None
             for a change inside one of their states.
     """
 
@@ -298,7 +298,7 @@ class LifecycleMachine:
     def available_transitions(self) -> tuple[Transition, ...]:
         """What get_available_transitions answers: rcl's edges from the state that others see.
 
-        Beside connected stands disconnect and beside disconnected connect. While connecting or
+        From connected, disconnect is offered, and from disconnected, connect. While connecting or
         disconnecting nothing can be asked for, so nothing is offered.
         """
         if self.state in {NodeState.CONNECTING, NodeState.DISCONNECTING}:
@@ -332,7 +332,7 @@ class LifecycleMachine:
         self._announce(before, None if connecting else request.value)
 
     def finish(self, outcome: CallbackOutcome) -> None:
-        """End the running step of a transition with what its callback came to.
+        """End the running step of a transition with the outcome of its callback.
 
         Raises:
             RefusedError: no transition is running.

@@ -1,11 +1,10 @@
-"""The managed node's face to ROS: five lifecycle_msgs services and `~/transition_event`.
+"""The five lifecycle_msgs services and `~/transition_event` of a managed node, and its own timers.
 
-Owns: translation between messages and the state machine, nothing else. Names, types and QoS are
-rcl_lifecycle's (rcl_lifecycle/src/com_interface.c). A request that the state does not allow is
-answered with success=False; it never raises.
+Owns: translation between messages and the state machine; and how parts of a node run in the
+executor that spins it: turns, and timers that run in every state. None of it passes the gate.
 
-Turns of the executor that spins a node, and timers that run in every state. Owns: how the parts
-of a node come to run in its executor. None of it passes the gate.
+Names, types and QoS are rcl_lifecycle's (rcl_lifecycle/src/com_interface.c). A request that the
+state does not allow is answered with success=False; it never raises.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ _TRANSITION_EVENT_DEPTH = 10  # rmw_qos_profile_default
 
 
 class LifecycleServices:
-    """Serves one node's state machine to `ros2 lifecycle`, launch_ros, nav2 and everyone else."""
+    """Serves one node's state machine to `ros2 lifecycle`, launch_ros, nav2 and all others."""
 
     def __init__(
         self,
@@ -50,7 +49,7 @@ class LifecycleServices:
             node: the node to be seen as managed.
             state_machine: its state; only read.
             change: runs a transition, returns whether it succeeded.
-            refuse: told why a request that names no available transition was refused.
+            refuse: called with why a request that names no available transition was refused.
             configuration: returns the node configuration document, JSON.
             group: must be reentrant, so that others can ask while a transition runs.
         """
@@ -77,10 +76,10 @@ class LifecycleServices:
             Node.create_service(node, type_, f"~/{name}", callback, callback_group=group)
 
     def publish(self, transition: machine.Transition) -> None:
-        """Tell the world of a transition, with the fields that rcl_lifecycle fills in.
+        """Publish a transition event, with the fields that rcl_lifecycle fills in.
 
         rcl leaves `timestamp` and `transition` empty. Connect and disconnect fill in `transition`:
-        start and goal are the same there, so nothing else tells the two apart.
+        start and goal are the same there, so nothing else distinguishes the two.
         """
         event = msg.TransitionEvent(
             start_state=_state(transition.start), goal_state=_state(transition.goal)
@@ -189,7 +188,7 @@ class Turns:
     def call_soon(self, task: Callable[[], Coroutine[Any, Any, None] | None]) -> bool:
         """Run a function, sync or async, in the node's executor; returns whether there is one."""
         executor = self._node.executor
-        if executor is None or self._closed:  # a node that nobody spins receives nothing
+        if executor is None or self._closed:  # a node that is not spun receives nothing
             return False
         executor.create_task(task)
         return True

@@ -1,1 +1,1 @@
-"""What a node tells of itself: configuration, liveliness."""
+"""What a node reports about itself: configuration, graph membership, machine id."""

@@ -1,19 +1,14 @@
-"""The node configuration document: who a node is and what its endpoints really are.
+"""The node configuration document: a node's identity, its endpoints as they are, its capabilities.
 
-Owns: collecting a NodeConfiguration (schema: schemas/node_configuration.v1.schema.json) from a
-live node. It is served at `~/get_configuration` and sent to a supervisor.
+Owns: collecting a NodeConfiguration (schema: schemas/node_configuration.v1.schema.json) from a live
+node; the transports, wire formats and communication paradigms of each RMW, as far as this package
+can choose them (`connect_to`), which are the input of negotiation; what counts for its checksum, by
+which a reader knows that it must read it again; and one notification for all changes within one
+turn of the executor, none while there is no listener: a configuration costs a millisecond to
+collect.
 
-What a node can be connected by, talk in, and what for: the input of negotiation. Owns: the
-transports, wire formats and communication paradigms of each RMW, as far as this package can
-choose them (`connect_to`). See *Topological Discovery and Communication Negotiation*, "Node
-Configuration Interface".
-
-The checksum of a node configuration, by which a reader knows that it must read it again. Owns:
-what counts for it.
-
-Tells that a node's configuration is another now, once however much changed. Owns: making one
-notice of all changes within one turn of the executor, and nothing of it while nobody listens: a
-configuration costs a millisecond to collect.
+It is served at `~/get_configuration` and sent to a supervisor. See *Topological Discovery and
+Communication Negotiation*, "Node Configuration Interface".
 """
 
 from __future__ import annotations
@@ -83,7 +78,7 @@ _IPV6_ADDRESSES = Path("/proc/net/if_inet6")
 def transports() -> tuple[str, ...]:
     """Return what nodes of this process can be connected by, as connection URLs spell it.
 
-    Empty where the RMW's transports are not ours to choose: then what its endpoints' NFEs tell is
+    Empty where the RMW's transports are not ours to choose: then what its endpoints' NFEs show is
     all that is known.
     """
     if get_rmw_implementation_identifier() != _CONFIGURABLE_RMW:
@@ -106,7 +101,7 @@ def checksum(configuration: NodeConfiguration) -> str:
     """Return 16 hex digits that change exactly when a reader must read the document again.
 
     State, matches and what follows from them (whether a connection is established) change
-    all the time and are told by events, so they do not count.
+    all the time and are reported by events, so they do not count.
     """
     stable = dataclasses.replace(
         configuration,
@@ -145,7 +140,7 @@ def collect(
         node: the node itself.
         state: of its state machine.
         spec: what it was planned to be.
-        data_layer: its declared endpoints and what stands for them.
+        data_layer: its declared endpoints and their entities.
         undeclared: kind and rclpy object of endpoints that its code made by itself.
     """
     endpoints = (
@@ -255,7 +250,7 @@ def _with_matches(report: EndpointReport, witness: Node, entity: Any) -> Endpoin
         entity: its rclpy object.
     """
     info = _own_endpoint(witness, report.resolved, report.kind, guid_of(entity))
-    # Counted before the peers are asked for: who comes meanwhile must not count as unknown.
+    # Counted before the peers are queried: a peer matched meanwhile must not count as unknown.
     matched = count_peers(entity)
     others = endpoints_of(witness, _OTHER[report.kind], report.resolved)
     return dataclasses.replace(
@@ -272,7 +267,7 @@ def _own_endpoint(node: Node, topic: str, kind: EndpointKind, gid: str = "") -> 
     """Return what this process's graph cache says of the node's own endpoint on `topic`.
 
     It knows own endpoints at once, discovery has no part in it. None if there is none, or if
-    there are several and no GID tells which is which.
+    there are several and no GID identifies which is which.
     """
     name = node.get_fully_qualified_name()
     own = [info for info in endpoints_of(node, kind, topic) if info.node == name]
@@ -299,7 +294,7 @@ def _nfes(
     try:
         nfes = get_network_flow_endpoints(entity)
     except MiddlewareError:
-        return None  # "the RMW cannot tell" is a value here, and the verifier's to judge
+        return None  # "unknown to the RMW" is a value here, and the verifier's to judge
     publishes = kind is EndpointKind.PUBLISHER
     if publishes and connection is not None and connection.has_shared_memory:
         return (*nfes, SHARED_MEMORY)
@@ -323,7 +318,7 @@ def _actual_qos(entity: Any, info: EndpointInfo | None) -> QosProfile:
 
 
 def _transports(endpoints: tuple[EndpointReport, ...]) -> tuple[str, ...]:
-    """Return what the node can be reached by, as far as its endpoints' NFEs tell."""
+    """Return what the node can be reached by, as far as its endpoints' NFEs show."""
     found = {_transport(nfe) for endpoint in endpoints for nfe in endpoint.nfes or ()}
     return tuple(sorted(found))
 
@@ -344,7 +339,7 @@ class ConfigurationChanges:
     Args:
         later: runs a function in the node's executor.
         collect: returns the configuration as it is now.
-        failed: told with a traceback that it could not be collected; nobody is told then.
+        failed: called with the traceback if it cannot be collected; no listener is notified then.
     """
 
     def __init__(
@@ -378,7 +373,7 @@ class ConfigurationChanges:
             listener(configuration)
 
     def collect(self) -> NodeConfiguration | None:
-        """Return the configuration as it is now; None, and a word in the log, if that fails."""
+        """Return the configuration as it is now; None, and a line in the log, if that fails."""
         try:
             return self._collect()
         except Exception:  # noqa: BLE001 - describing itself must not end the node

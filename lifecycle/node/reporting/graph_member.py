@@ -1,7 +1,7 @@
-"""A node's own part in the graph: what it tells everybody of itself.
+"""A managed node's reporter to the ROS graph: its publisher and heartbeat in every lifecycle state.
 
 Owns: the reporter's place on a managed node: its publisher and its timer must work in every state,
-so they do not pass the gate. What is told is lifecycle.graph's.
+so they do not pass the gate. What is reported is lifecycle.graph's.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 
 
 class GraphMember:
-    """Tells the graph of one node, from its construction until it is destroyed.
+    """Reports one node to the graph, from its construction until it is destroyed.
 
     Args:
-        node: that is told of; its executor sends the heartbeats.
+        node: to report; its executor sends the heartbeats.
         group: reentrant.
     """
 
@@ -39,15 +39,15 @@ class GraphMember:
         self._reporter.joined(state.seen.label, connected=state.connected, checksum=checksum)
 
     def state_changed(self, state: NodeState) -> None:
-        """Tell the state that the node is in now."""
+        """Report the state that the node is in now."""
         self._reporter.state_changed(state.seen.label, connected=state.connected)
 
     def configuration_changed(self, checksum: str) -> None:
-        """Tell that the configuration is to be read again, if the checksum is another."""
+        """Report that the configuration is to be read again, if the checksum is another."""
         self._reporter.configuration_changed(checksum)
 
     def connection_event(self, event: ConnectionEvent) -> None:
-        """Tell what became of a connection or mapping."""
+        """Report what became of a connection or mapping."""
         kind = event.kind
         if kind is ConnectionEventKind.CONNECTION_ESTABLISHED:
             self._reporter.connection_established(event.connection, event.urls)

@@ -1,4 +1,7 @@
-"""What tells one machine from another. Owns: where that is found."""
+"""The id of this machine, which distinguishes it from others.
+
+Owns: where that is found.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ their own share /etc/machine-id or have none, and always share the kernel's boot
 
 @functools.lru_cache(maxsize=1)
 def machine_id() -> str:
-    """Return what tells this machine from others.
+    """Return what distinguishes this machine from others.
 
     It is $LIFECYCLE_MACHINE_ID where that is set, else /etc/machine-id (machine-id(5)), else the
     kernel's boot id. Nodes of one id are taken to share memory and loopback.
