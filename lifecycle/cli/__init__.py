@@ -93,7 +93,7 @@ def program() -> int:
         return main()
     code = own_streams(waits=verb != ["up"]).settled(main())
     if verb == ["up"]:
-        # The interpreter takes a moment to end, and what was said of the run stands.
+        # The interpreter takes a moment to end, and the reported result of the run is final.
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, signal.SIG_IGN)
     return code

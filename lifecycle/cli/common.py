@@ -44,10 +44,10 @@ def timeout_option(default_s: float, help_: str, *, or_0: bool = False) -> Calla
 
 
 def parse_assignments(assignments: tuple[str, ...]) -> dict[str, str]:
-    """Parse `name:=value` words, as `ros2 launch` spells them.
+    """Parse `name:=value` arguments, as `ros2 launch` spells them.
 
     Raises:
-        UsageError: a word without `:=` or with an empty name, or a name given twice.
+        UsageError: an argument without `:=` or with an empty name, or a name given twice.
     """
     values: dict[str, str] = {}
     for word in assignments:
@@ -67,7 +67,7 @@ def load_manifest(
 
     Args:
         path: the file.
-        assignments: `name:=value` words.
+        assignments: `name:=value` arguments.
         quiet: print nothing.
         machine: what its nodes run is looked for, too, as `up --machine` would start it; None looks
             for nothing.

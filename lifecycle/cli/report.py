@@ -88,7 +88,7 @@ def write_report(path: Path, text: str) -> None:
 def _replace(file: int, data: bytes) -> None:
     """Replace what is in a file: all of it, or where a disk is full none of it.
 
-    Half a report might read as a success; what stands there says that the command never ended.
+    Half a report might read as a success; what is there says that the command never ended.
     """
     is_file = stat.S_ISREG(os.fstat(file).st_mode)
     if is_file:
@@ -170,7 +170,7 @@ class ReportFile:
     """The report of one command; use it in a `with` around all that may fail.
 
     Whatever leaves the block, the file says how the command ended: the verdict given to `end`, or
-    the exception. Until then it says that there was no end, for whoever finds it after a SIGKILL.
+    the exception. Until then it says that there was no end, for a reader after a SIGKILL.
 
     Args:
         path: opened by `report_option`; None writes nothing.

@@ -1,8 +1,9 @@
-"""Standard output and standard error that are closed, full or not read, and what then is lost.
+"""Standard output and error that are closed, full or not read, and what is lost then.
 
 Owns: `own_streams`, which keeps standard output for what a verb prints (Fast DDS 2.14 prints errors
-of TCP connections there, where they would stand among JSON lines or in a CSV file), and after which
-writing to either stream never raises; and `Writer`, by which a supervisor never waits for a reader.
+of TCP connections there, where they would end up among JSON lines or in a CSV file), and after
+which writing to either stream never raises; and `Writer`, by which a supervisor never waits for a
+reader.
 """
 
 from __future__ import annotations
@@ -133,7 +134,7 @@ def own_streams(*, waits: bool = True) -> Streams:
 
 
 def echo_while_read(text: str) -> None:
-    """Print one text of many that follow changes; end the verb once nobody reads them any more.
+    """Print one text of many that follow changes; end the verb once they are not read any more.
 
     Raises:
         Exit: standard output has ended.
@@ -186,7 +187,7 @@ def _never_wait(descriptor: int) -> None:
 
 
 def _write_some(descriptor: int, data: memoryview) -> int:
-    """Write something, also where somebody made the descriptor non-blocking."""
+    """Write something, also where the descriptor was made non-blocking."""
     while True:
         try:
             return os.write(descriptor, data)
@@ -205,7 +206,7 @@ class Writer:
     Args:
         descriptor: where to.
         name: of the stream, for messages.
-        marker: makes what stands in the stream of a message about it.
+        marker: makes the note in the stream from a message about the loss.
         say: takes messages that the stream itself cannot take, from any thread.
         encoding: of the texts.
 

@@ -34,9 +34,9 @@ def target_arguments(function: F) -> F:
 def target_run(
     environment: Mapping[str, str], target: str, assignments: tuple[str, ...], machine: str
 ) -> Path:
-    """Return the run directory that a word means: a manifest's, or a system's by name.
+    """Return the run directory that a target names: a manifest's, or a system's by name.
 
-    A manifest that is not the one that runs any more is said on stderr, and makes no difference.
+    A manifest that is no longer the one that runs is reported on stderr, and makes no difference.
 
     Raises:
         UsageError: no such run.
@@ -61,7 +61,7 @@ def _say_differences(path: Path, plan: Plan) -> None:
 def target_plan(
     environment: Mapping[str, str], target: str, assignments: tuple[str, ...], machine: str
 ) -> tuple[Path, Plan | None]:
-    """Return the run directory that a word means, and the plan if the word is a manifest.
+    """Return the run directory that a target names, and the plan if it is a manifest.
 
     Raises:
         UsageError: no such run, or arguments for a system that is named.

@@ -1,11 +1,8 @@
-"""What `lifecycle up` shows: JSON lines, plain lines, or a live table on a terminal.
+"""Output of `lifecycle up`: JSON lines, plain lines, or a live table on a terminal.
 
-Owns: the choice between them and the two line formats. Everything comes from the supervisor's
-events.
-
-The live table of `lifecycle up` on a terminal. Owns: how a run looks while it happens. Log
-lines and notices scroll above the table; the table shows each node's process, state, matched
-endpoints and flows, and is drawn again at every event.
+Owns: the choice between them, the two line formats, and the live table: log lines and notices
+scroll above it; it shows each node's process, state, matched endpoints and flows, and is drawn
+again at every event. Everything comes from the supervisor's events.
 """
 
 from __future__ import annotations
@@ -63,17 +60,17 @@ class RunOutput(Protocol):
         """Show one event."""
 
     def watch(self, status: Callable[[], SystemStatus]) -> None:
-        """Take the way to ask for the status, once there is something to tell."""
+        """Take the way to ask for the status, once there is something to show."""
 
     def finish(self, result: UpResult) -> None:
-        """Show the result, and return once that is written or nobody takes it."""
+        """Show the result, and return once that is written or not taken."""
 
 
 class Sink(Protocol):
     """Where lines go; it never blocks and never fails."""
 
     def put(self, text: str, *, kept: bool = True) -> None:
-        """Take whole lines; those that are not `kept` may be dropped where nobody reads."""
+        """Take whole lines; those that are not `kept` may be dropped where not read."""
 
     def close(self) -> None:
         """Write what is left, bounded; again is harmless."""
@@ -171,7 +168,7 @@ class PlainLines:
         """Need nothing more than the events."""
 
     def __call__(self, event: Event) -> None:
-        """Write one event, if it has something to tell a person."""
+        """Write one event, if it has a line for people."""
         self._stopping = self._stopping or isinstance(event, Stopping)
         hidden = self._rollback.hides(event)
         if hidden or (isinstance(event, NodeChanged) and self._is_on_the_way(event)):
@@ -183,7 +180,7 @@ class PlainLines:
             if event.stage is Stage.ACTIVE and not self._active and missing(event.verdict):
                 # Not a system that broke: nodes become active one by one, and host by host.
                 line = one_line(f"not active yet; {missing(event.verdict)}")
-            # A verdict changes with every count in it; a person is told what reads differently.
+            # A verdict changes with every count in it; people see only what reads differently.
             if line == self._judged:
                 return
             self._judged = line
@@ -205,7 +202,7 @@ class PlainLines:
 
 
 def describe(event: Event) -> str | None:
-    """Return the line that tells a person of `event`, printable; None if it has none."""
+    """Return the line about `event` for people, printable; None if it has none."""
     line = _describe(event)
     if line is None:
         return None
@@ -308,7 +305,7 @@ def _(event: SystemReached) -> str:
 
 @_describe.register
 def _(event: Failure) -> str:
-    # What ends the run is the first that the last verdict says; once is enough.
+    # What ends the run comes first in the last verdict; once is enough.
     named = f"failed: {event.subject} ({event.rule})"
     return named if event.ends_run else f"{named}: {event.message}"
 
@@ -433,7 +430,7 @@ class Live:
         return self._writer is not None and self._writer.is_behind
 
     def _catch_up(self) -> None:
-        """Draw what was not drawn while nobody saw it."""
+        """Draw what was not drawn while the terminal was behind."""
         if self._skipped or self._missed:
             self._draw()
 

@@ -1,7 +1,7 @@
-"""What a running graph tells of the system that it is: the input of a captured manifest.
+"""Captures a running ROS graph as data for a manifest: nodes, endpoints, parameters, gaps.
 
-Owns: `CapturedSystem` and how an observation becomes one: tools left out, hidden participants given
-to their nodes, everything that the graph does not tell named as a gap. Pure.
+Owns: `CapturedSystem` and how an observation becomes one: tools left out, hidden participants
+assigned to their nodes, everything that the graph does not show named as a gap. Pure.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class CapturedParameter:
     """A parameter as its node describes it.
 
     Attributes:
-        type: word of rcl_interfaces, see ParameterDeclaration; empty if it is not set.
+        type: type name of rcl_interfaces, see ParameterDeclaration; empty if it is not set.
         value: at this moment; None where it is not set or cannot be written.
     """
 
@@ -52,11 +52,11 @@ class CapturedParameter:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class CapturedEndpoint:
-    """An endpoint as the graph and its node tell.
+    """An endpoint as the graph and its node report it.
 
     Attributes:
         name: fully qualified.
-        declared: as a node of ours spells it in its code; the full name where nobody tells.
+        declared: as a node of ours spells it in its code; the full name where that is not known.
         qos: None for services and actions.
         unique: as a node of ours reports; else NOT_REQUIRED.
         dscp: likewise; None if it is not marked.
@@ -81,7 +81,7 @@ class CapturedNode:
         managed: it offers the lifecycle services.
         state: lifecycle_msgs/State label; empty if not known.
         parameters: None where it did not answer.
-        tells: its own configuration says more than discovery does.
+        tells: its own configuration has more than discovery does.
         gaps: what is not known of it, one phrase each.
     """
 
@@ -106,7 +106,7 @@ class CapturedNode:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class CapturedMachine:
-    """A machine that nodes of ours named; `address` is empty if none of them told one."""
+    """A machine that nodes of ours named; `address` is empty if none of them reported one."""
 
     name: str
     machine_id: str
@@ -142,7 +142,7 @@ def capture(
     namespaces: tuple[str, ...] = (),
     unsettled: str = "",
 ) -> CapturedSystem:
-    """Return what `observation` tells; the same for the same content in any order.
+    """Return what `observation` shows; the same for the same content in any order.
 
     Args:
         observation: of every node in the graph, configurations of ours included.
@@ -209,7 +209,7 @@ def capture(
 
 
 def _owners(configurations: Mapping[str, NodeConfiguration]) -> dict[str, str]:
-    """Return the node that each hidden participant stands for, as the nodes themselves tell."""
+    """Return the node that owns each hidden participant, as the nodes themselves report."""
     owners = {}
     for name, configuration in configurations.items():
         namespace = name.rpartition("/")[0]
@@ -276,7 +276,7 @@ def _machines(
 
 
 def _address(configuration: NodeConfiguration) -> str:
-    """Return an address that others reach the node's machine at, as its subscriptions tell."""
+    """Return an address that others reach the node's machine at, as its subscriptions report."""
     return next(
         (
             nfe.internet_address
@@ -375,7 +375,7 @@ def _endpoint(endpoint: ObservedEndpoint, reports: Iterable[EndpointReport]) -> 
         type=endpoint.type,
         qos=qos,
         unique=report.unique if report else UniqueRequirement.NOT_REQUIRED,
-        # 0 is what nobody marked.
+        # 0 is unmarked.
         dscp=(report.dscp or None) if report else None,
     )
 

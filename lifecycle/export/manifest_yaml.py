@@ -1,11 +1,9 @@
-"""A captured system as a manifest, and its nodes as NoDL v2 documents.
+"""Writes a captured system as a manifest in YAML, and its nodes as NoDL v2 documents.
 
-Owns: how what a graph tells is written in the manifest's words, and `# gap:` on every line whose
-value it does not tell. What is written passes `lifecycle check`. Pure.
-
-Data as YAML text that reads back the same here, in YAML 1.1 and in YAML 1.2. Owns: when a
-scalar needs quotes, how comments stand beside what they are about, and that the same data give
-the same text.
+Owns: how captured facts are spelled in a manifest, with `# gap:` on every line whose value the
+graph does not show; and YAML text that reads back the same here, in YAML 1.1 and in YAML 1.2: when
+a scalar needs quotes, how comments are placed beside what they are about, and that the same data
+give the same text. What is written passes `lifecycle check`. Pure.
 """
 
 from __future__ import annotations
@@ -43,7 +41,7 @@ class Noted:
 
 _PLAIN = re.compile(r"[A-Za-z_/][A-Za-z0-9_/.-]*")
 _WORDS = frozenset({"null", "true", "false", "yes", "no", "on", "off", "y", "n"})
-"""Words that some version of YAML does not read as strings, in any spelling of case."""
+"""Scalars that some version of YAML does not read as strings, in any spelling of case."""
 
 _ESCAPES = {"\\": "\\\\", '"': '\\"', "\n": "\\n", "\t": "\\t", "\r": "\\r"}
 
@@ -135,7 +133,7 @@ def to_manifest(system: CapturedSystem, *, references: Mapping[str, str] | None 
 
     Args:
         system: what was captured.
-        references: by node key, what stands for the node's interface, `local://camera.nodl.yaml`;
+        references: by node key, the reference to the node's interface, `local://camera.nodl.yaml`;
             interfaces are written out without it.
     """
     head = [

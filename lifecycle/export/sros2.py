@@ -66,7 +66,7 @@ class Enclave:
         path: `/teleop/camera`.
         profiles: of its nodes.
         processes: names of the plan's processes; empty for a supervisor's.
-        chosen: the manifest names it, by the variable or by `--enclave`; else it must be told.
+        chosen: the manifest names it, by the variable or by `--enclave`; else it must be given.
     """
 
     path: str
@@ -299,7 +299,7 @@ def _token(name: str) -> str:
 
 
 def _free(path: str, taken: Iterable[str]) -> str:
-    """Return a path that nobody has yet: a process may be named as a supervisor's enclave is."""
+    """Return a path that is not in use yet: a process may be named as a supervisor's enclave is."""
     every = {*taken}
     number = 2
     free = path

@@ -1,4 +1,4 @@
-"""Plan × Observation → Verdict, and the verdict's reports. Pure: no ROS, no files, no clock."""
+"""Verifies Plan × Observation → Verdict, and reports it. Pure: no ROS, no files, no clock."""
 
 from lifecycle.verify.judge import missing, not_ok, verify
 from lifecycle.verify.observation import (

@@ -1,12 +1,9 @@
-"""Plan × Observation → Verdict.
+"""Verifies a running ROS 2 system against its plan: Plan × Observation → Verdict.
 
-Owns: `verify`, and when a verdict closes the gate. Everything it needs is in its arguments. Pure.
-
-One report per planned flow: what carries it, how unique it is, and whether it is as declared.
-Owns: turning the view and the findings into FlowReports.
-
-What a verdict still waits for, or takes on trust, in one line. Owns: `missing`, `not_ok`,
-`taken_on_trust`.
+Owns: `verify` and when a verdict closes the gate; one FlowReport per planned flow (what carries it,
+how unique it is, whether it is as declared); and the one-line summaries of what a verdict still
+waits for or accepts unverified: `missing`, `not_ok`, `taken_on_trust`. Everything it needs is in
+its arguments. Pure.
 """
 
 from __future__ import annotations
@@ -135,7 +132,7 @@ def _transport(
     source: Sequence[NetworkFlowEndpoint],
     destination: Sequence[NetworkFlowEndpoint],
 ) -> str:
-    """Say what can carry a flow: transports that both ends list, shared memory on one machine only.
+    """Return what can carry a flow: transports both ends list, shared memory on one machine only.
 
     NFEs do not prove which of them carries the data, so several are joined by "or".
     """
@@ -175,7 +172,7 @@ def verify(
         observation: what was seen, tools and client library endpoints left in or not.
         stage: which moment it is judged against.
         machines: names of the machines whose nodes the caller brings up; those of others are
-            brought up by somebody else and may be active before ours. None: all are ours.
+            brought up elsewhere and may be active before ours. None: all are ours.
         ahead: fully qualified names of nodes that an earlier gate let through, which may be active
             although this one has not opened yet.
     """
@@ -233,7 +230,7 @@ def missing(verdict: Verdict) -> str:
 
     Returns:
         `missing: /robot/camera (node), /robot/video (publisher of /robot/camera)`, then what is
-        there but wrong, `wrong: /robot/base (state.wrong-state)`, then what nobody can tell yet,
+        there but wrong, `wrong: /robot/base (state.wrong-state)`, then what is not known yet,
         `unknown: /robot/scan (graph.unattributed-endpoint)`; empty when nothing is waited for.
     """
     findings = [each for each in verdict.findings if each.outcome is Outcome.VIOLATED]
@@ -251,7 +248,7 @@ def missing(verdict: Verdict) -> str:
             phrase = kind.absence.format(kind=what, node=finding.node)
             absent.append(f"{finding.subject} ({phrase})")
         elif kind.awaits is not None:
-            # While what would tell is missing, that is what is waited for.
+            # While what would show it is missing, that is what is waited for.
             if kind.awaits.id not in broken:
                 unknown.append(named)
         elif finding.outcome is Outcome.UNVERIFIABLE:

@@ -1,7 +1,7 @@
-"""Laying the plan and the observation side by side.
+"""Matches declared endpoints with those observed in the ROS graph and in node reports.
 
-Owns: which observed endpoint and which report belong to which declared endpoint, and what is left
-over. All rules read the result, so that they agree on what is the same thing. Pure.
+Owns: `lay_out`: which observed endpoint and which report belong to which declared endpoint, and
+what is left over. All rules read the result, so that they agree on what is the same thing. Pure.
 """
 
 from __future__ import annotations
@@ -233,7 +233,7 @@ def _match_node(
             if observed is not None and observed.gid:
                 pools[place].remove(observed)
             elif observed is not None:
-                used.add(place)  # found by name only: it stands for any number of them
+                used.add(place)  # found by name only: it represents any number of them
             elif unseen and report is not None and _is_there(report, planned.resolved):
                 observed = _as_observed(node, report, report.resolved)
             if report is not None:
@@ -304,12 +304,12 @@ def _pick_observed(
 
 
 def _is_there(report: EndpointReport, name: str) -> bool:
-    """Tell whether a node says that an endpoint exists under a name; it may have been remapped."""
+    """Return whether a node reports an endpoint under a name; it may have been remapped."""
     return report.mapped and not report.error and name in (report.resolved, *report.aliases)
 
 
 def _as_observed(node: PlannedNode, report: EndpointReport, name: str) -> ObservedEndpoint:
-    """An endpoint that only its node told of, discovery not showing it, or not yet."""
+    """An endpoint that only its node reports: discovery does not show it, or not yet."""
     return ObservedEndpoint(
         kind=report.kind,
         node=node.full_name,
@@ -322,7 +322,7 @@ def _as_observed(node: PlannedNode, report: EndpointReport, name: str) -> Observ
 
 
 def _is_part_of(endpoint: ObservedEndpoint, actions: set[tuple[str, EndpointKind, str]]) -> bool:
-    """Tell whether an endpoint is a hidden part of an action that is declared or seen."""
+    """Return whether an endpoint is a hidden part of an action that is declared or seen."""
     action = action_part(endpoint.kind, endpoint.name)
     return action is not None and (endpoint.node, *action) in actions
 
@@ -354,7 +354,7 @@ def _seen(
 ) -> tuple[SeenEndpoint, ...]:
     """Collect publishers and subscriptions with all that is known of them."""
     known = {id(each.observed): each for each in actual if each.observed is not None}
-    # Nobody here can see those, but who hears them counts them.
+    # Not visible here, but the endpoints that match them count them.
     found = [
         SeenEndpoint(
             kind=each.planned.kind,

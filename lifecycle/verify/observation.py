@@ -1,7 +1,7 @@
-"""What was seen of a running system: the input of `verify` beside the plan.
+"""What was observed of a running system and what its nodes report: the input of `verify`.
 
-Owns: the observation types and the node configuration (schema: schemas/node_configuration.v1
-.schema.json), which nodes report and observers collect. Pure.
+Owns: the observation types and the node configuration (schema:
+schemas/node_configuration.v1.schema.json), which nodes report and observers collect. Pure.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ LONGEST_VALUE = 4096
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Identity:
-    """What tells one node instance from every other.
+    """What distinguishes one node instance from every other.
 
     Attributes:
         machine_id: /etc/machine-id, or the boot id where there is none.
@@ -46,11 +46,11 @@ class Identity:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class ConnectionReport:
-    """What a node says of one of its connections.
+    """What a node reports of one of its connections.
 
     Attributes:
         name: as `connect_to` named it; empty for the node's own participant.
-        urls: what it was told, as text; empty if the RMW chose.
+        urls: what it was given, as text; empty if the RMW chose.
         node_name: base name of the hidden node that carries it; empty for the node's own.
         established: it exists and, where it has mappings, all of them have a matched peer.
         mappings: declared names of what is mapped onto it, `publishers/video`.
@@ -67,19 +67,19 @@ class ConnectionReport:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class EndpointReport:
-    """What a node says of one of its endpoints.
+    """What a node reports of one of its endpoints.
 
     Attributes:
         name: declared name; empty for one that no interface declares.
         resolved: fully qualified.
         gid: hex, empty if not yet created or not known.
-        nfes: this endpoint's own network flow endpoints; None where the RMW cannot tell.
+        nfes: this endpoint's own network flow endpoints; None where the RMW cannot list them.
         participant: base name of the hidden node that carries it; empty for the node's own.
         matched: number of matched remote endpoints; None where unknown.
         peers: GIDs, hex, of those matched endpoints that the node's discovery knows, sorted; None
-            where the RMW cannot tell them apart. Fewer than `matched`: some are not known to it.
+            where the RMW cannot distinguish them. Fewer than `matched`: some are not known to it.
         server_matched: of a service or action client that exists: a server of its name is matched
-            with it both ways; None for everything else and where the RMW cannot tell.
+            with it both ways; None for everything else and where the RMW cannot show it.
         dscp: DSCP read back from the sender sockets with getsockopt, 0–63; None if not read.
         error: why the endpoint could not be made as asked; empty if it was.
         connection: name of the connection it is mapped onto; empty for the node's own participant,
@@ -89,7 +89,7 @@ class EndpointReport:
         lossy: the node's hint: its data bear an unreliable transport; None without one.
         size_bytes: the node's hint: its largest serialized message; None without one.
         type_hash: of the definition that it was made with (REP-2016), of publishers and
-            subscriptions that exist; empty where the RMW knows none, None where nobody looked.
+            subscriptions that exist; empty where the RMW knows none, None where it was not read.
     """
 
     kind: EndpointKind
@@ -116,11 +116,11 @@ class EndpointReport:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class ParameterReport:
-    """What a node says of one of its parameters.
+    """What a node reports of one of its parameters.
 
     Attributes:
-        type: a word of rcl_interfaces, "double_array"; empty for one that may have any type and is
-            not set.
+        type: as rcl_interfaces names it, "double_array"; empty for one that may have any type and
+            is not set.
         value: None if it is not set, or too long to be passed on. Doubles that are not finite are
             ".nan", ".inf" and "-.inf", because JSON has no others.
         digest: of a value that is too long; else empty.
@@ -150,7 +150,7 @@ class ParameterReport:
 
 
 def digest_of(value: ParameterValue) -> str:
-    """Return what stands for a value that is too long to be passed on; empty for every other.
+    """Return the digest of a value that is too long to be passed on; empty for every other.
 
     Args:
         value: as `portable` spells it.
@@ -167,13 +167,13 @@ class NodeConfiguration:
         name: fully qualified node name.
         state: lifecycle_msgs/State label.
         connected: the data layer is made (nested state of inactive; True while active).
-        transports: what the node can be connected by, words of media.
+        transports: what the node can be connected by, names of media.
         serializations: wire formats, "cdr".
         paradigms: "publish-subscribe", "request-response".
         connections: every connection that exists or was asked for.
         checksum: of everything but state, matches, whether connections are established, and itself;
             changes exactly when a reader must read again. Hex SHA-256, 16 digits.
-        parameters: all that are declared, sorted by name; None where the node does not say.
+        parameters: all that are declared, sorted by name; None where the node does not report them.
     """
 
     identity: Identity
@@ -198,7 +198,7 @@ def decode_configuration(text: str | bytes, node: str) -> NodeConfiguration:
     """Return the node configuration that a node answered with.
 
     Args:
-        text: JSON, from whoever has a service of that name.
+        text: JSON, from any node that has a service of that name.
         node: fully qualified name of the node that was asked.
 
     Raises:
@@ -266,7 +266,7 @@ def _is_address(text: str) -> bool:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class NodeParameters:
-    """What a node's parameter services said of the parameters that its plan names.
+    """What a node's parameter services returned for the parameters that its plan names.
 
     Attributes:
         node: fully qualified name.
@@ -302,11 +302,11 @@ class ObservedEndpoint:
     Attributes:
         node: fully qualified node name; empty while discovery does not know it.
         qos: history and depth are UNKNOWN/0 over Fast DDS; None for services and actions.
-        type_hash: of the definition that it was made with, as discovery tells (REP-2016,
+        type_hash: of the definition that it was made with, as announced (REP-2016,
             `RIHS01_df66…`; those of several messages of a service or an action in the order of
-            `manifest.type_hash.join`); empty if it announces none, None if that was not seen.
+            `manifest.installed_types.join`); empty if it announces none, None if that was not seen.
         gid: hex; empty for services and actions of a known node.
-        address: IP address of its participant, where its node is not known and discovery tells.
+        address: IP address of its participant, where its node is not known and discovery shows it.
     """
 
     kind: EndpointKind

@@ -1,21 +1,19 @@
-"""The verdict as text for people. Pure.
+"""Verification reports of a verdict: text, JUnit XML, SARIF 2.1.0 and JSON.
 
-Owns: layout and wording; the findings' own sentences come from the rules.
+Owns: layout and wording of the text (the findings' own sentences come from the rules); the JUnit
+test cases and their results; the SARIF log; the JSON document of schemas/verdict.v1.schema.json,
+and how findings are written in any JSON. Pure.
 
-The verdict as JUnit XML, for continuous integration. Owns: which test cases there are, and what
-each comes to. Their names and number are always the same, so that reports can be compared case
-by case: one for the manifest, one for each rule, one for the end of the run. What refuses the
-system is a failure. What could not be verified and was allowed is in the case's system-out, as
-flows are in their suite's; a case is skipped only where nothing was judged, and then the end of
-the run fails.
+JUnit, for continuous integration: names and number of the cases are always the same, so that
+reports can be compared case by case: one for the manifest, one for each rule, one for the end of
+the run. What refuses the system is a failure. What could not be verified and was allowed is in the
+case's system-out, as flows are in their suite's; a case is skipped only where nothing was judged,
+and then the end of the run fails.
 
-The verdict as SARIF 2.1.0, for editors and code scanning. Source of the format: OASIS SARIF
-2.1.0. Violated is an error, unverifiable a warning; a finding points at the declaration in the
-manifest. A run that was no success has at least one error; its rule is `run.end` where no
-finding is to blame, so that an unjudged system does not look good.
-
-The verdict as JSON. Owns: the document of schemas/verdict.v1.schema.json, and how findings are
-written in any.
+SARIF, for editors and code scanning (source of the format: OASIS SARIF 2.1.0): violated is an
+error, unverifiable a warning; a finding points at the declaration in the manifest. A run that was
+no success has at least one error; its rule is `run.end` where no finding is to blame, so that an
+unjudged system does not look good.
 """
 
 from __future__ import annotations
@@ -111,7 +109,7 @@ def _finding(finding: Finding, *, colour: bool, width: int) -> list[str]:
 
 
 def _wrap(text: str, width: int, *, first: str = "") -> list[str]:
-    """Wrap between words only: names and addresses stay whole. `first` starts the first line."""
+    """Wrap at spaces only: names and addresses stay whole. `first` starts the first line."""
     return textwrap.wrap(
         one_line(text),
         width,
@@ -155,7 +153,7 @@ def to_junit(verdict: Verdict, plan: Plan | None, *, strict: bool = False) -> st
     """Write JUnit XML.
 
     Args:
-        verdict: what the cases come to.
+        verdict: gives the results of the cases.
         plan: None where there is none, because the manifest cannot be used.
         strict: what cannot be verified refuses the system, whatever its policy says.
     """
@@ -207,7 +205,7 @@ class _Cases:
             _not_judged(case)
 
     def of_end(self, suite: ET.Element) -> None:
-        """Fail where the run was no success: one whose system nobody judged must not read well."""
+        """Fail where the run was no success: one without a judged system must not read well."""
         case = ET.SubElement(suite, "testcase", classname="run", name="end")
         run = self._verdict.run
         if run is None and self._verdict.judged:
@@ -333,7 +331,7 @@ def _invocations(run: RunEnd | None) -> _Json:
 
 
 def _end_result(verdict: Verdict) -> list[_Json]:
-    """Return what a log without an error has to say of a run that was no success."""
+    """Return the error of a run that was no success, for a log that has none."""
     run = verdict.run
     if run is None or run.exit_code == 0:
         return []

@@ -1,8 +1,9 @@
-"""What every ROS 2 graph holds that no manifest declares.
+"""Filters tools and client library endpoints, which no manifest declares, out of a ROS graph.
 
-Owns: which nodes are tools, the endpoints that client libraries bring along, and the folding of an
-action's hidden topics and services into action endpoints; which names a plan declares, so that
-nobody's own housekeeping is taken for harmless under one of them. Data and predicates only. Pure.
+Owns: which nodes are tools; the endpoints that client libraries bring along; the folding of an
+action's hidden topics and services into action endpoints; which hidden node belongs to which
+planned node; and which names a plan declares, so that an unknown node's housekeeping is not taken
+for harmless under one of them. Data and predicates only. Pure.
 
 Sources: rcl (parameter, type description and logger services, rosout), rcl_lifecycle, the actions
 article (https://design.ros2.org/articles/actions.html), names of nodes as the tools choose them.
@@ -31,7 +32,7 @@ PLACEHOLDER_NAMES = frozenset({"_NODE_NAME_UNKNOWN_", "_CREATED_BY_BARE_DDS_APP_
 """What rmw_dds_common calls the node of an endpoint whose node it does not know (yet)."""
 
 GRAPH_TOPIC = "/lifecycle/graph"
-"""Where nodes tell the graph what becomes of them, and hear of others (lifecycle.graph)."""
+"""Where nodes publish changes of themselves and receive those of others (lifecycle.graph)."""
 
 NOISE_TOPICS = frozenset(
     {
@@ -72,7 +73,7 @@ OUR_SERVICES: Mapping[str, str] = {
     "remap": "rcl_interfaces/srv/SetParameters",
     "alias": "rcl_interfaces/srv/SetParameters",
 }
-"""Services that nodes of ours offer besides. The names are common words and the types standard, so
+"""Services that nodes of ours offer besides. The names are common and the types standard, so
 that a node counts as ours only with the two that no other node has together, `OURS_BY`."""
 
 OURS_BY = frozenset({"get_configuration", "map_to"})
@@ -112,7 +113,7 @@ def tolerating_pattern(full_name: str, patterns: Collection[str] = TOLERATED_NOD
 
     Args:
         full_name: fully qualified, `/launch_ros_4711`. A manifest may declare a node of such a
-            name; whoever filters must keep declared names.
+            name; a caller that filters must keep declared names.
         patterns: as in `policy.tolerated_nodes`; our own observers are always tolerated.
     """
     base = full_name.rpartition("/")[2]
@@ -123,7 +124,7 @@ def tolerating_pattern(full_name: str, patterns: Collection[str] = TOLERATED_NOD
 
 
 def is_noise_node(full_name: str) -> bool:
-    """Tell whether a node is named as a tool that everybody may be expected to use."""
+    """Return whether a node is named as a tool that any user may be expected to run."""
     return bool(tolerating_pattern(full_name))
 
 
@@ -185,19 +186,19 @@ class DeclaredNames:
         return tuple(sorted(name for each, name in self.names if each is _NAMESPACES[kind]))
 
     def has(self, kind: EndpointKind, name: str) -> bool:
-        """Tell whether an endpoint meets declared ones; a part of an action, that action's."""
+        """Return whether an endpoint meets declared ones; a part of an action, that action's."""
         part = action_part(kind, name)
         return (_NAMESPACES[kind], name) in self.names or (part is not None and self.has(*part))
 
     def fed_by(self, kind: EndpointKind, name: str) -> bool:
-        """Tell whether an endpoint that is not a declared node's would feed or serve the system."""
+        """Return whether an endpoint of an undeclared node would feed or serve the system."""
         if kind not in OFFERS or (kind, name) in NOISE_TOPICS:
             return False
         return self.has(kind, name) or (kind, name) in self.own
 
 
 def known_node(full_name: str) -> str:
-    """Return a node's name, or an empty one where it only stands for "not known"."""
+    """Return a node's name, or an empty one where it only means "not known"."""
     return "" if full_name.rpartition("/")[2] in PLACEHOLDER_NAMES else full_name
 
 
@@ -206,11 +207,11 @@ NO_NAMES = DeclaredNames()
 
 
 def is_noise_endpoint(kind: EndpointKind, node: str, name: str, type_: str, *, ours: bool) -> bool:
-    """Tell whether an endpoint is one that client libraries make without being asked.
+    """Return whether an endpoint is one that client libraries make without being asked.
 
     Offering such a service counts as noise only under the node's own name; using it, under any:
     who drives another node's lifecycle or parameters declares nothing. A service of another type
-    only has the name, and is somebody's. An endpoint whose node is not known is never noise: it
+    only has the name, and belongs to a user. An endpoint whose node is not known is never noise: it
     may be the first sign of a node that must not be there.
 
     Args:
@@ -241,7 +242,7 @@ def our_nodes(endpoints: Iterable[ObservedEndpoint]) -> frozenset[str]:
     """Return the nodes that offer the node interface and the node configuration interface.
 
     Args:
-        endpoints: all of whoever is asked about; nothing left out as noise before.
+        endpoints: all of the nodes in question; nothing left out as noise before.
     """
     offered: dict[str, set[str]] = {}
     for each in endpoints:
@@ -259,11 +260,11 @@ def our_nodes(endpoints: Iterable[ObservedEndpoint]) -> frozenset[str]:
 def without_noise(
     endpoints: Iterable[ObservedEndpoint], *, but: DeclaredNames = NO_NAMES
 ) -> tuple[ObservedEndpoint, ...]:
-    """Return what somebody wrote on purpose, in order; the input must be complete per node.
+    """Return what was written on purpose, in order; the input must be complete per node.
 
     Args:
         endpoints: to choose from.
-        but: names that are looked for: whoever offers them is kept, whatever it looks like.
+        but: names that are looked for: endpoints of them are kept, whatever they look like.
     """
     found = tuple(endpoints)
     ours = our_nodes(found)
@@ -326,7 +327,7 @@ def fold_actions(endpoints: Iterable[ObservedEndpoint]) -> tuple[ObservedEndpoin
                     node=node,
                     name=name,
                     type=type_,
-                    # Of nobody known these are all that tells whose it is.
+                    # Where the node is not known, only these identify the owner.
                     gid="" if node else parts[0].gid,
                     address=parts[0].address,
                     type_hash=_action_hash(parts),
@@ -350,8 +351,8 @@ class Owners:
 
     Args:
         nodes: of the plan.
-        reported: what nodes say of themselves; only planned ones count.
-        tolerated: patterns of names of tools, whose nodes belong to nobody by name alone.
+        reported: what nodes report of themselves; only planned ones count.
+        tolerated: patterns of names of tools, whose nodes have no owner by name alone.
     """
 
     def __init__(

@@ -1,9 +1,9 @@
-"""Which transport carries a flow.
+"""Which transport carries a flow: intra-process, shared memory, UDP, TCP, multicast.
 
 Owns: the judgement from process, machine and NFEs. An NFE list says what an endpoint could use, not
 what is used; what Fast DDS does with it is known, and is written down here. Pure.
 
-Fast DDS hands data over inside a process without any transport (measured with 2.14: UDP only, 50 MB
+Fast DDS passes data on inside a process without any transport (measured with 2.14: UDP only, 50 MB
 published, next to nothing on the interface), and between processes of one host it prefers shared
 memory to any IP transport that both ends have. To subscriptions that listen at one multicast group
 it sends one datagram to the group; to one that listens there alone, the same one datagram by
@@ -30,7 +30,7 @@ NONE = "none"
 UNKNOWN = "unknown"
 
 _ANY_PORT = 0
-"""Of the NFE that stands for a URL: no port tells one transport from another."""
+"""Of the NFE made from a URL: no port distinguishes one transport from another."""
 
 _FAMILIES = {InternetProtocol.IPV4: "v4", InternetProtocol.IPV6: "v6"}
 
@@ -46,7 +46,7 @@ def effective_transport(view: View, flow: FlowView) -> str:
 
 
 def _ways(view: View, node: str, ends: Sequence[Actual]) -> tuple[NetworkFlowEndpoint, ...]:
-    """Return the NFEs of one side, and what it was connected to where they do not tell.
+    """Return the NFEs of one side, and what it was connected to where they do not show it.
 
     rmw_fastrtps lists no NFE of a TCP transport at a publisher.
     """
@@ -75,7 +75,7 @@ def _is_tcp(nfe: NetworkFlowEndpoint) -> bool:
 
 
 def _as_nfe(text: str) -> NetworkFlowEndpoint | None:
-    """Return what a connection URL says of the network; None if it says nothing."""
+    """Return a connection URL's network part as an NFE; None if it has none."""
     try:
         url = parse(text)
     except ConnectionUrlError:
@@ -133,7 +133,7 @@ def carrier(
 
 
 def spell_transport(nfe: NetworkFlowEndpoint) -> str:
-    """Return the word for an IP NFE's transport, `udpv4`."""
+    """Return the name of an IP NFE's transport, `udpv4`."""
     return nfe.transport_protocol.value + _FAMILIES[nfe.internet_protocol]
 
 

@@ -1,8 +1,8 @@
-"""Which reported endpoints are unique in the whole system.
+"""Which endpoints have unique network flow endpoints (NFEs) in the whole system.
 
 Owns: applying the definitions of `lifecycle.network.nfe` across all reports at once. Pure.
 
-Compared are the endpoints that nodes report. An endpoint that nobody reports lives in another
+Compared are the endpoints that nodes report. An endpoint that no node reports lives in another
 process, and it cannot share one of these NFEs: a UDP or TCP port belongs to one process of a host
 (bind(2), EADDRINUSE), and another host has other addresses. So unknown NFEs make an answer unknown
 only inside one process.
@@ -140,7 +140,7 @@ def _that_count(nfes: tuple[LocatedNfe, ...], address: str) -> tuple[LocatedNfe,
 
     A host has addresses that lead nowhere outside, and many hosts have the same: each container
     bridge is 172.17.0.1. Two endpoints on two of them do not share a flow. Wildcards and groups
-    stand for the declared address too.
+    count as the declared address too.
     """
     wanted = canonical(address)
     found = tuple(

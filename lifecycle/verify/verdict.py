@@ -1,4 +1,4 @@
-"""The verdict: three outcomes, findings, flows.
+"""The verdict of a verification: three outcomes, findings, flow reports.
 
 Owns: the result types of `verify` (schema: schemas/verdict.v1.schema.json). Pure.
 """
@@ -82,19 +82,19 @@ class FlowReport:
         subscription: fully qualified node name.
         source: the publisher's NFEs, with the DSCP read back from its sockets; empty when unknown.
         destination: the subscription's NFEs; empty when unknown.
-        unique: how unique the flow is; None when it cannot be told.
+        unique: how unique the flow is; None when it cannot be determined.
         dscp: read back from the sender's UDP sockets; None when not read, or where TCP carries it.
         reader_dscp: likewise of what the subscription sends, its acknowledgements; None also where
-            it sends from its node's own participant, which nobody marks.
+            it sends from its node's own participant, which is never marked.
         requirement: the publisher's and the subscription's requirement.
         demanded: what a link demands.
         max_delay_ms: what a link demands, declared and not measured here; None if not asked for.
         five_qi: what is planned, 3GPP TS 23.501 Table 5.7.4-1; None if not asked for, or if several
             publishers differ.
         five_qi_reason: why it is this 5QI, or none, where the manifest says `auto`; else empty.
-        effective_transport: the word of the Medium that carries it; "unknown" where nobody tells,
+        effective_transport: name of the Medium that carries it; "unknown" where nothing shows it,
             "none" where the ends have nothing in common.
-        transport: "udp", "tcp", "shm or udp" …; what can carry it, as far as the NFEs tell.
+        transport: "udp", "tcp", "shm or udp" …; what can carry it, as far as the NFEs show.
         tuples: IP flows that the two ends' NFEs form, each with its 5-tuple and flow label; follows
             from source and destination. Where shared memory carries the flow, none of them does.
     """
@@ -141,7 +141,7 @@ class ToleratedNode:
     """A node that no manifest declares and that the policy lets be there.
 
     Attributes:
-        node: fully qualified node name; empty for endpoints whose node nobody knows.
+        node: fully qualified node name; empty for endpoints whose node is not known.
         because: what tolerates it: `tolerated_nodes: rviz_*` or `undeclared_nodes: open`.
         endpoints: what it has, without the housekeeping of client libraries.
     """
@@ -151,7 +151,7 @@ class ToleratedNode:
     endpoints: tuple[OpenEndpoint, ...] = ()
 
     def describe(self) -> str:
-        """Return it in a few words, `/rviz2 (subscription of /map)`."""
+        """Return it in short, `/rviz2 (subscription of /map)`."""
         named = dict.fromkeys(f"{each.kind.noun} of {each.name}" for each in self.endpoints)
         name = self.node or "an unknown node"
         return f"{name} ({', '.join(named)})" if named else name

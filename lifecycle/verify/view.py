@@ -1,7 +1,7 @@
-"""What every rule reads: the plan and the observation laid side by side.
+"""The view that every verification rule reads: declared beside observed endpoints and flows.
 
-Owns: the types of the view and the one way to combine announced and reported QoS. How the view is
-filled is `layout`'s. Pure.
+Owns: the types of the view and the one way to combine announced and reported QoS. `matcher.lay_out`
+fills it. Pure.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ class View:
         observed: nodes of the graph by full name, tools and hidden participants left out, sorted.
         reported: every report, sorted by name.
         configurations: reports by full node name; the first of several.
-        parameters: what parameter services said, by full node name.
+        parameters: what parameter services returned, by full node name.
         actual: every declared endpoint, in plan order.
         actual_by_node: the same by full node name.
         undeclared: endpoints of declared nodes that no declaration covers, sorted.
@@ -198,21 +198,21 @@ class View:
         )
 
     def is_absent(self, node: PlannedNode) -> bool:
-        """Tell whether nothing at all is seen of a node: then one finding says it all."""
+        """Return whether nothing at all is seen of a node: then one finding says it all."""
         if node.full_name in self.observed:
             return False
         return not any(each.observed for each in self.actual_by_node[node.full_name])
 
     def is_beyond(self, node: PlannedNode) -> bool:
-        """Tell whether a node is out of reach: it talks by memory of a host that is not ours."""
+        """Return whether a node is out of reach: it uses the memory of a host that is not ours."""
         return not self.brings_up(node) and only_shared_memory(node.connections)
 
     def ours(self, node: PlannedNode) -> bool:
-        """Tell whether a node runs in our host, and so must report its configuration."""
+        """Return whether a node runs in our host, and so must report its configuration."""
         return node.run.kind is RunKind.PYTHON
 
     def brings_up(self, node: PlannedNode) -> bool:
-        """Tell whether the caller brings this node up, and so knows which state it must be in."""
+        """Return whether the caller brings this node up, and so knows the state it must be in."""
         return self.machines is None or node.machine in self.machines
 
     @property
@@ -226,21 +226,21 @@ class View:
         }
 
     def identity(self, full_name: str) -> Identity | None:
-        """Return what a node says that it is; None if it says nothing."""
+        """Return the identity that a node reports; None if it reports none."""
         configuration = self.configurations.get(full_name)
         return configuration.identity if configuration else None
 
 
 def only_shared_memory(connections: ParticipantConnections) -> bool:
-    """Tell whether a participant is known to have nothing but shared memory."""
+    """Return whether a participant is known to have nothing but shared memory."""
     scheme = f"{Medium.SHM}:"
     return bool(connections.urls) and all(url.startswith(scheme) for url in connections.urls)
 
 
 def may_hide(node: PlannedNode, endpoint: PlannedEndpoint) -> bool:
-    """Tell whether discovery need not show an endpoint to an observer.
+    """Return whether discovery need not show an endpoint to an observer.
 
-    That is so on every participant that was told how to connect: it announces itself to its peers
+    That is so on every participant that was given connection URLs: it announces itself to its peers
     alone, or on a host or group that the observer is not part of; and with static endpoint
     discovery it announces no endpoint at all.
     """
@@ -259,7 +259,7 @@ def connection_of(node: PlannedNode, endpoint: PlannedEndpoint) -> str:
 
 
 def actual_qos(observed: QosProfile | None, reported: QosProfile | None) -> QosProfile | None:
-    """Combine what discovery announces with what the node says of itself.
+    """Combine what discovery announces with what the node reports of itself.
 
     Discovery wins where it knows a policy: it is what the other side acts on. Fast DDS does not
     announce history and depth, so those come from the node.

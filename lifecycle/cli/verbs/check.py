@@ -1,8 +1,8 @@
 """`lifecycle check`: judge a manifest without running anything. Imports nothing of ROS.
 
-What `lifecycle check` found, as text, JSON, SARIF 2.1.0 or JUnit. Owns: `CheckReport` and its
-formats. The tests of a JUnit report are the same four whatever was found, so that a CI's
-history can follow them; none is ever skipped.
+Owns: the verb, `CheckReport` and its formats: text, JSON, SARIF 2.1.0 and JUnit. The tests of a
+JUnit report are the same four whatever was found, so that a CI's history can follow them; none is
+ever skipped.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ TESTS = {
     "plan": ("plan.",),
     "programs": ("program.",),
 }
-"""Test → beginnings of the rules that it stands for; any other rule is of the system."""
+"""Test → beginnings of the rules that it covers; any other rule is of the system."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,11 +1,9 @@
-"""`lifecycle flows`: show every network flow and how unique it is, and program networks with them.
+"""`lifecycle flows`: show every network flow and how unique it is, or export them (`--export`).
 
-`apply`, `diff` and `remove` are flows_program.py's.
-
-Flows as a table, JSON or CSV. Owns: the columns of the table, and words for the unknown.
-
-`lifecycle flows --export`: verified flows as the file of another system. Owns: from options to
-what an export needs, and its refusals. The texts are `programming.rules`'s.
+Owns: flows as a table, JSON or CSV: the columns of the table, and how unknown values read; and for
+`--export` the step from options to what an export needs, and its refusals. The exported texts are
+from `programming.rules`; `apply`, `diff` and `remove`, which program networks, are in
+flows_program.py.
 """
 
 from __future__ import annotations

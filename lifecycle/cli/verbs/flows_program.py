@@ -43,7 +43,7 @@ class _WithSubcommands(click.Group):
         parent: click.Context | None = None,
         **extra: Any,
     ) -> click.Context:
-        """Choose by the first word."""
+        """Choose by the first argument."""
         if args and args[0] in (*self.commands, "-h", "--help"):
             return super().make_context(info_name, args, parent=parent, **extra)
         return self._show.make_context(info_name, args, parent=parent, **extra)

@@ -152,7 +152,7 @@ def render(picture: Picture, format_: str) -> str:
 
 
 def _replace(path: Path, text: str) -> None:
-    """Write a file so that whoever reads it sees the old one or the new one, whole."""
+    """Write a file so that a reader sees the old one or the new one, whole."""
     part = None
     try:
         with tempfile.NamedTemporaryFile(

@@ -1,6 +1,6 @@
 """`lifecycle status`: show what a running supervisor sees.
 
-A status as plain text. Owns: its columns.
+Owns: the verb, and the columns of a status as plain text.
 """
 
 from __future__ import annotations

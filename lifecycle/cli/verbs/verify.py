@@ -47,7 +47,7 @@ def command(  # noqa: PLR0917 - click passes options by name
     except Ended as ended:
         click.echo(f"ended before it was judged: {ended.reason}", err=True)
         return ended.exit_code
-    # From here on a signal ends what waits for somebody to read.
+    # From here on a signal ends what waits for a reader.
     if seen.where:
         click.echo(lines(seen.where), err=True)
     colour = format_ == "text" and sys.stdout.isatty()

@@ -19,7 +19,7 @@ WRITERS: Mapping[str, Callable[[Picture], str]] = {
     "svg": picture_to_svg,
     "html": picture_to_html,
 }
-"""What writes a picture, by the word of `--format`."""
+"""What writes a picture, by the value of `--format`."""
 
 __all__ = [
     "WRITERS",

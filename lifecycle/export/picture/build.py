@@ -1,7 +1,7 @@
-"""Plan, or Plan × Observation × Verdict → Picture.
+"""Builds the picture of a ROS graph from a plan, or from Plan × Observation × Verdict.
 
-Owns: the picture as a whole, its nodes and where they are. Laying the two side by side is verify's;
-nothing here judges again. Pure.
+Owns: the picture as a whole, its nodes and where they are. The matching of plan and observation is
+`verify.matcher`'s; nothing here judges again. Pure.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from lifecycle.verify.verdict import Stage, Verdict
 from lifecycle.verify.view import View
 
 UNKNOWN_NODE = ""
-"""Stands for the node of endpoints whose node nobody tells."""
+"""Name of the node of endpoints whose node is not known."""
 
 _STATES = {
     "active": PicturedNodeState.ACTIVE,
@@ -44,7 +44,7 @@ class Supervised:
 
     Attributes:
         pid: 0 if it runs no process for it.
-        dead: its process has ended although nobody asked it to.
+        dead: its process has ended without being asked to.
         silent: it was found silent.
         doing: what it does or waits for; empty when nothing.
     """
@@ -167,10 +167,10 @@ def _state(name: str, view: View, presence: Presence, supervised: Supervised) ->
 
 
 def _untold(managed: bool | None, presence: Presence) -> PicturedNodeState:
-    """The state of a node that tells none."""
+    """The state of a node that reports none."""
     if managed is False:
         return PicturedNodeState.PLAIN
-    # A declared node was asked; one that nobody declared was not.
+    # A declared node was asked; an undeclared one was not.
     asked = managed and presence is Presence.PRESENT
     return PicturedNodeState.SILENT if asked else PicturedNodeState.UNKNOWN
 

@@ -19,7 +19,7 @@ _STYLES = {
 def picture_to_dot(picture: Picture) -> str:
     """Return one digraph: nodes by machine and process, edges with their flows.
 
-    States are colours and words; missing is dashed and red, undeclared is dotted and orange; edges
+    States are colours and labels; missing is dashed and red, undeclared is dotted and orange; edges
     of unique flows are bold.
     """
     lines = [

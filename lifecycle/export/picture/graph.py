@@ -1,7 +1,7 @@
-"""What DOT and Mermaid both say of a picture: nodes in their frames, edges with their words.
+"""Nodes, frames and edge labels that the DOT and Mermaid graphs of a picture share.
 
-Owns: the words, and which edges there are; how each language spells them is its own module's. Both
-lay out by themselves, so one graph says what rows and columns say in two. Pure.
+Owns: the texts, and which edges there are; each language's module owns its spelling. Both lay out
+by themselves, so one graph shows what rows and columns show in two. Pure.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ _LABEL_CHARACTERS = 60
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Edge:
-    """What goes from one node to another, or to nobody.
+    """What goes from one node to another, or nowhere.
 
     Attributes:
-        source: node id; empty if nobody is there.
+        source: node id; empty if there is none.
         target: likewise.
         words: one line each.
         unique: its flow is, or in the picture of a plan is to be.
@@ -75,7 +75,7 @@ def framed(
 
 
 def node_words(node: PicturedNode) -> tuple[str, ...]:
-    """Return what stands in a node: name, state, participants that are not ordinary, findings."""
+    """Return the text in a node: name, state, participants that are not ordinary, findings."""
     words = [f"{STATES[node.state].symbol} {node.state.value}"]
     words += remark(node.presence) if node.presence is Presence.MISSING else ()
     words += node.notes
@@ -88,7 +88,7 @@ def node_words(node: PicturedNode) -> tuple[str, ...]:
 
 
 def edges(picture: Picture) -> Iterator[Edge]:
-    """Yield every arrow, and an edge to nobody for each end without one."""
+    """Yield every arrow, and an edge to nowhere for each end without one."""
     flows = {(flow.topic, *flow.names): flow for flow in picture.flows}
     names = {node.id: node.name for node in picture.nodes()}
     carriers = {each.id: each.name for node in picture.nodes() for each in node.participants}

@@ -1,10 +1,8 @@
-"""A picture as one HTML page that needs nothing else: no network, no other file, no script.
+"""A picture as one self-contained HTML page: no network, no other file.
 
-Owns: the page: what stands on it, in which order, and that nothing of a graph is ever taken for
-markup. The script only filters and lights up what is there already. Pure.
-
-The style sheet and the script of the HTML page. Owns how it looks and what hovering does.
-Without the script everything is there; it filters rows and lights up what belongs together.
+Owns: the page, its contents and their order, and that nothing of a graph is ever taken for markup;
+the style sheet, and the script, which only filters rows and highlights what belongs together on
+hovering. Without the script everything is there. Pure.
 """
 
 from __future__ import annotations

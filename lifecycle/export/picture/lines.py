@@ -1,13 +1,8 @@
-"""What a picture shows between nodes: topics, services, actions, flows and participants.
+"""Topics, services, actions, flows and participants as a picture shows them between nodes.
 
-The lines of a picture: topics, services and actions, and who is on them. Owns: which ends and
-arrows a line has, and what is said of them.
-
-The flows of a picture: what carries each, between which participants, and how unique it is.
-Owns: turning flow reports and undeclared pairs into PicturedFlows.
-
-The participants of a picture's nodes: as planned, as their nodes tell, and which carries what.
-Owns: laying planned and reported participants side by side.
+Owns: which ends and arrows a line has, and their remarks; turning flow reports and undeclared pairs
+into PicturedFlows: what carries each, between which participants, and how unique it is; and
+matching planned with reported participants, and which carries what. Pure.
 """
 
 from __future__ import annotations
@@ -79,7 +74,7 @@ def _ends(basis: Basis) -> Iterable[_LineEnd]:
         actual = each.observed.type if each.observed else each.planned.type
         differs = () if actual == each.planned.type else (f"declared as {each.planned.type}",)
         error = (each.report.error,) if each.report and each.report.error else ()
-        # Where somebody looked, the flow tells beside it whether that is so.
+        # With an observation, the flow beside it shows whether that is so.
         asked = tuple(_asked(each.node, each.planned)) if basis.verdict is None else ()
         yield _LineEnd(
             kind=each.planned.kind,
@@ -247,7 +242,7 @@ _UNIQUE = {
 
 
 def pictured_flows(basis: Basis, nodes: Mapping[str, PicturedNode]) -> tuple[PicturedFlow, ...]:
-    """Return every planned flow in plan order, then every pair that nobody declared.
+    """Return every planned flow in plan order, then every undeclared pair.
 
     Args:
         basis: what the picture is drawn from.

@@ -13,7 +13,7 @@ from lifecycle.export.picture.model import DASHES, LINES, STATES, LineKind, Pict
 def picture_to_mermaid(picture: Picture) -> str:
     """Return one flowchart: nodes by machine and process, edges with their flows.
 
-    States are colours and words; missing is dashed and red, undeclared is dotted and orange; edges
+    States are colours and labels; missing is dashed and red, undeclared is dotted and orange; edges
     of unique flows are thick.
     """
     lines = ["---", f"title: {json.dumps(picture.title)}", "---", "flowchart LR"]

@@ -1,14 +1,12 @@
-"""A picture of a system as declared, or as it runs beside that, in no language yet.
+"""The picture of a system, as declared or as it runs: its types, colours and symbols.
 
-Owns: the types; JSON-able through `lifecycle.codec` (schema: schemas/graph.v1.schema.json). How
-they are filled is build.py's. Pure.
+Owns: the types, JSON-able through `lifecycle.codec` (schema: schemas/graph.v1.schema.json), which
+build.py fills; the colours, symbols and labels of states, presence and outcomes in every picture
+and its legend; and `Basis`, what a picture is drawn from: plan and observation side by side and the
+verdict on them, what a plan alone changes, and where findings are shown. Pure.
 
-How states, presence and outcomes look in every picture, and in its legend. Owns: colours,
-symbols and words. Colours are those of Okabe and Ito (*Color Universal Design*, 2008), which
-colour-blind readers tell apart; each also has a symbol, and the word stands beside it.
-
-What a picture is drawn from: plan and observation side by side, and the verdict on them. Owns:
-what a plan alone changes, and which findings stand where.
+Colours are those of Okabe and Ito (*Color Universal Design*, 2008), which colour-blind readers can
+distinguish; each also has a symbol, and its label is written beside it.
 """
 
 from __future__ import annotations
@@ -23,7 +21,7 @@ from lifecycle.verify.view import View
 
 
 class LineKind(enum.Enum):
-    """What a line stands for; services and actions run from client to server."""
+    """What a line represents; services and actions run from client to server."""
 
     TOPIC = "topic"
     SERVICE = "service"
@@ -31,21 +29,21 @@ class LineKind(enum.Enum):
 
 
 class Presence(enum.Enum):
-    """How something that is drawn stands to the declaration."""
+    """How something that is drawn compares with the declaration."""
 
     PRESENT = "present"  # declared, and there
     MISSING = "missing"  # declared, and not there
     UNDECLARED = "undeclared"  # there, and not declared
-    PLANNED = "planned"  # declared, and nobody looked: the picture of a plan
+    PLANNED = "planned"  # declared, and not observed: the picture of a plan
 
     @property
     def as_declared(self) -> bool:
-        """Whether nothing is to be said of it."""
+        """Whether it needs no remark."""
         return self in (Presence.PRESENT, Presence.PLANNED)
 
 
 class PicturedNodeState(enum.Enum):
-    """What a node is doing, as far as anybody tells."""
+    """What a node is doing, as far as it is known."""
 
     ACTIVE = "active"
     CONNECTED = "inactive, connected"
@@ -63,7 +61,7 @@ class PicturedNodeState(enum.Enum):
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class PicturedParticipant:
-    """One DDS participant of a node: a connection, or what tells a publisher's flow apart.
+    """One DDS participant of a node: a connection, or what makes a publisher's flow unique.
 
     Attributes:
         id: unique in the picture.
@@ -87,7 +85,7 @@ class PicturedNode:
         name: fully qualified.
         machine: empty if it is not known, or there is only this host.
         process: as planned; empty if it is not known.
-        pid: as the node or its supervisor tells; None if nobody does.
+        pid: as the node or its supervisor reports; None if neither does.
         notes: what is not ordinary about it.
         findings: numbers of those that concern it.
     """
@@ -114,7 +112,7 @@ class PicturedProcess:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class PicturedMachine:
-    """One machine, or what runs nobody knows where."""
+    """One machine, or what runs on an unknown one."""
 
     title: str
     processes: tuple[PicturedProcess, ...]
@@ -187,10 +185,10 @@ class PicturedFlow:
         subscription: participant id.
         names: of the two nodes.
         outcome: None in the picture of a plan.
-        medium: what carries it; "unknown" where nobody tells. In the picture of a plan what is to.
+        medium: what carries it; "unknown" where not shown. In the picture of a plan what is to.
         planned: what was to carry it; empty if that was left open.
         tuples: network flow endpoints, `udp 10.0.0.1:7412 → 10.0.0.2:7413`.
-        dscp: in words; empty if none was read back. In the picture of a plan what is asked for.
+        dscp: spelled out; empty if none was read back. In the picture of a plan what is asked for.
         unique: "strongly unique", "weakly unique", "not unique" or "uniqueness unknown". In the
             picture of a plan what a link demands; empty if none does.
         demands: what is asked of it.
@@ -315,7 +313,7 @@ OUTCOMES = {
 
 
 def remark(presence: Presence) -> tuple[str, ...]:
-    """What is said of something beside its name: nothing if it is as declared."""
+    """The remark beside something's name: none if it is as declared."""
     return () if presence.as_declared else (PRESENCE_WORDS[presence],)
 
 
@@ -329,8 +327,8 @@ class Basis:
     """The two sides of a picture.
 
     Attributes:
-        view: plan and observation; the observation is empty where nobody looked.
-        verdict: on the two; None where nobody looked, which makes it the picture of a plan.
+        view: plan and observation; the observation is empty for the picture of a plan.
+        verdict: on the two; None without an observation, which makes it the picture of a plan.
         reports: the verdict's, by topic, publisher and subscription.
     """
 

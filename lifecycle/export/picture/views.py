@@ -1,11 +1,10 @@
-"""The two graphs of a picture as rows and columns.
+"""Layout of the computational graph and the data layer graph as rows and columns.
 
-Owns: what stands in which row and column: the computational graph has nodes and what they publish
-and offer, the data layer graph participants and flows. Pure.
-
-Where everything of a picture stands: columns for who, rows for what goes between them. Owns:
-the arithmetic. Nothing ever overlaps, however much there is: many columns stand upright words,
-a few lie. All text is monospaced, so that its width is known without a font.
+Owns: what is in which row and column: the computational graph has nodes and what they publish and
+offer, the data layer graph participants and flows; and the arithmetic that places them: columns for
+who, rows for what goes between them. Nothing ever overlaps, however much there is: many columns
+have upright titles, a few horizontal ones. All text is monospaced, so that its width is known
+without a font. Pure.
 """
 
 from __future__ import annotations
@@ -53,9 +52,9 @@ class Column:
     Attributes:
         id: unique in the matrix.
         title: in bold.
-        badge: a state: its words; empty for none.
+        badge: a state: its label; empty for none.
         notes: below, small.
-        style: classes of its box, words for CSS.
+        style: classes of its box, for CSS.
         badge_style: class of the badge.
     """
 
@@ -87,7 +86,7 @@ class Mark:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Stroke:
-    """What goes from one column to another; `label` stands on it."""
+    """What goes from one column to another; `label` is written on it."""
 
     source: str
     target: str
@@ -240,7 +239,7 @@ def text_width(text: str, em: int = HEAD_EM) -> int:
 
 
 class _Wrapper(textwrap.TextWrapper):
-    """Breaks words after what separates the options of a URL, too."""
+    """Breaks lines after what separates the options of a URL, too."""
 
     wordsep_simple_re = re.compile(r"(\s+|(?<=[?&]))")
 
@@ -287,7 +286,7 @@ def computational(picture: Picture) -> tuple[tuple[Group, ...], tuple[Row, ...]]
 
 
 def data_layer(picture: Picture) -> tuple[tuple[Group, ...], tuple[Row, ...]]:
-    """Return participants as columns, those that carry or are told something; flows as rows."""
+    """Return participants as columns, those with flows or notes; flows as rows."""
     used = {end for flow in picture.flows for end in (flow.publisher, flow.subscription)}
     groups = []
     for machine in picture.machines:
@@ -389,7 +388,7 @@ def _said(end: PicturedEnd, names: dict[str, str]) -> str:
 
 
 def end_words(end: PicturedEnd) -> tuple[str, ...]:
-    """Return what is said of an end beside its node's name."""
+    """Return the remark on an end beside its node's name."""
     return (*remark(end.presence), *end.notes, *filter(None, [numbers(end.findings)]))
 
 
@@ -431,9 +430,9 @@ def _flow(flow: PicturedFlow) -> Row:
 
 
 def edge_label(flow: PicturedFlow) -> str:
-    """What stands on the edge of a flow: medium, DSCP, uniqueness; or that it is not there.
+    """The label on the edge of a flow: medium, DSCP, uniqueness; or that it is not there.
 
-    How unique a planned flow is to be stands among its demands.
+    How unique a planned flow is to be is among its demands.
     """
     if flow.presence is Presence.MISSING:
         return "missing"
@@ -472,5 +471,5 @@ def _outcome(outcome: Outcome | None) -> str:
 
 
 def is_unique(flow: PicturedFlow) -> bool:
-    """Tell whether a flow is drawn thick."""
+    """Return whether a flow is drawn thick."""
     return flow.unique in ("weakly unique", "strongly unique")

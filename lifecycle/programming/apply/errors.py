@@ -22,7 +22,7 @@ class MissingFeatureError(ProgrammingError):
 
 
 class NotOursError(ProgrammingError):
-    """Something stands in the way that somebody else made; it is never touched."""
+    """An object that is not ours is in the way; it is never touched."""
 
 
 class SettingsError(UsageError):

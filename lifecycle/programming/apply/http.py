@@ -348,7 +348,7 @@ class _Connection:
 
     httpx bounds each read and write, never all of them together: a server that sends a byte a
     second would hold a request up for as long as it likes. So a request is made in a thread, and
-    whoever waits for it shuts the socket down at the deadline.
+    the waiting thread shuts the socket down at the deadline.
     """
 
     def __init__(self, client: httpx.Client) -> None:
@@ -382,7 +382,7 @@ class _Connection:
                 sent.url,
                 headers=headers,
                 content=sent.body,
-                # A little more: the deadline of the whole is kept by whoever waits.
+                # A little more: the waiting thread keeps the deadline of the whole.
                 timeout=limit_s + _SPARE_S,
                 extensions={"trace": self._trace},
             ) as response:
@@ -593,7 +593,7 @@ class Api:
         if isinstance(found, httpx.TransportError):
             reason = _transport_reason(found)
             return HttpError(f"cannot {what}: {reason}", uncertain=uncertain)
-        # What a library makes of bytes that it did not expect; never its own words, which may
+        # What a library makes of bytes that it did not expect; never its own message, which may
         # quote the request.
         raise HttpError(
             f"cannot {what}: its answer is no HTTP that can be read ({type(found).__name__})",
@@ -612,12 +612,12 @@ class Api:
         def work() -> None:
             try:
                 found.append(connection.send(sent, headers, limit_s))
-            except Exception as error:  # noqa: BLE001 - told by the thread that waits
+            except Exception as error:  # noqa: BLE001 - handled by the thread that waits
                 found.append(error)
             finally:
                 over.set()
 
-        # Nobody joins it: looking a name up cannot be ended from outside.
+        # Never joined: looking a name up cannot be ended from outside.
         threading.Thread(target=work, name="lifecycle-http", daemon=True).start()
         try:
             with self._deadline.waking(over):
@@ -782,7 +782,7 @@ def _with_hint(error: HttpError, asked_s: float, total_s: float) -> HttpError:
 
 
 def text_of(value: object, secret: str = "") -> str:
-    """A server's words on one line, printable and short, without `secret`."""
+    """A server's text on one line, printable and short, without `secret`."""
     if not isinstance(value, str):
         return ""
     if secret:

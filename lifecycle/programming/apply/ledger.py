@@ -42,7 +42,7 @@ _LOCK_CHECK_S = 0.05
 class EntryState(enum.Enum):
     """How far something is."""
 
-    PENDING = "pending"  # asked for, but nobody knows whether it was made
+    PENDING = "pending"  # asked for, but not known to be made
     MADE = "made"
 
 
@@ -99,8 +99,8 @@ class LedgerFile:
     """The file.
 
     Attributes:
-        owner: the supervisor whose end ends it all; None if somebody applied by hand, so that it
-            stays until it is removed by hand or the system is brought down.
+        owner: the supervisor whose end ends it all; None if applied manually, so that it
+            stays until it is removed manually or the system is brought down.
         boot_id: of the kernel that the owner ran on.
     """
 
@@ -131,7 +131,7 @@ class Ledger:
         """Keep other processes out, such as `flows apply` beside `up`; does not nest.
 
         Raises:
-            ProgrammingError: somebody else keeps it for too long.
+            ProgrammingError: another process keeps it for too long.
         """
         for each in (self._directory.parent, self._directory):
             _own_directory(each)
@@ -154,7 +154,7 @@ class Ledger:
         """Return what is written.
 
         Raises:
-            ProgrammingError: it cannot be read: what it tells of cannot be removed then.
+            ProgrammingError: it cannot be read: what it lists cannot be removed then.
         """
         try:
             data = self._path.read_bytes()
@@ -198,7 +198,7 @@ class Ledger:
             self._path.unlink(missing_ok=True)
             return
         before = self.read()
-        # What somebody applies by hand after a supervisor has died is not the dead one's.
+        # What is applied manually after a supervisor has died is not the dead one's.
         owner = None if owner_is_dead(before) else before.owner
         if self._owned:
             pid = os.getpid()
@@ -227,14 +227,14 @@ def has_ledger(directory: Path) -> bool:
 
 
 def owner_is_dead(file: LedgerFile) -> bool:
-    """Whether the supervisor that made all this is gone; False if somebody applied by hand."""
+    """Whether the supervisor that made all this is gone; False if applied manually."""
     if file.owner is None:
         return False
     return file.boot_id != boot_id() or start_ticks(file.owner.pid) != file.owner.start_ticks
 
 
 def digest_of(*parts: str) -> str:
-    """Return a digest of texts: 16 hex digits, enough to tell changes apart."""
+    """Return a digest of texts: 16 hex digits, enough to distinguish changes."""
     whole = hashlib.sha256("\0".join(parts).encode())
     return whole.hexdigest()[:16]
 

@@ -33,11 +33,11 @@ _PATCHABLE = ("notificationDestination", "flowInfo", "qosReference")
 _COMPARED = ("ueIpv4Addr", "ueIpv6Addr", "qosReference", "notificationDestination")
 
 _NO_PATCH = (404, 405, 415, 501)
-"""Statuses with which servers say that they know no PATCH."""
+"""Statuses of servers without PATCH."""
 
 
 def nef_scope(settings: NefTargetSettings) -> str:
-    """Return the URL of our collection of subscriptions, without the last word."""
+    """Return the URL of our collection of subscriptions, without the last path segment."""
     root = settings.url.rstrip("/")
     return f"{root}/3gpp-as-session-with-qos/v1/{as_segment(settings.scs_as_id)}"
 
@@ -134,7 +134,7 @@ def _path(id_: str) -> str:
 
 
 def _refused(subscription: Fields) -> str:
-    """Say so if the server granted another reference than was asked for."""
+    """Note it if the server granted another reference than was asked for."""
     granted = text_of(subscription.text("appliedQosRef"))
     return f"granted as {granted}" if granted else ""
 

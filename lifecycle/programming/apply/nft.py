@@ -1,6 +1,6 @@
-"""nftables on this host: one owned table, replaced in one piece.
+"""Applies an nftables ruleset on this host: one owned table, replaced in one transaction.
 
-Owns: when the table is written, and whose it is. What stands in it is `export.nftables`.
+Owns: when the table is written, and whose it is. Its contents are `rules.nftables`.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class NftTarget:
         """Compare the table with the rules.
 
         Raises:
-            NotOursError: a table of this name is somebody else's.
+            NotOursError: a table of this name is not ours.
             PrivilegeError: reading needs the same privilege as writing.
         """
         marking, left_out = _marking(rules)
@@ -231,7 +231,7 @@ class NftTarget:
 
 
 def root_qdiscs(tool: Tool) -> tuple[tuple[str, str], ...]:
-    """Return (device, kind) of every root queueing discipline; empty where tc does not tell."""
+    """Return (device, kind) of every root queueing discipline; empty where tc fails."""
     argv = ["tc", "-j", "qdisc", "show"]
     try:
         output = tool.run(argv)

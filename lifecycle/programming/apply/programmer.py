@@ -2,8 +2,8 @@
 
 Owns: `Programmer`: from flow reports to rules to targets, again whenever the reports change, and
 everything removed in the end; the address that this host sends from to a destination, as its
-routing decides; and the removal of what dead runs left. What somebody applied by hand stays:
-`lifecycle flows remove` or `lifecycle down` ends it. Blocking: a supervisor has a thread for it.
+routing decides; and the removal of what dead runs left. What was applied manually stays: `lifecycle
+flows remove` or `lifecycle down` ends it. Blocking: a supervisor has a thread for it.
 """
 
 from __future__ import annotations
@@ -52,11 +52,11 @@ class RouteSources:
     """Observes source addresses, see rules.SourceAddress.
 
     A publisher's socket is bound to `0.0.0.0`, so the source address of its packets is known only
-    by the route they take. For publishers on other machines this host cannot tell.
+    by the route they take. For publishers on other machines this host cannot know it.
 
     Args:
         plan: says which machine a node is on.
-        machine: the machine that this host is; empty to tell by the addresses it has.
+        machine: the machine that this host is; empty to determine it by its addresses.
     """
 
     def __init__(self, plan: Plan, machine: str = "") -> None:
@@ -160,7 +160,7 @@ class Programmer:
             flows: as last verified.
             hold: a flow that was programmed and is not verified at this moment keeps its rule
                 until it is verified again or is no longer declared: while a node restarts, its old
-                rule harms nobody, and a session of a mobile network is costly to make again.
+                rule does no harm, and a session of a mobile network is costly to make again.
             within_s: for all that servers are asked; None for the patience with each request.
 
         Returns:
@@ -245,7 +245,7 @@ def open_programmer(
         plan: of the system.
         options: one per target.
         environment: says where run directories are.
-        machine: the machine that this host is; empty to tell by its addresses.
+        machine: the machine that this host is; empty to determine it by its addresses.
         owned: the caller is the supervisor whose end is to end what is made.
         treatment: see Treatment.
 
@@ -327,7 +327,7 @@ def sweep_orphans(root: Path, *, own: str = "", within_s: float | None = None) -
 
 
 def remove_run(directory: Path, *, within_s: float | None = None) -> tuple[TargetChanges, ...]:
-    """Remove everything that a run has in networks, also what somebody applied by hand.
+    """Remove everything that a run has in networks, also what was applied manually.
 
     For `lifecycle down`.
 

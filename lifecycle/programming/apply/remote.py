@@ -82,7 +82,7 @@ class Service(Protocol):
         ...
 
     def asks(self, rules: Sequence[FlowRule]) -> tuple[tuple[RemoteRequest, ...], tuple[str, ...]]:
-        """Return what is to be asked for, and each flow that this interface cannot say, and why."""
+        """Return what is to be asked for, and each flow this interface cannot express, and why."""
         ...
 
     def create(self, body: Body) -> Made:
@@ -249,7 +249,7 @@ class RemoteTarget:
         return ChangeKind.KEEP, seen.detail
 
     def _make(self, change: FlowChange, body: Body) -> str:
-        """Make one change; returns what is to be told of it."""
+        """Make one change; returns what is to be reported of it."""
         entry = self._record().entry(change.key)
         if change.kind is ChangeKind.DELETE:
             assert entry is not None

@@ -1,4 +1,4 @@
-"""From options or a ledger to targets.
+"""Creates network targets (nftables, tc, NEF, CAMARA) from options or from a ledger.
 
 Owns: which targets there are and what each needs. A ledger's record has to be enough to remove what
 it lists, long after the options are forgotten.
@@ -31,7 +31,7 @@ KINDS = (nft.KIND, tc.KIND, nef.KIND, camara.KIND)
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class TargetOptions:
-    """What a person says of one target.
+    """The options of one target.
 
     Attributes:
         kind: of KINDS.
@@ -67,7 +67,7 @@ class TargetOptions:
             )
 
     def tc(self) -> TcSettings:
-        """Return what tc is to be told.
+        """Return the settings for tc.
 
         Raises:
             UsageError: the options do not fit together.

@@ -93,7 +93,7 @@ def probe_features(tool: Tool) -> TcFeatures | None:
     """Ask the kernel what it has, in a network namespace that is thrown away.
 
     Returns:
-        What it has; None where this user may not make a namespace, so that only trying tells.
+        What it has; None where this user may not make a namespace, so that only trying shows it.
     """
     for unshare in (("unshare", "-n"), ("unshare", "-Urn")):
         # Root whose CAP_NET_ADMIN was taken away makes a namespace that it may change nothing in:
@@ -150,7 +150,7 @@ class _Wanted:
 
     @property
     def digest(self) -> str:
-        """Tells one structure of classes from another."""
+        """Distinguishes one structure of classes from another."""
         return digest_of(*self.fresh)
 
     @property
@@ -196,7 +196,7 @@ class TcTarget:
         """Compare the device with the rules.
 
         Raises:
-            NotOursError: the device has a root qdisc of somebody else.
+            NotOursError: the device has a root qdisc that is not ours.
             MissingFeatureError: the kernel lacks what is needed.
             ProgrammingError: there is no such device, or the rates do not fit.
         """

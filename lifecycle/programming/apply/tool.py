@@ -1,10 +1,9 @@
-"""Running the programs that change the kernel: nft, tc and unshare.
+"""Runs nft, tc and unshare, with the deadline and cancellation of blocking network work.
 
-Owns: how they are started, bounded and asked in English, and what their refusals mean: a missing
-program, a missing privilege and a missing kernel feature are each one sentence of their own.
-
-Deadline and cancellation of blocking work on networks, from another thread or a signal. Owns:
-`Deadline`, which everything shares that one Programmer calls. Pure but for its clock.
+Owns: how the programs that change the kernel are started, bounded and asked in English, and what
+their refusals mean: a missing program, a missing privilege and a missing kernel feature are each
+one sentence of their own; and `Deadline`, which everything shares that one Programmer calls,
+cancelled from another thread or a signal and pure but for its clock.
 """
 
 from __future__ import annotations
@@ -74,7 +73,7 @@ class HostTool:
     """Programs of this host.
 
     Args:
-        prefix: words before each command line, such as `ip netns exec robot`.
+        prefix: arguments before each command line, such as `ip netns exec robot`.
     """
 
     def __init__(self, prefix: Sequence[str] = ()) -> None:
@@ -124,7 +123,7 @@ def demand(tool: Tool, argv: Sequence[str], *, doing: str, stdin: str = "") -> s
     Raises:
         PrivilegeError: it needs a privilege; says which command.
         MissingFeatureError: the kernel or the program is missing something.
-        ProgrammingError: it failed otherwise, in its own words.
+        ProgrammingError: it failed otherwise, with its own message.
     """
     output = tool.run(argv, stdin=stdin)
     if output.returncode == 0:

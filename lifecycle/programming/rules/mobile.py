@@ -77,7 +77,7 @@ class Requests(Generic[T]):
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Devices:
-    """How to tell which ends of flows are devices.
+    """Which ends of flows are devices.
 
     Attributes:
         networks: that devices have their addresses from.
@@ -96,7 +96,7 @@ class Devices:
 
 
 def parse_devices(texts: Iterable[str], *, address: str = "") -> Devices:
-    """Return how to tell devices.
+    """Parse which ends of flows are devices.
 
     Args:
         texts: `10.45.0.0/16`, `2001:db8:45::/48`, single addresses, or `source` and `destination`

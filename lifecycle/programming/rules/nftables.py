@@ -22,7 +22,7 @@ from lifecycle.programming.rules.rules import FlowRule, LeftOut, asks, named
 FAMILY = "inet"
 CHAIN = "post"
 PRIORITY_MANGLE = -150
-"""What `priority mangle` stands for in the postrouting hook (NF_IP_PRI_MANGLE)."""
+"""The value of `priority mangle` in the postrouting hook (NF_IP_PRI_MANGLE)."""
 
 MAX_COMMENT_BYTES = 127
 """Longest comment that nftables keeps (NFTNL_UDATA_COMMENT_MAXLEN, with its final zero 128)."""
@@ -197,13 +197,13 @@ def render_nft_removal(system: str) -> str:
     Raises:
         ValueError: the system's name is not one that a manifest may have.
     """
-    # `destroy` would say it in one line, but nftables 1.0.6 does not know the word.
+    # `destroy` would say it in one line, but nftables 1.0.6 does not know the keyword.
     table = table_name(system)
     return f"add table {FAMILY} {table}\ndelete table {FAMILY} {table}\n"
 
 
 def nft_keyword(dscp: int) -> str:
-    """Return how nft spells a DSCP, as a word where nftables 1.0.6 knows one.
+    """Return how nft spells a DSCP, as a keyword where nftables 1.0.6 knows one.
 
     Raises:
         ValueError: not 0–63.
@@ -271,7 +271,7 @@ def _group(
         _Part(protocol=network, field="daddr", type=address),
         _Part(protocol=transport, field="dport", type="inet_service"),
     )
-    # f: whole flows; p: flows whose source address is not known, told by port and destination.
+    # f: whole flows; p: flows whose source address is not known, matched by port and destination.
     letter, digit = "f" if sourced else "p", "6" if network == "ip6" else "4"
     field, value, comment = change
     return _Group(

@@ -1,9 +1,7 @@
-"""Every export of flows by the name that the command line gives it.
+"""Every export of flows by its command line name, and flow reports as CSV.
 
-Owns: the names, and what an export needs beside the flows. Pure.
-
-Flow reports as CSV, one line per network flow, for spreadsheets and other tools. Owns: the
-columns. They are only ever added to at the end.
+Owns: the names, what an export needs beside the flows, and the columns of the CSV: one line per
+network flow, for spreadsheets and other tools. Columns are only ever added at the end. Pure.
 """
 
 from __future__ import annotations
@@ -63,7 +61,7 @@ def flows_to_csv(flows: Iterable[FlowReport]) -> str:
     """Return flow reports as CSV with a header line (RFC 4180, but lines end with a newline).
 
     A pair whose NFEs form several flows has one line each; a pair without any known IP flow (shared
-    memory, or NFEs that nobody reported) has one line whose 5-tuple is empty.
+    memory, or NFEs that were not reported) has one line whose 5-tuple is empty.
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -117,7 +115,7 @@ T = TypeVar("T")
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class ExportSettings:
-    """What some exports need and flows do not say; None where it was not given."""
+    """What some exports need and flows do not contain; None where it was not given."""
 
     tc: TcSettings | None = None
     nef: NefSettings | None = None

@@ -1,9 +1,10 @@
-"""Flow rules: what a network may be told of the flows that were verified, and why of others not.
+"""Turns verified flows into flow rules for networks, with the reason for each flow left out.
 
-Owns: the step from flow reports to rules. A rule says only what was observed or declared: a flow
-whose verdict is not ok, shared memory, groups and tuples that two flows share in disagreement make
-no rule, and each is listed with its reason. And how a rule reads in the comments of every export:
-DSCP and TOS always side by side, because products differ in which of the two they ask for. Pure.
+Owns: the step from flow reports to rules, and how a rule reads in the comments of every export. A
+rule says only what was observed or declared: a flow whose verdict is not ok, shared memory, groups
+and tuples that two flows share in disagreement make no rule, and each is listed with its reason.
+Comments have DSCP and TOS always side by side, because products differ in which of the two they ask
+for. Pure.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ class FlowRule:
         key: names the flow for as long as its manifest does, whatever ports it has:
             `/robot/video /robot/camera → /viewer udp 10.77.0.2`.
         names: (topic, publisher, subscription) of every pair that this one flow carries.
-        source_address: empty where the sender's routing decides and nobody observed it: the rule
+        source_address: empty where the sender's routing decides and it was not observed: the rule
             then matches ports and destination only.
         source_port: 1–65535.
         destination_address: one unicast address.
@@ -160,7 +161,7 @@ def flow_rules(
     """Turn verified flows into rules.
 
     What a flow is to get comes from the plan: the DSCP and 5QI of its publisher, else the 5QI of
-    its subscription; a DSCP that was read back from the sockets stands where none was planned.
+    its subscription; a DSCP that was read back from the sockets is used where none was planned.
 
     A publisher sends from `0.0.0.0:port`. Its address is the one its machine was observed to send
     from to that destination (`source_address`), else the machine's declared address if the
@@ -173,7 +174,7 @@ def flow_rules(
         source_address: see SourceAddress; None if nothing was observed.
         mapping: gives the DSCP of flows that have a 5QI and no DSCP.
         label_flows: give each IPv6 flow a flow label of its own, so that the 3-tuple of addresses
-            and label tells it from others too.
+            and label distinguishes it from others too.
     """
     left_out: list[LeftOut] = []
     by_tuple: dict[tuple[object, ...], list[_Candidate]] = {}
@@ -277,7 +278,7 @@ def _ask(
     sends = _endpoint(publisher, EndpointKind.PUBLISHER, report.topic)
     takes = _endpoint(subscription, EndpointKind.SUBSCRIPTION, report.topic)
     dscp = None if sends is None else sends.dscp
-    # 0 is what an unmarked socket reads back: nobody asked for it.
+    # 0 is what an unmarked socket reads back: it was not asked for.
     dscp = dscp if dscp is not None else report.dscp or None
     asked = [each.five_qi for each in (sends, takes) if each is not None]
     return dscp, next((each for each in asked if each is not None), None)

@@ -1,26 +1,20 @@
 """Flow rules as lines for `tc -batch`: a queue per class on one network device, filters per flow.
 
-Owns: the qdisc `1f10:` at the root of a device, its classes, their queues and filters. The handle
-is the mark of ownership: tc has no comments, so only what hangs below this handle is ours.
-`tc -batch` is neither atomic nor dry-runnable, and a second `qdisc add` fails: look whether the
-handle is there first, and then send `render_tc(…, with_qdisc=False)`, whose lines all replace.
-Pure.
+Owns: the qdisc `1f10:` at the root of a device; which classes a link has for a set of rules: the
+ranking of DSCPs and 5QIs and how the link's rate is divided; the classes' queues; their filters,
+matching a flow or a mark with flower and with u32, and the handles of filters; and the settings of
+the tc export, with what a kernel can do. Pure.
 
-Which traffic classes a link has for a set of rules, in which order and with what rate. Owns:
-the ranking of DSCPs and 5QIs on one link and how its rate is divided.
+The handle is the mark of ownership: tc has no comments, so only what hangs below this handle is
+ours. `tc -batch` is neither atomic nor dry-runnable, and a second `qdisc add` fails: look whether
+the handle is there first, and then send `render_tc(…, with_qdisc=False)`, whose lines all replace.
 
-The kernel's own queues do not rank by DSCP as people expect: pfifo_fast and prio put EF, CS6
-and DF into one band. So each class of the rules gets a queue of its own here.
+The kernel's own queues do not rank by DSCP as people expect: pfifo_fast and prio put EF, CS6 and DF
+into one band. So each class of the rules gets a queue of its own here.
 
-Filters of `tc`: which packets of a device go to which class. Owns: matching a flow or a mark
-with flower and with u32, and the handles of filters.
-
-Filters carry an explicit preference and handle, which makes them replaceable one by one. u32
-names its root tables in the order in which they are made, so a filter that matches nothing
-holds the first place of each family.
-
-How one network device is to treat flows, and what its kernel can do. Owns: the settings of the
-tc export.
+Filters carry an explicit preference and handle, which makes them replaceable one by one. u32 names
+its root tables in the order in which they are made, so a filter that matches nothing holds the
+first place of each family.
 """
 
 from __future__ import annotations
@@ -40,7 +34,7 @@ DEFAULT_MINOR = 0xFFF
 """Minor number of the class that everything else goes to."""
 
 _FIRST = tuple(map(parse_dscp, ("EF", "VA")))
-"""Expedited forwarding and admitted voice come before everything (RFC 3246, RFC 5865)."""
+"""Expedited forwarding and voice-admit come before everything (RFC 3246, RFC 5865)."""
 
 _LOWEST = tuple(map(parse_dscp, ("LE", "CS1")))
 """Less than best effort (RFC 8622, RFC 4594 §4.10)."""
@@ -97,7 +91,7 @@ def divide(
 ) -> tuple[dict[str, int], int]:
     """Return the guaranteed rate of each class by name, and that of the rest, in kbit/s.
 
-    Classes that nobody gave a rate share what is left equally with the rest; those below the rest
+    Classes without a given rate share what is left equally with the rest; those below the rest
     get a hundredth of the link, so that they do not starve.
 
     Args:
@@ -170,7 +164,7 @@ OWNED_HANDLE = "1f10:"
 
 DEFAULT_QUEUE_MS = 50.0
 """How long the queue of each class may become. Without a bound of its own it is a thousand packets
-(txqueuelen): measured on a link of 20 Mbit/s at 120 % load, bulk then stood for 569 ms, and for
+(txqueuelen): measured on a link of 20 Mbit/s at 120 % load, bulk then waited 569 ms, and
 49 ms with this; a UDP datagram of 64 kB still arrives whole."""
 
 MIN_QUEUE_BYTES = 66_000

@@ -34,7 +34,7 @@ def render_zenoh(rules: Iterable[FlowRule], *, left_out: Sequence[LeftOut] = ())
     """Return a JSON5 configuration whose endpoints mark what is sent to each destination.
 
     One link carries all topics to its destination, so one address and port has one DSCP: where
-    rules disagree, the endpoints stand side by side and the comments say so.
+    rules disagree, the endpoints are side by side and the comments say so.
     """
     every = tuple(rules)
     marked: dict[str, list[FlowRule]] = {}

@@ -1,6 +1,7 @@
-"""What a rule is. Owns: `Rule`, which makes the findings that carry its id. Pure.
+"""What a verification rule is: its id, outcomes, fix, and when its findings clear.
 
-Whoever acts on findings asks their rules; nobody reads ids, subjects or messages for that.
+Owns: `Rule`, which makes the findings that carry its id. Code that acts on findings asks their
+rules and does not parse ids, subjects or messages. Pure.
 """
 
 from __future__ import annotations
@@ -19,15 +20,15 @@ class Heals(enum.Enum):
     """What takes a finding back."""
 
     WITH_TIME = "with time"  # a system on its way up breaks the rule for a moment
-    WITH_CHANGE = "with change"  # somebody has to change something
-    NEVER = "never"  # no second look can tell anything else
+    WITH_CHANGE = "with change"  # something has to be changed
+    NEVER = "never"  # no second look can show anything else
 
 
 class About(enum.Enum):
     """What a rule looks at that a node brings along: it is broken while the node is not there."""
 
     PRESENCE = "presence"  # whether the node itself, or an endpoint of it, is there and alive
-    MATCH = "match"  # whether two ends are matched: of that no node tells all
+    MATCH = "match"  # whether two ends are matched: no node reports all of that
     PROGRESS = "progress"  # how far a node has come: its state, its report
     CONNECTION = "connection"  # a node's connections, and what is mapped onto them
 
@@ -46,11 +47,11 @@ class Rule:
             manifest waived the requirement itself.
         heals: what takes its findings back.
         about: what it looks at that a node brings along; None for anything else.
-        if_unheard: it breaks where one participant does not hear another.
+        if_unheard: it breaks where one participant does not discover another.
         absence: for a rule whose violated findings say that something is not there (yet), how to
             call that, with `{kind}` of the endpoint and `{node}`; empty for others.
         awaits: for a rule whose findings say that something is not known (yet), the rule that is
-            broken while what would tell is not there; None for others.
+            broken while what would show it is not there; None for others.
         names_expected: its subjects mean nothing without what was expected of them.
         names_log: its fix is in a log, and ends in the name of the file where that is known.
     """

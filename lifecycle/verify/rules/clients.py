@@ -1,6 +1,7 @@
 """Rules about declared clients of services and actions that no server is matched with. Pure.
 
-A client tells whether a server is matched with it both ways; a server tells nothing of its clients.
+A client reports whether a server is matched with it both ways; a server reports nothing about its
+clients.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ RULES = (MISSING_REPORT, INCOMPLETE_REPORT)
 
 
 def check(view: View) -> Iterator[Finding]:
-    """Judge that our own nodes tell all that only they can tell."""
+    """Judge that our own nodes report all that only they can report."""
     for name, node in view.planned.items():
         if not view.ours(node) or view.is_absent(node):
             continue

@@ -1,7 +1,7 @@
 """Rules about connections and mappings: missing, failed, otherwise than planned. Pure.
 
-A connection is a participant that only its own node can tell of: discovery shows a hidden node, but
-neither what it was told to connect to nor why it could not. So the nodes' reports are judged.
+A connection is a participant that only its own node can report on: discovery shows a hidden node,
+but neither its connection URLs nor why it could not connect. So the nodes' reports are judged.
 """
 
 from __future__ import annotations

@@ -75,7 +75,7 @@ def check(view: View) -> Iterator[Finding]:
 
 
 def differ(one: str, other: str) -> bool:
-    """Tell whether two hashes are of two definitions; those of two hash versions are not compared.
+    """Return whether two hashes are of two definitions; other hash versions are not compared.
 
     A hash begins with its version, `RIHS01_` (REP-2016).
     """

@@ -1,4 +1,4 @@
-"""Rules about endpoints: missing, undeclared, of another type, not made, nobody's. Pure."""
+"""Rules about endpoints: missing, undeclared, of another type, not made, unattributed. Pure."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def _declared(actual: Actual, *, absent: bool) -> Iterator[Finding]:
 
 
 def _remapped(actual: Actual) -> str:
-    """Say which other name its node has the endpoint under; empty if it has none."""
+    """Return which other name its node has the endpoint under; empty if it has none."""
     planned, report = actual.planned, actual.report
     if report is None or report.resolved == planned.resolved:
         return ""
@@ -136,7 +136,7 @@ def _remapped(actual: Actual) -> str:
 
 
 def _is_hidden(actual: Actual) -> bool:
-    """Tell whether neither discovery nor a report could have shown the endpoint."""
+    """Return whether neither discovery nor a report could have shown the endpoint."""
     return actual.unseen and actual.report is None
 
 
@@ -199,7 +199,7 @@ def _undeclared(view: View) -> Iterator[Finding]:
 
 
 def _given_name(view: View, endpoint: ObservedEndpoint) -> str:
-    """Say that a name was given to a declared endpoint while it ran; empty if it was not."""
+    """Explain a name that a declared endpoint was given while it ran; empty if it was not."""
     for actual in view.actual_by_node[endpoint.node]:
         report = actual.report
         if report is None or report.kind is not endpoint.kind:
@@ -216,7 +216,7 @@ def _given_name(view: View, endpoint: ObservedEndpoint) -> str:
 
 
 def _conflicts(view: View) -> Iterator[Finding]:
-    """A topic, service or action of ours that somebody undeclared uses with another type."""
+    """A topic, service or action of ours that an undeclared node uses with another type."""
     types: dict[tuple[str, str], dict[str, None]] = {}
     for actual in view.actual:
         place = (MEETS[actual.planned.kind], actual.planned.resolved)

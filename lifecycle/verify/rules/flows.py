@@ -2,7 +2,7 @@
 
 What is strictly required, or demanded by a link, must be proven: what cannot be is violated. An
 optionally required endpoint never violates: the requirement is met by trying. `system_default`
-demands nothing either; the flow report says what came of it.
+demands nothing either; the flow report has the result.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ RULES = (NOT_UNIQUE, UNVERIFIABLE, BROKEN_ENDPOINT, NOT_MEASURED)
 
 
 def check(view: View) -> Iterator[Finding]:
-    """Judge every strict endpoint, then every link's demand, then name what nobody measures."""
+    """Judge every strict endpoint, then every link's demand, then name what is not measured."""
     uniqueness = Uniqueness(view.reported, view.addresses)
     for actual in view.actual:
         yield from _broken(actual)
@@ -76,7 +76,7 @@ def check(view: View) -> Iterator[Finding]:
 
 
 def _not_measured(view: View) -> Iterator[Finding]:
-    """One finding per number: whoever declares it is told that nobody has compared it."""
+    """One finding per declared number: it reports that the number was not compared."""
     for actual in view.actual:
         planned, node = actual.planned, actual.node.full_name
         if actual.observed is None and actual.report is None:
@@ -192,7 +192,7 @@ def _demanded(flow: FlowView, uniqueness: Uniqueness) -> Iterator[Finding]:
 
 
 def _why_unproven(actual: Actual) -> str:
-    """Say why the network flow endpoints of an endpoint, or of its neighbours, are not known."""
+    """Return why the network flow endpoints of an endpoint, or of its neighbours, are not known."""
     if actual.report is None:
         return f"{actual.node.full_name} does not report its network flow endpoints"
     if actual.report.nfes is None:

@@ -1,4 +1,4 @@
-"""When a publisher and a subscription count as matched, and the rules about declared pairs. Pure.
+"""Decides when a publisher and a subscription are matched; rules about declared pairs. Pure.
 
 Owns: `match` and `obstacle`, by which the rules here and `lifecycle.graph`'s links judge a pair.
 
@@ -7,7 +7,7 @@ name each other. Where an end's RMW only counts its peers, the count must be tha
 of the graph that can match it, tools' included: a count that is lower or higher proves nothing
 about this pair. Where neither end reports, discovery has to do: both ends are there, of one type,
 and compatible, which is DDS's own condition for a match (DDS 1.4 §2.2.2.5, §2.2.3) but for the
-partition, which nobody announces upward; that is not enough for a declared link.
+partition, which no layer reports upward; that is not enough for a declared link.
 """
 
 from __future__ import annotations
@@ -58,10 +58,10 @@ class MatchEnd:
     """A publisher or a subscription, with all that is known of it.
 
     Attributes:
-        qos: as announced or reported, `UNKNOWN_QOS` where nobody says.
+        qos: as announced or reported, `UNKNOWN_QOS` where neither is known.
         gid: hex; empty where it is not known.
         report: what its node says; None if it says nothing.
-        expected: it is one that the system has for good, so that whoever can match it must; a
+        expected: it is one that the system has for good, so that whatever can match it must; a
             tool's may be matched or not.
     """
 
@@ -218,7 +218,7 @@ def _by_count(word: str, matched: int, end: MatchEnd, others: Sequence[MatchEnd]
 
 
 def _compatible(offered: QosProfile, requested: QosProfile) -> bool:
-    """Tell whether nothing certain stands against a match."""
+    """Return whether nothing certain prevents a match."""
     return all(
         each.severity is not Certainty.CERTAIN for each in incompatibilities(offered, requested)
     )

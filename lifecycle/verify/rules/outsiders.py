@@ -1,8 +1,8 @@
-"""Rules about endpoints of no declared node: of tolerated tools, and of no known node at all. Pure.
+"""Rules about endpoints of undeclared nodes: of tolerated tools, and of unknown nodes. Pure.
 
 What decides is what an endpoint does, not what its node is called: a publisher on a declared topic
-and a server of a declared service or action feed the system, whoever owns them. Who only listens,
-or asks, is tolerated where the policy names its node.
+and a server of a declared service or action feed the system, whichever node owns them. A node that
+only subscribes or calls is tolerated where the policy names it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ UNATTRIBUTED_ENDPOINT = Rule(
     fix="wait for discovery; a plain DDS program never tells a node name: give it another domain",
     heals=Heals.WITH_TIME,
     if_unheard=True,
-    awaits=MISSING_NODE,  # discovery tells of an endpoint before it tells of its node
+    awaits=MISSING_NODE,  # discovery shows an endpoint before its node
 )
 RULES = (UNATTRIBUTED_ENDPOINT,)
 
@@ -48,7 +48,7 @@ _VENDORS = {
 
 
 def check(view: View) -> Iterator[Finding]:
-    """Judge what tools offer under declared names, and what nobody known has."""
+    """Judge what tools offer under declared names, and what no known node has."""
     if view.plan.policy.undeclared_nodes is not EndpointPolicy.DECLARED:
         return
     yield from _offered_by_tools(view)
@@ -76,7 +76,7 @@ def _offered_by_tools(view: View) -> Iterator[Finding]:
 
 
 def _unattributed(view: View) -> Iterator[Finding]:
-    """Closed world: every endpoint must be known to be somebody's, at the latest before the gate.
+    """Closed world: every endpoint must be attributed to a node, at the latest before the gate.
 
     After it, who only listens may be a tool whose name has yet to come; who feeds may not.
     """
@@ -95,7 +95,7 @@ def _unattributed(view: View) -> Iterator[Finding]:
 
 
 def described(endpoint: ObservedEndpoint) -> str:
-    """Say what is known of an endpoint's participant: vendor, address, GID; empty for nothing."""
+    """Describe an endpoint's participant as far as known: vendor, address, GID; else empty."""
     known = []
     vendor = int(endpoint.gid[:4], 16) if len(endpoint.gid) == _GUID_DIGITS else 0
     if vendor:

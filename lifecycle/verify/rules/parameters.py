@@ -69,7 +69,7 @@ def check(view: View) -> Iterator[Finding]:
 
 
 def _known(view: View, name: str) -> dict[str, ParameterReport] | str:
-    """Return a node's parameters by name; why not if they are not known, empty if nobody asked."""
+    """Return a node's parameters by name; why not if they are not known, empty if not asked."""
     report = view.configurations.get(name)
     if report is not None and report.parameters is not None:
         return {each.name: each for each in report.parameters}

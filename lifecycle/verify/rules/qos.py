@@ -151,7 +151,7 @@ def _comparable(planned: PlannedEndpoint, declared: QosProfile) -> Iterator[str]
 def spell(profile: QosProfile, policy: str) -> str:
     """Spell one policy's value for people; every form of infinite is `infinite`.
 
-    A depth is unknown where the history is: 0 stands for "not observable" then.
+    A depth is unknown where the history is: 0 means "not observable" then.
     """
     if policy == "depth" and profile.history is History.UNKNOWN:
         return "UNKNOWN"

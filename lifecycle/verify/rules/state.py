@@ -65,7 +65,7 @@ def _judge(view: View, name: str, node: PlannedNode) -> Iterator[Finding]:
         for state in (observed.state if observed else None, report.state if report else None)
         if state
     )
-    # On the way to what is allowed; `activating` is nobody's aim, so no message names it.
+    # On the way to what is allowed; `activating` is never the goal, so no message names it.
     passing = {"activating"} if ahead else set()
     wrong = [state for state in states if state not in allowed | passing]
     expected = wanted
@@ -102,7 +102,7 @@ def _judge(view: View, name: str, node: PlannedNode) -> Iterator[Finding]:
 
 
 def _says_so(view: View, node: PlannedNode, report: NodeConfiguration | None) -> bool:
-    """Tell whether one of our nodes itself says that it is managed, by telling its state.
+    """Return whether one of our nodes itself reports that it is managed, by its state.
 
     It is driven by its host and not by the services, which discovery may show late: the graph
     shows a node before all of its endpoints.

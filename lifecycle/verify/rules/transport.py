@@ -1,8 +1,8 @@
-"""The rules about what carries a flow. Pure.
+"""Rules about the transport that carries a flow: shared memory, intra-process, UDP, TCP. Pure.
 
-A network treats only what it sees: a flow that is handed over in shared memory, or inside a
-process, meets no rule of it. NFEs list what an endpoint could use; what is used is
-`verify.transport`'s.
+A network treats only what it sees: a flow that is passed on in shared memory, or inside a process,
+meets no rule of it. NFEs list what an endpoint could use; which one is used is decided in
+`verify.transport`.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def check(view: View) -> Iterator[Finding]:
 
 
 def _is_decided(view: View, flow: FlowView) -> bool:
-    """Tell whether somebody asked for the medium; else the plan only says what is expected."""
+    """Return whether the medium was asked for; else the plan only has what is expected."""
     if view.plan.data_layer.at is not None:
         return True
     return any(
