@@ -1,9 +1,9 @@
-"""JSON in and out for the package's frozen dataclasses.
+"""JSON encoding and decoding of the package's frozen dataclasses, and ranges for their schemas.
 
-Owns: the one way a dataclass becomes JSON (control channel, reports, files) and comes back typed.
-Enums travel as their values, tuples as arrays, None as null. Owns also the ranges that the schemas
-of results say (`make schemas`); reading enforces none of them, for whoever reads says in words of
-its own what is out of range. Imports nothing of the package.
+Owns: the one way a dataclass becomes JSON (control channel, reports, files) and becomes typed
+again. Enums travel as their values, tuples as arrays, None as null. Owns also the ranges in the
+schemas of results (`make schemas`); reading enforces none of them, because each reader reports what
+is out of range in its own message. Imports nothing of the package.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ T = TypeVar("T")
 
 
 def says(**keywords: object) -> msgspec.Meta:
-    """Return what a schema says of a value, for `Annotated`: `says(minimum=1)`."""
+    """Return what a schema requires of a value, for `Annotated`: `says(minimum=1)`."""
     return msgspec.Meta(extra_json_schema=keywords)
 
 

@@ -1,6 +1,6 @@
-"""The root exception, its kinds, and the process exit codes each one maps to.
+"""Exceptions and process exit codes: the root exception, its kinds, and the exit code of each.
 
-Owns: every exit code of the command line and the exceptions that cross room borders. One
+Owns: every exit code of the command line and the exceptions that cross package borders. One
 boundary (`lifecycle.cli.main`) turns exceptions into exit codes. Imports nothing of the package.
 """
 
@@ -32,7 +32,7 @@ class LifecycleError(Exception):
     """Root of every exception that this package raises on purpose.
 
     Attributes:
-        message: one sentence that starts with "cannot", quotes the value, says what is allowed.
+        message: one sentence that starts with "cannot", quotes the value, states what is allowed.
         hint: the next thing to do, often a command; empty where there is none.
         exit_code: what the command line exits with when nothing handled it.
     """

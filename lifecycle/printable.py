@@ -1,10 +1,10 @@
-r"""Text from elsewhere as a terminal may show it: control characters and bidi overrides escaped.
+r"""Escape control characters and bidi overrides in text from elsewhere before a terminal shows it.
 
 Owns: which characters reach a terminal, a log or a report as they are. Names in a graph, texts of
-other nodes and lines of processes are chosen by whoever runs them: ESC moves a cursor, a newline
-begins a line that looks like ours, U+202E turns a line around (CVE-2021-42574), a lone surrogate
-cannot be written at all. What `str.isprintable` calls no printable character is written as Python
-would, `\x1b`, `\n`, `\u202e`. Imports nothing of the package.
+other nodes and lines of processes are chosen by others: ESC moves a cursor, a newline begins a line
+that looks like ours, U+202E turns a line around (CVE-2021-42574), a lone surrogate cannot be
+written at all. What `str.isprintable` calls no printable character is written as Python would,
+`\x1b`, `\n`, `\u202e`. Imports nothing of the package.
 """
 
 from __future__ import annotations

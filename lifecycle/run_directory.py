@@ -1,6 +1,6 @@
-"""The directory of one supervised system: lock, record, control socket.
+"""Run directory of one supervised system: lock, process record, control socket.
 
-Owns: where it is, that only one supervisor has it, and what it says about the processes, so that
+Owns: where it is, that only one supervisor has it, and what it records of the processes, so that
 the next `up` can find what a killed supervisor left behind. Must not import rclpy.
 """
 
@@ -38,11 +38,11 @@ LEDGER_NAME = "programmed.json"
 """File in a run directory that lists what is ours in networks, see programming/apply/ledger.py."""
 
 LEDGER_LOCK_NAME = "programmed.lock"
-"""File beside it, locked by whoever changes it."""
+"""File beside it, locked while it is changed."""
 
 
 OWN_CHILD = threading.Lock()
-"""Held by whoever runs a program and waits for it himself. If it were buried as an orphan first,
+"""Held while a thread runs a program and waits for it. If that were reaped as an orphan first,
 its exit code would be lost, and `subprocess` takes a lost one for success."""
 
 
@@ -124,7 +124,7 @@ def start_ticks(pid: int) -> int | None:
         text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
     except (FileNotFoundError, ProcessLookupError):
         return None
-    # The command stands in parentheses and may hold any character; the state follows it.
+    # The command is in parentheses and may hold any character; the state follows it.
     fields = text.rpartition(")")[2].split()
     return None if fields[0] in "ZX" else int(fields[19])
 
@@ -263,7 +263,7 @@ class RunDirectory:
 def read_record(path: Path) -> RunRecord | None:
     """Return the record in a run directory; None if there is none that can be read."""
     try:
-        # Not blocking: of a pipe in its place nobody might write the other end.
+        # Not blocking: a pipe in its place might have no writer.
         record = os.open(path / "record.json", os.O_RDONLY | os.O_NONBLOCK | _OURS)
         with os.fdopen(record, "rb") as file:
             if not stat.S_ISREG(os.fstat(record).st_mode):
@@ -306,9 +306,9 @@ def connect(path: Path, timeout_s: float) -> socket.socket:
     """Connect to a control socket, with that limit for whatever is done on it.
 
     Raises:
-        TimeoutError: whoever listens there takes nobody.
-        ConnectionRefusedError: nobody listens there any more.
-        FileNotFoundError: nobody ever did.
+        TimeoutError: the listener there accepts no connection.
+        ConnectionRefusedError: nothing listens there any more.
+        FileNotFoundError: there never was a listener.
     """
     sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:

@@ -1,7 +1,7 @@
-"""The language: a YAML document → a frozen, checked `Manifest`. Needs no ROS.
+"""Load and check a declarative manifest: YAML document → frozen, checked `Manifest`. Needs no ROS.
 
 `load` reads a manifest with its includes and raises `ManifestError` with every finding at once.
-What leaves this room are the types of `model`, `qos` and `diagnostics`; nothing outside knows YAML.
+Other packages use the types of `model`, `qos` and `diagnostics`; nothing outside knows YAML.
 YAML and JSON Schema are imported when `load` is asked for.
 """
 

@@ -1,6 +1,6 @@
-"""Positions in a document and the diagnostics that point at them.
+"""Diagnostics of a manifest: file, line and column, rule, severity, message and hint.
 
-Owns: `Position`, `Diagnostic`, `ManifestError`. Every check appends diagnostics and goes on, so
+Owns: `Position`, `Diagnostic`, `ManifestError`. Every check appends diagnostics and continues, so
 that a user sees all findings at once. Pure.
 """
 
@@ -24,7 +24,7 @@ class Severity(enum.Enum):
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Position:
-    """Where something stands in a document.
+    """A place in a document.
 
     Attributes:
         file: path as the user wrote it.

@@ -1,14 +1,10 @@
-"""What every flow need comes to once mappings, links, types and machines are taken into account.
+"""Effective flow needs of endpoints: DSCP, 5QI, size and transport after mappings, links and types.
 
 Owns: `FlowNeeds`, which the checks and the planner both read, so that `check` judges what `plan`
-will do. Reads interface definitions; starts nothing.
-
-Which 5QI a publisher's need comes to, and whether that class keeps what is declared. Owns:
-`five_qi: auto`, and the check of a 5QI that is written. The table is `lifecycle.network`'s.
-
-Which DSCP an endpoint's need comes to, and why. Owns: the ways to a DSCP besides writing it: a
-TRANSPORT_PRIORITY through its mapping, a 5QI through a mapping, and a value of one's own where
-the DSCP is the identifier.
+will do; `five_qi: auto`, and whether a class keeps what is declared (the table is in
+`lifecycle.network`); the ways to a DSCP besides writing it: a TRANSPORT_PRIORITY through its
+mapping, a 5QI through a mapping, and a value of its own where the DSCP is the identifier. Reads
+interface definitions; starts nothing.
 """
 
 from __future__ import annotations
@@ -51,7 +47,7 @@ _ANY_LOSS = 1.0
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class FlowClass:
-    """A 5QI and what there is to say of it.
+    """A 5QI with its reason and problems.
 
     Attributes:
         five_qi: 1–254; None if not asked for, or if none fits.
@@ -127,7 +123,7 @@ DIRECT = TransportPriorityMapping(mask=0xFF)
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Marking:
-    """A DSCP and where it comes from.
+    """A DSCP and its source.
 
     Attributes:
         dscp: 0–63; None if nothing is marked.
@@ -226,7 +222,7 @@ class ResolvedNeed:
         max_delay_ms: declared, else the shortest of the links from this node on the topic.
         max_message_size: declared, else the type's bound, bytes; None without either.
         max_datagram_bytes: what its participant must not exceed so that IP does not fragment it;
-            None if that cannot happen or cannot be told.
+            None if that cannot happen or is not known.
         transports: all that its participant may use; empty for any.
         told_apart: every subscription of its topic asks for an NFE of its own, which identifies the
             flow (weakly unique) whatever the publisher has.
@@ -267,7 +263,7 @@ class ParticipantGroup:
         kind: PUBLISHER, or SUBSCRIPTION: then what they acknowledge with carries the DSCP.
         names: declared, in the interface's order.
         unique: it carries one publisher that needs an NFE of its own.
-        five_qi: the class by which a network tells it from others; None if it need not.
+        five_qi: the class by which a network distinguishes it; None if it need not.
     """
 
     kind: EndpointKind = EndpointKind.PUBLISHER
@@ -404,7 +400,7 @@ class FlowNeeds:
     def _by_participant(self, need: FlowNeed) -> bool:
         """Whether the need is met by what its participant may use, with no connection at all.
 
-        Where discovery says what participants have, negotiation decides (`lifecycle.plan`).
+        Where discovery sets what participants have, negotiation decides (`lifecycle.plan`).
         """
         discovery = self._manifest.discovery
         return (
@@ -417,14 +413,14 @@ class FlowNeeds:
         return (Medium.UDPV6 if ":" in self._addresses.get(node.machine, "") else Medium.UDPV4,)
 
     def _with_datagrams(self, node_key: str, each: ResolvedNeed) -> ResolvedNeed:
-        """Say how small datagrams must be; only a flow that a network knows can be harmed."""
+        """Return how small datagrams must be; only a flow that a network knows can be harmed."""
         if each.need.kind is not EndpointKind.PUBLISHER or not each.prioritised:
             return each
         declared = self._manifest.network.max_datagram_bytes
         ipv6 = ":" in self._addresses.get(self._machines[node_key], "")
         limit = declared or max_unfragmented(ipv6=ipv6)
         size = each.max_message_size
-        # Of what size messages are nobody knows; if the path is known to be narrow, be careful.
+        # The size of messages is not known; if the path is known to be narrow, be careful.
         small = declared is None if size is None else not is_fragmented(size, limit)
         if small:
             return each
@@ -480,8 +476,8 @@ def _with_identifiers(
 ) -> dict[_Key, ResolvedNeed]:
     """Give each publisher that needs a unique flow a DSCP of its own (*Unique Network Flows*).
 
-    A DSCP that is written stays. The others get what nobody else has, over all nodes, in the order
-    of the manifest; when the 64 are used up, the rest have a problem instead.
+    A DSCP that is written stays. The others get unused values, over all nodes, in the order of the
+    manifest; when the 64 are used up, the rest have a problem instead.
     """
     asking = [
         key

@@ -1,17 +1,13 @@
-"""The ament resource index: which packages, interfaces and NoDL documents are installed.
+"""Installed packages, interface types and type hashes (REP-2016), read from the ament index.
 
-Owns: where the index lies and how a resource is found in it, as ament_index_python does, but for a
-prefix that AMENT_PREFIX_PATH need not name: wheels install the index under `sys.prefix`. Reads the
-file system; needs no ROS.
+Owns: where the ament resource index is and how a resource is found in it, as ament_index_python
+does, but for a prefix that AMENT_PREFIX_PATH need not name: wheels install the index under
+`sys.prefix`. The three answers to "is there a `sensor_msgs/msg/Image`?". The type hash of an
+interface, from the `share/<package>/<kind>/<Type>.json` that rosidl installs beside every
+definition, and how the hashes of a service's and an action's messages are put together.
 
-Whether an interface type exists, told by the ament index alone. Owns: the three answers to "is
-there a `sensor_msgs/msg/Image`?". Imports no message package, so that a manifest is checked
-without ROS installed or sourced.
-
-The type hash (REP-2016) of an interface as it is installed here, from its type description.
-Owns: reading `share/<package>/<kind>/<Type>.json`, which rosidl installs beside every
-definition, and how the hashes of a service's and an action's messages are put together. Imports
-no message package. Reads the file system.
+Imports no message package, so that a manifest is checked without ROS installed or sourced. Reads
+the file system.
 """
 
 from __future__ import annotations
@@ -62,7 +58,7 @@ _RESOURCE = "rosidl_interfaces"
 
 
 class TypeStatus(enum.Enum):
-    """What the index says of a type."""
+    """What the index holds of a type."""
 
     EXISTS = "exists"
     NO_SUCH_TYPE = "no such type"  # the package is installed, the type is not in it
@@ -87,7 +83,7 @@ def look_up(type_: str, prefixes: Sequence[Path]) -> TypeLookup:
 
     Args:
         type_: `package/msg/Type`, `package/srv/Type` or `package/action/Type`.
-        prefixes: where to search, from `ament_index.search_prefixes`.
+        prefixes: where to search, from `search_prefixes`.
     """
     package, _, name = type_.partition("/")
     found = find_resource(_RESOURCE, package, prefixes)
@@ -99,7 +95,7 @@ def look_up(type_: str, prefixes: Sequence[Path]) -> TypeLookup:
     types = _types(found)
     if name in types:
         return TypeLookup(status=TypeStatus.EXISTS)
-    # A type of the same kind comes first: `msg/Imu` for `msg/IMU`, not `srv/SetCameraInfo`.
+    # A type of the same kind is preferred: `msg/Imu` for `msg/IMU`, not `srv/SetCameraInfo`.
     kind = name.partition("/")[0]
     same_kind = [each for each in types if each.startswith(f"{kind}/")]
     similar = nearest(name, same_kind) or nearest(name, types)
@@ -144,7 +140,7 @@ def installed_hash(type_: str, prefixes: Sequence[Path]) -> str:
 
     Args:
         type_: `package/msg/Type`, `package/srv/Type` or `package/action/Type`.
-        prefixes: where to search, from `ament_index.search_prefixes`.
+        prefixes: where to search, from `search_prefixes`.
     """
     package, _, rest = type_.partition("/")
     index = find_resource("rosidl_interfaces", package, prefixes) if rest else None

@@ -1,10 +1,10 @@
-"""A manifest file → a checked system: the door of this room.
+"""Load a manifest file: parse, substitute, validate, build, join includes, check. The entry point.
 
 Owns: `load`: the run of source → arguments → schema → build for a manifest and everything it
-includes, then of the checks, with every finding gathered on the way. A part that something is wrong
-in is left out, and the rest is checked in the same run. It is imported when `load` is asked for: a
-process that hosts a node needs a manifest's types, but never YAML nor JSON Schema, and those are
-half of what it would import. Touches the file system; needs no ROS.
+includes, then of the checks, with every finding gathered on the way. A part with an error is left
+out, and the rest is checked in the same run. It is imported when `load` is asked for: a process
+that hosts a node needs a manifest's types, but never YAML nor JSON Schema, and those are half of
+what it would import. Touches the file system; needs no ROS.
 """
 
 from __future__ import annotations
@@ -308,7 +308,7 @@ class _Loading:
             self.found.append(warning("manifest.suffix", at, message, hint))
 
     def _check_outermost(self, root: Cursor, manifest: Manifest) -> None:
-        """Say so where a system-wide section of an included manifest does not come to hold."""
+        """Warn where a system-wide section of an included manifest has no effect."""
         if self._outermost is None:
             self._outermost = manifest
             return
@@ -342,7 +342,7 @@ def _mark(each: Diagnostic) -> tuple[str, int, int]:
 
 
 _READING = ("yaml.", "manifest.", "nodl.", "check.parameter")
-"""Rules whose messages quote what a file holds before anything says that it is one of ours."""
+"""Rules whose messages quote what a file holds before it is known to be one of ours."""
 
 
 def _without_outside_text(
@@ -373,13 +373,13 @@ _QUOTES_NOTHING = frozenset({"yaml.file", "yaml.empty", "manifest.suffix"})
 def _sorted(found: Sequence[Diagnostic], read: Iterable[str]) -> tuple[Diagnostic, ...]:
     """Return findings without repetitions, by file in the order of reading, then by position.
 
-    Of a value that is refused as YAML nothing else is said: `.nan` is no number, that is all.
+    Of a value that is refused as YAML nothing else is reported: `.nan` is no number, that is all.
     """
     refused = {_mark(each) for each in found if each.rule.startswith("yaml.")}
     unique = [
         each
         for each in dict.fromkeys(found)
-        # What is said of a whole document stands where its first key does.
+        # A finding about a whole document has the position of its first key.
         if each.rule.startswith("yaml.") or not each.at.path or _mark(each) not in refused
     ]
     files = list(dict.fromkeys([*read, *(each.at.file for each in unique)]))

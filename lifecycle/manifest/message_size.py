@@ -1,11 +1,9 @@
-"""How large a message of a type can get, told by the installed interface definitions alone.
+"""Upper bound of a message type's serialized size, from the installed `.idl` definitions alone.
 
-Owns: the bound of a type's serialized size, from the `.idl` file that every interface package
-installs, also for what was written as `.msg`. Imports no message package. Reads the file system.
-
-The part of OMG IDL that ROS interfaces are installed in: one structure, its fields and
-typedefs. Owns: reading `struct Name { … }` out of an `.idl` file as rosidl writes or accepts it
-(https://design.ros2.org/articles/idl_interface_definition.html). Everything else is skipped.
+Owns: that bound, from the `.idl` file that every interface package installs, also for what was
+written as `.msg`; and reading `struct Name { … }`, its fields and typedefs, out of an `.idl` file
+as rosidl writes or accepts it (https://design.ros2.org/articles/idl_interface_definition.html);
+all else is skipped. Imports no message package. Reads the file system.
 """
 
 from __future__ import annotations
@@ -217,7 +215,7 @@ def bounded_size(type_: str, prefixes: Sequence[Path]) -> int | None:
 
     Args:
         type_: `package/msg/Type`.
-        prefixes: where to search, from `ament_index.search_prefixes`.
+        prefixes: where to search, from `installed_types.search_prefixes`.
     """
     layout = _Layout()
     try:

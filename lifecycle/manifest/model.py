@@ -1,8 +1,7 @@
-"""The frozen manifest: what a document says once it is valid, arguments and includes resolved.
+"""Types of a valid manifest: system, nodes, interfaces, flows, connections, discovery, policies.
 
-Owns: the types that cross from this room into plan/: the system, and of each node how it runs, its
-interface, its flows and its connections. Nothing here knows
-YAML. Pure.
+Owns: the frozen types that cross from here into plan/, with arguments and includes resolved.
+Nothing here knows YAML. Pure.
 """
 
 from __future__ import annotations
@@ -48,11 +47,11 @@ class EndpointKind(enum.Enum):
 
 
 class RunKind(enum.Enum):
-    """How a node comes to run."""
+    """How a node is started."""
 
     PYTHON = "python"  # our host imports module:Class
     COMMAND = "command"  # any executable, given --ros-args
-    ATTACH = "attach"  # somebody else starts it
+    ATTACH = "attach"  # started outside the supervisor
 
 
 class Condition(enum.Enum):
@@ -73,9 +72,9 @@ class Condition(enum.Enum):
 class DiscoveryMode(enum.Enum):
     """How participants find each other."""
 
-    DYNAMIC = "dynamic"  # by multicast: whoever comes is found
-    STATIC = "static"  # nobody but the planned participants, at planned addresses and ports
-    STATIC_ENDPOINTS = "static_endpoints"  # likewise, and endpoints are known without being told
+    DYNAMIC = "dynamic"  # by multicast: any participant is found
+    STATIC = "static"  # only the planned participants, at planned addresses and ports
+    STATIC_ENDPOINTS = "static_endpoints"  # likewise, and endpoints are known without announcement
     SERVER = "server"  # by a discovery server that the supervisor starts and watches
 
 
@@ -92,7 +91,7 @@ class Authority(enum.Enum):
     """Who calls connect_to and map_to (*Topological Discovery and Communication Negotiation*)."""
 
     NODES = "nodes"  # each node follows the instructions that it was started with
-    SUPERVISOR = "supervisor"  # nodes have nothing open for data until they are told
+    SUPERVISOR = "supervisor"  # nodes open nothing for data until instructed
 
 
 class DataLayerSource(enum.Enum):
@@ -185,7 +184,7 @@ class Endpoint:
         type: `package/msg/Type`, `package/srv/Type` or `package/action/Type`.
         qos: what it is made with; None for actions.
         qos_defaults: policies of `qos` that no manifest writes: they are the default of the kind,
-            good for making the endpoint, and nobody requires them.
+            good for making the endpoint, and not required.
     """
 
     kind: EndpointKind
@@ -202,7 +201,7 @@ class ParameterDeclaration:
 
     Attributes:
         type: bool, int, double, string, bool_array, int_array, double_array, string_array or
-            byte_array, the words of rcl_interfaces and generate_parameter_library.
+            byte_array, the names of rcl_interfaces and generate_parameter_library.
     """
 
     name: str
@@ -215,7 +214,7 @@ class ParameterDeclaration:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Interface:
-    """What a node offers and needs, in NoDL v2 words.
+    """What a node offers and needs, in NoDL v2 terms.
 
     Attributes:
         source: empty when inline, else the reference it was read from.
@@ -315,11 +314,11 @@ class ConnectionDeclaration:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class NodeDeclaration:
-    """What a manifest says of one node that its plan takes over as it is.
+    """What a manifest declares of one node that its plan takes over as it is.
 
     Attributes:
         key: its key under `nodes:`, unique in the system (prefixed by includes as `prefix/key`).
-        name: ROS base name; the key's last part unless `name:` says otherwise.
+        name: ROS base name; the key's last part unless `name:` is set.
         namespace: absolute, `/` for the root.
         managed: True for a ROS 2 managed node; False for a plain node, which nothing can hold
             back from sending.
@@ -348,7 +347,7 @@ class Node(NodeDeclaration):
 
     Attributes:
         process: nodes with the same non-empty process name share one process.
-        positions: where parts of the node stand, by path below it: `machine`, `namespace`, `name`,
+        positions: where parts of the node are, by path below it: `machine`, `namespace`, `name`,
             `process`, `remap.scan`, `parameters.rate`, `parameter_files.0`; sorted, read with
             `where`.
         written_paths: paths as the manifest writes them, by place: `parameter_files.0`,
@@ -364,7 +363,7 @@ class Node(NodeDeclaration):
     written_paths: tuple[tuple[str, str], ...] = ()
 
     def where(self, part: str) -> Position:
-        """Return where a part of this node stands; the node's own position if that is not known."""
+        """Return the position of a part of this node; the node's own if that is not known."""
         index = bisect.bisect_left(self.positions, part, key=_path)
         found = self.positions[index : index + 1]
         return found[0][1] if found and found[0][0] == part else self.at
@@ -445,13 +444,13 @@ class Discovery:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class DataLayer:
-    """How endpoints come onto connections; for the whole system.
+    """How endpoints are mapped to connections; for the whole system.
 
     Attributes:
         authority: who calls connect_to and map_to.
         source: what the data layer graph is made from.
         events: connections and mappings are followed by graph events, and made again when lost.
-        multicast_group: where groups are given out from, one per topic that goes by multicast.
+        multicast_group: where groups are given out from, one per topic sent by multicast.
     """
 
     authority: Authority = Authority.NODES
@@ -467,7 +466,7 @@ class Network:
 
     Attributes:
         flow_identification: how publishers that need a unique flow get one.
-        transport_priority_mapping: what `transport_priority` goes through, as Connext Micro
+        transport_priority_mapping: how `transport_priority` becomes a TOS byte, as Connext Micro
             computes it; None takes the value as the TOS byte itself (mask 0xff).
         five_qi_dscp: marks publishers that ask for a 5QI and no DSCP; None marks none.
         max_datagram_bytes: UDP payload that the path carries unfragmented; None assumes Ethernet.
@@ -500,12 +499,12 @@ class Policy:
 
     Attributes:
         undeclared_nodes: OPEN tolerates nodes of other systems in the graph.
-        tolerated_nodes: patterns of names of nodes that may be there although nobody declared them,
-            as long as they only listen: `*` stands for any characters, `?` for one; a pattern with
+        tolerated_nodes: patterns of names of nodes that may exist without being declared,
+            as long as they only listen: `*` matches any characters, `?` for one; a pattern with
             a slash is compared with the full name, any other with the base name.
         unverifiable_blocks: an unverifiable finding closes the gate.
-        unpublished: severity of a subscription that nobody publishes; None ignores it.
-        unheard: severity of a publisher that nobody hears; None ignores it.
+        unpublished: severity of a subscription without publisher; None ignores it.
+        unheard: severity of a publisher without subscription; None ignores it.
     """
 
     undeclared_nodes: EndpointPolicy = EndpointPolicy.DECLARED
@@ -540,7 +539,7 @@ class Link:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class SystemDeclaration:
-    """What a manifest says of its system that the plan takes over as it is."""
+    """What a manifest declares of its system that the plan takes over as it is."""
 
     system: str
     machines: tuple[Machine, ...] = ()
@@ -557,7 +556,7 @@ class Manifest(SystemDeclaration):
     Attributes:
         path: the file it was read from, as the user wrote it.
         arguments: resolved values by name.
-        positions: where values of `discovery:` and `data_layer:` stand, by path, `discovery.mode`.
+        positions: where values of `discovery:` and `data_layer:` are, by path, `discovery.mode`.
     """
 
     path: str
@@ -568,5 +567,5 @@ class Manifest(SystemDeclaration):
     positions: tuple[tuple[str, Position], ...] = ()
 
     def where(self, path: str, section: Position) -> Position:
-        """Return where a value stands; the position of its section where it is not written."""
+        """Return the position of a value; that of its section where it is not written."""
         return dict(self.positions).get(path, section)

@@ -1,12 +1,10 @@
-"""ROS names: which are legal, what a declared name becomes, and which rules remap it.
+"""ROS names and remap rules: which names are legal, how they expand, and which rule applies.
 
 Owns: the rules of rmw_validate_node_name, rmw_validate_namespace, rmw_validate_full_topic_name,
-rcl_validate_topic_name, rcl_expand_topic_name and the order in which rcl applies
-them. plan/ resolves every endpoint through `resolve`. Pure.
-
-Remap rules as `ros2 run … --ros-args -r RULE` takes them: what each one matches. Owns: the
-grammar of one rule, as rcl's argument parser has it (rcl/arguments.c, rcl/lexer.c):
-`[node:][rostopic://|rosservice://]from:=to`, `[node:]__node:=name`, `[node:]__ns:=/namespace`.
+rcl_validate_topic_name, rcl_expand_topic_name and the order in which rcl applies them; the grammar
+of a remap rule of `ros2 run … --ros-args -r RULE`, as rcl's argument parser has it
+(rcl/arguments.c, rcl/lexer.c): `[node:][rostopic://|rosservice://]from:=to`, `[node:]__node:=name`,
+`[node:]__ns:=/namespace`. plan/ resolves every endpoint through `resolve`. Pure.
 """
 
 from __future__ import annotations
@@ -60,7 +58,7 @@ class RemapRule:
     replacement: str
 
     def applies_to(self, kind: RemapKind, node_name: str) -> bool:
-        """Tell whether rcl looks at this rule at all for a name of `kind` in node `node_name`."""
+        """Whether rcl looks at this rule at all for a name of `kind` in node `node_name`."""
         return bool(self.kind & kind) and self.node in ("", node_name)
 
 
@@ -353,6 +351,6 @@ def _digit_first(name: str) -> bool:
 
 
 def _odd(text: str, allowed: str) -> str:
-    """Name the first character that is neither a word's nor in `allowed`; empty if none is."""
+    """Name the first character outside `[A-Za-z0-9_]` and `allowed`; empty if none is."""
     found = _NOT_IN[allowed].search(text)
     return f", not {found[0]!r}" if found else ""

@@ -1,13 +1,10 @@
-"""NoDL v2 documents in place of an inline interface.
+"""NoDL v2 documents as interfaces: references, includes, endpoints and parameter declarations.
 
 Owns: resolving references (`local://relative/path`, `nodl://package/name`) with the documents they
-include, and turning a document into an `Interface`. The document format is nodl.schema.yaml of
-ros-tooling/nodl 2.0. What this package does not use of it is reported as a warning; what breaks
-it is an error. Writing NoDL (`to_nodl`) is left for later and belongs here as well.
-
-One NoDL v2 document's entries → endpoints and parameter declarations. Owns: the field names and
-defaults of nodl.schema.yaml and parameter.schema.yaml (the shape of
-generate_parameter_library), and what is said of fields that nothing here uses.
+include, and turning a document into an `Interface`. The format is nodl.schema.yaml of
+ros-tooling/nodl 2.0, with its field names and defaults, and parameter.schema.yaml (the shape of
+generate_parameter_library). What this package does not use of it is reported as a warning; what
+breaks it is an error. Writing NoDL (`to_nodl`) is left for later and belongs here as well.
 """
 
 from __future__ import annotations
@@ -231,7 +228,7 @@ class NodlReader:
             self._unused(place, f"the parameter map {name!r}")
             return
         if type_ in ("", "none"):
-            return  # `none` stands for no parameter at all
+            return  # `none` means no parameter at all
         default = self._document.find((*place, "default_value"))
         self.parameters.append(
             ParameterDeclaration(

@@ -1,4 +1,4 @@
-"""QoS profiles in rmw's words, the presets ROS names, and offered/requested compatibility.
+"""QoS profiles with rmw's names, the presets of ROS, and offered/requested QoS compatibility.
 
 Owns: the one rule of QoS compatibility that static checks and live verification share. Pure.
 """
@@ -161,7 +161,7 @@ class Incompatibility:
         policy: the profile's field, `reliability`, `liveliness_lease_duration`.
         offered: the publisher's value as rmw spells it, `BEST_EFFORT`; durations as `500000000 ns`.
         requested: the subscription's value, likewise.
-        severity: CERTAIN where rmw reports an error, POSSIBLE where the values do not tell.
+        severity: CERTAIN where rmw reports an error, POSSIBLE where the values leave it open.
     """
 
     policy: str
@@ -173,7 +173,7 @@ class Incompatibility:
 def incompatibilities(offered: QosProfile, requested: QosProfile) -> tuple[Incompatibility, ...]:
     """Compare what a publisher offers with what a subscription requests, policy by policy.
 
-    A policy whose value is SYSTEM_DEFAULT, UNKNOWN or BEST_AVAILABLE stands for every value it
+    A policy whose value is SYSTEM_DEFAULT, UNKNOWN or BEST_AVAILABLE represents every value it
     may turn out to be: if some of them do not match, the result is POSSIBLE, if all, CERTAIN. That
     yields rmw_dds_common's `qos_profile_check_compatible` (its errors are CERTAIN, its warnings
     POSSIBLE), with two differences on purpose: BEST_AVAILABLE, which rmw passes over, is resolved

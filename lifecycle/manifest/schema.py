@@ -1,15 +1,10 @@
-"""A document against its JSON Schema → diagnostics that people can act on.
+"""Validate a document against its JSON Schema, with diagnostics that people can act on.
 
-Owns: loading the shipped schemas and turning each violation into one `Diagnostic`; the words are
-`wording`'s, and `violation` picks the branch that was meant where a choice failed.
-Pure but for reading the shipped schemas.
-
-The words of messages about values that do not fit the schema. Owns: what is allowed, said by a
-schema's keywords, in a phrase; the nearest spelling. Every message starts with "cannot" and
-quotes the value.
-
-One broken keyword of a JSON Schema, typed. Owns: the adapter around jsonschema's
-`ValidationError`, whose fields are untyped and optional.
+Owns: loading the shipped schemas; turning each violation into one `Diagnostic`, for the branch that
+was meant where a choice failed; the wording: what is allowed, derived from a schema's keywords, and
+the nearest spelling. Every message starts with "cannot" and quotes the value. Also the adapter
+around jsonschema's `ValidationError`, whose fields are untyped and optional. Pure but for reading
+the shipped schemas.
 """
 
 from __future__ import annotations
@@ -45,9 +40,9 @@ class Violation:
         operand: what the schema has for that keyword.
         schema: the subschema that holds the keyword.
         value: the offending value.
-        place: where that value stands.
+        place: path of that value.
         is_key: the value is a key of the mapping at `place`.
-        name: the key, known to the schema, that the value stands under; empty where the user
+        name: the key, known to the schema, of the value; empty where the user
             chooses keys, and in lists.
         branches: for `anyOf` and `oneOf`, what each branch has against the value.
     """
@@ -104,7 +99,7 @@ def _name(each: ValidationError) -> str:
 
 
 def _meant(choice: Violation) -> tuple[Violation, ...] | None:
-    """Return what the one branch says whose type fits the value; None if no single one fits."""
+    """Return what the one branch violates whose type fits the value; None if no single one fits."""
     fitting = [
         branch
         for branch in choice.branches
@@ -127,11 +122,11 @@ _TYPES = {
 
 
 MAX_WORDS = 500
-"""Words among which a nearest one is looked for; among more it would take longer than it helps."""
+"""Names among which a nearest one is looked for; among more it would take longer than it helps."""
 
 
 def nearest(word: str, known: Collection[str]) -> str:
-    """Return the known word that `word` was most probably meant to be; empty if none is near."""
+    """Return the known name that `word` was most probably meant to be; empty if none is near."""
     if len(known) > MAX_WORDS:
         return ""
     spelled = {each.lower(): each for each in known}
@@ -140,7 +135,7 @@ def nearest(word: str, known: Collection[str]) -> str:
 
 
 def did_you_mean(word: str, known: Collection[str]) -> str:
-    """Return a question for a hint; empty if no known word is near."""
+    """Return a question for a hint; empty if no known name is near."""
     found = nearest(word, known)
     return f"did you mean {found!r}?" if found else ""
 
@@ -180,7 +175,7 @@ def bad_value(each: Violation) -> tuple[str, str]:
 
 
 def _allowed(each: Violation) -> tuple[str, str]:
-    """Say what the broken keyword allows, and a hint."""
+    """Return what the broken keyword allows, and a hint."""
     if each.keyword in {"oneOf", "anyOf"}:
         own = [inner for branch in each.branches for inner in branch if inner.place == each.place]
         types = [
@@ -198,7 +193,7 @@ def _allowed(each: Violation) -> tuple[str, str]:
 
 
 def _way(each: Violation) -> tuple[str, str]:
-    """Word a failed choice between ways to fill a mapping."""
+    """Describe a failed choice between ways to fill a mapping."""
     ways: list[list[str]] = [branch["required"] for branch in each.operand]
     given = [key for key in each.value if any(key in way for way in ways)]
     only = "exactly one" if each.keyword == "oneOf" else "at least one"
@@ -214,7 +209,7 @@ def _way(each: Violation) -> tuple[str, str]:
 
 
 def _types(value: object, types: list[str]) -> tuple[str, str]:
-    """Say which types are allowed, and how to get there from `value`."""
+    """Return which types are allowed, and how to get there from `value`."""
     words = [_TYPES[each] for each in types if not (each == "integer" and "number" in types)]
     words = list(dict.fromkeys(words))
     joined = " or ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
@@ -253,7 +248,7 @@ def _listed(types: str | list[str]) -> list[str]:
 
 
 MANIFEST = "manifest.v1.schema.json"
-"""The file, in schemas/, that says what a manifest may hold."""
+"""The file, in schemas/, that defines what a manifest may hold."""
 
 _SUBSTITUTION = {"$ref": "#/$defs/substitution"}
 
@@ -275,8 +270,8 @@ def validate(
     Args:
         document: what to check.
         definition: name under `$defs` of the manifest's schema, for a part of a manifest that
-            stands in a file of its own; the whole manifest if empty.
-        ignore: values already reported; nothing is said about them or anything inside.
+            is in a file of its own; the whole manifest if empty.
+        ignore: values already reported; nothing is reported about them or anything inside.
 
     Returns:
         Every violation and the value it is about, at most `MAX_FINDINGS`, in no particular order.
@@ -286,7 +281,7 @@ def validate(
     errors = _validator(definition).iter_errors(document.root.plain())
     broken = list(violations(errors))
     enums = {each.place for each in broken if each.keyword == "enum"}
-    # The words allowed say more than that they are strings.
+    # The allowed values are more precise than that they are strings.
     broken = [each for each in broken if not (each.keyword == "type" and each.place in enums)]
     # `required` holds for everything that is no mapping, so that several ways seem to be taken.
     broken = [each for each in broken if isinstance(each.value, dict) or not each.is_way]
@@ -316,7 +311,7 @@ def _validator(definition: str) -> jsonschema.Draft202012Validator:
 def _resolved_only(schema: object) -> object:
     """Return the schema of documents without substitutions.
 
-    Editors see the document before substitution, so that the shipped schema lets `$(arg x)` stand
+    Editors see the document before substitution, so that the shipped schema lets `$(arg x)` be
     where a number must; the loader checks what it became.
     """
     if isinstance(schema, list):
@@ -381,6 +376,6 @@ def _missing_keys(document: Document, each: Violation) -> Iterator[tuple[Place, 
 
 
 def _misspelt(each: Violation) -> set[str]:
-    """Return the known keys that unknown ones stand for: the unknown key is finding enough."""
+    """Return the known keys that unknown ones probably mean: the unknown key is finding enough."""
     known = each.schema.get("properties", {})
     return {nearest(key, known) for key in each.value if key not in known}

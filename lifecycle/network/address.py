@@ -19,7 +19,7 @@ def parse_address(text: str) -> IpAddress | None:
 
 
 def canonical(text: str) -> str:
-    """Return the one spelling of an address (RFC 5952); text that is none comes back unchanged."""
+    """Return the one spelling of an address (RFC 5952); text that is none is returned unchanged."""
     address = parse_address(text)
     return text if address is None else str(address)
 
@@ -30,7 +30,7 @@ def socket_text(address: str, port: int) -> str:
 
 
 def is_wildcard(text: str) -> bool:
-    """Whether this is `0.0.0.0` or `::`, which stands for every unicast address of its host."""
+    """Whether this is `0.0.0.0` or `::`, which means every unicast address of its host."""
     address = parse_address(text)
     return address is not None and address.is_unspecified
 
@@ -50,9 +50,9 @@ def is_loopback(text: str) -> bool:
 def may_be_same(a: str, b: str, *, same_machine: bool | None) -> bool:
     """Return whether packets of two sockets with these local addresses can carry one address.
 
-    - Groups and global addresses are the same where their spelling is: the network cannot tell two
-      machines apart that claim one address.
-    - `0.0.0.0` and `::` stand for every unicast address of their machine.
+    - Groups and global addresses are the same where their spelling is: the network cannot
+      distinguish two machines that claim one address.
+    - `0.0.0.0` and `::` mean every unicast address of their machine.
     - Loopback and link-local addresses mean something on their own machine and link only
       (RFC 6890, RFC 4007).
 

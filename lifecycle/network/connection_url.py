@@ -1,8 +1,9 @@
-"""Connection URLs: what `connect_to` is told, transport and addresses.
+"""Connection URLs of `connect_to`: parse and write transport, address, port and options.
 
-Owns: their grammar, `TRANSPORT://[ADDRESS][:PORT][?OPTION=VALUE&…]`, both ways. The idea is that of
-*Topological Discovery and Communication Negotiation* ("Statically Configured Nodes"); what
-a URL becomes is middleware/'s. Pure.
+Owns: their grammar, `TRANSPORT://[ADDRESS][:PORT][?OPTION=VALUE&…]`, both ways; which transport has
+which option, how a value is read and spelled, and the option names. The idea is that of
+*Topological Discovery and Communication Negotiation* ("Statically Configured Nodes"); what a URL
+becomes is decided in middleware/. Pure.
 
     udpv4://10.77.0.1:7911?metatraffic_port=7910&output_port=7999&peer=10.77.0.2:7910&multicast=off
     udpv6://[fd77::1]:7911?metatraffic_port=7910&peer=[fd77::2]:7910&multicast=off
@@ -10,9 +11,6 @@ a URL becomes is middleware/'s. Pure.
     tcpv4://10.77.0.1:5100?peer=10.77.0.2:5100
     tcpv4://10.77.0.1:5101?server=10.77.0.3:42100
     shm://
-
-The options of connection URLs: `?peer=10.77.0.2:7910&multicast=off`. Owns: which transport has
-which option, how a value is read and spelled, and the words that occur in them.
 """
 
 from __future__ import annotations
@@ -53,7 +51,7 @@ class Peer:
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """Return a hint with the known word that is nearest; empty if none is near."""
+    """Return a hint with the known name that is nearest; empty if none is near."""
     close = difflib.get_close_matches(word.lower(), list(known), n=1, cutoff=0.6)
     return f"did you mean {close[0]!r}?" if close else ""
 
@@ -109,9 +107,9 @@ class Option:
 
     Attributes:
         attribute: of ConnectionUrl.
-        read: returns what a value says, given the option's name and the text.
+        read: returns the parsed value, given the option's name and the text.
         transports: that have the option.
-        repeated: it may stand several times.
+        repeated: it may be given several times.
     """
 
     attribute: str
@@ -120,7 +118,7 @@ class Option:
     repeated: bool = False
 
     def spell(self, value: Any) -> tuple[str, ...]:
-        """Return the texts that say `value`."""
+        """Return the texts of `value`."""
         if self.read is _switch:
             return ("on" if value else "off",)
         return tuple(str(each) for each in (value if self.repeated else (value,)))
@@ -147,7 +145,7 @@ OPTIONS = {
 
 
 def read_options(transport: Medium, query: str) -> dict[str, Any]:
-    """Return what the part after `?` says, by attribute of ConnectionUrl.
+    """Return the options after `?`, by attribute of ConnectionUrl.
 
     Raises:
         ConnectionUrlError: an unknown option, one that the transport has not, or a bad value.
@@ -188,10 +186,10 @@ class ConnectionUrl:
             the group's port for UDPM; None leaves it to the middleware.
         metatraffic_port: discovery arrives here, UDP only; None leaves it to the middleware.
         output_port: fixed source port of what is sent, UDP only; None lets the kernel choose.
-        peers: participants to look for at the start. With any, and `multicast` off, nobody else is
+        peers: participants to look for at the start. With any, and `multicast` off, no other is
             looked for.
         multicast: discovery also announces by multicast, UDP only.
-        server: discovery servers; the participant becomes their client and finds nobody else.
+        server: discovery servers; the participant becomes their client and finds no others.
         server_prefix: GUID prefix of the first server; those after it count up in the byte that
             `fast-discovery-server -i ID` sets.
         ttl: hops of what is sent, 0–255; 0 stays on this host. None leaves it to the middleware.
@@ -222,7 +220,7 @@ class ConnectionUrl:
 
 
 def parse(text: str) -> ConnectionUrl:
-    """Return what a connection URL says.
+    """Parse a connection URL.
 
     Raises:
         ConnectionUrlError: unknown scheme or option, a value out of range, an option that the

@@ -1,4 +1,6 @@
-"""How large a datagram may be, and what IP does with a larger one. Owns: the arithmetic. Pure.
+"""UDP datagram size, MTU and IP fragmentation.
+
+Owns: the arithmetic. Pure.
 
 A UDP datagram that does not fit the path's MTU is split by IP. Only the first fragment carries the
 ports, so that a rule on ports treats the others as something else, and one lost fragment loses them

@@ -1,14 +1,12 @@
-"""Differentiated services code points: names, numbers and the TOS byte they travel in.
+"""DSCP (differentiated services code point): names, numbers, TOS byte, TRANSPORT_PRIORITY mapping.
 
-Owns: every spelling of a DSCP that a user may write or read. Pure.
+Owns: every spelling of a DSCP that a user may write or read; TRANSPORT_PRIORITY → TOS byte as RTI
+Connext Micro computes it (*Connext Micro, Transport Priority*, "Using transport priority with
+UDP"), for systems that number so, and what that mapping silently loses. Pure.
 
 A DSCP is the upper six bits of the byte that IPv4 calls TOS and IPv6 calls traffic class; the lower
 two are ECN (RFC 2474, RFC 3168). Products differ in which of the two numbers they ask for, so both
 are always shown side by side.
-
-TRANSPORT_PRIORITY → TOS byte as RTI Connext Micro computes it, for systems that number so.
-Owns: the mapping of *Connext Micro, Transport Priority*, "Using transport priority with UDP",
-and what it silently loses.
 """
 
 from __future__ import annotations
@@ -77,7 +75,7 @@ def parse_dscp(value: str | int) -> int:
     Numbers may be decimal or hexadecimal (`0x2e`) text.
 
     Raises:
-        ValueError: neither a name nor a number in range; says the nearest name, or which DSCP was
+        ValueError: neither a name nor a number in range; names the nearest name, or which DSCP was
             meant when the number is a TOS byte.
     """
     # YAML reads `yes` and `on` as booleans, and bool is an int: True is not DSCP 1.

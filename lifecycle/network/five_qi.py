@@ -1,11 +1,9 @@
-"""5G QoS identifiers (5QIs): the standardized classes, checks against them, and proposals.
+"""5G QoS identifiers (5QIs): standardized classes, checks, proposals, and 5QI ↔ DSCP mappings.
 
 Owns: 3GPP TS 23.501 Table 5.7.4-1 as data with its sources, and the judgement whether a class can
-keep what a flow declares. Pure.
-
-5QI ↔ DSCP mappings: published ones with their provenance, and a user's own. Owns: reading them
-and looking up in them. No mapping is the default, because none is normative: what a network
-does is configured in that network.
+keep what a flow declares; reading mappings, published ones with their provenance and a user's own,
+and looking up in them. No mapping is the default, because none is normative: what a network does is
+configured in that network. Pure.
 """
 
 from __future__ import annotations
@@ -43,7 +41,7 @@ class FiveQi:
         max_data_burst_bytes: default volume served within the delay budget; None if not applicable.
         averaging_window_ms: default window of the guaranteed rate; None if not applicable.
         first_release: 3GPP release.
-        in_release_16: one of the 26 values that *Unique Network Flows* speaks of.
+        in_release_16: one of the 26 values that *Unique Network Flows* mentions.
         flagged: fields on which the sources disagree or that only a weak one supports.
         sources: names in the table's own list of those that agree.
         note: what is doubtful about the row; often empty.
@@ -200,7 +198,7 @@ def propose(
     rate_bps: float | None = None,
     include_flagged: bool = False,
 ) -> Proposal:
-    """Propose the least demanding class that keeps a delay and a loss, and say why.
+    """Propose the least demanding class that keeps a delay and a loss, with the reason.
 
     Least demanding, because a better class than needed wastes what the network has. Classes of
     Release 16 come first, as every network knows them; then the longest delay budget, the highest
@@ -303,7 +301,7 @@ def _served_bps(each: FiveQi) -> float:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class DscpMapping:
-    """One mapping and where it comes from.
+    """One mapping and its source.
 
     Attributes:
         source: who published it, where and when; for a user's own, who configured the network.
@@ -322,7 +320,7 @@ class DscpMapping:
         return next((dscp for each, dscp in self.values if each == value), None)
 
     def five_qis_for(self, dscp: int) -> tuple[int, ...]:
-        """Return the 5QIs that a DSCP may stand for: several share one."""
+        """Return the 5QIs that a DSCP may mean: several share one."""
         return tuple(each for each, code in self.values if code == dscp)
 
 
@@ -350,7 +348,7 @@ def dscp_mapping(name: str) -> DscpMapping:
     """Return a published mapping by its name.
 
     Raises:
-        ValueError: no such mapping; says which there are.
+        ValueError: no such mapping; names those that exist.
     """
     for each in dscp_mappings():
         if each.name == name:

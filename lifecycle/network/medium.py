@@ -1,8 +1,8 @@
-"""What carries data from one participant to another: media, and what a manifest may ask for.
+"""Transports between participants: UDP, TCP, shared memory, multicast, intraprocess.
 
 Owns: the one enum of media, with what plan, checks and verification need to know of each, and
-`FlowTransport`, the words of a manifest's `transport:`. What Fast DDS calls a transport in a
-profile is `middleware.fastdds.url_profile`'s. Pure.
+`FlowTransport`, the values of a manifest's `transport:`. What Fast DDS calls a transport in a
+profile is in `middleware.fastdds.url_profile`. Pure.
 """
 
 from __future__ import annotations
@@ -11,25 +11,25 @@ import enum
 
 
 class Medium(str, enum.Enum):
-    """What carries data. A member is its word, wherever text is wanted.
+    """What carries data. A member is its value, wherever text is wanted.
 
     In the order in which a connection is named after several.
     """
 
     SHM = "shm"
-    UDPM = "udpm"  # a multicast group, over IPv4 or IPv6 as its address says
+    UDPM = "udpm"  # a multicast group, over IPv4 or IPv6 by its address
     UDPV4 = "udpv4"
     UDPV6 = "udpv6"
     TCPV4 = "tcpv4"
     TCPV6 = "tcpv6"  # seen at others; nothing of ours is connected by it
-    INTRAPROCESS = "intraprocess"  # handed over inside a process
+    INTRAPROCESS = "intraprocess"  # passed on inside a process
 
     def __str__(self) -> str:
-        """Return the word; as StrEnum does, which Python 3.10 has not."""
+        """Return the value; as StrEnum does, which Python 3.10 has not."""
         return str(self.value)
 
     def __repr__(self) -> str:
-        """Return the word in quotes, as messages have it."""
+        """Return the value in quotes, as messages have it."""
         return repr(self.value)
 
     @property
@@ -59,7 +59,7 @@ class Medium(str, enum.Enum):
 
     @property
     def meaning(self) -> str:
-        """What people read; of an IP transport its word."""
+        """What people read; of an IP transport its value."""
         return _MEANINGS.get(self, self.value)
 
 
@@ -76,10 +76,10 @@ SCHEMES = (Medium.UDPV4, Medium.UDPV6, Medium.UDPM, Medium.TCPV4, Medium.SHM)
 """Media that connections are made of, the schemes of their URLs."""
 
 CONNECTABLE = (Medium.SHM, Medium.UDPV4, Medium.UDPV6, Medium.UDPM, Medium.TCPV4)
-"""The same, in the order in which a node says what it can be connected by."""
+"""The same, in the order in which a node reports what it can be connected by."""
 
 RMW_DEFAULT = (Medium.SHM, Medium.UDPV4)
-"""What a participant has if nobody says anything (Fast DDS 2.14)."""
+"""What a participant has by default (Fast DDS 2.14)."""
 
 TRANSPORTS_VARIABLE = "FASTDDS_BUILTIN_TRANSPORTS"
 
@@ -91,7 +91,7 @@ BUILTIN_TRANSPORTS = {
     "LARGE_DATA": (Medium.SHM, Medium.TCPV4, Medium.UDPV4),
     "NONE": (Medium.TCPV4,),
 }
-"""What a participant has by each word of FASTDDS_BUILTIN_TRANSPORTS."""
+"""What a participant has by each value of FASTDDS_BUILTIN_TRANSPORTS."""
 
 
 class FlowTransport(enum.Enum):
@@ -121,7 +121,7 @@ class FlowTransport(enum.Enum):
 
     @property
     def builtin(self) -> str | None:
-        """The word of FASTDDS_BUILTIN_TRANSPORTS that gives a participant it; None without."""
+        """The value of FASTDDS_BUILTIN_TRANSPORTS that gives a participant it; None without."""
         wanted = Medium.UDPV4 if self is FlowTransport.NETWORK else self.medium
         words = (each for each, has in BUILTIN_TRANSPORTS.items() if has == (wanted,))
         return next((each for each in words if each != "NONE"), None)

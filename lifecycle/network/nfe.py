@@ -1,20 +1,17 @@
-"""Network flow endpoints (NFEs) and what "unique" means, as *Unique Network Flows* defines it.
+"""Network flow endpoints (NFEs), flow tuples, uniqueness, as *Unique Network Flows* defines them.
 
 Owns: the NFE tuple, the requirement enum and the predicates dissimilar, unique, weakly and
-strongly unique. Pure.
+strongly unique; which NFEs of a publisher (source) and a subscription (destination) form a flow: a
+5-tuple, on IPv6 a flow label beside it, and the DSCP. Pure.
 
 The article defines uniqueness for one NFE. An endpoint usually has several: one per interface, one
 per transport, multicast beside unicast, and the middleware chooses per packet. Here an endpoint
 is unique when *every* IP NFE of it is dissimilar to every NFE of every other endpoint: the
 article's own getter example compares all pairs so, and one shared NFE (a multicast group, say) is a
-path on which the network cannot tell the endpoints apart.
+path on which the network cannot distinguish the endpoints.
 
 A publisher's NFE is the source of a flow and a subscription's the destination, two different places
 of the tuple; so publishers are compared with publishers and subscriptions with subscriptions.
-
-Network flows as tuples: what a source and a destination NFE make together. Owns: which NFEs of
-a publisher and a subscription form a flow, as *Unique Network Flows* describes it: a 5-tuple,
-on IPv6 a flow label beside it, and the DSCP.
 """
 
 from __future__ import annotations
@@ -54,7 +51,7 @@ class InternetProtocol(enum.Enum):
 class UniqueRequirement(enum.Enum):
     """`require_unique_network_flow_endpoints`: a creation-time option of every endpoint.
 
-    Values are the words of the manifest; `rmw_value` is the number in
+    Values are spelled as in the manifest; `rmw_value` is the number in
     rmw_unique_network_flow_endpoints_requirement_t.
     """
 
@@ -70,9 +67,9 @@ class UniqueRequirement(enum.Enum):
 
 
 class FlowIdentifier(enum.Enum):
-    """Which resources tell flows apart; the article's background section names the first three.
+    """Which resources distinguish flows; the article's background section names the first three.
 
-    ANY is its definition of dissimilar: a difference in one or more resources. The others say what
+    ANY is its definition of dissimilar: a difference in one or more resources. The others are what
     a given network looks at: a rule on ports does not see the DSCP.
     """
 
@@ -121,7 +118,7 @@ class NetworkFlowEndpoint:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class LocatedNfe:
-    """An NFE and the machine it is on, which says what `0.0.0.0` and `127.0.0.1` stand for.
+    """An NFE and the machine it is on, which defines what `0.0.0.0` and `127.0.0.1` mean.
 
     Attributes:
         machine_id: any text that is equal on one machine only; empty when not known.
@@ -200,10 +197,10 @@ def is_unique_endpoint(
     *,
     by: FlowIdentifier = FlowIdentifier.ANY,
 ) -> bool | None:
-    """Return whether every IP NFE of an endpoint is unique; None when that cannot be told.
+    """Return whether every IP NFE of an endpoint is unique; None when that is unknown.
 
-    An endpoint without an IP NFE is not unique: the network sees nothing of it that it could tell
-    from anything else.
+    An endpoint without an IP NFE is not unique: the network sees nothing of it that it could
+    distinguish.
 
     Args:
         nfes: of this endpoint; None when not known.
@@ -226,14 +223,14 @@ def is_unique_endpoint(
 def meets(
     demanded: FlowUniqueness, *, publisher: bool | None, subscription: bool | None
 ) -> bool | None:
-    """Return whether a flow is at least as unique as demanded; None when that cannot be told.
+    """Return whether a flow is at least as unique as demanded; None when that is unknown.
 
     One end that is unique is enough for WEAKLY, whatever is not known of the other; one that is
     not is enough to fail STRONGLY.
 
     Args:
         demanded: what is asked; NOT is always met.
-        publisher: whether the publisher's NFEs are unique, as `is_unique_endpoint` says.
+        publisher: whether the publisher's NFEs are unique, as `is_unique_endpoint` returns.
         subscription: the same of the subscription.
     """
     ends = (publisher, subscription)
@@ -253,7 +250,7 @@ def uniqueness(
     *,
     by: FlowIdentifier = FlowIdentifier.ANY,
 ) -> FlowUniqueness | None:
-    """Return how unique the flow from a publisher to a subscription is; None if it cannot be told.
+    """Return how unique the flow from a publisher to a subscription is; None if unknown.
 
     Strongly if both its NFEs are unique, weakly if one of them is. `meets` answers more where
     only one end is known.
@@ -361,7 +358,7 @@ def flow_tuples(
 
     Fast DDS sends unicast from its `0.0.0.0` sockets and multicast from those of one interface
     each, so where a sender has both kinds, each destination gets its own kind. A loopback address
-    only ever talks to a loopback address. Shared memory forms no flow.
+    only ever sends to a loopback address. Shared memory forms no flow.
     """
     senders = [each for each in source if is_ip(each)]
     found: dict[FlowTuple, None] = {}

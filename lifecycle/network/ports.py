@@ -1,13 +1,11 @@
-"""DDS port arithmetic: which UDP ports a participant uses and how many participants fit.
+"""DDS port arithmetic: UDP ports of a domain and participant, and how many participants fit a host.
 
 Owns: the formula of DDSI-RTPS §9.6.2.3 with its default constants, the platforms' ephemeral port
-ranges, and the limits that follow (the article *The ROS_DOMAIN_ID*). Pure.
+ranges, the limits that follow (the article *The ROS_DOMAIN_ID*), and the judgement whether so many
+participants and unique subscriptions fit on one host, with a message where they do not. Pure.
 
 These are the ports a participant asks for. A busy one is replaced by the implementation, so the
 ports of a running system are read from it, never inferred from here.
-
-Whether so many participants and unique subscriptions fit on one host. Owns the judgement.
-`ports` knows the arithmetic; this module says what to tell a person whose system overflows.
 """
 
 from __future__ import annotations
@@ -41,7 +39,7 @@ EPHEMERAL_RANGE_FILE = "/proc/sys/net/ipv4/ip_local_port_range"
 
 
 def domain_of(text: str) -> int | None:
-    """Return the domain id that ROS_DOMAIN_ID says, 0–232; None for what is none."""
+    """Return the domain id that ROS_DOMAIN_ID sets, 0–232; None for what is none."""
     if not (text.isascii() and text.isdecimal() and len(text) < 10):
         return None
     return domain if (domain := int(text)) <= MAX_DOMAIN_ID else None
@@ -57,7 +55,7 @@ class Platform(enum.Enum):
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class EphemeralRange:
-    """Ports that an operating system hands to whoever asks for any port; both ends belong to it."""
+    """Ports that an operating system gives to sockets bound to no port; both ends belong to it."""
 
     first: int
     last: int

@@ -1,4 +1,4 @@
-"""What each RMW can do about network flows: unique endpoints, the getter, DSCP.
+"""RMW capabilities for network flows: unique endpoints, the getter, DSCP, by RMW implementation.
 
 Owns: the capability table, each cell with its source, and the early answer whether a requirement
 is feasible. The reality at run time decides; this only fails earlier. Pure.

@@ -1,7 +1,7 @@
-"""Reads the tables that ship inside the package. Owns: where they are and how they become typed.
+"""Read the tables of network facts that ship inside the package.
 
-The files under `lifecycle/network/data/` are transcribed facts with their sources; nothing is
-computed into them.
+Owns: where they are and how they become typed. The files under `lifecycle/network/data/` are
+transcribed facts with their sources; nothing is computed into them.
 """
 
 from __future__ import annotations

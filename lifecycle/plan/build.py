@@ -1,17 +1,10 @@
-"""Manifest → Plan.
+"""Build the plan of a manifest: start order (`after:`), processes, flows, participants, discovery.
 
-Owns: `build_plan`, which puts the parts of this room together, and `check_plan`, which only says
-whether that can be done. Nothing here starts anything. Pure but for the environment, for finding
-executables and for reading parameter files.
-
-Dependency levels: which nodes wait for which. Owns: `dependency_levels`, the longest-path
-layering of the `after:` graph.
-
-Flows: every publisher → subscription pair of the computational graph. Owns: which pairs a
-system has, and what `links:` demand of them.
-
-Operating system processes: which nodes share one, and what each is started with. Owns: grouping
-nodes into processes, their argv and environment. Pure but for finding executables.
+Owns: `build_plan`, which puts the parts of this package together, and `check_plan`, which only
+reports whether that can be done; `dependency_levels`, the longest-path layering of the `after:`
+graph; which publisher → subscription pairs a system has, and what `links:` demand of them; grouping
+nodes into operating system processes, their argv and environment. Nothing here starts anything.
+Pure but for the environment, for finding executables and for reading parameter files.
 """
 
 from __future__ import annotations
@@ -63,7 +56,7 @@ from lifecycle.plan.participants import command_line, place_flows
 
 
 def dependency_levels(nodes: Sequence[Node]) -> tuple[tuple[str, ...], ...]:
-    """Layer nodes so that each stands one level below the last node it waits for.
+    """Layer nodes so that each is one level below the last node it waits for.
 
     Nodes of one level keep the manifest's order and do not wait for each other.
 
@@ -110,7 +103,7 @@ def _settle(root: Node, by_key: dict[str, Node], depth: dict[str, int]) -> None:
 
 
 ANY = "*"
-"""A link's `from` or `to` that stands for every node."""
+"""A link's `from` or `to` that matches every node."""
 
 _STRENGTH = {UniqueHow.NOT: 0, UniqueHow.WEAKLY: 1, UniqueHow.STRONGLY: 2}
 
@@ -186,7 +179,7 @@ def planned_processes(
         domain_id: 0–232.
         discovery_range: given to every process in ROS_AUTOMATIC_DISCOVERY_RANGE, but to commands
             that have shared memory alone: rmw_fastrtps_cpp 8.4 would have them look for peers at
-            127.0.0.1 only, where nobody is, and shared memory stays on this host anyway.
+            127.0.0.1 only, where no peer is, and shared memory stays on this host anyway.
         shared_memory: own participants have nothing else.
         environment: where AMENT_PREFIX_PATH is looked up.
 
@@ -216,7 +209,7 @@ def _process(
     graph_variables: tuple[tuple[str, str], ...],
     environment: Mapping[str, str],
 ) -> PlannedProcess:
-    """Plan one process; that its nodes can share it is `manifest.checks`' to say."""
+    """Plan one process; that its nodes can share it is checked by `manifest.checks`."""
     first = nodes[0]
     is_command = first.run.kind is RunKind.COMMAND
     return PlannedProcess(
@@ -300,7 +293,7 @@ def check_plan(
     try:
         domain_id = effective_domain(manifest.discovery, variables)
     except UsageError:
-        return ()  # the environment's fault, which says so where it is used
+        return ()  # the environment's fault, reported where it is used
     try:
         rmw = variables.get("RMW_IMPLEMENTATION", "") or DEFAULT_RMW
         _wired(manifest, variables, domain_id=domain_id, rmw=rmw)
@@ -332,7 +325,7 @@ def _wired(
 
 
 def _told(plan: Plan) -> Plan:
-    """Tell processes that make their own participants how to, by variables."""
+    """Configure processes that make their own participants, by variables."""
     variables = dict(variables_of(plan.discovery, plan.server))
     return dataclasses.replace(
         plan,
@@ -368,13 +361,13 @@ def effective_domain(discovery: Discovery, environment: Mapping[str, str]) -> in
 
 
 def effective_range(discovery: Discovery, environment: Mapping[str, str]) -> DiscoveryRange:
-    """Return how far discovery reaches: the manifest's word, else the environment's.
+    """Return how far discovery reaches: the manifest's value, else the environment's.
 
     `system_default` in the manifest leaves it to ROS_AUTOMATIC_DISCOVERY_RANGE where that is set;
-    other modes than DYNAMIC say themselves who is found, and rmw must add nothing to that.
+    other modes than DYNAMIC define themselves who is found, and rmw must add nothing to that.
 
     Raises:
-        UsageError: the manifest leaves it to the environment, which says something illegal.
+        UsageError: the manifest leaves it to the environment, which has an illegal value.
     """
     if discovery.mode is not DiscoveryMode.DYNAMIC:
         return DiscoveryRange.SYSTEM_DEFAULT
@@ -430,7 +423,7 @@ def _planned_file(files: tuple[str, ...], place: str, written: str) -> PlannedFi
     try:
         contents = read_bytes(files[int(index)], file=written)
     except ManifestError:
-        return PlannedFile(place=place, written=written)  # check.parameter-file says so
+        return PlannedFile(place=place, written=written)  # reported by check.parameter-file
     return PlannedFile(
         place=place, written=written, digest=hashlib.sha256(contents).hexdigest()[:16]
     )

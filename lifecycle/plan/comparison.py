@@ -1,15 +1,14 @@
-"""How two plans of one system differ, in the manifest's words, and the checksum of what is planned.
+"""Compare two plans of one system: differences, checksum, and the notice supervisors exchange.
 
-Owns: `changes`, `differences` and `plan_checksum`. Compared is what manifests declare, after
-includes and arguments: not where it is written, nor what follows from the host that planned it
-(folders, environment, installed types and executables), so that every host of a system comes to the
-same checksum from the same manifest. The order of entries counts where the manifest says it does:
-in a command line and among parameter files, and for nodes where ports are given out in their order.
-Pure.
+Owns: `changes`, `differences` and `plan_checksum`; `PlanNotice`, what a supervisor announces of its
+plan, its text on the wire with bounds in both directions, and `concerns`: whose plan has to be the
+same as ours. Pure.
 
-What a supervisor announces of its plan, so that others can compare it with their own. Owns:
-`PlanNotice`, its text on the wire with bounds in both directions, and `concerns`: whose plan
-has to be the same as ours. How two plans differ is `comparison`'s.
+Compared is what manifests declare, after includes and arguments: not where it is written, nor what
+follows from the host that planned it (folders, environment, installed types and executables), so
+that every host of a system computes the same checksum from the same manifest. The order of entries
+counts where the manifest gives it a meaning: in a command line and among parameter files, and for
+nodes where ports are given out in their order.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ _DECLARED = {
 """Fields that the manifest calls otherwise."""
 
 _NODE_DERIVED = (
-    # What the planner, the authority or a restart makes of the rest, and what `_node` words itself.
+    # What the planner, the authority or a restart makes of the rest, and what `_node` adds itself.
     *("key", "at", "run", "endpoints", "declared_parameters", "parameters", "parameter_files"),
     *("remap", "participants", "after", "transports", "max_datagram_bytes", "connections"),
     *("authority", "events", "membership", "files"),
@@ -58,7 +57,7 @@ class PlanDifference:
     Attributes:
         path: place in the manifest, `nodes.talker.run.python`.
         node: key of the node that it belongs to; empty where it belongs to the whole system.
-        old: the value in words, "not set" or "not declared" without one; cut to 80 characters.
+        old: the value as text, "not set" or "not declared" without one; cut to 80 characters.
         new: likewise.
         at: the position of the node or endpoint in the new plan; None where it has none.
     """
@@ -85,7 +84,7 @@ def changes(old: Plan, new: Plan) -> tuple[PlanDifference, ...]:
 
 
 def differences(old: Plan, new: Plan, *, words: tuple[str, str] = ("was", "is")) -> tuple[str, ...]:
-    """Say how two plans differ: `nodes.talker.run.python: was "a:Old", is "a:New"`.
+    """Describe how two plans differ: `nodes.talker.run.python: was "a:Old", is "a:New"`.
 
     Args:
         old: one plan.
@@ -268,7 +267,7 @@ MAX_TEXT = 1 << 20
 """Characters of a notice. A plan of 100 nodes takes about 40,000."""
 
 _MAX_PLAN_BYTES = 1 << 25
-"""Of a plan unpacked: what comes from the network must not fill our memory."""
+"""Of a plan unpacked: what the network delivers must not fill our memory."""
 
 
 class PlanNoticeError(ValueError):
@@ -277,7 +276,7 @@ class PlanNoticeError(ValueError):
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class PlanNotice:
-    """What one supervisor says of its plan.
+    """What one supervisor announces of its plan.
 
     Attributes:
         run: one run of it, unique.
@@ -302,7 +301,7 @@ class PlanNotice:
     reason: str = ""
 
     def replaces(self, other: PlanNotice) -> bool:
-        """Whether it is news of what `other` told of: one supervisor, or one in its place."""
+        """Whether it replaces `other`: from the same supervisor, or its successor."""
         if self.run == other.run:
             return True
         same = not {*self.machines}.isdisjoint(other.machines)
@@ -370,7 +369,7 @@ def concerns(plan: Plan, own: frozenset[str], notice: PlanNotice) -> bool:
     Args:
         plan: ours.
         own: machines whose nodes we bring up.
-        notice: what the other supervisor says.
+        notice: what the other supervisor announces.
     """
     theirs = {each.machine for each in plan.nodes} - own - {""}
     if notice.system == plan.system and not theirs.isdisjoint(notice.machines):

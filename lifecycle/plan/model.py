@@ -1,9 +1,8 @@
-"""The plan: the computational graph and the data layer graph of one system, ready to run.
+"""Types of a plan: nodes, participants, connections, flows and processes of one system.
 
-Owns: the types that cross from this room into verify/, middleware/, node/ and supervisor/.
-Every name in it is fully qualified. JSON-able through `lifecycle.codec`. Pure.
-
-The one way planning fails. Owns: `PlanError`.
+Owns: the types that cross from here into verify/, middleware/, node/ and supervisor/, and
+`PlanError`, the one way planning fails. Every name in it is fully qualified. JSON-able through
+`lifecycle.codec`. Pure.
 """
 
 from __future__ import annotations
@@ -72,7 +71,7 @@ class StaticEndpoint:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class StaticParticipant:
-    """A participant that others know without being told. `name` is its enclave, `/camera_net`."""
+    """A participant that others know without announcement. `name` is its enclave, `/camera_net`."""
 
     name: str
     endpoints: tuple[StaticEndpoint, ...]
@@ -80,12 +79,12 @@ class StaticParticipant:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class ParticipantConnections:
-    """How one participant is connected: what `connect_to` is told.
+    """How one participant is connected: the arguments of `connect_to`.
 
     Attributes:
         urls: its transports, as connection URLs in text; empty leaves everything to the RMW.
         static_name: its own name in `static_participants`.
-        static_participants: everybody, itself included, where endpoints are not announced.
+        static_participants: all, itself included, where endpoints are not announced.
         super_client: it learns of everything that the discovery servers of its URLs know, as an
             observer must; else only of what matches its own endpoints.
     """
@@ -113,9 +112,9 @@ class PlannedParticipant:
         max_datagram_bytes: UDP payload above which RTPS splits messages itself, so that IP does
             not; None leaves it to the RMW.
         non_blocking_send: its sockets never wait; what finds a full buffer is lost.
-        connection: name of the connection it stands for, unique in the node, `net`; empty for one
-            that only tells a publisher's flow apart.
-        connections: what `connect_to` is told.
+        connection: name of the connection it implements, unique in the node, `net`; empty for one
+            that only makes a publisher's flow unique.
+        connections: the arguments of `connect_to`.
         declared: the manifest spells the connection out.
     """
 
@@ -137,14 +136,13 @@ class PlannedEndpoint(Endpoint, FlowTerms):
     Attributes:
         resolved: fully qualified topic, service or action name after namespace and remap.
         dscp: 0–63 of what it sends: a publisher's data, a subscription's acknowledgements.
-        dscp_reason: where a DSCP comes from that is not written as such; empty if it is.
-        five_qi_reason: why it is this 5QI, or none, where the manifest says `auto`; else empty.
+        dscp_reason: source of a DSCP that is not written as such; empty if it is.
+        five_qi_reason: why it is this 5QI, or none, where the manifest has `auto`; else empty.
         participant: base name of the PlannedParticipant that carries it; empty for the node's own.
         max_delay_ms: declared bound, or the shortest of the links on its topic; None without.
         max_message_size: largest serialized message, bytes: as declared, else the type's bound;
             None if the type has none or is not installed here.
-        max_message_size_reason: where a size comes from that is not written as such; empty if it
-            is.
+        max_message_size_reason: source of a size that is not written as such; empty if it is.
         type_hash: of the definition that is installed here (REP-2016), as `ObservedEndpoint` has
             it; empty if the type is not installed here, or without hashes.
     """
@@ -184,12 +182,12 @@ class ExpectedParameter:
     """A parameter that a node must have, and what of it must be so.
 
     Attributes:
-        type: a word of rcl_interfaces, see ParameterDeclaration; "array" of an empty one whose type
-            is declared nowhere, which fits every array.
+        type: a type name of rcl_interfaces, see ParameterDeclaration; "array" of an empty one whose
+            type is declared nowhere, which fits every array.
         value: what it must be; None: anything of its type. Doubles that are not finite are ".nan",
             ".inf" and "-.inf", because JSON has no others.
-        source: who says the value: "parameters", "default_value" or a parameter file; empty without
-            a value.
+        source: what sets the value: "parameters", "default_value" or a parameter file; empty
+            without a value.
         read_only: it must be so; False asks nothing.
         optional: only a section for many nodes gives it, so that a node need not have it.
     """
@@ -219,9 +217,9 @@ class PlannedNode(NodeDeclaration):
         connections: how its own participant is connected; likewise shared by equals.
         authority: SUPERVISOR: `connect` maps nothing by itself; every endpoint must have been
             mapped by `map_to`, or the transition fails and names the missing ones.
-        events: it tells the graph what becomes of its connections and mappings.
-        membership: it tells the graph that it joins and leaves, its state and its checksum; so does
-            whoever tells events.
+        events: it notifies the graph of changes of its connections and mappings.
+        membership: it notifies the graph that it joins and leaves, of its state and its checksum;
+            so does a node with `events`.
         files: the paths among `parameter_files` and `run` as the manifest writes them.
     """
 
@@ -274,8 +272,8 @@ class PlannedFlow:
         subscription: key of the subscribing node.
         unique: the strongest demand of a link on this pair.
         linked: a `links:` entry names this pair.
-        transport: what a link says must carry it; ANY where none does.
-        medium: the word of a Medium that will carry it; empty if that is not known before the
+        transport: what a link demands for it; ANY where none does.
+        medium: the value of the Medium that will carry it; empty if that is not known before the
             nodes' configurations are.
         medium_reason: one phrase for people, "same host", "links say so".
         quantities: numbers of its links that only a measurement could prove.
@@ -299,7 +297,7 @@ class PlannedServer:
 
     Attributes:
         machine: where it runs; empty for this host.
-        address: what clients are told, and it listens on.
+        address: given to clients, and listened on.
         port: 1–65535.
         tcp: over TCP; else UDP.
         prefix: its GUID prefix, as in connection URLs.
@@ -358,7 +356,7 @@ class PlanError(LifecycleError):
 
     Attributes:
         at: the declaration that cannot be planned; None when no single one is to blame.
-        diagnostics: everything that is wrong, one by one; empty where the message says it all.
+        diagnostics: everything that is wrong, one by one; empty where the message is complete.
     """
 
     exit_code = ExitCode.MANIFEST_INVALID
@@ -377,7 +375,7 @@ class PlanError(LifecycleError):
 
     @classmethod
     def of(cls, diagnostics: tuple[Diagnostic, ...]) -> PlanError:
-        """Return the error that says all of these, at least one, at the place of the first."""
+        """Return the error that reports all of these, at least one, at the place of the first."""
         first = diagnostics[0]
         rest = [
             f"{each.message}; {each.hint}" if each.hint else each.message

@@ -1,13 +1,13 @@
-"""What a node's parameters must be: what its interface declares, with the values it is given.
+"""Expected parameter values of a node: declared parameters with the values that override them.
 
 Owns: from the manifest's sources of values to `ExpectedParameter`, and the one spelling of
 values that are compared. Reads parameter files. The checks, which know their layout, are imported
-late: whoever only wants a plan's types needs no YAML.
+late: a process that only needs a plan's types needs no YAML.
 
-Values come, weakest first, from a declaration's default, what a `command:` itself says after
+Values are taken, weakest first, from a declaration's default, what a `command:` itself sets after
 `--ros-args`, the parameter files, and `parameters:`. Among the sections of files rcl has an order
-of its own (measured, rclpy 7.1): sections of one name are one, in the place where that name stood
-first, and of those that match a node the later wins. `-p` goes into the section `/**`.
+of its own (measured, rclpy 7.1): sections of one name are one, at the place of the first of them,
+and of those that match a node the later wins. `-p` goes into the section `/**`.
 """
 
 from __future__ import annotations
@@ -149,7 +149,7 @@ def _undeclared(name: str, given: _Given) -> ExpectedParameter | None:
 
 
 def _command_line(node: Node) -> Iterator[tuple[str, str, str]]:
-    """Yield what a node's own command line says of parameters: (file, "", "") or ("", name, text).
+    """Yield what a node's own command line sets of parameters: (file, "", "") or ("", name, text).
 
     As rcl's parser reads it: between `--ros-args` and `--`, `-p name:=value`, which may begin with
     the name of a node, and `--params-file`.

@@ -1,10 +1,10 @@
-"""Extra participants for endpoints that need a network flow or a mark of their own.
+"""Extra DDS participants for endpoints that need a unique network flow or a DSCP of their own.
 
-Owns: naming and describing the participants that `manifest/flows.py` groups
-endpoints into, and what one costs. On Fast DDS a publisher's
-network flow endpoints are its participant's sender sockets, so only a participant of its own makes
-it unique, and only all publishers of one participant together can carry a DSCP. From the same
-sockets subscriptions send their acknowledgements. Pure.
+Owns: naming and describing the participants that `manifest/flows.py` groups endpoints into, and
+what one costs. On Fast DDS a publisher's network flow endpoints are its participant's sender
+sockets, so only a participant of its own makes it unique, and only all publishers of one
+participant together can carry a DSCP. From the same sockets subscriptions send their
+acknowledgements. Pure.
 """
 
 from __future__ import annotations
@@ -136,7 +136,7 @@ def participants_cost(count: int, *, others: int = 0) -> ParticipantCost:
 def command_line(node: Node, environment: Mapping[str, str]) -> tuple[str, ...]:
     """Return the full argv of a COMMAND node.
 
-    Parameter files come before single parameters, because rcl lets the later one win.
+    Parameter files precede single parameters, because rcl lets the later one win.
 
     Raises:
         PlanError: the package or its executable cannot be found.

@@ -1,9 +1,9 @@
-"""What nodes run, looked for without running it: programs, packages, Python classes, handlers.
+"""Find what nodes run without running it: executables, packages, Python classes, handlers.
 
 Owns: `resolve_programs`, a stage of its own between a valid manifest and its plan, because what it
 finds depends on the host. It looks where `up` would: PATH of the node's environment, the working
 directory, AMENT_PREFIX_PATH, the modules of this interpreter. What Python or exec(3) would refuse
-is an error; what only running would tell, or another host, is named as unresolved.
+is an error; what only running it, or another host, can show is named as unresolved.
 """
 
 from __future__ import annotations
@@ -62,11 +62,11 @@ class UnresolvedProgram:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Resolution:
-    """What came of looking for everything that a manifest runs.
+    """The result of looking for everything that a manifest runs.
 
     Attributes:
         diagnostics: what would fail, in the order of the manifest.
-        unresolved: what could not be told, likewise.
+        unresolved: what could not be decided, likewise.
     """
 
     diagnostics: tuple[Diagnostic, ...] = ()
@@ -250,7 +250,7 @@ def _names(folder: Path) -> tuple[str, ...]:
 
 
 def _pairs(node: Node, found: NodeClass, at: Position) -> Iterator[Diagnostic]:
-    """Yield what `node.handlers.match` would refuse when the node is configured."""
+    """Yield what `node.author.handlers.match` would refuse when the node is configured."""
     wanted = {(e.kind, e.name): e for e in node.interface.endpoints if e.kind in _WORDS}
     taken: dict[tuple[EndpointKind, str, bool], Handler] = {}
     for each in found.handlers:

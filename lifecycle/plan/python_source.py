@@ -1,9 +1,9 @@
-"""Python classes found and read without importing them: where they are, their bases, their methods.
+"""Find and read Python node classes without importing them: module, bases, methods, endpoints.
 
-Owns: `Sources`, which follows `module:Class` through source files as `node.loading` would through
-imports, `NodeClass`, what a class says of endpoints, and the two ways in which that ends:
-`NotThereError`, what Python itself would refuse, and `UnknownError`, what only running would tell.
-Reads files; runs nothing.
+Owns: `Sources`, which follows `module:Class` through source files as `node.author.spec` would
+through imports, `NodeClass`, what a class declares of endpoints, and the two ways in which that
+ends: `NotThereError`, what Python itself would refuse, and `UnknownError`, what only running it can
+show. Reads files; runs nothing.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class NotThereError(LifecycleError):
 
 
 class UnknownError(LifecycleError):
-    """Only running it would tell; the message is the reason, half a sentence."""
+    """Only running it can show that; the message is the reason, half a sentence."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,7 +75,7 @@ class Handler:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Access:
-    """An endpoint that code asks for by a name that stands there: `self.publisher("chatter")`."""
+    """An endpoint that code asks for by a literal name: `self.publisher("chatter")`."""
 
     kind: EndpointKind
     name: str
@@ -85,7 +85,7 @@ class Access:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class NodeClass:
-    """What the source of a class tells.
+    """What the source of a class shows.
 
     Attributes:
         is_node: it is a node class; None if one of its bases cannot be found.
@@ -151,7 +151,7 @@ class Sources:
 
         Raises:
             NotThereError: there is no such module, or no such class in it.
-            UnknownError: that cannot be told.
+            UnknownError: that cannot be decided.
         """
         source = self._module(module)
         value = self._named(source, name, 0)
@@ -237,11 +237,11 @@ class Sources:
         return line, known, unknown
 
     def _value(self, module: _Module, expression: ast.expr, depth: int) -> _Value:
-        """Return what an expression stands for.
+        """Return the value of an expression.
 
         Raises:
-            NotThereError: for nothing.
-            UnknownError: that cannot be told.
+            NotThereError: it has none.
+            UnknownError: that cannot be decided.
         """
         if isinstance(expression, ast.Subscript):
             return self._value(module, expression.value, depth)
@@ -273,7 +273,7 @@ class Sources:
         raise NotThereError(f"cannot import {name!r} from {module} ({_shown(source.file)})")
 
     def _named(self, module: _Module, name: str, depth: int) -> _Value | None:
-        """Return what a name stands for at the top of a module; None if for nothing."""
+        """Return the value of a name at the top of a module; None without one."""
         if depth > _DEEPEST:
             raise UnknownError(f"{name} goes through more than {_DEEPEST} modules")
         nodes = module.bound.get(name, [])
@@ -534,7 +534,7 @@ def _methods(node: ast.ClassDef) -> Iterator[tuple[str, ast.AST]]:
 
 
 def _made_in_body(of: _Class) -> str:
-    """Say what of a class body makes methods otherwise than by `def`; empty if nothing does."""
+    """Return what of a class body makes methods otherwise than by `def`; empty if nothing does."""
     for each in of.node.body:
         if isinstance(each, (*_Function, ast.Pass, ast.AnnAssign, ast.ClassDef)):
             continue

@@ -1,6 +1,6 @@
-"""A plan as text for people.
+"""Print a plan as text: what `lifecycle plan` shows.
 
-Owns: what `lifecycle plan` prints. JSON is `lifecycle.codec`'s, pictures are export/'s. Pure.
+Owns: that text. JSON is written by `lifecycle.codec`, pictures by export/. Pure.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ RMW_CHOOSES = "as the RMW chooses"
 
 
 def data_layer(plan: Plan, width: int) -> list[str]:
-    """Say how participants find each other and who connects them; nothing where all is usual."""
+    """Describe how participants find each other and who connects them; nothing if all is usual."""
     rows: list[tuple[str, str]] = []
     if plan.discovery_mode is not DiscoveryMode.DYNAMIC or (
         plan.discovery.transport is not FlowTransport.ANY
@@ -146,7 +146,7 @@ def _spelled(each: ParticipantConnections) -> list[str]:
 
 
 def medium(flow: PlannedFlow) -> str:
-    """Say what carries a flow and why; empty if that is not known yet."""
+    """Describe what carries a flow and why; empty if that is not known yet."""
     if not flow.medium:
         return flow.medium_reason
     return f"{flow.medium} ({flow.medium_reason})"
@@ -218,7 +218,7 @@ def _alternatives(plan: Plan, extra: int) -> str:
 
 
 def middleware(plan: Plan, width: int) -> list[str]:
-    """Say what each RMW of the system can do of what the system asks for."""
+    """Describe what each RMW of the system can do of what the system asks for."""
     asked = [each for node in plan.nodes for each in node.endpoints if _asks(each)]
     if not asked:
         return []
@@ -254,7 +254,7 @@ def _asks(each: PlannedEndpoint) -> bool:
 
 
 def notes(plan: Plan, width: int) -> list[str]:
-    """Say what a need brings with it that a user may not expect."""
+    """Describe what a need brings with it that a user may not expect."""
     rows = [
         (f"{node.full_name} {each.resolved}", text)
         for node in plan.nodes

@@ -1,12 +1,12 @@
-"""The TCP ports and peers of nodes that are started again while others stay.
+"""Restart nodes while others keep running: new TCP ports and peers for their participants.
 
 Owns: `restarted`, `moved_observer`, `moving_nodes` and `is_restarted_url`. Pure.
 
 Fast DDS 2.14 keeps an accepted TCP connection under the listening port that its dialler names, also
-once that one is gone, and takes no other in its place: who comes again on the same port and dials
-is not found by those who stayed (eProsima/Fast-DDS#1914). Who was dialled is dialled again. So
-whoever looks for others comes back on a port that it never had, and looks for all of its partners
-that stayed: none of them can know that port.
+once that one is gone, and takes no other in its place: a participant that returns on the same port
+and dials is not found by those that stayed (eProsima/Fast-DDS#1914). One that was dialled is
+dialled again. So a participant that looks for others returns on a port that it never had, and looks
+for all of its partners that stayed: none of them can know that port.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from lifecycle.plan.negotiation.parties import hosts_of, terms_of
 
 RESTART_PORTS_FROM = 2000
 """How far above `first_port` the ports of restarted participants begin: out of the way of ports
-that are negotiated while a system runs, and of groups' (connection_set.GROUP_PORTS_FROM)."""
+that are negotiated while a system runs, and of groups' (negotiate.GROUP_PORTS_FROM)."""
 
 OBSERVER_PORTS_FROM = 3000
-"""Likewise, of observers that a discovery server did not take to."""
+"""Likewise, of observers that a discovery server did not accept."""
 
 Heard = Mapping[str, Mapping[str, tuple[str, ...]]]
-"""What nodes say that they are connected by: full node name → connection, empty for the node's own
+"""What nodes report as their connections: full node name → connection, empty for the node's own
 participant → URLs."""
 
 _LAST_PORT = 65535
@@ -43,7 +43,7 @@ their process and ""; for an observer, "" and its machine."""
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class _Listener:
-    """One participant with a TCP port. `url` is the one of its URLs that says it."""
+    """One participant with a TCP port. `url` is the one of its URLs with that port."""
 
     host: str
     url: ConnectionUrl
@@ -55,7 +55,7 @@ class _Listener:
 
     @property
     def moves(self) -> bool:
-        """Whether it needs another port when it comes again: it is not only dialled."""
+        """Whether it needs another port when it returns: it is not only dialled."""
         return bool(self.url.peers or self.url.server)
 
 
@@ -66,7 +66,7 @@ def restarted(plan: Plan, keys: Collection[str], *, first: Plan, heard: Heard = 
         plan: as the system runs.
         keys: of all nodes of the processes that are started again.
         first: the plan before anything was started again.
-        heard: what the nodes of other supervisors say, which restart them without telling.
+        heard: what the nodes of other supervisors report, which restart them without notice.
 
     Raises:
         PlanError: a host has no ports left.
@@ -94,7 +94,7 @@ def moved_observer(
 ) -> ParticipantConnections:
     """Return how an observer is connected on a TCP port that it never had.
 
-    Nobody but a discovery server need know that port.
+    Only a discovery server need know that port.
 
     Args:
         plan: of its system.
@@ -133,8 +133,8 @@ def moving_nodes(plan: Plan) -> frozenset[str]:
 def is_restarted_url(planned: str, reported: str, *, first_port: int) -> bool:
     """Whether a participant that was planned with one URL has the other because of a restart.
 
-    Another host's supervisor restarts its nodes without telling, and so does ours for whoever looks
-    on. Which peers there were then cannot be known afterwards.
+    Another host's supervisor restarts its nodes without notice, and to an observing command so
+    does ours. Which peers there were then cannot be known afterwards.
 
     Args:
         planned: a connection URL.
@@ -183,7 +183,7 @@ def _remote_nodes(
 ) -> ConnectionUrl:
     """Return the participant's URL on the next port of its own.
 
-    Every participant of a host has one port of each round, whoever restarts it: supervisors that
+    Every participant of a host has one port of each round, whichever restarts it: supervisors that
     share a host need not ask each other.
     """
     peer_supervisors = [each for each in original if each[0] and original[each].host == now.host]

@@ -1,7 +1,7 @@
-"""Validated `discovery:`, `data_layer:` and `connections:` of a document → frozen types.
+"""Validated `discovery:`, `data_layer:` and `connections:` sections → frozen types.
 
 Owns: reading connection URLs out of a document, and the findings about them that a schema cannot
-see. Pure.
+detect. Pure.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ _KINDS = {kind.value: kind for kind in EndpointKind}
 
 
 def build_discovery(root: Cursor) -> Discovery:
-    """Build what a document says of discovery; the defaults where it says nothing."""
+    """Build the discovery of a document; the defaults where it declares nothing."""
     cursor = root.get("discovery")
     return Discovery() if cursor is None else cursor.build(Discovery, at=cursor.key_at)
 
 
 def build_data_layer(root: Cursor, found: list[Diagnostic]) -> DataLayer:
-    """Build what a document says of its data layer; the defaults where it says nothing."""
+    """Build the data layer of a document; the defaults where it declares nothing."""
     cursor = root.get("data_layer")
     if cursor is None:
         return DataLayer()
@@ -47,7 +47,7 @@ def build_data_layer(root: Cursor, found: list[Diagnostic]) -> DataLayer:
 
 
 def section_positions(root: Cursor) -> tuple[tuple[str, Position], ...]:
-    """Return where values of `discovery:` and `data_layer:` stand, by path, `discovery.mode`."""
+    """Return positions of values of `discovery:` and `data_layer:`, by path, `discovery.mode`."""
     return tuple(
         (f"{section}.{key}", value.at)
         for section in ("discovery", "data_layer")
@@ -69,7 +69,7 @@ def build_connections(
 
     Args:
         node: the node.
-        interface: of that node; what `map: all` stands for.
+        interface: of that node; what `map: all` expands to.
         found: findings are appended here.
     """
     return tuple(
@@ -111,10 +111,10 @@ def _map(connection: Cursor, interface: Interface) -> tuple[tuple[EndpointKind, 
 
 
 def connection_positions(node: Cursor) -> list[tuple[str, Position]]:
-    """Return where the parts of a node's connections stand, by path below the node.
+    """Return where the parts of a node's connections are, by path below the node.
 
     `connections.net`, `connections.net.urls.0`, `connections.net.map.publishers.0`, and
-    `connections.net.map` where it is one word.
+    `connections.net.map` where it is a single string.
     """
     positions = []
     for name, connection in node.entries("connections"):

@@ -1,7 +1,7 @@
-"""Typed access to a validated document.
+"""Typed access by key to a validated document, with source positions.
 
-Owns: `Cursor`, which reads a value by key with the type that the schema has already made sure of,
-and knows its position. A cursor on a document that was not validated may fail an assertion. Pure.
+Owns: `Cursor`, which reads a value with the type that the schema has already ensured, and knows its
+position. A cursor on a document that was not validated may fail an assertion. Pure.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ E = TypeVar("E", bound=enum.Enum)
 T = TypeVar("T")
 
 _EXACT = 2**53
-"""Above, a float says nothing of an integer."""
+"""Above, a float cannot represent every integer."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,12 +39,12 @@ class Cursor:
 
     @property
     def at(self) -> Position:
-        """Where the value stands."""
+        """Position of the value."""
         return self.document.at(self.place)
 
     @property
     def key_at(self) -> Position:
-        """Where the key of the value stands."""
+        """Position of the key of the value."""
         return self.document.key_at(self.place)
 
     @property

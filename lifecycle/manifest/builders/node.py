@@ -1,7 +1,7 @@
-"""Validated node of a document → frozen `Node`.
+"""Validated `nodes:` entry → frozen `Node`: run, interface, QoS, flows, parameters, remaps.
 
-Owns: how a node's keys become fields, its parameters flat and its paths absolute. What its
-interface holds is `build_interface`'s. Pure but for reading interfaces by reference.
+Owns: how a node's keys become fields, its parameters flat and its paths absolute, and
+`build_interface`, which other documents use as well. Pure but for reading interfaces by reference.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from lifecycle.manifest.yaml.yaml_parser import YAML_1_1_BOOLEANS, has_leading_z
 from lifecycle.network.dscp import parse_dscp
 
 Findings = list[Diagnostic]
-"""Findings in the order in which they turn up; every builder appends and goes on."""
+"""Findings in the order of detection; every builder appends and continues."""
 
 _DEFAULT_PRESET = {
     EndpointKind.PUBLISHER: "default",
@@ -142,7 +142,7 @@ def _qos(endpoint: Cursor, default: QosProfile, found: Findings) -> QosProfile:
 
 
 def _defaults(qos: Cursor | None) -> tuple[str, ...]:
-    """Return the policies that are not written; whoever names a preset writes all of it."""
+    """Return the policies that are not written; naming a preset writes all of it."""
     if qos is None:
         return POLICIES
     if not isinstance(qos.value.data, Mapping) or "preset" in qos:
@@ -363,7 +363,7 @@ def _flows(node: Cursor) -> list[FlowNeed]:
                     FlowNeed,
                     kind=kind,
                     name=name,
-                    # A number may stand as 46.0 or 0x2e: the scalar counts, not its text.
+                    # A number may be written as 46.0 or 0x2e: the scalar counts, not its text.
                     dscp=None if dscp is None else parse_dscp(_dscp_word(dscp)),
                     five_qi=None if auto else cursor.integer("five_qi"),
                     five_qi_auto=auto,
@@ -406,7 +406,7 @@ def _written_paths(node: Cursor) -> Iterator[tuple[str, str]]:
 
 
 def _positions(cursor: Cursor) -> list[tuple[str, Position]]:
-    """Return where the parts of a node stand that later checks point at."""
+    """Return the positions of the parts of a node that later checks point at."""
     positions = []
     for part in _POSITIONED:
         value = cursor.get(part)
@@ -414,7 +414,7 @@ def _positions(cursor: Cursor) -> list[tuple[str, Position]]:
             positions.append((part, value.at))
     run = cursor.get("run")
     if run is not None:
-        # A program is looked for where its name stands; an `attach: true` has none.
+        # A missing program is reported where its name is written; an `attach: true` has none.
         positions += [(f"run.{name}", each.at) for name, each in run.entries() if name in _PROGRAMS]
     positions += [(f"remap.{name}", each.key_at) for name, each in cursor.entries("remap")]
     files = enumerate(cursor.items("parameter_files"))

@@ -1,7 +1,7 @@
-"""Validated document → frozen types: everything of a manifest but its nodes.
+"""Validated document → frozen `Manifest`: machines, network, flows policy, links; nodes by `node`.
 
 Owns: what one document declares, before it is joined with others by `include`, and the findings
-that need more than a schema to be seen. Pure but for reading interfaces by reference.
+that a schema cannot detect. Pure but for reading interfaces by reference.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _MAX_MAPPING_BYTES = 1_000_000
 
 
 def build_network(root: Cursor, *, base: Path, found: list[Diagnostic]) -> Network:
-    """Build what a document says of its network; the defaults where it says nothing.
+    """Build the network of a document; the defaults where it declares nothing.
 
     Args:
         root: the document.

@@ -1,9 +1,9 @@
-"""Everything a manifest's parts say about each other: the checks that need the whole system.
+"""Static checks of a whole manifest: the registry of `check.*` rules and which of them can run.
 
 Owns: `CHECKS`, the one registry. Each check is a generator of diagnostics with rule ids `check.*`
-and says what it needs: of a manifest in which something is wrong already, those checks run that
-what is wrong cannot put right, on the nodes that are sound for them. Needs no ROS: types come from
-the ament index.
+and declares what it needs: in a manifest that already has errors, a check runs on the nodes that
+are sound for it, if mending those errors cannot remove its findings. Needs no ROS: types are read
+from the ament index.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Checks of the addresses and ports that connection URLs fix.
+"""Checks of connection URLs: conflicting ports, addresses of the machine, peers, combined URLs.
 
 Owns: check.connection-ports, check.connection-address, check.connection-peer,
 check.connection-urls. Pure.
@@ -193,7 +193,7 @@ def _well_known(system: DeclaredSystem, uses: list[_Use]) -> Iterator[Diagnostic
 def _peers(
     system: DeclaredSystem, url: ConnectionUrl, at: Position, contacts: set[tuple[str, int]]
 ) -> Iterator[Diagnostic]:
-    """Warn of peers whom nobody of the system is."""
+    """Warn of peers that match no participant of the system."""
     discovery = system.manifest.discovery
     planned = discovery.mode is not DiscoveryMode.DYNAMIC and (
         discovery.transport is not FlowTransport.SHM

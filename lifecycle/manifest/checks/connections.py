@@ -1,11 +1,8 @@
-"""Checks of who talks to whom: ends that have no other end.
+"""Checks of unconnected topics, services and actions, and of the `connections:` that nodes declare.
 
-Owns: check.unpublished, check.unheard, check.no-server. How severe they are is the manifest's
-policy. Pure.
-
-Checks of the connections that nodes spell out: what they carry, and what flows ask of that.
-Owns: check.connection-endpoint, check.connection-name, check.connection-foreign,
-check.connection-flow. Their addresses and ports are `connection_urls`'.
+Owns: check.unpublished, check.unheard, check.no-server, whose severity is the manifest's policy;
+check.connection-endpoint, check.connection-name, check.connection-foreign, check.connection-flow.
+Addresses and ports of connections are checked by `connection_urls`. Pure.
 """
 
 from __future__ import annotations
@@ -42,7 +39,7 @@ _OTHER_END = {
     EndpointKind.SERVICE_CLIENT: EndpointKind.SERVICE_SERVER,
     EndpointKind.ACTION_CLIENT: EndpointKind.ACTION_SERVER,
 }
-"""Kinds that make no sense alone. A server that nobody calls is an offer."""
+"""Kinds that make no sense alone. A server without a client is an offer."""
 
 _RULES = {
     EndpointKind.SUBSCRIPTION: "check.unpublished",

@@ -1,4 +1,4 @@
-"""Checks of how participants find each other, and of who connects them.
+"""Checks of participant discovery (range, RMW, transport, discovery server) and of the authority.
 
 Owns: check.discovery-range, check.discovery-address, check.discovery-rmw,
 check.discovery-transport, check.discovery-server, check.discovery-foreign, check.authority. Pure.
@@ -165,7 +165,7 @@ def _server(system: DeclaredSystem, section: Position) -> Iterator[Diagnostic]:
 def _rmws(
     system: DeclaredSystem, environment: Mapping[str, str], section: Position
 ) -> Iterator[Diagnostic]:
-    """Only Fast DDS can be told all this; a server serves only its own kind."""
+    """Only Fast DDS can be configured so; a server serves only its own kind."""
     discovery = system.manifest.discovery
     dynamic = discovery.mode is DiscoveryMode.DYNAMIC
     at = system.manifest.where(f"discovery.{'transport' if dynamic else 'mode'}", section)
@@ -193,7 +193,7 @@ def _rmws(
 
 
 def _foreign(discovery: Discovery, node: Node) -> Iterator[Diagnostic]:
-    """Judge a node whose participant is not ours to make; a command can be told by variables."""
+    """Judge a node whose participant is not ours to make; variables can configure a command's."""
     transport = discovery.transport
     if node.run.kind is RunKind.PYTHON or (
         discovery.mode is DiscoveryMode.DYNAMIC and transport is FlowTransport.ANY
@@ -220,7 +220,7 @@ def _foreign(discovery: Discovery, node: Node) -> Iterator[Diagnostic]:
 def _unfound(
     system: DeclaredSystem, environment: Mapping[str, str], node: Node
 ) -> Iterator[Diagnostic]:
-    """Judge a command that is told to use IPv6 and to look on this host alone.
+    """Judge a command that is configured to use IPv6 and to look on this host alone.
 
     rmw_fastrtps_cpp 8.4 does the latter by the peer 127.0.0.1, and no variable names another.
     """

@@ -1,9 +1,8 @@
-"""Checks of how flows travel: by which transport, and in how large datagrams.
+"""Checks of flows against transport (UDP, TCP, shared memory), datagram size and RMW capabilities.
 
-Owns: check.flow-transport, check.flow-fragments, check.ipv6-transports. Pure.
-
-Checks of flow needs against what the RMW can do. Owns: check.rmw. The capability table is
-`lifecycle.network`'s, and what happens at run time decides; this only fails earlier.
+Owns: check.flow-transport, check.flow-fragments, check.ipv6-transports, check.rmw. The capability
+table is in `lifecycle.network`; what happens at run time decides, check.rmw only fails earlier.
+Pure.
 """
 
 from __future__ import annotations
@@ -42,8 +41,8 @@ def check_middleware(
 ) -> Iterator[Diagnostic]:
     """Yield findings about what the RMW of a node cannot do.
 
-    An error where a need that must be met certainly is not; else a warning that names where the
-    answer comes from. Without RMW_IMPLEMENTATION it is ROS 2's default.
+    An error where a need that must be met certainly is not; else a warning that names the source
+    of the answer. Without RMW_IMPLEMENTATION it is ROS 2's default.
     """
     for node in system.manifest.nodes:
         rmw = rmw_of(node, environment)
@@ -121,7 +120,7 @@ def _link(
 ) -> Iterator[Diagnostic]:
     ends = [system.nodes.get(key) for key in (link.from_node, link.to_node)]
     if ends[0] is None or ends[1] is None:
-        return  # `links` says so
+        return  # reported by check.link-unknown-node
     for node in ends:
         if node is not None:
             yield from _rmw(node, link.transport, link.at, environment)

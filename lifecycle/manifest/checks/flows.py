@@ -1,14 +1,10 @@
-"""Checks of what endpoints ask of their network flows, one by one.
+"""Checks of network flow needs: DSCP, priority, 5QI, DSCPs as flow identifiers, and links.
 
 Owns: check.flow-unknown-endpoint, check.flow-dscp, check.transport-priority, check.flow-five-qi,
-check.five-qi-class, check.flow-impossible, check.flow-foreign. Pure.
-
-Checks of DSCP values that are to tell flows apart. Owns: check.dscp-exhausted,
-check.dscp-not-unique, check.dscp-repurposed: the limits that *Unique Network Flows* gives for
-the DSCP as an identifier.
-
-Checks of links: their ends exist, meet on the topic, and ask for what the link demands. Owns:
-check.link-unknown-node, check.link-topic, check.link-not-unique.
+check.five-qi-class, check.flow-impossible, check.flow-foreign; check.dscp-exhausted,
+check.dscp-not-unique, check.dscp-repurposed, the limits that *Unique Network Flows* gives for the
+DSCP as an identifier; check.link-unknown-node, check.link-topic, check.link-not-unique: the ends of
+a link exist, meet on the topic, and ask for what the link demands. Pure.
 """
 
 from __future__ import annotations
@@ -195,10 +191,10 @@ _OWN = "give it another DSCP, or none: then it gets one that nobody has"
 
 
 def check_identifiers(system: DeclaredSystem, needs: FlowNeeds) -> Iterator[Diagnostic]:
-    """Yield findings about publishers that their DSCP tells apart.
+    """Yield findings about publishers that are identified by their DSCP.
 
-    All nodes are counted. The article counts subscriptions too; here they are told apart by their
-    ports, and a DSCP that one acknowledges with must only not be an identifier of another's.
+    All nodes are counted. The article counts subscriptions too; here their ports distinguish them,
+    and a DSCP that one acknowledges with must only not be an identifier of another's.
     """
     if system.manifest.network.flow_identification is FlowIdentification.DSCP:
         yield from _repurposed(system, needs)
@@ -263,7 +259,7 @@ def _repurposed(system: DeclaredSystem, needs: FlowNeeds) -> Iterator[Diagnostic
 
 
 def _relied_on(system: DeclaredSystem, needs: FlowNeeds) -> Iterator[Diagnostic]:
-    """Judge publishers that only their DSCP tells apart although nobody said so.
+    """Judge publishers that only their DSCP distinguishes although that is declared nowhere.
 
     A link may demand a unique flow of a publisher that asks for none but is marked: then its DSCP
     is re-purposed as the identifier, and of those there are 64, all else in the NFE being equal.
@@ -344,7 +340,7 @@ def _end(
         yield error("check.link-unknown-node", link.at, message, hint)
         return
     if key not in system.nodes:
-        return  # what is wrong in it comes first
+        return  # its own errors are reported first
     found = [each for each in system.named(kind, link.topic) if each.node.key == key]
     if found:
         yield from found
@@ -372,8 +368,8 @@ def _uniqueness(link: Link, ends: list[Resolved], needs: FlowNeeds) -> Iterator[
         for each in silent:
             message = f"{_flow(link)}: {_end_name(each)} does not ask to be unique"
             yield error("check.link-not-unique", link.at, message, _remedy(each))
-    # A DSCP of its own makes an NFE unique as well; `flows` judges whether it is its own. That of
-    # a subscription is of its acknowledgements and tells no data apart.
+    # A DSCP of its own makes an NFE unique as well; `check_identifiers` judges whether it is its
+    # own. That of a subscription is of its acknowledgements and distinguishes no data.
     marked = any(
         _dscp(each, needs) is not None
         for each in ends

@@ -1,10 +1,7 @@
-"""Checks of QoS: whether every publisher and subscription that meet will match.
+"""Checks that endpoints match: QoS compatibility of publishers and subscriptions, and types.
 
-Owns: check.qos-incompatible, check.qos-doubtful. The rule itself is `lifecycle.manifest.qos`'s.
-Pure.
-
-Checks of types: they exist, and all ends of one name agree on one. Owns: check.type-unknown,
-check.type-not-installed, check.type-mismatch. Reads the ament index.
+Owns: check.qos-incompatible, check.qos-doubtful, by the rule of `lifecycle.manifest.qos`;
+check.type-unknown, check.type-not-installed, check.type-mismatch. Reads the ament index.
 """
 
 from __future__ import annotations
@@ -43,7 +40,7 @@ def _judge(
 ) -> Iterator[Diagnostic]:
     offered, requested = offering.endpoint.qos, requesting.endpoint.qos
     if offered is None or requested is None or offering.endpoint.type != requesting.endpoint.type:
-        return  # types that differ are `check_types`'s finding
+        return  # types that differ are reported by `check_types`
     other = requesting if at is offering else offering
     doubtful = []
     unknown = _left_open(offering) | _left_open(requesting)
@@ -63,7 +60,7 @@ def _judge(
 
 
 def _left_open(end: Resolved) -> set[str]:
-    """Return the policies that only a node's own code knows: it is not ours, and nobody wrote them.
+    """Return the policies that only a node's own code knows: it is not ours, they are not written.
 
     Whether they fit is judged when it runs (graph.qos-incompatible).
     """
@@ -73,9 +70,9 @@ def _left_open(end: Resolved) -> set[str]:
 
 
 def _is_settled(each: Incompatibility) -> bool:
-    """Whether an untold liveliness is no reason to doubt.
+    """Whether an undeclared liveliness is no reason to doubt.
 
-    Every preset of rmw but one says SYSTEM_DEFAULT there, and DDS's default is AUTOMATIC (DDS 1.4
+    Every preset of rmw but one has SYSTEM_DEFAULT there, and DDS's default is AUTOMATIC (DDS 1.4
     §2.2.3), which satisfies everything but a request for MANUAL_BY_TOPIC.
     """
     told = (each.offered, each.requested)

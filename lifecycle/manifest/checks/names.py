@@ -1,10 +1,8 @@
-"""Checks of names: legal ones, and none of them twice.
+"""Checks of ROS names and remap rules: illegal names, duplicates, unused or colliding rules.
 
-Owns: check.name, check.duplicate-node, check.duplicate-endpoint. Pure.
-
-Checks of remap rules: readable, used, and not tying two endpoints of a node together. Owns:
+Owns: check.name, check.duplicate-node, check.duplicate-endpoint, check.several-servers;
 check.remap-rule, check.remap-identity, check.remap-action, check.remap-unused,
-check.remap-shadowed, check.remap-collision.
+check.remap-shadowed, check.remap-collision. Pure.
 """
 
 from __future__ import annotations
@@ -105,7 +103,7 @@ def _duplicate_endpoints(group: tuple[Resolved, ...]) -> Iterator[Diagnostic]:
 
 
 def _remapped(each: Resolved) -> bool:
-    """Whether a rule gave it its name; then the rule is what `remaps` reports."""
+    """Whether a rule gave it its name; then `check_remaps` reports the rule."""
     return expand(each.endpoint.name, each.node.name, each.node.namespace) != each.name
 
 

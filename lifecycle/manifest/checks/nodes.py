@@ -1,8 +1,8 @@
-"""Checks of where and in which order nodes run: machines, processes, ports, and `after`.
+"""Checks of where and in which order nodes start: machines, processes, domain, ports, `after`.
 
 Owns: check.unknown-machine, check.process-machine, check.process-run, check.process-environment,
 check.process-name, check.domain, check.ports, check.after-unknown, check.after-self,
-check.after-cycle, check.after-unmanaged. Port arithmetic is `lifecycle.network`'s. Pure.
+check.after-cycle, check.after-unmanaged. Port arithmetic is in `lifecycle.network`. Pure.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def check_ports(
     discovery = system.manifest.discovery
     domain = discovery.domain_id
     if domain is None:
-        # One that is no domain is nobody's fault but the environment's, and refused where it is.
+        # One that is no domain is the environment's fault, and refused where it is used.
         domain = domain_of(environment.get("ROS_DOMAIN_ID", "")) or 0
     start = Position(file=system.manifest.path, line=1, column=1, path="discovery.domain_id")
     at = discovery.at or start
@@ -119,7 +119,7 @@ def check_ports(
 
 
 def _hosts(system: DeclaredSystem) -> list[list[Machine]]:
-    """Group machines that are one host: of one address, or of none, which stands for this host."""
+    """Group machines that are one host: of one address, or of none, which means this host."""
     hosts: dict[str, list[Machine]] = {}
     for machine in system.manifest.machines:
         hosts.setdefault(machine.address, []).append(machine)
@@ -147,7 +147,7 @@ def _crowded(
     for each in refused:
         message, _, hint = each.partition("; ")
         yield error("check.ports", at, message, hint)
-    # Where no participant at all is safe, check.domain has said so.
+    # Where no participant at all is safe, check.domain has reported it.
     if not refused and max_participants(domain, Platform.LINUX).participants:
         for each in over(ephemeral=Platform.LINUX):
             message, _, hint = each.partition("; ")
@@ -166,7 +166,7 @@ def _participants(nodes: list[Node], needs: FlowNeeds) -> int:
 
 
 def check_order(system: DeclaredSystem) -> Iterator[Diagnostic]:
-    """Yield findings about the order in which nodes come up."""
+    """Yield findings about the start order of nodes."""
     for node in system.manifest.nodes:
         for after in node.after:
             if not system.may_exist(after.node):
@@ -174,7 +174,7 @@ def check_order(system: DeclaredSystem) -> Iterator[Diagnostic]:
                 hint = did_you_mean(after.node, system.known)
                 yield error("check.after-unknown", after.at, message, hint)
             elif after.node not in system.nodes:
-                continue  # what is wrong in it comes first
+                continue  # its own errors are reported first
             elif after.node == node.key:
                 message = f"cannot make {node.key!r} wait for itself"
                 yield error("check.after-self", after.at, message, "remove it")

@@ -1,19 +1,12 @@
-"""Checks of parameters given in the manifest against those that the interface declares.
+"""Checks of ROS parameters and parameter files (YAML) against the parameters an interface declares.
 
-Owns: check.parameter-undeclared, check.parameter-type, check.parameter-unused. An interface that
-declares no parameters says nothing about them, so nothing is checked then. Pure.
+Owns: check.parameter-undeclared, check.parameter-type, check.parameter-unused, also for values in
+files; check.parameter-file, check.parameter-file-unmatched; whether a value fits a type of
+rcl_interfaces/ParameterType, and what rcl makes of a scalar in a parameter file; the layout that
+rcl_yaml_param_parser reads (namespaces and node names down to `ros__parameters`, parameters nested
+with dots) and how rclcpp and rclpy match a section to a node. Reads the files.
 
-Checks of parameter files: there, readable, for a node of this system, and fitting its
-interface. Owns: check.parameter-file, check.parameter-file-unmatched, and the parameter rules
-for values that stand in files. Reads the files.
-
-Types of parameter values, as rcl_interfaces/ParameterType has them. Owns: whether a value fits
-a declared type, and what rcl makes of a scalar in a parameter file.
-
-ROS parameter files: text → sections, one for each node or pattern that the file names. Owns:
-the layout that rcl_yaml_param_parser reads (namespaces and node names down to
-`ros__parameters`, parameters nested with dots) and how rclcpp and rclpy match a section to a
-node.
+An interface that declares no parameters leaves them open, so nothing is checked then.
 """
 
 from __future__ import annotations
@@ -54,7 +47,7 @@ _LONGEST_INTEGER = 80
 
 
 def is_implicit(name: str) -> bool:
-    """Tell whether ROS declares this parameter itself, in every node or for every topic."""
+    """Whether ROS declares this parameter itself, in every node or for every topic."""
     return name in _IMPLICIT or name.startswith("qos_overrides.")
 
 
@@ -83,7 +76,7 @@ def misfit(value: ParameterValue, declared: str) -> str:
 
 
 def suggestion(value: ParameterValue, declared: str) -> str:
-    """Return how to write the value so that it fits; empty where that cannot be told."""
+    """Return how to write the value so that it fits; empty if not known."""
     if declared == "double" and isinstance(value, int) and not isinstance(value, bool):
         return f"write {float(value)}"
     if declared == "string" and not isinstance(value, (str, tuple)):
@@ -100,7 +93,7 @@ def read_scalar(text: str, *, quoted: bool) -> bool | int | float | str:
 
     Args:
         text: as written, without quotes.
-        quoted: it stood in quotes.
+        quoted: it was written in quotes.
     """
     if quoted:
         return text
@@ -148,7 +141,7 @@ def _given(node: Node) -> Iterator[Diagnostic]:
 
 
 def _no_effect(node: Node) -> Iterator[Diagnostic]:
-    """Warn of what a node that somebody else starts will never be given, only judged by."""
+    """Warn of values that an attached node is judged by but never given."""
     if node.run.kind is not RunKind.ATTACH:
         return
     places = [(f"parameters.{name}", "parameters") for name, _ in node.parameters[:1]]
@@ -177,7 +170,7 @@ def _pattern(name: str) -> re.Pattern[str] | None:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Section:
-    """What a file sets for the nodes that one name or pattern stands for.
+    """What a file sets for the nodes that match one name or pattern.
 
     Attributes:
         pattern: `/robot/camera`, `/**`, `/robot/*`; always with a leading slash.
@@ -190,11 +183,11 @@ class Section:
 
     @property
     def is_wildcard(self) -> bool:
-        """Whether it may stand for several nodes."""
+        """Whether it may match several nodes."""
         return "*" in self.pattern
 
     def matches(self, node: str) -> bool:
-        """Tell whether a node with this fully qualified name takes the section's values."""
+        """Whether a node with this fully qualified name takes the section's values."""
         pattern = _pattern(self.pattern)
         return pattern is not None and pattern.fullmatch(node) is not None
 
@@ -367,7 +360,7 @@ def _unmatched_node(
 
 
 def _unmatched_sections(file: _ParameterFile, system: DeclaredSystem) -> Iterator[Diagnostic]:
-    """Warn of sections for nobody in a file that is of use otherwise: most are misspelt."""
+    """Warn of sections that match no node in a file of which others do: most are misspelt."""
     names = [full_name(node) for node in system.manifest.nodes]
     dead = [each for each in file.sections if not any(each.matches(name) for name in names)]
     if len(dead) == len(file.sections):

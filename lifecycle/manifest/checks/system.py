@@ -1,11 +1,10 @@
-"""The manifest as the checks read it: every endpoint with its fully qualified name.
+"""The manifest as the checks read it: endpoints with fully qualified names, implicit ones included.
 
-Owns: resolving all names once, so that each check compares names that are already whole. An
-endpoint whose name cannot be resolved is left out here and reported by `names`. Pure.
-
-Endpoints that every ROS 2 node, or every managed one, has without declaring them. Owns: their
-names, so that what talks to them is not called unconnected. Sources: rcl's rosout and type
-description service, rclpy's parameter services, rcl_lifecycle's services and event.
+Owns: resolving all names once, so that each check compares fully qualified names; an endpoint whose
+name cannot be resolved is left out here and reported by `names`. The names of the endpoints that
+every ROS 2 node, or every managed one, has without declaring them, so that what connects to them is
+not reported as unconnected. Sources: rcl's rosout and type description service, rclpy's parameter
+services, rcl_lifecycle's services and event. Pure.
 """
 
 from __future__ import annotations
@@ -153,7 +152,7 @@ def _resolve(
 
 
 def usable_rules(node: Node) -> tuple[tuple[str, str], ...]:
-    """Return the node's remap rules that rcl reads; `remaps` reports the others."""
+    """Return the node's remap rules that rcl reads; `check_remaps` reports the others."""
     return tuple(rule for rule in node.remap if not isinstance(read_rule(*rule), LifecycleError))
 
 

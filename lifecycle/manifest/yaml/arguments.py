@@ -1,9 +1,9 @@
-"""Arguments of a manifest and substitutions inside its values.
+"""Launch-like arguments of a manifest and `$(arg …)`, `$(env …)` substitutions in its values.
 
-Owns: `$(arg NAME)`, `$(env NAME [DEFAULT])`, `$$(` for a literal `$(`, and how argument values come
-about: given as `name:=value`, else the default. A substitution never adds structure: its text is
-never parsed as YAML again, it only takes the type of a scalar where it is one whole unquoted value.
-Pure; the environment is handed in.
+Owns: `$(arg NAME)`, `$(env NAME [DEFAULT])`, `$$(` for a literal `$(`, and where argument values
+are taken from: given as `name:=value`, else the default. A substitution never adds structure: its
+text is never parsed as YAML again, it only takes the type of a scalar where it is one whole
+unquoted value. Pure; the environment is injected.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Substituted:
 
     Attributes:
         arguments: (name, value) in the order of declaration.
-        broken: values that could not be substituted; they are reported in `diagnostics` and stand
+        broken: values that could not be substituted; they are reported in `diagnostics` and stay
             in `document` as written.
     """
 
@@ -260,5 +260,5 @@ class _Substitution:
 
 
 def _encodable(text: str) -> bool:
-    """Tell whether text from outside holds no half characters, as undecodable bytes leave them."""
+    """Whether text from outside holds no half characters, as undecodable bytes leave them."""
     return not any("\ud800" <= character <= "\udfff" for character in text)

@@ -1,4 +1,4 @@
-"""Positioned values: what a YAML document holds and where each piece of it stands.
+"""YAML values with their source positions (file, line, column), and paths into a document.
 
 Owns: `Value`, `Document` and the spelling of document paths. Knows nothing of YAML's syntax nor
 of what a manifest means, so that NoDL documents use it as well. Pure.
@@ -48,7 +48,7 @@ class Value:
         column: from 1.
         key: line and column of the key that names it in a mapping; None elsewhere.
         text: a scalar as written, without its quotes.
-        quoted: the scalar stood in quotes or was a block scalar: it is a string whatever it holds.
+        quoted: the scalar was in quotes or was a block scalar: it is a string whatever it holds.
     """
 
     data: Scalar | tuple[Value, ...] | Mapping[str, Value]
@@ -73,8 +73,8 @@ class Document:
 
     Attributes:
         file: path as the user wrote it.
-        root: the outermost value; a mapping when it comes from `source.read_document`.
-        place: where `root` stands in that file; empty for a whole file.
+        root: the outermost value; a mapping when read by `source.read_document`.
+        place: path of `root` in that file; empty for a whole file.
     """
 
     file: str

@@ -1,7 +1,7 @@
-"""Joining manifests: which file an include names, and what becomes of what it declares.
+"""`include:` of manifests: find included files, prefix and namespace them, join the results.
 
 Owns: finding included files, refusing cycles, moving a manifest under a key prefix and a namespace,
-and joining it with the one that includes it. Reading them is `load`'s. Looks at the file system for
+and joining it with the one that includes it. `load` reads them. Looks at the file system for
 existence only.
 """
 
@@ -50,7 +50,7 @@ class Origin:
         """Return the origin of a path as the user wrote it."""
         try:
             identity = os.path.realpath(path)
-        except (OSError, ValueError):  # a name that no file can have; opening it says so
+        except (OSError, ValueError):  # a name that no file can have; opening it reports that
             identity = str(path)
         return cls(path=path, identity=identity)
 
@@ -97,7 +97,7 @@ def move(manifest: Manifest, *, prefix: str, namespace: str) -> Manifest:
     """Put a manifest under a key prefix and a namespace.
 
     Names of nodes move with their namespace, and so do relative topic names; an absolute topic
-    name stays where it is. A link's topic goes where its publisher goes.
+    name stays where it is. A link's topic moves with its publisher.
     """
     old = {node.key: node for node in manifest.nodes}
     new = {node.key: _move_node(node, prefix, namespace) for node in manifest.nodes}

@@ -1,4 +1,4 @@
-"""A file → positioned values: reading, size, encoding.
+"""Read a YAML file safely: regular files only, size limit, encoding; then parse it.
 
 Owns: every way in which a path may be no readable text; `compose` owns what the text may hold.
 Reading is bounded in time and memory: nothing but a regular file is read, and of that at most one
@@ -114,7 +114,7 @@ def read_bytes(path: str | Path, *, file: str) -> bytes:
 def is_outside(file: str, manifest: str, environment: Mapping[str, str]) -> bool:
     """Whether a file is neither in the folder of a manifest nor of an installed package.
 
-    What such a file holds is not for whoever wrote the manifest: `include: /etc/shadow` must not
+    What such a file holds is not for the manifest's author: `include: /etc/shadow` must not
     have root print it. Links are followed, so that none leads out of the folder.
 
     Args:

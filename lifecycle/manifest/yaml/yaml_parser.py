@@ -1,16 +1,17 @@
-"""YAML text → positioned values, on PyYAML's event stream.
+"""Hardened YAML 1.2 parser on PyYAML's events: positions, limits, and types of plain scalars.
 
-Owns: every limit on what a document may hold (values, depth, aliases, tags, keys). The limits
-are checked event by event, before anything is built or expanded, so that a hostile document
-costs no more than reading it up to the offence. No constructor of PyYAML ever runs. Pure.
+Owns: every limit on what a document may hold (values, depth, aliases, tags, keys, numbers), and the
+one place where text becomes bool, int, float, null or string; used for scalars as written and again
+for a scalar that was one whole substitution. Pure.
 
-What an unquoted scalar means: YAML 1.2's core schema, and the limits on numbers. Owns: the one
-place where text becomes bool, int, float, null or string; used for scalars as written and again
-for a scalar that was one whole substitution. Source of the rules: YAML 1.2.2 §10.3.2. So `yes`,
-`on`, `off` and `1:30` are strings here, and `0o17` is octal. In one thing they are narrower, as
-JSON is: an integer does not begin with 0. Of `017` YAML 1.1 makes fifteen and 1.2 seventeen, of
-`018` a string and eighteen, and writers of 1.1 do write the string '018' bare. A string is what
-no reader can take for another number.
+The limits are checked event by event, before anything is built or expanded, so that a hostile
+document costs no more than reading it up to the offence. No constructor of PyYAML ever runs.
+
+Unquoted scalars follow YAML 1.2.2 §10.3.2, the core schema. So `yes`, `on`, `off` and `1:30` are
+strings here, and `0o17` is octal. In one thing the rules are narrower, as JSON is: an integer does
+not begin with 0. Of `017` YAML 1.1 makes fifteen and 1.2 seventeen, of `018` a string and eighteen,
+and writers of 1.1 do write the string '018' bare. A string is what no reader can take for another
+number.
 """
 
 from __future__ import annotations
@@ -243,7 +244,7 @@ class _Composer:
         if _UNFIT.search(event.value):
             message = f"cannot use {_cut(event.value)}: it holds a NUL or half a character"
             self._note("yaml.character", mark, message, "remove the escape")
-        quoted = bool(event.style)  # libyaml says "" for a plain scalar, PyYAML None
+        quoted = bool(event.style)  # libyaml has "" for a plain scalar, PyYAML None
         data: Scalar = event.value
         if not quoted:
             try:
@@ -377,7 +378,7 @@ class _Composer:
         self, mark: tuple[int, int], message: str, hint: str = "", *, rule: str = "yaml.limit"
     ) -> NoReturn:
         """Give up at once, with everything found so far."""
-        # After a syntax error nobody knows which value this would have been.
+        # After a syntax error it is unknown which value this would have been.
         place = () if rule == "yaml.syntax" else self._next_place()[:_SHOWN_DEPTH]
         raise ManifestError([*self._found, error(rule, self._position(mark, place), message, hint)])
 
@@ -387,7 +388,7 @@ def _cut(text: str) -> str:
 
 
 def _explain(why: str, text: str, line: int, column: int) -> tuple[str, str]:
-    """Put a parser's reason into words and a hint; libyaml's and PyYAML's wordings differ."""
+    """Return a parser's reason as a phrase and a hint; libyaml's and PyYAML's wordings differ."""
     if "mapping values are not allowed" in why:
         return "cannot read a second ': ' in this value", "put the value in quotes"
     if "cannot start any token" in why:

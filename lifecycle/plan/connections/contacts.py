@@ -1,7 +1,7 @@
-"""Where participants listen for each other, as far as that is planned.
+"""Discovery addresses and ports of participants, peers (static peers), as far as they are planned.
 
 Owns: `Contact`, reading contacts out of connection URLs, spelling the URL of a participant whose
-ports are fixed, and `reached_hosts`, where multicast alone may not reach everybody. Pure.
+ports are fixed, and `reached_hosts`, where multicast alone may not reach every participant. Pure.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def contacts_of(host: str, urls: Iterable[str]) -> tuple[Contact, ...]:
 def _contact(host: str, url: ConnectionUrl) -> Contact | None:
     address, port = url.address, url.metatraffic_port
     if url.transport is Medium.UDPM:
-        # The group is where data go; discovery listens on the interfaces.
+        # The group is for data; discovery listens on the interfaces.
         address = next(iter(url.interfaces), "")
     elif url.transport is Medium.TCPV4:
         port = url.port
@@ -80,8 +80,8 @@ def peers_by(transport: Medium, contacts: Iterable[Contact], *, host: str) -> tu
 
     Args:
         transport: of the URL.
-        contacts: everybody who is to be found.
-        host: of the participant with the URL; a group with TTL 0 reaches nobody elsewhere.
+        contacts: all participants to be found.
+        host: of the participant with the URL; a group with TTL 0 reaches no other host.
     """
     group = transport is Medium.UDPM
     return tuple(
@@ -101,7 +101,7 @@ def fixed_url(
     ports: Sequence[int],
     peers: Sequence[Peer],
 ) -> ConnectionUrl:
-    """Return the URL of a participant that nobody but these peers finds.
+    """Return the URL of a participant that only these peers find.
 
     Args:
         transport: UDPV4, UDPV6 or TCPV4.
@@ -128,7 +128,7 @@ def fixed_url(
 def reached_hosts(plan: Plan, own: Collection[str]) -> Mapping[str, int]:
     """Return the other hosts of a system that are looked for by address, beside multicast.
 
-    A router does not pass multicast. Where discovery finds whoever comes, beyond this host, the
+    A router does not pass multicast. Where discovery finds any participant, beyond this host, the
     addresses of `machines:` are as good as ROS_STATIC_PEERS; other modes have their own peers.
     IPv6 hosts are found by multicast only: rmw_fastrtps resolves no IPv6 address of a peer.
 

@@ -1,14 +1,12 @@
-"""How the nodes' own participants and the supervisors' observers find each other.
+"""Plan the control plane: discovery transport, discovery server, URLs and ports of participants.
 
-Owns: what `discovery:` comes to: the transport of the control plane, the discovery server, and for
-every own participant the connection URLs with ports that are given out in the plan's order
-(metatraffic, user data, source port; observers first, then processes, then extra participants).
-Pure.
-
-How supervisors' own participants are connected, so that they see what they must judge. Owns:
-`connect_observers`. An observer is on the control plane like the nodes' own participants; for
-connections by other transports it gets those as well, as far as one participant can have them:
-where ports are fixed, not shared memory beside UDP.
+Owns: what `discovery:` results in: the transport of the control plane, the discovery server, and
+for every own participant of a node the connection URLs with ports that are given out in the plan's
+order (metatraffic, user data, source port; observers first, then processes, then extra
+participants); and `connect_observers`, so that supervisors' own participants see what they must
+judge. An observer is on the control plane like the nodes' own participants; for connections by
+other transports it gets those as well, as far as one participant can have them: where ports are
+fixed, not shared memory beside UDP. Pure.
 """
 
 from __future__ import annotations
@@ -54,7 +52,7 @@ class Control:
 def control_transport(discovery: Discovery, hosts: Hosts) -> FlowTransport:
     """Return what own participants use: as declared, else what the mode needs.
 
-    ANY leaves it to the RMW. With endpoints known without being told, one host needs no more than
+    ANY leaves it to the RMW. With endpoints known without announcement, one host needs no more than
     shared memory for everything else.
     """
     if discovery.transport is not FlowTransport.ANY or discovery.mode is DiscoveryMode.DYNAMIC:
@@ -67,7 +65,7 @@ def control_transport(discovery: Discovery, hosts: Hosts) -> FlowTransport:
 
 
 def is_fixed(discovery: Discovery) -> bool:
-    """Whether participants have planned ports and find nobody but planned peers."""
+    """Whether participants have planned ports and find only planned peers."""
     return discovery.mode in _FIXED
 
 
@@ -77,7 +75,7 @@ def connect_control(
     """Connect own participants, extra ones without connection, and observers.
 
     Args:
-        nodes: of the whole system; a participant that stands for a declared connection has its URLs
+        nodes: of the whole system; a participant of a declared connection has its URLs
             already and is left alone, and so are all extra ones where endpoints are static: they
             carry data and become connections (`static_endpoints`).
         discovery: as declared.
@@ -127,7 +125,7 @@ def _server(discovery: Discovery, hosts: Hosts, pool: PortPool, *, tcp: bool) ->
 def _everywhere(
     nodes: Sequence[PlannedNode], connections: ParticipantConnections, *, extra: bool
 ) -> tuple[PlannedNode, ...]:
-    """Connect all own participants and the extra ones that stand for no connection alike."""
+    """Connect all own participants and the extra ones without a connection alike."""
     return tuple(
         dataclasses.replace(
             node,
@@ -224,8 +222,8 @@ def _urls(
     order = {key: index for index, key in enumerate(alone)}
 
     def looks_for(key: tuple[str, str, str], other: tuple[str, str, str]) -> bool:
-        # Two ends that dial each other refuse both connections (Fast DDS 2.14). Observers come
-        # first, so whoever dials them finds them there.
+        # Two ends that dial each other refuse both connections (Fast DDS 2.14). Observers are
+        # first, so that they are there when dialled.
         return order[other] < order[key] if kind is Medium.TCPV4 else other != key
 
     return {
@@ -266,7 +264,7 @@ def connect_observers(
         nodes: with all their connections.
         hosts: of the system.
         control: what own participants have.
-        fixed: nobody is found by multicast.
+        fixed: nothing is found by multicast.
         may_use_tcp: connections that are not planned may use TCP.
 
     Returns:
@@ -282,7 +280,7 @@ def connect_observers(
     kinds = {url.transport.unicast for _, url in urls if url.transport.is_network}
     if may_use_tcp:
         kinds.add(Medium.TCPV4)
-    # Whoever is found by multicast, or looks for the observer, need not be looked for.
+    # A peer found by multicast, or that looks for the observer, need not be looked for.
     ours = {
         contact.peer
         for host, each in with_tcp(control, hosts)
@@ -318,7 +316,7 @@ def _observer(  # noqa: PLR0917 - all are needed, and it is called once
     hosts: Hosts,
 ) -> ParticipantConnections:
     if control.server is not None:
-        return base  # it is told of everything
+        return base  # the server announces everything to it
     own = {contact.peer for contact in contacts_of(host, base.urls)}
     wanted = [each for each in contacts if each.peer not in own]
     urls = _base_urls(base)

@@ -1,12 +1,10 @@
-"""Which machines are one host, where it is reached, and which of its ports are given out.
+"""Hosts of a plan: machines by address, port allocation, and DDS participants and ports per host.
 
-Owns: `Hosts` and `PortPool`. Machines of one address are one host, and so are those of none, which
-stand for this host. Ports are given out in a fixed order, so that equal plans have equal ports.
+Owns: `Hosts`, `PortPool`, and counting the participants of each machine. Machines of one address
+are one host, and so are those without one, which mean this host. Ports are given out in a fixed
+order, so that equal plans have equal ports. Ports that are not planned are those of the DDS
+formula; a busy one is replaced when it is bound, so the real ones are read from the running system.
 Pure.
-
-What a plan asks of its machines: participants and the UDP ports they will ask for. Owns:
-counting the participants of each machine. The ports are those of the formula; a busy one is
-replaced when it is taken, so the real ones are read from the running system.
 """
 
 from __future__ import annotations
@@ -65,7 +63,7 @@ class Hosts:
         return len(self.used) > 1
 
     def address(self, host: str, *, ipv6: bool = False) -> str:
-        """Return what others reach a host by; loopback where nobody else is.
+        """Return what others reach a host by; loopback if it is the only host.
 
         Args:
             host: one of `used`.
@@ -135,7 +133,7 @@ class PortPool:
         )
 
     def reserve(self, hosts: Iterable[str], port: int) -> None:
-        """Give a port to somebody who has chosen it."""
+        """Take a port that was chosen elsewhere."""
         for host in hosts:
             self._taken.setdefault(host, set()).add(port)
 

@@ -1,6 +1,6 @@
-"""Endpoints that are known without being announced (Fast DDS, STATIC EDP).
+"""Static endpoint discovery (Fast DDS STATIC EDP): endpoints known without being announced.
 
-Owns: the connection `data` that carries a node's topics in that mode, and the table of everybody's
+Owns: the connection `data` that carries a node's topics in that mode, and the table of all
 endpoints: DDS names, ids that are unique in the system, and rmw_fastrtps's own topic
 `ros_discovery_info` of each participant. Pure.
 """
@@ -33,7 +33,7 @@ MAX_USER_ID = 32767
 """Fast DDS 2.14 reads ids of endpoints as int16_t."""
 
 GRAPH_TOPIC = "ros_discovery_info"
-"""By which rmw tells who owns an endpoint; every participant has a writer and a reader of it."""
+"""By which rmw maps endpoints to nodes; every participant has a writer and a reader of it."""
 
 GRAPH_TYPE = "rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_"
 
@@ -43,7 +43,7 @@ def place_static(
 ) -> tuple[PlannedNode, ...]:
     """Put every topic that no declared connection carries onto a connection with fixed ports.
 
-    A participant that tells a publisher's flow apart becomes a connection as well.
+    A participant that makes a publisher's flow unique becomes a connection as well.
 
     Raises:
         PlanError: too few ports, or more endpoints than there are ids.

@@ -1,16 +1,13 @@
-"""The data layer of a plan: control plane, declared and negotiated connections, put together.
+"""Wire a plan: connect participants, place endpoints on declared or negotiated connections.
 
 Owns: `wire`, in this order: ports that are written down are kept free, own participants and
-observers are connected, endpoints are negotiated for, observers learn to see the outcome. Pure.
+observers are connected, endpoints are negotiated for, observers are extended to see the result.
+Placing a node's endpoints on the connections that `connections:` declares for it, with what
+`flows:` asks of them. Pure.
 
-What a wired plan asks of participants that they cannot do. Owns: `infeasible`. Services and
-actions whose two ends have no transport in common, marks and ports of their own where no UDP
-socket is. Topics are negotiated, which finds the like (`negotiate`); what is negotiated while
-the system runs is judged there.
-
-Connections that a manifest spells out → participants of the plan. Owns: placing a node's
-endpoints on the connections that `connections:` declares for it, with what `flows:` asks of
-them.
+Also `infeasible`, what a wired plan asks of participants that they cannot do: services and actions
+whose two ends have no transport in common, marks and ports of their own where no UDP socket is. For
+topics `negotiate` finds the like; what is negotiated while the system runs is judged there.
 """
 
 from __future__ import annotations
@@ -93,7 +90,7 @@ def infeasible(
 
 
 class _Carriers:
-    """Knows by which transports an endpoint can be reached; nothing where nobody knows."""
+    """Knows by which transports an endpoint can be reached; nothing where that is unknown."""
 
     def __init__(self, parties: Mapping[str, Party]) -> None:
         self._parties = parties
@@ -210,7 +207,7 @@ def wire(
     nodes, control = connect_control(nodes, discovery, hosts, pool)
     if discovery.mode is DiscoveryMode.STATIC_ENDPOINTS:
         nodes = place_static(nodes, hosts, pool)
-    # Who can come at any time must say so where others work out connections from it.
+    # A node that can join at any time must announce it where others work out connections from it.
     comes_and_goes = (
         discovery.mode is DiscoveryMode.DYNAMIC and data_layer.source is DataLayerSource.DYNAMIC
     )
@@ -320,7 +317,7 @@ def _by_machine(
 
 
 def _may_use_tcp(nodes: Sequence[PlannedNode], flows: Sequence[PlannedFlow]) -> bool:
-    """Whether something says that TCP may be negotiated while the system runs."""
+    """Whether anything declares that TCP may be negotiated while the system runs."""
     wishes = {each.transport for each in flows}
     wishes |= {each.transport for node in nodes for each in node.endpoints}
     reliable = any(each.lossy is False for node in nodes for each in node.endpoints)

@@ -1,7 +1,7 @@
-"""The data layer graph: who takes part, what was negotiated, and what changes between two of them.
+"""The data layer graph: parties, negotiated connections and mappings, and the diff of two graphs.
 
-Owns: `Party`, `Terms` and `DataLayerGraph`. The rules are `media`'s, and `negotiate`
-applies them. Pure.
+Owns: `Party`, `Terms` and `DataLayerGraph`. The rules are in `media`, and `negotiate` applies them.
+Pure.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class PartyEndpoint:
         alone: it shares its participant with no other.
         group: endpoints that may share a participant have the same.
         transport: what its node's manifest asks for.
-        lossy: the data bear an unreliable transport; None if nobody said.
+        lossy: the data bear an unreliable transport; None if not declared.
         size_bytes: largest serialized message; None if not known.
     """
 
@@ -68,7 +68,7 @@ class Party:
         host: its host, see `lifecycle.plan.connections.hosts`; parties of equal hosts share memory.
         process: unique on the host.
         transports: all that it can be connected by.
-        own: transports of its own participant; empty if nobody knows them.
+        own: transports of its own participant; empty if not known.
         connectable: `connect_to` is there to be called.
         connections: names that are taken.
         contacts: where its own participant is reached.
@@ -93,7 +93,7 @@ class Terms:
     """What a system's data layer is made under.
 
     Attributes:
-        fixed: every port is planned, and nobody is found by multicast.
+        fixed: every port is planned, and nothing is found by multicast.
         server: the discovery server that every connection must know; None without.
         server_medium: it listens on TCPV4 or UDPV4.
         first_port: first of the ports given out, per host.
@@ -120,7 +120,7 @@ class NegotiatedFlow:
     Attributes:
         publisher: key of the publishing party.
         subscription: key of the subscribing party.
-        medium: as `PlannedFlow.medium`; empty where the RMW decides and nobody knows.
+        medium: as `PlannedFlow.medium`; empty where the RMW decides and it is not known.
         reason: one phrase for people.
     """
 
@@ -138,7 +138,7 @@ class NegotiatedConnection:
     Attributes:
         node: key of the party.
         name: unique in the node.
-        urls: what `connect_to` is told.
+        urls: the arguments of `connect_to`.
         map: labels of the endpoints that it carries, `publishers/video`, sorted.
         reason: one phrase for people.
     """

@@ -1,4 +1,4 @@
-"""What carries data between two nodes: the rules of negotiation for one pair.
+"""Which transport carries a publisher → subscription pair: the rules of negotiation for one pair.
 
 Owns: `carried`, what Fast DDS does with two participants, and `choose`, which medium a pair gets
 and why. Pure.
@@ -20,7 +20,7 @@ class Pair:
     """A publisher and a subscription of one topic.
 
     Attributes:
-        link: what a link says must carry it.
+        link: the transport that a link demands.
     """
 
     publisher: Party
@@ -56,7 +56,7 @@ class Choice:
     """What a pair gets.
 
     Attributes:
-        medium: as `PlannedFlow.medium`; empty if nobody knows, or with a problem.
+        medium: as `PlannedFlow.medium`; empty if not known, or with a problem.
         reason: one phrase for people.
         problem: why nothing can carry it; starts with "cannot".
         hint: what may help.
@@ -75,7 +75,7 @@ def carried(writer: Collection[str], reader: Collection[str], *, same_host: bool
     more than one means that it arrives twice.
 
     Args:
-        writer: transports of one participant, words of media; a group is
+        writer: transports of one participant, values of Medium; a group is
             `udpm@239.255.1.9:7901`.
         reader: of the other one.
         same_host: whether they share memory and loopback.
@@ -90,7 +90,7 @@ def carried(writer: Collection[str], reader: Collection[str], *, same_host: bool
     if same_host and groups & {*reader}:
         found.add(Medium.UDPM)
     elif _has_ipv4(writer, same_host=same_host) and _has_ipv4(reader, same_host=same_host):
-        # A group with TTL 0 also receives what comes to loopback by unicast.
+        # A group with TTL 0 also receives what is sent to loopback by unicast.
         found.add(Medium.UDPV4)
     found |= {each for each in (Medium.UDPV6, Medium.TCPV4) if each in writer and each in reader}
     return sorted(found)
@@ -155,7 +155,7 @@ def choose(
 
 
 def _common_ground(pair: Pair) -> str:
-    """Return why the two cannot talk whatever carries it; empty if they can."""
+    """Return why the two cannot communicate whatever carries it; empty if they can."""
     one, other = pair.publisher, pair.subscription
     for word, mine, theirs in (
         ("wire format", one.serializations, other.serializations),

@@ -1,12 +1,10 @@
-"""Negotiation: node configurations, placement and hints → the data layer graph.
+"""Negotiate transports and connections: node configurations, placement, hints → data layer graph.
 
 Owns: `negotiate`, which chooses a medium for every publisher → subscription pair and gives a node a
-connection only where its own participant would not carry the data anyway. Deterministic, and
-independent of the order of the parties. Pure.
-
-Connections of negotiated endpoints: as few as carry them, with names, ports, groups and URLs.
-Owns: `connections_of`. What exists already keeps its name and, while its transports are the
-same, its URLs.
+connection only where its own participant would not carry the data anyway; `connections_of`, as few
+connections as carry the endpoints, with names, ports, groups and URLs. What exists already keeps
+its name and, while its transports are the same, its URLs. Deterministic, and independent of the
+order of the parties. Pure.
 """
 
 from __future__ import annotations
@@ -40,7 +38,7 @@ from lifecycle.plan.negotiation.media import (
 )
 
 GROUP_PORTS_FROM = 1000
-"""How far above `first_port` the ports of groups begin: out of the way of everybody's own."""
+"""How far above `first_port` the ports of groups begin: out of the way of participants' own."""
 
 _NOT_WORD = re.compile(r"[^A-Za-z0-9]+")
 
@@ -51,7 +49,7 @@ class Wanted:
 
     Attributes:
         transports: what its connection must have; a group is `udpm@/topic`.
-        partners: (party, kind, endpoint) of everybody whom it exchanges data with.
+        partners: (party, kind, endpoint) of all that it exchanges data with.
     """
 
     party: Party
@@ -90,7 +88,7 @@ def connections_of(
 
     Args:
         wanted: the endpoints.
-        parties: everybody who takes part.
+        parties: all that take part.
         terms: what the system gives.
         before: what is there already.
 
@@ -325,7 +323,7 @@ class _Writer:
 
 
 Wishes = Mapping[tuple[str, str, str], FlowTransport]
-"""What links say: (topic, key of the publishing party, key of the subscribing one)."""
+"""What links demand: (topic, key of the publishing party, key of the subscribing one)."""
 
 _Key = tuple[str, EndpointKind, str]
 
@@ -339,13 +337,13 @@ def negotiate(
 ) -> DataLayerGraph:
     """Choose how data get from every publisher to every subscription of its topic.
 
-    In this order: what a link says, what the publisher asks for, what the subscription asks for,
+    In this order: what a link demands, what the publisher asks for, what the subscription asks for,
     the same process, the same host, another host (see `media.py`). What cannot be made
     is a problem; everything else is negotiated all the same.
 
     Args:
         parties: nodes with their endpoints, in any order.
-        wishes: what links say.
+        wishes: what links demand.
         terms: what the system gives.
         before: what is there already: connections that still fit keep their names, ports, groups
             and URLs, so that little is made anew.
@@ -456,7 +454,7 @@ def _problem(pair: Pair, message: str, hint: str = "") -> NegotiationProblem:
 
 
 def _foreign(pair: Pair) -> bool:
-    """Whether an end of a pair has a participant that nobody here makes."""
+    """Whether an end of a pair has a participant that is not made here."""
     return not (pair.publisher.connectable and pair.subscription.connectable)
 
 
@@ -595,7 +593,7 @@ class _PairCarriers:
         )
 
     def _partners(self, key: _Key) -> set[tuple[str, str, str]]:
-        """Return (party, kind, endpoint) of everybody whom an endpoint exchanges data with."""
+        """Return (party, kind, endpoint) of all that an endpoint exchanges data with."""
         found = set()
         for pair, _ in self._chosen:
             ends = (_writer(pair), _reader(pair))

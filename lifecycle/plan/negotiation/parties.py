@@ -1,9 +1,8 @@
-"""Nodes of a plan as parties of a negotiation, and what was negotiated back in the plan.
+"""Nodes of a plan as parties of a negotiation, the terms of the system, and the result in the plan.
 
-Owns: `party_of_node`, `place_negotiated` and the wishes that links make. Pure.
-
-What a plan gives to a negotiation, before anything runs and while it does. Owns: `terms_of` and
-`Terms` of a plan in the making: ports that are taken, groups, observers.
+Owns: `party_of_node`, `place_negotiated` and the wishes that links make; `terms_of` and `Terms` of
+a plan in the making: ports that are taken, groups, observers. It is used before anything runs and
+while it does. Pure.
 """
 
 from __future__ import annotations
@@ -66,7 +65,7 @@ def _transport(url: ConnectionUrl) -> str:
 
 
 def wishes_of(flows: Iterable[PlannedFlow]) -> Mapping[tuple[str, str, str], FlowTransport]:
-    """Return what links say must carry each pair."""
+    """Return the transport that links demand for each pair."""
     return {
         (each.topic, each.publisher, each.subscription): each.transport
         for each in flows
@@ -83,7 +82,7 @@ def party_of_node(
     """Return a node as a party, from what its manifest declares alone.
 
     Args:
-        node: its participants that are declared or tell flows apart in place, no negotiated ones.
+        node: its participants that are declared or make flows unique in place, no negotiated ones.
         hosts: of the system.
         rmw: the RMW identifier that it runs with.
         variables: what a COMMAND node's process gets beside its own.
@@ -107,7 +106,7 @@ def party_of_node(
 
 
 def _by_variable(node: PlannedNode, variables: Mapping[str, str]) -> tuple[str, ...]:
-    """Return the transports that variables give a node; () for a word of another kind."""
+    """Return the transports that variables give a node; () for any other value."""
     environment = dict(node.run.environment)
     if node.run.kind is RunKind.COMMAND:
         environment = {**variables, **environment}
@@ -142,8 +141,8 @@ def endpoint_of(node: PlannedNode, each: PlannedEndpoint) -> PartyEndpoint:
 def place_negotiated(node: PlannedNode, connections: Sequence[NegotiatedConnection]) -> PlannedNode:
     """Give a node the connections that were negotiated for it.
 
-    An extra participant that told a publisher's flow apart and carries none any more goes; what it
-    was to do, the publisher's connection does.
+    An extra participant that made a publisher's flow unique and carries none any more is removed;
+    the publisher's connection takes its purpose.
     """
     places: dict[str, NegotiatedConnection] = {
         label: each for each in connections for label in each.map
