@@ -24,7 +24,7 @@ from xml.etree import ElementTree as ET
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds import url_profile
-from lifecycle.middleware.fastdds.profiles import DEFAULT_FILE, PROFILES_FILE_VARIABLE, text
+from lifecycle.middleware.fastdds.profiles import DEFAULT_FILE, PROFILES_FILE_VARIABLE
 from lifecycle.middleware.fastdds.profiles import child as _child
 from lifecycle.middleware.fastdds.profiles import text as _text
 from lifecycle.network.connection_url import ConnectionUrl
@@ -44,18 +44,18 @@ def endpoint_table(participants: Sequence[StaticParticipant]) -> str:
     root = ET.Element("staticdiscovery")
     for participant in participants:
         element = ET.SubElement(root, "participant")
-        text(element, "name", participant.name)
+        _text(element, "name", participant.name)
         for endpoint in participant.endpoints:
             _check(endpoint, participant, seen)
             line = ET.SubElement(element, "writer" if endpoint.writer else "reader")
-            text(line, "userId", str(endpoint.user_id))
-            text(line, "topicName", endpoint.topic)
-            text(line, "topicDataType", endpoint.type)
-            text(line, "topicKind", "NO_KEY")
+            _text(line, "userId", str(endpoint.user_id))
+            _text(line, "topicName", endpoint.topic)
+            _text(line, "topicDataType", endpoint.type)
+            _text(line, "topicKind", "NO_KEY")
             reliability = "RELIABLE" if endpoint.reliable else "BEST_EFFORT"
-            text(line, "reliabilityQos", f"{reliability}_RELIABILITY_QOS")
+            _text(line, "reliabilityQos", f"{reliability}_RELIABILITY_QOS")
             durability = "TRANSIENT_LOCAL" if endpoint.transient_local else "VOLATILE"
-            text(line, "durabilityQos", f"{durability}_DURABILITY_QOS")
+            _text(line, "durabilityQos", f"{durability}_DURABILITY_QOS")
     return ET.tostring(root, encoding="unicode")
 
 
@@ -66,7 +66,7 @@ def endpoint_profiles(endpoints: Sequence[StaticEndpoint]) -> str:
     for endpoint in endpoints:
         tag = "data_writer" if endpoint.writer else "data_reader"
         element = ET.SubElement(profiles, tag, profile_name=endpoint.profile)
-        text(element, "userDefinedID", str(endpoint.user_id))
+        _text(element, "userDefinedID", str(endpoint.user_id))
     return ET.tostring(root, encoding="unicode", xml_declaration=True)
 
 

@@ -1,19 +1,15 @@
-"""Hidden nodes: a DDS participant with nothing on it but what was requested, and their spin thread.
+"""Hidden nodes: a DDS participant with nothing on it but what was requested.
 
-Owns: how such a node and its context are made, which of them this process has, and the thread that
-spins one beside the program's own loop.
+Owns: how such a node and its context are made, and which of them this process has.
 """
 
 from __future__ import annotations
 
-import logging
 import os
-import threading
 import weakref
 from collections.abc import Sequence
 
 import rclpy
-from rclpy.executors import ExternalShutdownException, ShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
@@ -89,33 +85,3 @@ def hidden_nodes() -> tuple[Node, ...]:
 def forget_hidden(node: Node) -> None:
     """No longer list a node that is about to be destroyed; again is harmless."""
     _hidden.discard(node)
-
-
-_logger = logging.getLogger(__name__)
-
-
-class Spinner:
-    """Spins one node in a thread, from now until `stop` or the end of its context.
-
-    Args:
-        node: an observer's, spun by nothing else.
-        thread: its name.
-    """
-
-    def __init__(self, node: Node, *, thread: str) -> None:
-        # Never EventsExecutor: on Jazzy's wheels it spins at full load and loses every call.
-        self._executor = SingleThreadedExecutor(context=node.context)
-        self._executor.add_node(node)
-        self._thread = threading.Thread(target=self._spin, name=thread, daemon=True)
-        self._thread.start()
-
-    def stop(self) -> None:
-        """End the thread; again is harmless."""
-        self._executor.shutdown()
-        self._thread.join()
-
-    def _spin(self) -> None:
-        try:
-            self._executor.spin()
-        except (ExternalShutdownException, ShutdownException):
-            _logger.debug("the context was shut down")

@@ -99,51 +99,37 @@ class ServiceCalls:
             ServiceUnansweredError: at the deadline, or as soon as the service is forgotten.
         """
         try:
-            return await self._call(
-                service, type_, request, timeout_s=timeout_s, repeat=repeat, before=before
-            )
+            loop = asyncio.get_running_loop()
+            deadline = loop.time() + timeout_s
+            client = self._client(service, type_)
+            if not await self._found(client, service, deadline):
+                raise ServiceUnansweredError(service, found=False, timeout_s=timeout_s)
+            if before is not None:
+                await before()
+            answer: asyncio.Future[Any] = loop.create_future()
+
+            def arrived(pending: Future) -> None:
+                with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
+                    loop.call_soon_threadsafe(_deliver, answer, pending)
+
+            attempt_s = _FIRST_ATTEMPT_S if repeat else timeout_s
+            sent = []
+            try:
+                while (left_s := deadline - loop.time()) > 0:
+                    sent.append(client.call_async(request))
+                    sent[-1].add_done_callback(arrived)
+                    await asyncio.wait((answer,), timeout=min(attempt_s, left_s))
+                    if answer.done():
+                        return answer.result()
+                    attempt_s = min(2 * attempt_s, _LONGEST_ATTEMPT_S)
+            finally:
+                for pending in sent:
+                    client.remove_pending_request(pending)
+                answer.cancel()
+            raise ServiceUnansweredError(service, found=True, timeout_s=timeout_s)
         except InvalidHandle as error:
             # Its node left, and its client was destroyed meanwhile.
             raise ServiceUnansweredError(service, found=False, timeout_s=timeout_s) from error
-
-    async def _call(
-        self,
-        service: str,
-        type_: type[Any],
-        request: object,
-        *,
-        timeout_s: float,
-        repeat: bool,
-        before: Callable[[], Awaitable[None]] | None,
-    ) -> Any:
-        loop = asyncio.get_running_loop()
-        deadline = loop.time() + timeout_s
-        client = self._client(service, type_)
-        if not await self._found(client, service, deadline):
-            raise ServiceUnansweredError(service, found=False, timeout_s=timeout_s)
-        if before is not None:
-            await before()
-        answer: asyncio.Future[Any] = loop.create_future()
-
-        def arrived(pending: Future) -> None:
-            with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
-                loop.call_soon_threadsafe(_deliver, answer, pending)
-
-        attempt_s = _FIRST_ATTEMPT_S if repeat else timeout_s
-        sent = []
-        try:
-            while (left_s := deadline - loop.time()) > 0:
-                sent.append(client.call_async(request))
-                sent[-1].add_done_callback(arrived)
-                await asyncio.wait((answer,), timeout=min(attempt_s, left_s))
-                if answer.done():
-                    return answer.result()
-                attempt_s = min(2 * attempt_s, _LONGEST_ATTEMPT_S)
-        finally:
-            for pending in sent:
-                client.remove_pending_request(pending)
-            answer.cancel()
-        raise ServiceUnansweredError(service, found=True, timeout_s=timeout_s)
 
     def open(self, service: str, type_: type[Any]) -> bool:
         """Make the client of a service now; False if there is one already."""

@@ -19,7 +19,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from lifecycle.codec import from_json, to_json
-from lifecycle.errors import LifecycleError, UsageError
+from lifecycle.errors import UsageError
 from lifecycle.programming.apply.errors import ProgrammingError
 from lifecycle.run_directory import (
     LEDGER_LOCK_NAME,
@@ -237,13 +237,6 @@ def digest_of(*parts: str) -> str:
     """Return a digest of texts: 16 hex digits, enough to distinguish changes."""
     whole = hashlib.sha256("\0".join(parts).encode())
     return whole.hexdigest()[:16]
-
-
-def as_programming_error(error: LifecycleError | OSError) -> LifecycleError:
-    """Return any failure as one of ours, for reports that list several."""
-    return (
-        error if isinstance(error, LifecycleError) else ProgrammingError(f"cannot go on: {error}")
-    )
 
 
 def _own_directory(path: Path) -> None:

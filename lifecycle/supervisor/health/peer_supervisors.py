@@ -103,16 +103,16 @@ class _PeerSupervisor:
 class PeerSupervisors:
     """Watches the peers that a system depends on; `open` it in a loop and `close` it."""
 
-    def __init__(self, system: System, air: AliveExchange) -> None:
+    def __init__(self, system: System, exchange: AliveExchange) -> None:
         self._system = system
-        self._air = air
+        self._exchange = exchange
         self._loop = asyncio.get_running_loop()
         self._closed = False
         self._known: list[_PeerSupervisor] = []
         self._machines: list[_PeerSupervisor] = []
-        self._ears: list[AliveReceiver] = []
+        self._watches: list[AliveReceiver] = []
         self._attached: tuple[str, ...] = ()
-        self._voices: list[AliveSender] = []
+        self._announcements: list[AliveSender] = []
         self._said: Mapping[str, str] = {}
         self._missing: dict[str, _PeerSupervisor] = {}
         self._calling: asyncio.Task[None] | None = None
@@ -129,30 +129,32 @@ class PeerSupervisors:
                 what = f"the supervisor of machine {machine!r}"
                 self._machines.append(_PeerSupervisor(what, machine, tuple(nodes)))
                 listener = self._listener(self._machines[-1])
-                self._ears.append(self._air.watch_machine(plan.system, machine, listener))
+                self._watches.append(self._exchange.watch_machine(plan.system, machine, listener))
         self._attached = self._attached_nodes()
         for name in self._attached:
             listener = self._listener(_PeerSupervisor(repr(name), "", (name,)))
-            self._ears.append(self._air.watch_node(name, listener))
+            self._watches.append(self._exchange.watch_node(name, listener))
         if remote:
             own = dict.fromkeys(node.planned.machine for node in self._system.nodes.values())
-            self._voices = [self._air.announce_machine(plan.system, each) for each in own if each]
+            self._announcements = [
+                self._exchange.announce_machine(plan.system, each) for each in own if each
+            ]
             self._system.liveliness.listen(self._tell)
 
     def renew(self) -> None:
         """Follow the attached nodes of the plan as it is now, where they are others."""
         if self._attached == self._attached_nodes():
             return
-        for each in (*self._ears, *self._voices):
+        for each in (*self._watches, *self._announcements):
             each.destroy()
-        self._ears.clear()
-        self._voices.clear()
+        self._watches.clear()
+        self._announcements.clear()
         self._machines.clear()
         self._missing.clear()
-        for neighbour in self._known:
+        for peer in self._known:
             # The return of one that is no longer planned is never reported.
             for cause in (Cause.LOST, Cause.TOLD):
-                self._system.liveliness.came_back(neighbour.nodes, cause)
+                self._system.liveliness.came_back(peer.nodes, cause)
         self._known.clear()
         self.open()
 
@@ -173,19 +175,19 @@ class PeerSupervisors:
         self._closed = True
         tasks = [*self._tasks, *([self._calling] if self._calling else [])]
         await ended(*tasks)
-        for each in (*self._ears, *self._voices):
+        for each in (*self._watches, *self._announcements):
             each.destroy()
-        self._ears.clear()
-        self._voices.clear()
+        self._watches.clear()
+        self._announcements.clear()
 
-    def _listener(self, neighbour: _PeerSupervisor) -> Listener:
-        self._known.append(neighbour)
+    def _listener(self, peer: _PeerSupervisor) -> Listener:
+        self._known.append(peer)
 
         def soon(do: Callable[..., None]) -> Callable[..., None]:
             def in_loop(*arguments: object) -> None:
                 # A receiver that was destroyed may have had a callback on its way.
-                if any(each is neighbour for each in self._known):
-                    do(neighbour, *arguments)
+                if any(each is peer for each in self._known):
+                    do(peer, *arguments)
 
             def call(*arguments: object) -> None:
                 with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
@@ -195,57 +197,55 @@ class PeerSupervisors:
 
         return Listener(heard=soon(self._heard), left=soon(self._left), told=soon(self._told))
 
-    def _heard(self, neighbour: _PeerSupervisor, heard: bool) -> None:
-        if self._closed or heard is neighbour.heard:
+    def _heard(self, peer: _PeerSupervisor, heard: bool) -> None:
+        if self._closed or heard is peer.heard:
             return
-        neighbour.heard = heard
+        peer.heard = heard
         if heard:
-            self._found(neighbour)
+            self._found(peer)
         else:
-            self._lost(neighbour)
+            self._lost(peer)
 
-    def _lost(self, neighbour: _PeerSupervisor) -> None:
-        neighbour.lost_at_s = self._loop.time()
-        if neighbour.machine:
-            self._system.emit(MachineConnection(machine=neighbour.machine, established=False))
-        detail = f"{neighbour.what} is not heard any more"
-        self._system.liveliness.fell_silent(neighbour.nodes, Cause.LOST, detail)
-        self._missing[neighbour.what] = neighbour
-        self._air.send_again_soon()
+    def _lost(self, peer: _PeerSupervisor) -> None:
+        peer.lost_at_s = self._loop.time()
+        if peer.machine:
+            self._system.emit(MachineConnection(machine=peer.machine, established=False))
+        detail = f"{peer.what} is not heard any more"
+        self._system.liveliness.fell_silent(peer.nodes, Cause.LOST, detail)
+        self._missing[peer.what] = peer
+        self._exchange.send_again_soon()
         self._start(self._have_hosts(Operation.SEND_AGAIN_SOON))
         if self._calling is None:
             self._calling = asyncio.ensure_future(self._call())
 
-    def _found(self, neighbour: _PeerSupervisor) -> None:
+    def _found(self, peer: _PeerSupervisor) -> None:
         lost_s = 0.0
-        if neighbour.lost_at_s is not None:
-            lost_s = self._loop.time() - neighbour.lost_at_s
-            self._missing.pop(neighbour.what, None)
+        if peer.lost_at_s is not None:
+            lost_s = self._loop.time() - peer.lost_at_s
+            self._missing.pop(peer.what, None)
             # DDS may have forgotten the names of those whom it lost for long.
-            self._air.tell_names()
+            self._exchange.tell_names()
             self._start(self._have_hosts(Operation.TELL_NAMES))
-        neighbour.lost_at_s = None
-        if neighbour.machine:
+        peer.lost_at_s = None
+        if peer.machine:
             self._system.emit(
-                MachineConnection(machine=neighbour.machine, established=True, lost_s=lost_s)
+                MachineConnection(machine=peer.machine, established=True, lost_s=lost_s)
             )
-        self._system.liveliness.came_back(neighbour.nodes, Cause.LOST)
+        self._system.liveliness.came_back(peer.nodes, Cause.LOST)
 
-    def _left(self, neighbour: _PeerSupervisor) -> None:
+    def _left(self, peer: _PeerSupervisor) -> None:
         """It left properly, or DDS forgot it after it was lost."""
-        if self._closed or not neighbour.heard:
+        if self._closed or not peer.heard:
             return
-        neighbour.heard = False
-        if neighbour.machine:
-            self._system.emit(
-                MachineConnection(machine=neighbour.machine, established=False, left=True)
-            )
-        self._system.liveliness.came_back(neighbour.nodes, Cause.TOLD)
+        peer.heard = False
+        if peer.machine:
+            self._system.emit(MachineConnection(machine=peer.machine, established=False, left=True))
+        self._system.liveliness.came_back(peer.nodes, Cause.TOLD)
 
-    def _told(self, neighbour: _PeerSupervisor, silent: Mapping[str, str]) -> None:
+    def _told(self, peer: _PeerSupervisor, silent: Mapping[str, str]) -> None:
         if self._closed:
             return
-        for name in neighbour.nodes:
+        for name in peer.nodes:
             if name in silent:
                 self._system.liveliness.fell_silent((name,), Cause.TOLD, silent[name])
             else:
@@ -264,7 +264,7 @@ class PeerSupervisors:
         for pause_s in (*SAID_AGAIN_S, None):
             if silent is not self._said:
                 return
-            for voice in self._voices:
+            for voice in self._announcements:
                 voice.tell(silent)
             if pause_s is not None:
                 await asyncio.sleep(pause_s)
@@ -274,7 +274,7 @@ class PeerSupervisors:
         machines = {each.name: each.address for each in self._system.plan.machines}
         while self._missing:
             names = (each.machine for each in self._missing.values())
-            self._air.call_out([a for name in names if (a := machines.get(name, ""))])
+            self._exchange.call_out([a for name in names if (a := machines.get(name, ""))])
             await asyncio.sleep(CALL_EACH_S)
         self._calling = None
 
