@@ -24,7 +24,7 @@ from pathlib import Path
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import UsageError
-from lifecycle.plan.model import Plan
+from lifecycle.plan import Plan
 
 RUN_VARIABLE = "LIFECYCLE_RUN"
 """Set in every process of a run, with the run's id: what proves that a process is ours."""

@@ -50,7 +50,7 @@ class _Verbs(click.Group):
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Look first whether a verb that needs the RMW can have it."""
         if args and args[0] in _PARTICIPANTS and not {"-h", "--help"} & {*args}:
-            from lifecycle.middleware.rcl.rmw_choice import check_rmw
+            from lifecycle.middleware import check_rmw
 
             check_rmw(os.environ)
         return super().resolve_command(ctx, args)

@@ -13,7 +13,7 @@ from lifecycle.printable import lines
 
 if TYPE_CHECKING:
     from lifecycle.manifest import Loaded, Manifest
-    from lifecycle.plan.programs import Resolution
+    from lifecycle.plan import Resolution
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -100,8 +100,8 @@ def resolve(manifest: Manifest, machine: str = "") -> Resolution:
     Raises:
         UsageError: the manifest declares no such machine.
     """
-    from lifecycle.plan.programs import resolve_programs
-    from lifecycle.supervisor.run.options import own_machines
+    from lifecycle.plan import resolve_programs
+    from lifecycle.supervisor import own_machines
 
     own = own_machines(manifest, machine)
     return resolve_programs(manifest, environment=os.environ, is_ours=own.__contains__)

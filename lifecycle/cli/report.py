@@ -230,7 +230,7 @@ class ReportFile:
 
 def exit_code_of(error: BaseException) -> ExitCode:
     """Return the exit code of a command that ended by an exception."""
-    from lifecycle.supervisor.run.signals import Ended
+    from lifecycle.supervisor import Ended
 
     if isinstance(error, LifecycleError | Ended):
         return error.exit_code
@@ -242,7 +242,7 @@ def exit_code_of(error: BaseException) -> ExitCode:
 def _verdict_of(error: BaseException) -> Verdict:
     """Return the verdict of a command that ended by an exception before anything was judged."""
     from lifecycle.manifest import ManifestError, Severity
-    from lifecycle.supervisor.run.signals import Ended
+    from lifecycle.supervisor import Ended
     from lifecycle.verify import Finding, Outcome
 
     code = exit_code_of(error)

@@ -17,7 +17,7 @@ from lifecycle.errors import ExitCode, UsageError
 from lifecycle.printable import lines
 
 if TYPE_CHECKING:
-    from lifecycle.plan.model import Plan
+    from lifecycle.plan import Plan
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -49,7 +49,7 @@ def target_run(
 
 
 def _say_differences(path: Path, plan: Plan) -> None:
-    from lifecycle.supervisor.control.client import differences
+    from lifecycle.supervisor import differences
 
     if found := differences(path, plan):
         listed = "\n".join(found)
@@ -68,7 +68,7 @@ def target_plan(
         ManifestError: the manifest cannot be loaded.
     """
     from lifecycle.run_directory import run_name, runtime_root
-    from lifecycle.supervisor.control.client import find_run
+    from lifecycle.supervisor import find_run
 
     root = runtime_root(environment)
     if not os.path.isfile(target):  # noqa: PTH113 - Path.is_file() raises for a name too long
@@ -118,8 +118,7 @@ def give_order(  # noqa: PLR0917 - in the order of the command line
         UsageError: no such run, or no manifest to reload.
         ManifestError: the manifest cannot be loaded.
     """
-    from lifecycle.supervisor.control.client import order
-    from lifecycle.supervisor.control.server import ControlRequest, Question
+    from lifecycle.supervisor import ControlRequest, Question, order
 
     path, plan = target_plan(os.environ, target, assignments, machine)
     if reload and plan is None:

@@ -24,11 +24,9 @@ from rich.table import Table
 from rich.text import Text
 
 from lifecycle.cli.standard_streams import Writer
-from lifecycle.node.host.control import Operation
+from lifecycle.node import Operation
 from lifecycle.printable import json_text, log_line, one_line
-from lifecycle.supervisor.control.status import NodeStatus, SystemStatus
-from lifecycle.supervisor.processes.spawn import ProcessState
-from lifecycle.supervisor.run.events import (
+from lifecycle.supervisor import (
     Event,
     Failure,
     GateOpened,
@@ -37,19 +35,22 @@ from lifecycle.supervisor.run.events import (
     NodeAlive,
     NodeChanged,
     NodeSilent,
+    NodeStatus,
     Notice,
     ProcessChanged,
+    ProcessState,
     Reach,
     RunStarted,
     Stopped,
     Stopping,
     SystemReached,
+    SystemStatus,
+    UpResult,
     VerdictChanged,
     WiringChanged,
     WiringLost,
     to_record,
 )
-from lifecycle.supervisor.run.options import UpResult
 from lifecycle.verify import Outcome, Stage, Verdict, missing, not_ok, render_text, to_json
 
 

@@ -10,23 +10,28 @@ import dataclasses
 import re
 from collections.abc import Iterable, Mapping
 
-from lifecycle.manifest.model import DiscoveryRange, EndpointKind, ParameterValue
-from lifecycle.manifest.names import (
+from lifecycle.manifest import (
+    DiscoveryRange,
+    EndpointKind,
+    History,
+    ParameterValue,
+    QosProfile,
     full_name_problem,
     name_problem,
     namespace_problem,
     node_name_problem,
 )
-from lifecycle.manifest.qos import History, QosProfile
-from lifecycle.network.nfe import InternetProtocol, UniqueRequirement
-from lifecycle.verify.observation import (
+from lifecycle.network import InternetProtocol, UniqueRequirement
+from lifecycle.verify import (
     EndpointReport,
     NodeConfiguration,
     Observation,
     ObservedEndpoint,
     ObservedNode,
+    is_noise_endpoint,
+    is_noise_node,
+    known_node,
 )
-from lifecycle.verify.tool_filter import is_noise_endpoint, is_noise_node, known_node
 
 _TYPE = re.compile(r"[a-zA-Z][a-zA-Z0-9_]*/(msg|srv|action)/[a-zA-Z][a-zA-Z0-9_]*")
 _NOISE_PARAMETERS = ("use_sim_time", "start_type_description_service")

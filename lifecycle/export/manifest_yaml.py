@@ -21,11 +21,16 @@ from lifecycle.export.captured import (
     CapturedParameter,
     CapturedSystem,
 )
-from lifecycle.manifest.model import DiscoveryRange, EndpointKind, ParameterValue
-from lifecycle.manifest.names import expand
-from lifecycle.manifest.qos import INFINITE_NS, History, QosProfile
-from lifecycle.network.dscp import describe
-from lifecycle.network.nfe import UniqueRequirement
+from lifecycle.manifest import (
+    INFINITE_NS,
+    DiscoveryRange,
+    EndpointKind,
+    History,
+    ParameterValue,
+    QosProfile,
+    expand,
+)
+from lifecycle.network import UniqueRequirement, describe
 
 Scalar = Union[bool, int, float, str]  # noqa: UP007 - a run-time alias on Python 3.10
 Tree = Union[Scalar, "Noted", Sequence["Tree"], Mapping[str, "Tree"]]

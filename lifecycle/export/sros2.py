@@ -18,9 +18,9 @@ import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping
 
-from lifecycle.manifest.model import EndpointKind, RunKind
-from lifecycle.plan.model import Plan, PlannedNode, PlannedProcess
-from lifecycle.verify.tool_filter import GRAPH_TOPIC, NODE_SERVICES, OUR_SERVICES
+from lifecycle.manifest import EndpointKind, RunKind
+from lifecycle.plan import Plan, PlannedNode, PlannedProcess
+from lifecycle.verify import GRAPH_TOPIC, NODE_SERVICES, OUR_SERVICES
 
 OVERRIDE = "ROS_SECURITY_ENCLAVE_OVERRIDE"
 """The variable by which rcl takes an enclave for every context of a process."""

@@ -24,7 +24,7 @@ from std_msgs.msg import String
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.graph.scheduler import Remove
-from lifecycle.verify.tool_filter import GRAPH_TOPIC
+from lifecycle.verify import GRAPH_TOPIC
 
 _logger = logging.getLogger(__name__)
 

@@ -22,7 +22,7 @@ from lifecycle.graph.scheduler import LoopScheduler, ThreadScheduler
 from lifecycle.graph.state import GraphState
 from lifecycle.graph.transport import GraphTransport
 from lifecycle.middleware import GraphObserver, NodeClients
-from lifecycle.plan.model import ParticipantConnections, Plan
+from lifecycle.plan import ParticipantConnections, Plan
 from lifecycle.verify import Observation, Stage, Verdict, verify
 
 

@@ -20,19 +20,21 @@ from lifecycle.graph.messages import (
     MappingEstablished,
     MappingLost,
 )
-from lifecycle.manifest.model import EndpointKind
-from lifecycle.network.medium import NETWORK_MEDIA
-from lifecycle.network.nfe import FlowTuple, flow_tuples
-from lifecycle.verify.observation import (
+from lifecycle.manifest import EndpointKind
+from lifecycle.network import NETWORK_MEDIA, FlowTuple, flow_tuples
+from lifecycle.verify import (
+    NONE,
+    UNKNOWN_QOS,
     ConnectionReport,
     EndpointReport,
     Identity,
+    MatchEnd,
     NodeConfiguration,
+    Outcome,
+    carrier,
+    match,
+    obstacle,
 )
-from lifecycle.verify.rules.matching import MatchEnd, match, obstacle
-from lifecycle.verify.transport import NONE, carrier
-from lifecycle.verify.verdict import Outcome
-from lifecycle.verify.view import UNKNOWN_QOS
 
 
 class EventKind(enum.Enum):

@@ -22,18 +22,16 @@ from lifecycle.graph.messages import GraphMessage, Heartbeat
 from lifecycle.graph.parameters import ParameterReadings, ParameterServices
 from lifecycle.graph.scheduler import Remove, set_within
 from lifecycle.graph.state import Answer, GraphState, Look
-from lifecycle.plan.model import Plan
-from lifecycle.verify.observation import (
+from lifecycle.plan import Plan
+from lifecycle.verify import (
+    NO_NAMES,
+    DeclaredNames,
     EndpointReport,
     Identity,
     NodeConfiguration,
     Observation,
     ObservedEndpoint,
     ObservedNode,
-)
-from lifecycle.verify.tool_filter import (
-    NO_NAMES,
-    DeclaredNames,
     is_noise_node,
     known_node,
     tolerating_pattern,

@@ -15,7 +15,7 @@ from typing import Protocol
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.graph.scheduler import set_within
-from lifecycle.verify.observation import NodeParameters, ParameterReport
+from lifecycle.verify import NodeParameters, ParameterReport
 
 _logger = logging.getLogger(__name__)
 

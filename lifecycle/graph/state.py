@@ -43,8 +43,8 @@ from lifecycle.graph.model import (
     match_ends,
 )
 from lifecycle.graph.scheduler import Remove
-from lifecycle.manifest.model import EndpointKind
-from lifecycle.verify.observation import (
+from lifecycle.manifest import EndpointKind
+from lifecycle.verify import (
     ConnectionReport,
     NodeConfiguration,
     NodeParameters,

@@ -27,19 +27,24 @@ from lifecycle.manifest.model import (
     RunKind,
 )
 from lifecycle.manifest.names import resolve
-from lifecycle.network.datagram import SAFE_DATAGRAM_BYTES, is_fragmented, max_unfragmented
-from lifecycle.network.dscp import (
+from lifecycle.network import (
     ECN_MASK,
     MAX_DSCP,
+    SAFE_DATAGRAM_BYTES,
+    ClassIssue,
     MappedPriority,
+    Medium,
     TransportPriorityMapping,
+    UniqueRequirement,
+    check_class,
     code_points,
     describe,
+    five_qi_of,
+    is_fragmented,
     map_priority,
+    max_unfragmented,
+    propose,
 )
-from lifecycle.network.five_qi import ClassIssue, check_class, five_qi_of, propose
-from lifecycle.network.medium import Medium
-from lifecycle.network.nfe import UniqueRequirement
 
 _OPERATOR_SPECIFIC = range(128, 255)  # TS 24.501 §9.11.4.12
 _ANY_LOSS = 1.0

@@ -14,11 +14,13 @@ from typing import Annotated
 from lifecycle.codec import DomainId, Positive, says
 from lifecycle.manifest.diagnostics import Position, Severity
 from lifecycle.manifest.qos import POLICIES, QosProfile
-from lifecycle.network.connection_url import ConnectionUrl
-from lifecycle.network.dscp import TransportPriorityMapping
-from lifecycle.network.five_qi import DscpMapping
-from lifecycle.network.medium import FlowTransport
-from lifecycle.network.nfe import UniqueRequirement
+from lifecycle.network import (
+    ConnectionUrl,
+    DscpMapping,
+    FlowTransport,
+    TransportPriorityMapping,
+    UniqueRequirement,
+)
 
 
 class EndpointKind(enum.Enum):

@@ -16,30 +16,34 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from lifecycle.errors import UsageError
-from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position
-from lifecycle.manifest.flows import FlowNeeds, ParticipantGroup, ResolvedNeed
-from lifecycle.manifest.installed_types import installed_hash, search_prefixes
-from lifecycle.manifest.model import (
+from lifecycle.manifest import (
+    Diagnostic,
     Discovery,
     DiscoveryMode,
     DiscoveryRange,
     Endpoint,
     EndpointKind,
+    FlowNeeds,
     FlowTerms,
     FlowTransport,
     Link,
     Manifest,
+    ManifestError,
     Node,
     NodeDeclaration,
+    ParticipantGroup,
+    Position,
+    ResolvedNeed,
     RunKind,
     SystemDeclaration,
     UniqueHow,
+    error,
+    installed_hash,
+    read_bytes,
+    resolve,
+    search_prefixes,
 )
-from lifecycle.manifest.names import resolve
-from lifecycle.manifest.yaml.document import error
-from lifecycle.manifest.yaml.source import read_bytes
-from lifecycle.network.ports import MAX_DOMAIN_ID, domain_of
-from lifecycle.network.rmw_capabilities import DEFAULT_RMW
+from lifecycle.network import DEFAULT_RMW, MAX_DOMAIN_ID, domain_of
 from lifecycle.plan.connections.wiring import WiredSystem, place_declared, variables_of, wire
 from lifecycle.plan.model import (
     Plan,

@@ -22,7 +22,7 @@ import zlib
 from collections.abc import Iterator, Mapping
 
 from lifecycle.codec import from_json, to_json, to_plain
-from lifecycle.manifest.diagnostics import Position
+from lifecycle.manifest import Position
 from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedNode
 
 _VALUE_CHARACTERS = 80

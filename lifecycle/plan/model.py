@@ -12,9 +12,9 @@ from typing import Annotated, Any
 
 from lifecycle.codec import DomainId, DscpValue, Port, Positive, says
 from lifecycle.errors import ExitCode, LifecycleError
-from lifecycle.manifest.diagnostics import Diagnostic, Position
-from lifecycle.manifest.model import (
+from lifecycle.manifest import (
     Authority,
+    Diagnostic,
     DiscoveryMode,
     DiscoveryRange,
     Endpoint,
@@ -25,12 +25,13 @@ from lifecycle.manifest.model import (
     NodeDeclaration,
     ParameterDeclaration,
     ParameterValue,
+    Position,
     Quantity,
     Run,
     SystemDeclaration,
     UniqueHow,
 )
-from lifecycle.network.medium import Medium
+from lifecycle.network import Medium
 
 _UdpUnicast = Annotated[Medium, says(enum=[Medium.UDPV4.value, Medium.UDPV6.value])]
 

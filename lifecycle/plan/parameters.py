@@ -18,12 +18,11 @@ import os
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, NamedTuple
 
-from lifecycle.manifest.diagnostics import Position
-from lifecycle.manifest.model import Node, ParameterDeclaration, ParameterValue
+from lifecycle.manifest import Node, ParameterDeclaration, ParameterValue, Position
 from lifecycle.plan.model import ExpectedParameter
 
 if TYPE_CHECKING:
-    from lifecycle.manifest.checks.parameters import Section
+    from lifecycle.manifest import Section
 
 GIVEN = "parameters"
 COMMAND = "command"
@@ -104,7 +103,7 @@ class ParameterFiles:
         return found
 
     def _file(self, path: str) -> _GivenFile:
-        from lifecycle.manifest.checks.parameters import read_sections, shown_path
+        from lifecycle.manifest import read_sections, shown_path
 
         if path not in self._files:
             shown = shown_path(path, self._manifest)
@@ -114,7 +113,7 @@ class ParameterFiles:
 
 
 def _declared(declaration: ParameterDeclaration, given: _Given | None) -> ExpectedParameter:
-    from lifecycle.manifest.checks.parameters import misfit
+    from lifecycle.manifest import misfit
 
     type_ = declaration.type
     if given is None and declaration.default is not None:
@@ -134,7 +133,7 @@ def _declared(declaration: ParameterDeclaration, given: _Given | None) -> Expect
 
 
 def _undeclared(name: str, given: _Given) -> ExpectedParameter | None:
-    from lifecycle.manifest.checks.parameters import type_of
+    from lifecycle.manifest import type_of
 
     if given.value is None:
         return None
@@ -173,7 +172,7 @@ def _command_line(node: Node) -> Iterator[tuple[str, str, str]]:
 
 def _scalar(text: str) -> ParameterValue | None:
     """Return what rcl makes of a value on a command line; None of anything but a plain scalar."""
-    from lifecycle.manifest.checks.parameters import read_scalar
+    from lifecycle.manifest import read_scalar
 
     if len(text) > 1 and text[0] == text[-1] in "'\"" and not {text[0], "\\"} & set(text[1:-1]):
         return read_scalar(text[1:-1], quoted=True)

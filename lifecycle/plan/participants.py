@@ -16,10 +16,8 @@ import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from lifecycle.manifest.diagnostics import Position
-from lifecycle.manifest.flows import ParticipantGroup
-from lifecycle.manifest.model import Node, ParameterValue, Run
-from lifecycle.network.dscp import describe
+from lifecycle.manifest import Node, ParameterValue, ParticipantGroup, Position, Run
+from lifecycle.network import describe
 from lifecycle.plan.model import PlanError, PlannedEndpoint, PlannedParticipant
 
 

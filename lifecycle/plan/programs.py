@@ -15,10 +15,18 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
-from lifecycle.manifest.diagnostics import Diagnostic, Position
-from lifecycle.manifest.model import Endpoint, EndpointKind, Manifest, Node, RunKind
-from lifecycle.manifest.schema import did_you_mean
-from lifecycle.manifest.yaml.document import error, warning
+from lifecycle.manifest import (
+    Diagnostic,
+    Endpoint,
+    EndpointKind,
+    Manifest,
+    Node,
+    Position,
+    RunKind,
+    did_you_mean,
+    error,
+    warning,
+)
 from lifecycle.plan.model import PlanError
 from lifecycle.plan.participants import find_executable
 from lifecycle.plan.python_source import (

@@ -17,8 +17,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest.model import EndpointKind
-from lifecycle.manifest.schema import did_you_mean
+from lifecycle.manifest import EndpointKind, did_you_mean
 
 _MOST_BYTES = 4 * 2**20
 _DEEPEST = 40

@@ -9,22 +9,30 @@ import shlex
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
 
-from lifecycle.manifest.flows import OWN_FLOW
-from lifecycle.manifest.model import (
+from lifecycle.manifest import (
+    BEST_AVAILABLE_NS,
+    OWN_FLOW,
     DataLayer,
     DataLayerSource,
     DiscoveryMode,
     EndpointKind,
     FlowIdentification,
     FlowTransport,
+    History,
+    Liveliness,
+    QosProfile,
+    Reliability,
     RunKind,
     UniqueHow,
 )
-from lifecycle.manifest.qos import BEST_AVAILABLE_NS, History, Liveliness, QosProfile, Reliability
-from lifecycle.network.dscp import describe
-from lifecycle.network.nfe import UniqueRequirement
-from lifecycle.network.ports import unique_flow_ports
-from lifecycle.network.rmw_capabilities import Capability, FlowSide, capabilities
+from lifecycle.network import (
+    Capability,
+    FlowSide,
+    UniqueRequirement,
+    capabilities,
+    describe,
+    unique_flow_ports,
+)
 from lifecycle.plan.connections.hosts import demand
 from lifecycle.plan.model import (
     ParticipantConnections,

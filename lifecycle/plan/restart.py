@@ -15,8 +15,7 @@ import dataclasses
 from collections.abc import Collection, Iterator, Mapping
 from types import MappingProxyType
 
-from lifecycle.network.connection_url import ConnectionUrl, Peer, parse
-from lifecycle.network.medium import Medium
+from lifecycle.network import ConnectionUrl, Medium, Peer, parse
 from lifecycle.plan.connections.contacts import contacts_of
 from lifecycle.plan.connections.hosts import PortPool
 from lifecycle.plan.model import ParticipantConnections, Plan, PlanError, PlannedNode

@@ -3,3 +3,7 @@
 `rules` is pure: nftables, tc, a NEF, CAMARA, Zenoh, Fast DDS Pro. `apply` has the targets, the
 ledger of what is ours in each, and HTTP. Must not import rclpy.
 """
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -9,8 +9,8 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Collection, Iterable, Sequence
 
-from lifecycle.manifest.model import EndpointKind
-from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedFlow, PlannedNode
+from lifecycle.manifest import EndpointKind
+from lifecycle.plan import Plan, PlannedEndpoint, PlannedFlow, PlannedNode
 from lifecycle.verify.observation import (
     EndpointReport,
     NodeConfiguration,

@@ -14,10 +14,9 @@ from collections.abc import Iterable
 
 from lifecycle import codec
 from lifecycle.codec import Count, DscpValue
-from lifecycle.manifest.model import EndpointKind, ParameterValue
-from lifecycle.manifest.qos import QosProfile
-from lifecycle.network.nfe import NetworkFlowEndpoint, UniqueRequirement
-from lifecycle.plan.parameters import portable
+from lifecycle.manifest import EndpointKind, ParameterValue, QosProfile
+from lifecycle.network import NetworkFlowEndpoint, UniqueRequirement
+from lifecycle.plan import portable
 
 LONGEST_CONFIGURATION = 1 << 22
 """Characters of a node configuration as JSON; one of 1,000 endpoints takes about 600,000."""

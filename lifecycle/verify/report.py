@@ -25,10 +25,9 @@ from urllib.parse import quote
 from xml.etree import ElementTree as ET
 
 from lifecycle import codec
-from lifecycle.manifest.model import UniqueHow
-from lifecycle.network.dscp import describe
-from lifecycle.network.medium import NETWORK_MEDIA
-from lifecycle.plan.model import Plan
+from lifecycle.manifest import UniqueHow
+from lifecycle.network import NETWORK_MEDIA, describe
+from lifecycle.plan import Plan
 from lifecycle.printable import json_text, lines, one_line
 from lifecycle.verify.rules import RULES
 from lifecycle.verify.rules.catalogue import Rule

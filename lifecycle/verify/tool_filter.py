@@ -15,10 +15,8 @@ import dataclasses
 import re
 from collections.abc import Collection, Iterable, Mapping
 
-from lifecycle.manifest.installed_types import join
-from lifecycle.manifest.model import TOLERATED_NODES, EndpointKind
-from lifecycle.plan.model import Plan, PlannedNode
-from lifecycle.plan.participants import owner_of
+from lifecycle.manifest import TOLERATED_NODES, EndpointKind, join
+from lifecycle.plan import Plan, PlannedNode, owner_of
 from lifecycle.verify.observation import NodeConfiguration, ObservedEndpoint
 
 OUR_NODES = "_lifecycle_*"

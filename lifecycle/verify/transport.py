@@ -14,14 +14,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from lifecycle.network.address import is_multicast
-from lifecycle.network.connection_url import ConnectionUrlError, parse
-from lifecycle.network.medium import Medium
-from lifecycle.network.nfe import (
+from lifecycle.network import (
+    ConnectionUrlError,
     InternetProtocol,
+    Medium,
     NetworkFlowEndpoint,
     TransportProtocol,
     is_ip,
+    is_multicast,
+    parse,
 )
 from lifecycle.verify.observation import Identity
 from lifecycle.verify.view import Actual, FlowView, View

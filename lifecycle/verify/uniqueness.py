@@ -17,15 +17,17 @@ import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 
-from lifecycle.manifest.model import EndpointKind
-from lifecycle.network.address import canonical, is_multicast, is_wildcard
-from lifecycle.network.nfe import (
+from lifecycle.manifest import EndpointKind
+from lifecycle.network import (
     InternetProtocol,
     LocatedNfe,
     NetworkFlowEndpoint,
     TransportProtocol,
+    canonical,
     is_ip,
+    is_multicast,
     is_unique_endpoint,
+    is_wildcard,
     located,
 )
 from lifecycle.verify.observation import EndpointReport, NodeConfiguration

@@ -11,9 +11,8 @@ from collections.abc import Iterable
 from typing import Annotated
 
 from lifecycle.codec import DscpValue, Octet, says
-from lifecycle.manifest.model import EndpointKind, UniqueHow
-from lifecycle.network.medium import Medium
-from lifecycle.network.nfe import FlowTuple, NetworkFlowEndpoint, UniqueRequirement, flow_tuples
+from lifecycle.manifest import EndpointKind, UniqueHow
+from lifecycle.network import FlowTuple, Medium, NetworkFlowEndpoint, UniqueRequirement, flow_tuples
 
 _Carrier = Annotated[str, says(enum=[*map(str, Medium), "none", "unknown"])]
 

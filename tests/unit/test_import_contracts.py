@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import graphlib
-import importlib
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +11,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
+ROOMS = sorted(each.parent.name for each in (ROOT / "lifecycle").glob("*/__init__.pyi"))
 PURE_ROOMS = (
     "manifest",
     "network",
@@ -64,16 +64,45 @@ def test_networks_are_programmed_without_ros_and_loaded_without_httpx() -> None:
     assert result.returncode == 0, result.stderr
 
 
-@pytest.mark.parametrize("room", ["node", "middleware", "graph", "supervisor"])
-def test_a_name_that_a_room_loads_on_first_use_is_in_the_module_that_it_names(room: str) -> None:
+@pytest.mark.parametrize("room", ROOMS)
+def test_a_name_that_a_room_offers_is_in_the_module_that_its_stub_names(room: str) -> None:
     folder = ROOT / "lifecycle" / room
-    homes = importlib.import_module(f"lifecycle.{room}")._HOME
+    stub = ast.parse((folder / "__init__.pyi").read_text())
     missing = [
-        f"{name} in {home}"
-        for name, home in homes.items()
-        if name not in _bound(folder.joinpath(*home.split(".")).with_suffix(".py"))
+        f"{each.name} in {node.module}"
+        for node in stub.body
+        if isinstance(node, ast.ImportFrom) and node.module
+        for each in node.names
+        if each.name not in _bound(_file(folder.joinpath(*node.module.split("."))))
     ]
     assert missing == []
+
+
+def _file(module: Path) -> Path:
+    return (
+        module.with_suffix(".py") if module.with_suffix(".py").exists() else module / "__init__.py"
+    )
+
+
+def test_rooms_are_entered_by_their_doors() -> None:
+    """What a room's stub does not list is its own affair, for all others but its tests."""
+    around = [
+        f"{path.relative_to(ROOT)}:{node.lineno}: {name}"
+        for path in sorted((ROOT / "lifecycle").rglob("*.py"))
+        for node in ast.walk(ast.parse(path.read_text()))
+        for name in _modules_imported(node)
+        if (parts := name.split("."))[0] == "lifecycle"
+        and len(parts) > 2
+        and parts[1] in ROOMS
+        and parts[1] != path.relative_to(ROOT / "lifecycle").parts[0]
+    ]
+    assert around == []
+
+
+def _modules_imported(node: ast.AST) -> list[str]:
+    if isinstance(node, ast.ImportFrom):
+        return [node.module or ""]
+    return [each.name for each in node.names] if isinstance(node, ast.Import) else []
 
 
 def _bound(path: Path) -> set[str]:

@@ -26,10 +26,8 @@ from lifecycle.cli.report import (
 )
 from lifecycle.codec import Count, to_json
 from lifecycle.errors import ExitCode, LifecycleError
-from lifecycle.manifest import Diagnostic, Manifest, ManifestError, Severity, load
-from lifecycle.manifest.diagnostics import Position
-from lifecycle.plan import check_plan, effective_domain
-from lifecycle.plan.programs import Resolution, UnresolvedProgram
+from lifecycle.manifest import Diagnostic, Manifest, ManifestError, Position, Severity, load
+from lifecycle.plan import Resolution, UnresolvedProgram, check_plan, effective_domain
 from lifecycle.printable import json_text, lines
 
 _NOT_XML = re.compile(r"[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")

@@ -20,7 +20,7 @@ def command(target: str, assignments: tuple[str, ...], machine: str, timeout: fl
     TARGET is a manifest, or the name of a running system as `lifecycle status` shows it. Where the
     supervisor itself was killed, what it left behind is ended too.
     """
-    from lifecycle.supervisor.control.client import down
+    from lifecycle.supervisor import down
 
     path = target_run(os.environ, target, assignments, machine)
     try:

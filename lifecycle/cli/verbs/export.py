@@ -12,11 +12,11 @@ import click
 
 from lifecycle.cli.common import load_manifest, manifest_arguments
 from lifecycle.errors import ExitCode, UsageError
-from lifecycle.manifest.model import EndpointPolicy
+from lifecycle.manifest import EndpointPolicy
 from lifecycle.printable import lines
 
 if TYPE_CHECKING:
-    from lifecycle.export.sros2 import Enclave
+    from lifecycle.export import Enclave
 
 
 @click.group("export")
@@ -52,7 +52,7 @@ def sros2(manifest: str, assignments: tuple[str, ...], output: Path, days: int) 
     takes; permissions.xml and governance.xml are for whoever signs without it. Nothing is signed:
     the commands that are printed do that.
     """
-    from lifecycle.export.sros2 import documents
+    from lifecycle.export import documents
     from lifecycle.plan import build_plan
 
     plan = build_plan(load_manifest(manifest, assignments).manifest)
@@ -93,7 +93,7 @@ def _write(path: Path, text: str) -> None:
 
 def _next_commands(enclaves: tuple[Enclave, ...], output: Path, domain_id: int) -> str:
     """Return what to do with the files, as lines for a shell."""
-    from lifecycle.export.sros2 import OVERRIDE
+    from lifecycle.export import OVERRIDE
 
     policy = shlex.quote(str(output / "policy.xml"))
     said = [

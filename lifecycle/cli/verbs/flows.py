@@ -25,20 +25,18 @@ from lifecycle.cli.verbs.flows_program import (
 )
 from lifecycle.codec import to_json
 from lifecycle.errors import UsageError
-from lifecycle.manifest.model import UniqueHow
-from lifecycle.network.dscp import describe
-from lifecycle.network.nfe import NetworkFlowEndpoint
+from lifecycle.manifest import UniqueHow
+from lifecycle.network import NetworkFlowEndpoint, describe
 from lifecycle.printable import json_text, lines, one_line
-from lifecycle.programming.rules.registry import flows_to_csv
+from lifecycle.programming import flows_to_csv
 from lifecycle.verify import FlowReport
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from lifecycle.plan.model import Plan
-    from lifecycle.programming.apply import TargetOptions, Treatment
-    from lifecycle.programming.rules import ExportSettings
-    from lifecycle.verify.verdict import FlowReport
+    from lifecycle.plan import Plan
+    from lifecycle.programming import ExportSettings, TargetOptions, Treatment
+    from lifecycle.verify import FlowReport
 
 
 _HEADS = (
@@ -157,8 +155,7 @@ class Export:
         Raises:
             UsageError: it cannot be exported so.
         """
-        from lifecycle.programming.apply import open_programmer
-        from lifecycle.programming.rules import EXPORTS, ExportInput
+        from lifecycle.programming import EXPORTS, ExportInput, open_programmer
 
         programmer = open_programmer(plan, (), environment=os.environ, treatment=self._treatment)
         given = ExportInput(
@@ -178,8 +175,7 @@ class Export:
 
 
 def _settings(options: Sequence[TargetOptions]) -> ExportSettings:
-    from lifecycle.programming.apply.settings import load_settings
-    from lifecycle.programming.rules import ExportSettings
+    from lifecycle.programming import ExportSettings, load_settings
 
     for each in options:
         if each.kind == "tc":
@@ -221,7 +217,7 @@ def _show(
     """
     from lifecycle.cli.verbs.verify import exit_code
     from lifecycle.plan import build_plan
-    from lifecycle.supervisor.run.attach import follow_running, judge_running
+    from lifecycle.supervisor import follow_running, judge_running
     from lifecycle.verify import Verdict
 
     exporter = None

@@ -18,9 +18,9 @@ from lifecycle.errors import ExitCode, UsageError
 from lifecycle.printable import lines
 
 if TYPE_CHECKING:
-    from lifecycle.plan.model import Plan
-    from lifecycle.programming.apply import Programmer, TargetChanges, TargetOptions, Treatment
-    from lifecycle.verify.verdict import FlowReport, Verdict
+    from lifecycle.plan import Plan
+    from lifecycle.programming import Programmer, TargetChanges, TargetOptions, Treatment
+    from lifecycle.verify import FlowReport, Verdict
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -153,8 +153,7 @@ def chosen(
     Raises:
         UsageError: they do not fit together.
     """
-    from lifecycle.programming.apply import TargetOptions, parse_queue, parse_rate
-    from lifecycle.programming.rules.tc import TcMatch
+    from lifecycle.programming import TargetOptions, TcMatch, parse_queue, parse_rate
 
     kinds = tuple(dict.fromkeys(targets))
     if "tc" not in kinds and (device or rate or any(guarantees)):
@@ -203,8 +202,8 @@ def treatment_of(*, mapping: str, flow_labels: bool) -> Treatment:
     Raises:
         UsageError: no such mapping, or its file cannot be used.
     """
-    from lifecycle.network.five_qi import dscp_mapping, parse_mapping
-    from lifecycle.programming.apply import Treatment
+    from lifecycle.network import dscp_mapping, parse_mapping
+    from lifecycle.programming import Treatment
 
     if not mapping:
         return Treatment(label_flows=flow_labels)
@@ -228,7 +227,7 @@ def apply(
 
     What is made stays until `remove`, or until the system is brought down.
     """
-    from lifecycle.programming.apply import PartlyError
+    from lifecycle.programming import PartlyError
 
     programmer = _open(plan, options, treatment)
     try:
@@ -356,7 +355,7 @@ def _plan(manifest: str, assignments: tuple[str, ...]) -> Plan:
 
 
 def _judged(manifest: str, assignments: tuple[str, ...], timeout_s: float) -> tuple[Plan, Verdict]:
-    from lifecycle.supervisor.run.attach import judge_running
+    from lifecycle.supervisor import judge_running
 
     seen = judge_running(_plan(manifest, assignments), timeout_s=timeout_s, strict=False)
     if seen.where:
@@ -377,7 +376,7 @@ def _spell(plan: Plan) -> str:
 def _open(
     plan: Plan, options: Sequence[TargetOptions], treatment: Treatment | None = None
 ) -> Programmer:
-    from lifecycle.programming.apply import open_programmer
+    from lifecycle.programming import open_programmer
 
     return open_programmer(plan, options, environment=os.environ, treatment=treatment)
 

@@ -18,7 +18,7 @@ from lifecycle.errors import ExitCode, UsageError
 from lifecycle.printable import json_text
 
 if TYPE_CHECKING:
-    from lifecycle.export.picture import Picture
+    from lifecycle.export import Picture
     from lifecycle.plan import Plan
 
 _CLEAR = "\x1b[H\x1b[2J"
@@ -61,7 +61,7 @@ def command(
     if path is not None:
         _supervised(path, draw, watch=watch)
     elif plan is not None:
-        from lifecycle.supervisor.run.looking import attached_picture, attached_pictures
+        from lifecycle.supervisor import attached_picture, attached_pictures
 
         if watch:
             attached_pictures(plan, draw)
@@ -73,7 +73,7 @@ def command(
 
 
 def _say_if_empty(picture: Picture, plan: Plan) -> None:
-    from lifecycle.export.picture import PicturedNodeState
+    from lifecycle.export import PicturedNodeState
 
     if all(node.state is PicturedNodeState.ABSENT for node in picture.nodes()):
         click.echo(
@@ -93,14 +93,14 @@ def _found(
         return target_run(os.environ, target, assignments, machine), None
     from lifecycle.cli.common import load_manifest
     from lifecycle.plan import build_plan
-    from lifecycle.supervisor.run.looking import supervisor_of
+    from lifecycle.supervisor import supervisor_of
 
     plan = build_plan(load_manifest(target, assignments, quiet=True).manifest)
     return supervisor_of(os.environ, plan, machine), plan
 
 
 def _supervised(path: Path, draw: Callable[[Picture], None], *, watch: bool) -> None:
-    from lifecycle.supervisor.run.looking import supervised_picture, supervised_pictures
+    from lifecycle.supervisor import supervised_picture, supervised_pictures
 
     try:
         if not watch:
@@ -146,7 +146,7 @@ def render(picture: Picture, format_: str) -> str:
         from lifecycle.codec import to_json
 
         return json_text(to_json(picture).decode())
-    from lifecycle.export.picture import WRITERS
+    from lifecycle.export import WRITERS
 
     return WRITERS[format_](picture)
 

@@ -9,8 +9,7 @@ import click
 from lifecycle import codec
 from lifecycle.cli.common import format_option, load_manifest, manifest_arguments
 from lifecycle.errors import ExitCode
-from lifecycle.plan import Plan, build_plan
-from lifecycle.plan.render import render_text
+from lifecycle.plan import Plan, build_plan, render_text
 
 
 @click.command("plan")
@@ -34,6 +33,6 @@ def render(plan: Plan, format_: str) -> str:
         return render_text(plan, width=shutil.get_terminal_size((100, 24)).columns)
     if format_ == "json":
         return codec.to_json(plan).decode()
-    from lifecycle.export.picture import WRITERS, planned_picture
+    from lifecycle.export import WRITERS, planned_picture
 
     return WRITERS[format_](planned_picture(plan))

@@ -14,8 +14,8 @@ import click
 from lifecycle.cli.common import format_option, load_manifest
 from lifecycle.codec import to_json
 from lifecycle.errors import ExitCode, UsageError
-from lifecycle.manifest.model import Discovery
-from lifecycle.network.ports import (
+from lifecycle.manifest import Discovery
+from lifecycle.network import (
     Capacity,
     EphemeralRange,
     ParticipantPorts,
@@ -32,9 +32,7 @@ from lifecycle.network.ports import (
     safe_domains,
     unique_flow_ports,
 )
-from lifecycle.plan.build import build_plan, effective_domain
-from lifecycle.plan.connections.hosts import demand
-from lifecycle.plan.model import Plan
+from lifecycle.plan import Plan, build_plan, demand, effective_domain
 
 THIS = "this"
 

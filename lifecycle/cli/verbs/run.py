@@ -12,10 +12,9 @@ import click
 
 from lifecycle.cli.common import load_manifest
 from lifecycle.errors import ExitCode, UsageError
-from lifecycle.manifest.model import DiscoveryRange, RunKind
-from lifecycle.middleware.discovery.probe import peers_environment
-from lifecycle.plan import Plan, PlannedNode, build_plan
-from lifecycle.plan.connections.contacts import reached_hosts
+from lifecycle.manifest import DiscoveryRange, RunKind
+from lifecycle.middleware import peers_environment
+from lifecycle.plan import Plan, PlannedNode, build_plan, reached_hosts
 
 _ROS_ARGUMENTS = "--ros-args"
 
@@ -73,9 +72,7 @@ def find_node(plan: Plan, name: str) -> PlannedNode:
 
 def _run_class(plan: Plan, planned: PlannedNode, arguments: list[str], *, lifecycle: str) -> int:
     # Late: everything before this works without ROS, and says what is wrong without it.
-    from lifecycle.node.author.node import LifecycleNode
-    from lifecycle.node.author.spec import load_class
-    from lifecycle.node.host.standalone import run
+    from lifecycle.node import LifecycleNode, load_class, run
 
     if planned.run.working_directory:
         os.chdir(planned.run.working_directory)

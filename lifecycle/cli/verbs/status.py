@@ -12,8 +12,8 @@ import click
 from lifecycle.cli.common import format_option
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.printable import json_text, one_line
-from lifecycle.supervisor.control.status import NodeStatus, SystemStatus
-from lifecycle.verify.observation import ConnectionReport
+from lifecycle.supervisor import NodeStatus, SystemStatus
+from lifecycle.verify import ConnectionReport
 
 _HEADS = ("node", "process", "pid", "state", "matched", "unique flows", "")
 
@@ -75,8 +75,8 @@ def command(target: str | None, assignments: tuple[str, ...], machine: str, form
     from lifecycle.cli.target import target_run
     from lifecycle.codec import to_json
     from lifecycle.run_directory import runtime_root
-    from lifecycle.supervisor.control.client import running, status
-    from lifecycle.verify.verdict import Outcome
+    from lifecycle.supervisor import running, status
+    from lifecycle.verify import Outcome
 
     if target is None:
         names = running(runtime_root(os.environ))

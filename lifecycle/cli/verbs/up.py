@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from lifecycle.cli.up_output import RunOutput
-    from lifecycle.programming.apply import TargetOptions, Treatment
-    from lifecycle.supervisor.run.options import UpResult
+    from lifecycle.programming import TargetOptions, Treatment
+    from lifecycle.supervisor import UpResult
 
 
 @click.command("up")
@@ -82,12 +82,11 @@ def command(
     --program tells networks which flows were verified before anything is activated, and takes it
     back in the end.
     """
-    from lifecycle.supervisor.run.signals import Ended, Ending
+    from lifecycle.supervisor import Ended, Ending
 
     try:
         with Ending() as ending, ReportFile(report, strict=strict) as written:
-            from lifecycle.supervisor.connections.networks import token_variables
-            from lifecycle.supervisor.run.up import Forerunner
+            from lifecycle.supervisor import Forerunner, token_variables
 
             # Its imports and ours, and reading the manifest, take as long as each other: side by
             # side.

@@ -32,12 +32,12 @@ def command(  # noqa: PLR0917 - click passes options by name
     Exits with 0 if it is what was declared, 4 if it is not, and 5 under --strict, or where the
     manifest says that it blocks, if something could not be verified.
     """
-    from lifecycle.supervisor.run.signals import Ended, Ending
+    from lifecycle.supervisor import Ended, Ending
 
     try:
         with Ending() as ending, ReportFile(report, strict=strict) as written:
             from lifecycle.plan import build_plan
-            from lifecycle.supervisor.run.attach import judge_running
+            from lifecycle.supervisor import judge_running
 
             plan = build_plan(load_manifest(manifest, assignments).manifest)
             written.begin(plan)
@@ -58,7 +58,7 @@ def command(  # noqa: PLR0917 - click passes options by name
 
 def exit_code(verdict: object, *, strict: bool) -> ExitCode:
     """Return the exit code of a verdict."""
-    from lifecycle.supervisor.gate.gate import closes
+    from lifecycle.supervisor import closes
     from lifecycle.verify import Outcome, Verdict
 
     assert isinstance(verdict, Verdict)

@@ -20,12 +20,9 @@ from lifecycle.export.picture.model import (
     PicturedProcess,
     Presence,
 )
-from lifecycle.manifest.model import RunKind
-from lifecycle.plan.model import Plan
-from lifecycle.verify.matcher import lay_out
-from lifecycle.verify.observation import Observation
-from lifecycle.verify.verdict import Stage, Verdict
-from lifecycle.verify.view import View
+from lifecycle.manifest import RunKind
+from lifecycle.plan import Plan
+from lifecycle.verify import Observation, Stage, Verdict, View, lay_out
 
 UNKNOWN_NODE = ""
 """Name of the node of endpoints whose node is not known."""

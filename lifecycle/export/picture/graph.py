@@ -23,7 +23,7 @@ from lifecycle.export.picture.model import (
     remark,
 )
 from lifecycle.export.picture.views import edge_label, is_unique, wrapped
-from lifecycle.verify.verdict import Outcome
+from lifecycle.verify import Outcome
 
 _LABEL_CHARACTERS = 60
 

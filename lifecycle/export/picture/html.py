@@ -24,7 +24,7 @@ from lifecycle.export.picture.model import (
 from lifecycle.export.picture.svg import HEADINGS, figure_svg, legend_svg, style
 from lifecycle.export.picture.views import computational, data_layer, place
 from lifecycle.printable import one_line
-from lifecycle.verify.verdict import Outcome
+from lifecycle.verify import Outcome
 
 CSS = """\
 :root{color-scheme:light}

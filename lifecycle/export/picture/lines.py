@@ -21,13 +21,19 @@ from lifecycle.export.picture.model import (
     PicturedParticipant,
     Presence,
 )
-from lifecycle.manifest.model import EndpointKind, UniqueHow
-from lifecycle.network.dscp import describe
-from lifecycle.network.nfe import UniqueRequirement
-from lifecycle.plan.model import PlannedEndpoint, PlannedNode
-from lifecycle.verify.observation import NodeConfiguration
-from lifecycle.verify.verdict import Finding, FlowReport, Outcome
-from lifecycle.verify.view import Actual, FlowView, SeenEndpoint, View
+from lifecycle.manifest import EndpointKind, UniqueHow
+from lifecycle.network import UniqueRequirement, describe
+from lifecycle.plan import PlannedEndpoint, PlannedNode
+from lifecycle.verify import (
+    Actual,
+    Finding,
+    FlowReport,
+    FlowView,
+    NodeConfiguration,
+    Outcome,
+    SeenEndpoint,
+    View,
+)
 
 _KINDS = (
     (LineKind.TOPIC, EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION),

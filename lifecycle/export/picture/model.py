@@ -16,8 +16,7 @@ import enum
 from collections.abc import Callable, Mapping
 
 from lifecycle.codec import DomainId, Positive
-from lifecycle.verify.verdict import Finding, FlowReport, Outcome, Verdict
-from lifecycle.verify.view import View
+from lifecycle.verify import Finding, FlowReport, Outcome, Verdict, View
 
 
 class LineKind(enum.Enum):

@@ -29,7 +29,7 @@ from lifecycle.export.picture.views import (
     text_width,
 )
 from lifecycle.printable import one_line
-from lifecycle.verify.verdict import Outcome
+from lifecycle.verify import Outcome
 
 _INK, _QUIET = "#1b2733", "#4d5a66"
 _TINTS = ("#f1f5fb", "#fbf6ec")

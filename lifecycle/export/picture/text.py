@@ -18,7 +18,7 @@ from lifecycle.export.picture.model import (
 )
 from lifecycle.export.picture.views import edge_label, end_words
 from lifecycle.printable import one_line
-from lifecycle.verify.verdict import Outcome
+from lifecycle.verify import Outcome
 
 _ARROWS = {
     Presence.PRESENT: "──▶",

@@ -30,7 +30,7 @@ from lifecycle.export.picture.model import (
     numbers,
     remark,
 )
-from lifecycle.verify.verdict import Outcome
+from lifecycle.verify import Outcome
 
 MARGIN = 20
 HEAD_EM, QUIET_EM = 12, 10

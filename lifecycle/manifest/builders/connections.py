@@ -19,7 +19,7 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.manifest.yaml.document import error
 from lifecycle.manifest.yaml.yaml_parser import quote
-from lifecycle.network.connection_url import ConnectionUrl, ConnectionUrlError, parse
+from lifecycle.network import ConnectionUrl, ConnectionUrlError, parse
 
 _KINDS = {kind.value: kind for kind in EndpointKind}
 

@@ -42,7 +42,7 @@ from lifecycle.manifest.qos import (
 )
 from lifecycle.manifest.yaml.document import Scalar, error, warning
 from lifecycle.manifest.yaml.yaml_parser import YAML_1_1_BOOLEANS, has_leading_zero, quote
-from lifecycle.network.dscp import parse_dscp
+from lifecycle.network import parse_dscp
 
 Findings = list[Diagnostic]
 """Findings in the order of detection; every builder appends and continues."""

@@ -28,8 +28,7 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.manifest.yaml.document import Place, error
 from lifecycle.manifest.yaml.yaml_parser import quote
-from lifecycle.network.dscp import TransportPriorityMapping
-from lifecycle.network.five_qi import DscpMapping, dscp_mappings, parse_mapping
+from lifecycle.network import DscpMapping, TransportPriorityMapping, dscp_mappings, parse_mapping
 
 _MAX_MAPPING_BYTES = 1_000_000
 

@@ -30,8 +30,7 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.manifest.schema import did_you_mean
 from lifecycle.manifest.yaml.document import error, warning
-from lifecycle.network.dscp import describe
-from lifecycle.network.medium import Medium
+from lifecycle.network import Medium, describe
 
 _OTHER_END = {
     EndpointKind.SUBSCRIPTION: EndpointKind.PUBLISHER,

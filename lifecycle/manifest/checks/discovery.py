@@ -24,7 +24,7 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.manifest.schema import did_you_mean
 from lifecycle.manifest.yaml.document import error
-from lifecycle.network.medium import Medium
+from lifecycle.network import Medium
 
 FAST_DDS = "rmw_fastrtps"
 _FIXED = (DiscoveryMode.STATIC, DiscoveryMode.STATIC_ENDPOINTS)

@@ -23,16 +23,18 @@ from lifecycle.manifest.model import (
     RunKind,
 )
 from lifecycle.manifest.yaml.document import error, warning
-from lifecycle.network.datagram import RTPS_OVERHEAD_BYTES, datagram_bytes, max_unfragmented
-from lifecycle.network.medium import TRANSPORTS_VARIABLE
-from lifecycle.network.nfe import UniqueRequirement
-from lifecycle.network.rmw_capabilities import (
+from lifecycle.network import (
+    RTPS_OVERHEAD_BYTES,
+    TRANSPORTS_VARIABLE,
     Capability,
     Feasibility,
     FlowSide,
+    UniqueRequirement,
     capabilities,
+    datagram_bytes,
     dscp_feasibility,
     feasibility,
+    max_unfragmented,
 )
 
 

@@ -27,9 +27,7 @@ from lifecycle.manifest.names import full_name_problem
 from lifecycle.manifest.qos import Reliability
 from lifecycle.manifest.schema import did_you_mean
 from lifecycle.manifest.yaml.document import error, warning
-from lifecycle.network.dscp import MAX_DSCP, describe
-from lifecycle.network.five_qi import five_qi_of
-from lifecycle.network.nfe import UniqueRequirement
+from lifecycle.network import MAX_DSCP, UniqueRequirement, describe, five_qi_of
 
 ASKS_UNIQUE = (*OWN_FLOW, UniqueRequirement.SYSTEM_DEFAULT)
 """Requirements that may make an endpoint's NFE unique."""

@@ -16,7 +16,7 @@ from lifecycle.manifest.flows import FlowNeeds
 from lifecycle.manifest.model import After, Condition, EndpointKind, Machine, Node, RunKind
 from lifecycle.manifest.schema import did_you_mean
 from lifecycle.manifest.yaml.document import error, warning
-from lifecycle.network.ports import (
+from lifecycle.network import (
     MAX_DOMAIN_ID,
     EphemeralRange,
     Platform,

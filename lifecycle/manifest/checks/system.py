@@ -17,7 +17,7 @@ from lifecycle.errors import LifecycleError
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import Endpoint, EndpointKind, EndpointPolicy, Manifest, Node
 from lifecycle.manifest.names import RemapRule, full_node_name, parse_rule, resolve
-from lifecycle.network.rmw_capabilities import DEFAULT_RMW
+from lifecycle.network import DEFAULT_RMW
 
 _RMW_VARIABLE = "RMW_IMPLEMENTATION"
 

@@ -34,8 +34,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from lifecycle.middleware.discovery.probe import HEADER, Door, doors_of, send
 from lifecycle.middleware.sockets.dscp import own_udp_socket, socket_descriptors
 from lifecycle.middleware.sockets.url_check import open_sockets
-from lifecycle.network.connection_url import ConnectionUrl
-from lifecycle.network.medium import Medium
+from lifecycle.network import ConnectionUrl, Medium
 
 _UNANSWERED = 2
 """Retransmissions in a row after which a connection is dead for a leaving process: the kernel

@@ -39,9 +39,14 @@ from lifecycle.middleware.fastdds.url_profile import (
 )
 from lifecycle.middleware.sockets.dscp import own_udp_socket
 from lifecycle.middleware.sockets.url_check import open_sockets
-from lifecycle.network.connection_url import ConnectionUrl
-from lifecycle.network.medium import TRANSPORTS_VARIABLE, Medium
-from lifecycle.network.ports import DG, PARTICIPANTS_PER_DOMAIN, participant_ports
+from lifecycle.network import (
+    DG,
+    PARTICIPANTS_PER_DOMAIN,
+    TRANSPORTS_VARIABLE,
+    ConnectionUrl,
+    Medium,
+    participant_ports,
+)
 
 RANGE_VARIABLE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 

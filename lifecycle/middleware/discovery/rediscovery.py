@@ -43,9 +43,7 @@ from lifecycle.middleware.fastdds.url_profile import (
     leaves_discovery_open,
 )
 from lifecycle.middleware.sockets.dscp import own_udp_socket, socket_descriptors
-from lifecycle.network.connection_url import ConnectionUrl
-from lifecycle.network.medium import Medium
-from lifecycle.network.ports import participant_ports
+from lifecycle.network import ConnectionUrl, Medium, participant_ports
 
 _PARTICIPANTS = 32
 """Of a host whose address is known; further participants are reached by multicast."""

@@ -29,7 +29,7 @@ from rclpy.service import Service
 from rclpy.subscription import Subscription
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.manifest.qos import QosProfile
+from lifecycle.manifest import QosProfile
 from lifecycle.middleware.fastdds import default_qos, shared_executor
 from lifecycle.middleware.fastdds.participant_profile import (
     ParticipantSettings,
@@ -44,10 +44,8 @@ from lifecycle.middleware.sockets import dscp as marks
 from lifecycle.middleware.sockets.dscp import never_wait
 from lifecycle.middleware.sockets.nfe import get_network_flow_endpoints, has_shared_memory
 from lifecycle.middleware.sockets.url_check import open_sockets
-from lifecycle.network.connection_url import ConnectionUrl
-from lifecycle.network.medium import Medium
-from lifecycle.network.nfe import NetworkFlowEndpoint, UniqueRequirement
-from lifecycle.plan.model import ParticipantConnections
+from lifecycle.network import ConnectionUrl, Medium, NetworkFlowEndpoint, UniqueRequirement
+from lifecycle.plan import ParticipantConnections
 
 _UDP_ALONE = "only UDP sockets can be marked"
 

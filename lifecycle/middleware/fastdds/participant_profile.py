@@ -27,11 +27,16 @@ from lifecycle.middleware.fastdds import url_profile
 from lifecycle.middleware.fastdds.profiles import DEFAULT_FILE, PROFILES_FILE_VARIABLE
 from lifecycle.middleware.fastdds.profiles import child as _child
 from lifecycle.middleware.fastdds.profiles import text as _text
-from lifecycle.network.connection_url import ConnectionUrl
-from lifecycle.network.connection_url import parse as parse_url
-from lifecycle.network.medium import RMW_DEFAULT, TRANSPORTS_VARIABLE, Medium
-from lifecycle.plan.connections.static_endpoints import GRAPH_TOPIC, GRAPH_TYPE, MAX_USER_ID
-from lifecycle.plan.model import ParticipantConnections, StaticEndpoint, StaticParticipant
+from lifecycle.network import RMW_DEFAULT, TRANSPORTS_VARIABLE, ConnectionUrl, Medium
+from lifecycle.network import parse as parse_url
+from lifecycle.plan import (
+    GRAPH_TOPIC,
+    GRAPH_TYPE,
+    MAX_USER_ID,
+    ParticipantConnections,
+    StaticEndpoint,
+    StaticParticipant,
+)
 
 
 def endpoint_table(participants: Sequence[StaticParticipant]) -> str:

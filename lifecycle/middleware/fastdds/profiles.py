@@ -17,7 +17,7 @@ from pathlib import Path
 from xml.etree import ElementTree as ET
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.network.medium import Medium
+from lifecycle.network import Medium
 
 PROFILES_FILE_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 DEFAULT_FILE = "DEFAULT_FASTRTPS_PROFILES.xml"

@@ -22,9 +22,7 @@ from lifecycle.middleware.fastdds.profiles import child as _child
 from lifecycle.middleware.fastdds.profiles import locator as _locator
 from lifecycle.middleware.fastdds.profiles import tcp_locator as _tcp_locator
 from lifecycle.middleware.fastdds.profiles import text as _text
-from lifecycle.network.connection_url import ConnectionUrl, Peer
-from lifecycle.network.medium import Medium
-from lifecycle.network.ports import participant_ports
+from lifecycle.network import ConnectionUrl, Medium, Peer, participant_ports
 
 LOOPBACK = {Medium.UDPV4: "127.0.0.1", Medium.UDPV6: "::1"}
 """The transports that carry UDP, and where each finds this host."""

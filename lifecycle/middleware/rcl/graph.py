@@ -16,7 +16,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 import rclpy
 from rclpy.node import Node
 
-from lifecycle.manifest.model import EndpointKind
+from lifecycle.manifest import EndpointKind
 from lifecycle.middleware.discovery.dead_peers import (
     PROCESS_DIGITS,
     give_up_dead_connections,
@@ -31,12 +31,13 @@ from lifecycle.middleware.rcl.graph_queries import endpoints_of, endpoints_of_no
 from lifecycle.middleware.rcl.hidden_node import quiet_node
 from lifecycle.middleware.rcl.stale_node_filter import StaleNodeFilter
 from lifecycle.middleware.rcl.type_hash import with_service_hashes
-from lifecycle.network.medium import Medium
-from lifecycle.plan.model import ParticipantConnections
-from lifecycle.verify.observation import ObservedEndpoint, ObservedNode
-from lifecycle.verify.tool_filter import (
+from lifecycle.network import Medium
+from lifecycle.plan import ParticipantConnections
+from lifecycle.verify import (
     NO_NAMES,
     DeclaredNames,
+    ObservedEndpoint,
+    ObservedNode,
     fold_actions,
     is_noise_endpoint,
     known_node,

@@ -21,8 +21,14 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, LivelinessPolicy, ReliabilityPolicy
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.manifest.model import EndpointKind
-from lifecycle.manifest.qos import Durability, History, Liveliness, QosProfile, Reliability
+from lifecycle.manifest import (
+    Durability,
+    EndpointKind,
+    History,
+    Liveliness,
+    QosProfile,
+    Reliability,
+)
 from lifecycle.middleware.rcl import abi
 
 _UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"

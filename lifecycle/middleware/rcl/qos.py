@@ -25,7 +25,7 @@ from rclpy.qos import (
 )
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.manifest.qos import Durability, History, Liveliness, QosProfile, Reliability
+from lifecycle.manifest import Durability, History, Liveliness, QosProfile, Reliability
 
 _UNSPECIFIED_NS = 0
 _INFINITE_NS = 2**63 - 1

@@ -10,10 +10,9 @@ import dataclasses
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from lifecycle.manifest.installed_types import join
-from lifecycle.manifest.model import EndpointKind
+from lifecycle.manifest import EndpointKind, join
 from lifecycle.middleware.rcl.graph_queries import EndpointInfo, endpoints_of
-from lifecycle.verify.observation import ObservedEndpoint
+from lifecycle.verify import ObservedEndpoint
 
 if TYPE_CHECKING:
     from rclpy.node import Node

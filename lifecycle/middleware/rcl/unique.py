@@ -25,11 +25,11 @@ from rclpy.type_support import check_is_valid_msg_type
 from rclpy.validate_topic_name import validate_topic_name
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.manifest.qos import QosProfile
+from lifecycle.manifest import QosProfile
 from lifecycle.middleware.rcl import abi
 from lifecycle.middleware.rcl.qos import to_rclpy
 from lifecycle.middleware.sockets.nfe import NetworkFlowEndpointsUnsupported, read_handle
-from lifecycle.network.nfe import UniqueRequirement, is_ip
+from lifecycle.network import UniqueRequirement, is_ip
 
 _PUBLISHER_HINT = "give the publisher its own participant, or ask for optionally_required"
 _SUBSCRIPTION_HINT = "ask for optionally_required, or set RMW_IMPLEMENTATION=rmw_fastrtps_cpp"

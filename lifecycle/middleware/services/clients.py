@@ -19,11 +19,11 @@ from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.export.captured import CapturedParameter
+from lifecycle.export import CapturedParameter
 from lifecycle.middleware.rcl.graph import GraphObserver
 from lifecycle.middleware.services.parameters import read_parameters, report_parameters
 from lifecycle.middleware.services.service_calls import ServiceCalls, ServiceUnansweredError
-from lifecycle.verify.observation import (
+from lifecycle.verify import (
     ConfigurationError,
     NodeConfiguration,
     ParameterReport,

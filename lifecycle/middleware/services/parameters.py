@@ -15,11 +15,11 @@ from rcl_interfaces.msg import ParameterType
 from rcl_interfaces.msg import ParameterValue as ParameterValueMessage
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters
 
-from lifecycle.manifest.model import ParameterValue
-from lifecycle.verify.observation import ParameterReport
+from lifecycle.manifest import ParameterValue
+from lifecycle.verify import ParameterReport
 
 if TYPE_CHECKING:
-    from lifecycle.export.captured import CapturedParameter
+    from lifecycle.export import CapturedParameter
     from lifecycle.middleware.services.service_calls import ServiceCalls
 
 _TYPES = {
@@ -49,7 +49,7 @@ async def read_parameters(
     Raises:
         ServiceUnansweredError: no such service, or no answer.
     """
-    from lifecycle.export.captured import CapturedParameter
+    from lifecycle.export import CapturedParameter
 
     return tuple(
         CapturedParameter(

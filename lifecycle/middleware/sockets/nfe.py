@@ -21,7 +21,7 @@ from rclpy.subscription import Subscription
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds.shared_executor import is_guest
 from lifecycle.middleware.rcl import abi
-from lifecycle.network.nfe import InternetProtocol, NetworkFlowEndpoint, TransportProtocol
+from lifecycle.network import InternetProtocol, NetworkFlowEndpoint, TransportProtocol
 
 _TRANSPORTS = (TransportProtocol.UNKNOWN, TransportProtocol.UDP, TransportProtocol.TCP)
 _INTERNETS = (InternetProtocol.UNKNOWN, InternetProtocol.IPV4, InternetProtocol.IPV6)

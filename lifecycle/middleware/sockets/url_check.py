@@ -19,8 +19,7 @@ import psutil
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds.url_profile import UrlTransport, families
-from lifecycle.network.connection_url import ConnectionUrl
-from lifecycle.network.medium import Medium
+from lifecycle.network import ConnectionUrl, Medium
 
 _TABLES = (
     ("udp", Medium.UDPV4, socket.AF_INET),

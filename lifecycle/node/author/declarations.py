@@ -14,8 +14,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest.model import EndpointKind
-from lifecycle.manifest.qos import QosProfile
+from lifecycle.manifest import EndpointKind, QosProfile
 from lifecycle.node.actions import resolve_action_name
 from lifecycle.node.author import declaring
 from lifecycle.node.author.handlers import ActionHandler

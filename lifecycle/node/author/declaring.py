@@ -15,15 +15,13 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest.diagnostics import Position
-from lifecycle.manifest.model import EndpointKind, EndpointPolicy
-from lifecycle.manifest.qos import QosProfile
+from lifecycle.manifest import EndpointKind, EndpointPolicy, Position, QosProfile
 from lifecycle.middleware import from_rclpy
 from lifecycle.node.author.handlers import Handlers, match, needs_handler
 from lifecycle.node.connections.data_layer import CONFIGURED, NodeDataLayer
 from lifecycle.node.endpoints.mapping import Key, find_endpoint
 from lifecycle.node.lifecycle.machine import NodeState
-from lifecycle.plan.model import PlannedEndpoint, PlannedNode
+from lifecycle.plan import PlannedEndpoint, PlannedNode
 
 _METHODS = {
     EndpointKind.SUBSCRIPTION: "declare_subscription",

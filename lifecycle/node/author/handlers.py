@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
 
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest.model import EndpointKind
-from lifecycle.plan.model import PlannedEndpoint
+from lifecycle.manifest import EndpointKind
+from lifecycle.plan import PlannedEndpoint
 
 F = TypeVar("F", bound=Callable[..., Any])
 

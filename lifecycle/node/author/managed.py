@@ -19,7 +19,7 @@ from rclpy.task import Future
 from rclpy.timer import Timer
 
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest.model import EndpointKind, EndpointPolicy
+from lifecycle.manifest import EndpointKind, EndpointPolicy
 from lifecycle.node.author import parameters
 from lifecycle.node.author.declaring import DeclaredInCode
 from lifecycle.node.author.handlers import alternatives
@@ -42,8 +42,8 @@ from lifecycle.node.lifecycle.services import LifecycleServices, Turns
 from lifecycle.node.reporting import configuration
 from lifecycle.node.reporting.configuration import ConfigurationChanges
 from lifecycle.node.reporting.graph_member import GraphMember
-from lifecycle.plan.model import PlannedNode
-from lifecycle.verify.observation import NodeConfiguration
+from lifecycle.plan import PlannedNode
+from lifecycle.verify import NodeConfiguration
 
 
 class Undeclared:

@@ -36,8 +36,8 @@ from rclpy.time_source import TimeSource
 from rclpy.timer import Timer
 
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest.model import EndpointKind
-from lifecycle.network.connection_url import ConnectionUrl
+from lifecycle.manifest import EndpointKind
+from lifecycle.network import ConnectionUrl
 from lifecycle.node.author import parameters
 from lifecycle.node.author.declarations import Declarations
 from lifecycle.node.author.managed import Managed
@@ -55,7 +55,7 @@ from lifecycle.node.endpoints.publisher import DeclaredPublisher
 from lifecycle.node.lifecycle.gate import GatedPublisher, GatedTimer, NodeGate
 from lifecycle.node.lifecycle.machine import NodeState
 from lifecycle.node.reporting import configuration
-from lifecycle.verify.observation import ConnectionReport
+from lifecycle.verify import ConnectionReport
 
 if TYPE_CHECKING:
     from rclpy.action import ActionClient

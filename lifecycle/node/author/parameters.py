@@ -18,14 +18,14 @@ from rclpy.exceptions import (
 from rclpy.parameter import Parameter
 
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest.model import ParameterDeclaration, ParameterValue
+from lifecycle.manifest import ParameterDeclaration, ParameterValue
 from lifecycle.middleware import parameter_value, type_word
-from lifecycle.verify.observation import ParameterReport
+from lifecycle.verify import ParameterReport
 
 if TYPE_CHECKING:
     from rclpy.node import Node
 
-    from lifecycle.plan.model import PlannedNode
+    from lifecycle.plan import PlannedNode
 
 _TYPES = {
     "bool": Parameter.Type.BOOL,

@@ -22,10 +22,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lifecycle.errors import BringUpError, LifecycleError
-from lifecycle.manifest.diagnostics import Position
-from lifecycle.manifest.model import EndpointPolicy, Run, RunKind
+from lifecycle.manifest import EndpointPolicy, Position, Run, RunKind
 from lifecycle.node.author.handlers import nearest
-from lifecycle.plan.model import PlannedNode
+from lifecycle.plan import PlannedNode
 
 if TYPE_CHECKING:
     from rclpy.context import Context

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING
 
 from lifecycle.errors import LifecycleError, MiddlewareError
 from lifecycle.middleware import FlowParticipant, has_shared_memory
-from lifecycle.network.connection_url import ConnectionUrl
+from lifecycle.network import ConnectionUrl
 from lifecycle.node.author.handlers import nearest
-from lifecycle.plan.model import ParticipantConnections, PlannedParticipant
+from lifecycle.plan import ParticipantConnections, PlannedParticipant
 
 if TYPE_CHECKING:
     from rclpy.node import Node

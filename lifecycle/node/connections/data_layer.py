@@ -19,7 +19,7 @@ from rclpy.node import Node
 from rclpy.task import Future
 
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest.model import Authority, EndpointKind
+from lifecycle.manifest import Authority, EndpointKind
 from lifecycle.node.connections.connection_status import ConnectionEvent, ConnectionStatus
 from lifecycle.node.connections.connections import ConnectError, Connection, Connections
 from lifecycle.node.endpoints.endpoint_table import EndpointTable, PlannedPlaces
@@ -28,7 +28,7 @@ from lifecycle.node.endpoints.mapper import Mapper
 from lifecycle.node.endpoints.mapping import Mapping
 from lifecycle.node.endpoints.placing import After, Placer
 from lifecycle.node.lifecycle.machine import NodeState
-from lifecycle.plan.model import ParticipantConnections, PlannedEndpoint, PlannedNode
+from lifecycle.plan import ParticipantConnections, PlannedEndpoint, PlannedNode
 
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from rclpy.node import Node
 
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest.model import Authority, EndpointKind
+from lifecycle.manifest import Authority, EndpointKind
 from lifecycle.middleware import import_interface
 from lifecycle.node.author.handlers import alternatives
 from lifecycle.node.connections.connection_status import ConnectionStatus
@@ -22,7 +22,7 @@ from lifecycle.node.connections.connections import ConnectError, Connection, Con
 from lifecycle.node.endpoints.mapper import Mapper
 from lifecycle.node.endpoints.mapping import Key, Mapping, UnknownEndpointError, find_endpoint
 from lifecycle.node.endpoints.publisher import DeclaredPublisher, Kept
-from lifecycle.plan.model import PlannedEndpoint, PlannedNode, PlannedParticipant
+from lifecycle.plan import PlannedEndpoint, PlannedNode, PlannedParticipant
 
 if TYPE_CHECKING:
     from lifecycle.node.lifecycle.gate import NodeGate

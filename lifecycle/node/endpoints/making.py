@@ -14,12 +14,11 @@ from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest.model import EndpointKind
-from lifecycle.manifest.qos import QosProfile
+from lifecycle.manifest import EndpointKind, QosProfile
 from lifecycle.middleware import create_publisher, create_subscription, to_rclpy
 from lifecycle.node.actions import ActionWords, Goals, resolve_action_name
 from lifecycle.node.lifecycle.execution import positional_count
-from lifecycle.plan.model import PlannedEndpoint
+from lifecycle.plan import PlannedEndpoint
 
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup
@@ -242,7 +241,7 @@ class Maker:
         handler: Callable[..., Any] | None,
         name: str,
     ) -> Any:
-        from lifecycle.middleware.services.actions import GoalServer  # late: numpy, 100 ms
+        from lifecycle.middleware import GoalServer  # late: numpy, 100 ms
 
         assert handler is not None
         logger = self._node.get_logger()
@@ -279,7 +278,7 @@ class Maker:
         handler: Callable[..., Any] | None,  # noqa: ARG002 - it has none
         name: str,
     ) -> Any:
-        from lifecycle.middleware.services.actions import GoalClient
+        from lifecycle.middleware import GoalClient
         from lifecycle.node.author.node import refuse_to_block
 
         return self._action(

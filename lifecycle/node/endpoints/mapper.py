@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from rclpy.task import Future
 
-from lifecycle.manifest.model import EndpointKind
+from lifecycle.manifest import EndpointKind
 from lifecycle.node.connections.connection_status import ConnectionStatus
 from lifecycle.node.connections.connections import Connection, Connections
 from lifecycle.node.endpoints.making import CLIENTS

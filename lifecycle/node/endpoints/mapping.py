@@ -22,18 +22,18 @@ from rclpy.event_handler import (
 from rclpy.publisher import Publisher
 
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest.model import EndpointKind
+from lifecycle.manifest import EndpointKind
 from lifecycle.node.author.handlers import nearest
 from lifecycle.node.connections.connections import Connection
 from lifecycle.node.endpoints.making import wire_name
-from lifecycle.plan.model import PlannedEndpoint
+from lifecycle.plan import PlannedEndpoint
 
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup
     from rclpy.node import Node
     from rclpy.subscription import Subscription
 
-    from lifecycle.middleware.services.server_watch import ServerWatch
+    from lifecycle.middleware import ServerWatch
 
 
 Key = tuple[EndpointKind, str]

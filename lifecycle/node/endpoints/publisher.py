@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 from rclpy.serialization import serialize_message
 
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest.qos import Durability, History, QosProfile
+from lifecycle.manifest import Durability, History, QosProfile
 
 if TYPE_CHECKING:
     from rclpy.publisher import Publisher

@@ -18,8 +18,7 @@ from lifecycle.middleware import ParticipantSettings, participant_settings
 from lifecycle.node.author.node import LifecycleNode
 from lifecycle.node.author.spec import Construction, Mode, constructing, load_class, ros_arguments
 from lifecycle.node.host.control import HostSpec
-from lifecycle.plan.model import PlannedNode
-from lifecycle.plan.participants import parameter_text
+from lifecycle.plan import PlannedNode, parameter_text
 
 
 def process_context(spec: HostSpec) -> Context:

@@ -25,9 +25,9 @@ from typing import NoReturn
 
 from lifecycle import codec
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest.model import DiscoveryRange
-from lifecycle.plan.model import ParticipantConnections, PlannedNode
-from lifecycle.verify.observation import NodeConfiguration
+from lifecycle.manifest import DiscoveryRange
+from lifecycle.plan import ParticipantConnections, PlannedNode
+from lifecycle.verify import NodeConfiguration
 
 SIGN_DESCRIPTORS = 2
 """Beside the first byte of the HostSpec are the two descriptors of the busy sign, by which the
@@ -167,7 +167,7 @@ def report_failure(channel: HostChannel, node: str, error: Exception) -> None:
 def give_up(channel: HostChannel, node: str, error: Exception) -> NoReturn:
     """Report a failure, and end the process."""
     report_failure(channel, node, error)
-    from lifecycle.middleware.process.teardown import leave_and_exit
+    from lifecycle.middleware import leave_and_exit
 
     leave_and_exit(1)
 

@@ -13,7 +13,7 @@ import socket
 from typing import NoReturn
 
 from lifecycle import codec
-from lifecycle.manifest.model import DiscoveryRange
+from lifecycle.manifest import DiscoveryRange
 from lifecycle.node.host.control import HostChannel, HostSpec, give_up
 from lifecycle.node.host.preloading import preload
 

@@ -22,9 +22,7 @@ from rclpy.node import Node
 
 from lifecycle import codec
 from lifecycle.errors import LifecycleError
-from lifecycle.middleware.discovery.rediscovery import send_again_soon
-from lifecycle.middleware.process.busy_timer import BusySign
-from lifecycle.middleware.process.teardown import leave_and_exit
+from lifecycle.middleware import BusySign, leave_and_exit, send_again_soon
 from lifecycle.node.author.node import LifecycleNode
 from lifecycle.node.connections.data_layer import NodeInterface
 from lifecycle.node.host.constructing import Participants, class_of, construct
@@ -38,8 +36,8 @@ from lifecycle.node.host.control import (
 )
 from lifecycle.node.host.loop import NodeLoop, Watchdog, on_signal
 from lifecycle.node.lifecycle.machine import CallbackOutcome
-from lifecycle.plan.model import PlannedNode
-from lifecycle.verify.observation import NodeConfiguration
+from lifecycle.plan import PlannedNode
+from lifecycle.verify import NodeConfiguration
 
 _ANSWERED_WITHOUT_CONFIGURATION = frozenset(
     {Operation.ACTIVATE, Operation.DEACTIVATE, Operation.CLEANUP, Operation.SHUTDOWN}

@@ -33,10 +33,7 @@ from rclpy.executors import (
 )
 from rclpy.node import Node
 
-from lifecycle.middleware.discovery.rediscovery import tell_names
-from lifecycle.middleware.fastdds.participant import hidden_nodes
-from lifecycle.middleware.process.busy_timer import BusySign
-from lifecycle.middleware.process.teardown import leave_and_exit
+from lifecycle.middleware import BusySign, hidden_nodes, leave_and_exit, tell_names
 from lifecycle.node.author.node import LifecycleNode
 from lifecycle.node.lifecycle.execution import hint
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import importlib
 
 from lifecycle import codec
-from lifecycle.manifest.model import DiscoveryRange
+from lifecycle.manifest import DiscoveryRange
 from lifecycle.node.host.control import Command, HostSpec, Operation
 
 _PRELOADED = (

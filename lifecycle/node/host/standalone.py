@@ -27,15 +27,20 @@ import rclpy
 from rclpy.signals import SignalHandlerOptions
 
 from lifecycle.errors import ExitCode
-from lifecycle.manifest.model import Timeouts
-from lifecycle.middleware import ParticipantSettings, participant_settings
-from lifecycle.middleware.discovery.liveliness import AlivePublisher, node_topic
-from lifecycle.middleware.process.busy_timer import BusySign, Overdue
+from lifecycle.manifest import Timeouts
+from lifecycle.middleware import (
+    AlivePublisher,
+    BusySign,
+    Overdue,
+    ParticipantSettings,
+    node_topic,
+    participant_settings,
+)
 from lifecycle.node.author.node import LifecycleNode
 from lifecycle.node.author.spec import Construction, Mode, constructing, parse_mode
 from lifecycle.node.host.loop import NodeLoop, Watchdog, on_signal
 from lifecycle.node.lifecycle.machine import CallbackOutcome
-from lifecycle.plan.model import PlannedNode
+from lifecycle.plan import PlannedNode
 
 _SAID_AGAIN_S = (0.1, 0.3)
 """Fast DDS repeats what was lost after up to 3 s: too late for a silence."""

@@ -26,8 +26,7 @@ from rclpy.utilities import get_rmw_implementation_identifier
 
 from lifecycle import codec
 from lifecycle.errors import MiddlewareError
-from lifecycle.manifest.model import EndpointKind
-from lifecycle.manifest.qos import QosProfile
+from lifecycle.manifest import EndpointKind, QosProfile
 from lifecycle.middleware import (
     SHARED_MEMORY,
     EndpointInfo,
@@ -38,12 +37,7 @@ from lifecycle.middleware import (
     is_server_matched,
     matched_with,
 )
-from lifecycle.network.medium import Medium
-from lifecycle.network.nfe import (
-    InternetProtocol,
-    NetworkFlowEndpoint,
-    TransportProtocol,
-)
+from lifecycle.network import InternetProtocol, Medium, NetworkFlowEndpoint, TransportProtocol
 from lifecycle.node.author import parameters
 from lifecycle.node.author.declaring import interface_name
 from lifecycle.node.connections.connections import Connection
@@ -52,14 +46,8 @@ from lifecycle.node.endpoints.making import CLIENTS, wire_name
 from lifecycle.node.endpoints.mapping import Mapping, count_peers
 from lifecycle.node.lifecycle.machine import NodeState
 from lifecycle.node.reporting.machine_id import machine_id
-from lifecycle.plan.model import PlannedNode
-from lifecycle.plan.negotiation.data_layer import PARADIGMS, SERIALIZATIONS
-from lifecycle.verify.observation import (
-    ConnectionReport,
-    EndpointReport,
-    Identity,
-    NodeConfiguration,
-)
+from lifecycle.plan import PARADIGMS, SERIALIZATIONS, PlannedNode
+from lifecycle.verify import ConnectionReport, EndpointReport, Identity, NodeConfiguration
 
 if TYPE_CHECKING:
     from rclpy.node import Node

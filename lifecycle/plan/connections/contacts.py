@@ -10,9 +10,8 @@ import dataclasses
 import ipaddress
 from collections.abc import Collection, Iterable, Mapping, Sequence
 
-from lifecycle.manifest.model import DiscoveryMode, DiscoveryRange, FlowTransport
-from lifecycle.network.connection_url import ConnectionUrl, Peer, parse
-from lifecycle.network.medium import Medium
+from lifecycle.manifest import DiscoveryMode, DiscoveryRange, FlowTransport
+from lifecycle.network import ConnectionUrl, Medium, Peer, parse
 from lifecycle.plan.model import Plan
 
 _SPARE = 4

@@ -14,9 +14,8 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 
-from lifecycle.manifest.model import Discovery, DiscoveryMode, FlowTransport, RunKind
-from lifecycle.network.connection_url import ConnectionUrl, Peer, parse
-from lifecycle.network.medium import Medium
+from lifecycle.manifest import Discovery, DiscoveryMode, FlowTransport, RunKind
+from lifecycle.network import ConnectionUrl, Medium, Peer, parse
 from lifecycle.plan.connections.contacts import Contact, contacts_of, fixed_url, peers_by
 from lifecycle.plan.connections.hosts import LOOPBACK, Hosts, PortPool
 from lifecycle.plan.model import (

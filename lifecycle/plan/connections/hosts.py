@@ -12,11 +12,8 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 
-from lifecycle.manifest.model import EndpointKind, Machine, RunKind
-from lifecycle.network.connection_url import parse
-from lifecycle.network.medium import Medium
-from lifecycle.network.nfe import UniqueRequirement
-from lifecycle.network.ports import MAX_PORT, participant_ports
+from lifecycle.manifest import EndpointKind, Machine, RunKind
+from lifecycle.network import MAX_PORT, Medium, UniqueRequirement, parse, participant_ports
 from lifecycle.plan.model import Plan, PlanError, PlannedNode, PlannedProcess
 
 LOOPBACK = "127.0.0.1"

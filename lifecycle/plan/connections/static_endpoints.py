@@ -10,9 +10,8 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator, Sequence
 
-from lifecycle.manifest.model import EndpointKind, RunKind
-from lifecycle.manifest.qos import Durability, Reliability
-from lifecycle.network.medium import Medium
+from lifecycle.manifest import Durability, EndpointKind, Reliability, RunKind
+from lifecycle.network import Medium
 from lifecycle.plan.connections.contacts import contacts_of, fixed_url
 from lifecycle.plan.connections.control import participant_name
 from lifecycle.plan.connections.hosts import Hosts, PortPool

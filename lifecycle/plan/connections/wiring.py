@@ -15,21 +15,20 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
-from lifecycle.manifest.diagnostics import Diagnostic, Position
-from lifecycle.manifest.flows import ParticipantGroup
-from lifecycle.manifest.model import (
+from lifecycle.manifest import (
     ConnectionDeclaration,
     DataLayerSource,
+    Diagnostic,
     Discovery,
     DiscoveryMode,
     EndpointKind,
     FlowTransport,
     Manifest,
+    ParticipantGroup,
+    Position,
+    error,
 )
-from lifecycle.manifest.yaml.document import error
-from lifecycle.network.dscp import describe
-from lifecycle.network.medium import TRANSPORTS_VARIABLE, Medium
-from lifecycle.network.nfe import UniqueRequirement
+from lifecycle.network import TRANSPORTS_VARIABLE, Medium, UniqueRequirement, describe
 from lifecycle.plan.connections.control import (
     connect_control,
     connect_observers,

@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import dataclasses
 
-from lifecycle.manifest.model import EndpointKind, FlowTransport
-from lifecycle.manifest.qos import QosProfile
-from lifecycle.network.connection_url import Peer
-from lifecycle.network.medium import CONNECTABLE, RMW_DEFAULT, Medium
+from lifecycle.manifest import EndpointKind, FlowTransport, QosProfile
+from lifecycle.network import CONNECTABLE, RMW_DEFAULT, Medium, Peer
 from lifecycle.plan.connections.contacts import Contact
 
 PARADIGMS = ("publish-subscribe", "request-response")

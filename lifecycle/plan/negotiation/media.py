@@ -9,9 +9,8 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Collection
 
-from lifecycle.manifest.model import FlowTransport
-from lifecycle.network.datagram import is_fragmented, max_unfragmented
-from lifecycle.network.medium import Medium
+from lifecycle.manifest import FlowTransport
+from lifecycle.network import Medium, is_fragmented, max_unfragmented
 from lifecycle.plan.negotiation.data_layer import Party, PartyEndpoint
 
 

@@ -14,9 +14,8 @@ import ipaddress
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-from lifecycle.manifest.model import EndpointKind, FlowTransport
-from lifecycle.network.connection_url import ConnectionUrl, parse
-from lifecycle.network.medium import Medium
+from lifecycle.manifest import EndpointKind, FlowTransport
+from lifecycle.network import ConnectionUrl, Medium, parse
 from lifecycle.plan.connections.contacts import Contact, contacts_of, peers_by, ports_of
 from lifecycle.plan.connections.hosts import LOOPBACK, LOOPBACK6, PortPool
 from lifecycle.plan.model import PlanError

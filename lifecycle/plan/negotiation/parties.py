@@ -11,7 +11,7 @@ import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 
-from lifecycle.manifest.model import (
+from lifecycle.manifest import (
     DataLayer,
     Discovery,
     DiscoveryMode,
@@ -19,16 +19,19 @@ from lifecycle.manifest.model import (
     FlowTransport,
     RunKind,
 )
-from lifecycle.network.connection_url import ConnectionUrl, Peer, parse
-from lifecycle.network.medium import (
+from lifecycle.network import (
     BUILTIN_TRANSPORTS,
     CONNECTABLE,
+    DG,
     RMW_DEFAULT,
     TRANSPORTS_VARIABLE,
+    ConnectionUrl,
     Medium,
+    Peer,
+    UniqueRequirement,
+    domain_base,
+    parse,
 )
-from lifecycle.network.nfe import UniqueRequirement
-from lifecycle.network.ports import DG, domain_base
 from lifecycle.plan.connections.contacts import contacts_of, ports_of
 from lifecycle.plan.connections.control import is_fixed, participant_name
 from lifecycle.plan.connections.hosts import Hosts

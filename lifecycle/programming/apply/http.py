@@ -21,7 +21,7 @@ from collections.abc import Collection, Mapping
 from typing import Any, NoReturn, Protocol
 from urllib.parse import quote, unquote, urlsplit
 
-from lifecycle.network.address import is_loopback
+from lifecycle.network import is_loopback
 from lifecycle.programming.apply.errors import HttpError, MissingFeatureError, SettingsError
 from lifecycle.programming.apply.settings import Token
 from lifecycle.programming.apply.tool import Deadline

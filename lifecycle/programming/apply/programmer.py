@@ -19,9 +19,8 @@ from typing import TypeVar
 import psutil
 
 from lifecycle.errors import LifecycleError
-from lifecycle.network.address import canonical, is_loopback
-from lifecycle.network.five_qi import DscpMapping
-from lifecycle.plan.model import Plan, PlannedNode
+from lifecycle.network import DscpMapping, canonical, is_loopback
+from lifecycle.plan import Plan, PlannedNode
 from lifecycle.programming.apply.changes import Target, TargetChanges
 from lifecycle.programming.apply.errors import PartlyError
 from lifecycle.programming.apply.ledger import Ledger, has_ledger, owner_is_dead
@@ -29,7 +28,7 @@ from lifecycle.programming.apply.targets import TargetOptions, Targets
 from lifecycle.programming.apply.tool import Deadline
 from lifecycle.programming.rules.rules import FlowRule, LeftOut, RuleSet, SourceAddress, flow_rules
 from lifecycle.run_directory import is_held, run_name, runtime_root
-from lifecycle.verify.verdict import FlowReport, Outcome
+from lifecycle.verify import FlowReport, Outcome
 
 _DISCARD_PORT = 9
 """RFC 863; connecting a UDP socket sends nothing."""

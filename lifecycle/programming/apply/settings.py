@@ -33,7 +33,7 @@ from urllib.parse import urlsplit
 import msgspec
 import yaml
 
-from lifecycle.network.address import is_loopback
+from lifecycle.network import is_loopback
 from lifecycle.programming.apply.errors import SettingsError
 from lifecycle.programming.rules.camara import CamaraSettings
 from lifecycle.programming.rules.nef import NefSettings, UplinkFilter

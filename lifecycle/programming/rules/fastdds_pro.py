@@ -13,8 +13,7 @@ import dataclasses
 from collections.abc import Iterable, Iterator, Sequence
 from xml.sax.saxutils import quoteattr
 
-from lifecycle.network.dscp import describe, tos
-from lifecycle.network.nfe import InternetProtocol, TransportProtocol
+from lifecycle.network import InternetProtocol, TransportProtocol, describe, tos
 from lifecycle.programming.rules.rules import FlowRule, LeftOut, named
 
 _KINDS = {InternetProtocol.IPV4: "UDPv4", InternetProtocol.IPV6: "UDPv6"}

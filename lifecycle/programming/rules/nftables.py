@@ -15,8 +15,7 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 
 from lifecycle.codec import to_json
-from lifecycle.network.dscp import code_points, describe, dscp_name
-from lifecycle.network.nfe import InternetProtocol
+from lifecycle.network import InternetProtocol, code_points, describe, dscp_name
 from lifecycle.programming.rules.rules import FlowRule, LeftOut, asks, named
 
 FAMILY = "inet"

@@ -13,7 +13,7 @@ import enum
 import ipaddress
 import re
 
-from lifecycle.network.address import IpAddress
+from lifecycle.network import IpAddress
 
 PROTOCOL_NUMBERS = {"udp": 17, "tcp": 6}
 """The two that carry flows here (IANA Assigned Internet Protocol Numbers)."""

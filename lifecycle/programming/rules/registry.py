@@ -13,10 +13,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from types import MappingProxyType
 from typing import TypeVar
 
-from lifecycle.network.dscp import dscp_name, tos
-from lifecycle.network.five_qi import DscpMapping
-from lifecycle.network.nfe import FlowTuple
-from lifecycle.plan.model import Plan
+from lifecycle.network import DscpMapping, FlowTuple, dscp_name, tos
+from lifecycle.plan import Plan
 from lifecycle.programming.rules.camara import CamaraSettings, render_camara
 from lifecycle.programming.rules.fastdds_pro import render_fastdds_pro
 from lifecycle.programming.rules.nef import NefSettings, render_nef
@@ -24,7 +22,7 @@ from lifecycle.programming.rules.nftables import render_nft, render_nft_json
 from lifecycle.programming.rules.rules import RuleSet, SourceAddress, flow_rules, rules_digest
 from lifecycle.programming.rules.tc import TcSettings, render_tc
 from lifecycle.programming.rules.zenoh import render_zenoh
-from lifecycle.verify.verdict import FlowReport
+from lifecycle.verify import FlowReport
 
 COLUMNS = (
     "topic",

@@ -14,21 +14,30 @@ import hashlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from lifecycle.codec import to_json
-from lifecycle.manifest.model import EndpointKind
-from lifecycle.network.address import canonical, is_loopback, is_multicast, is_wildcard, socket_text
-from lifecycle.network.dscp import describe, parse_dscp
-from lifecycle.network.five_qi import DscpMapping
-from lifecycle.network.medium import Medium
-from lifecycle.network.nfe import FlowTuple, InternetProtocol, TransportProtocol, is_ip
-from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedNode
+from lifecycle.manifest import EndpointKind
+from lifecycle.network import (
+    DscpMapping,
+    FlowTuple,
+    InternetProtocol,
+    Medium,
+    TransportProtocol,
+    canonical,
+    describe,
+    is_ip,
+    is_loopback,
+    is_multicast,
+    is_wildcard,
+    parse_dscp,
+    socket_text,
+)
+from lifecycle.plan import Plan, PlannedEndpoint, PlannedNode
 from lifecycle.programming.rules.packet_filter import (
     PROTOCOL_NUMBERS,
     check_address,
     check_port,
     check_same_family,
 )
-from lifecycle.verify.transport import UNKNOWN
-from lifecycle.verify.verdict import FlowReport, Outcome
+from lifecycle.verify import UNKNOWN, FlowReport, Outcome
 
 MAX_FLOW_LABEL = 0xFFFFF
 """Twenty bits (RFC 6437)."""

@@ -25,9 +25,7 @@ import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-from lifecycle.network.dscp import describe, dscp_name, parse_dscp, tos
-from lifecycle.network.five_qi import five_qi_of
-from lifecycle.network.nfe import InternetProtocol
+from lifecycle.network import InternetProtocol, describe, dscp_name, five_qi_of, parse_dscp, tos
 from lifecycle.programming.rules.rules import FlowRule, LeftOut, asks, named
 
 DEFAULT_MINOR = 0xFFF

@@ -11,8 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from lifecycle.codec import to_json
-from lifecycle.network.dscp import describe, tos
-from lifecycle.network.nfe import InternetProtocol
+from lifecycle.network import InternetProtocol, describe, tos
 from lifecycle.programming.rules.rules import FlowRule, LeftOut, named
 
 

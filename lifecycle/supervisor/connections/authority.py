@@ -18,9 +18,9 @@ from typing import Protocol
 
 from lifecycle.errors import BringUpError
 from lifecycle.graph import set_within
-from lifecycle.manifest.model import Authority, Condition, DataLayerSource
-from lifecycle.node.host.control import Operation
-from lifecycle.plan.model import Plan
+from lifecycle.manifest import Authority, Condition, DataLayerSource
+from lifecycle.node import Operation
+from lifecycle.plan import Plan
 from lifecycle.supervisor.connections.desired_state import (
     ActualState,
     Instructions,
@@ -35,8 +35,7 @@ from lifecycle.supervisor.nodes.driver import ACTIVE, INACTIVE
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.run.events import Emitter, Notice, WiringChanged, WiringLost
 from lifecycle.supervisor.run.failure import ended
-from lifecycle.verify.observation import NodeConfiguration, Observation
-from lifecycle.verify.verdict import Finding
+from lifecycle.verify import Finding, NodeConfiguration, Observation
 
 
 def configured_before_any_connect(system: System) -> frozenset[str]:

@@ -10,11 +10,9 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Collection, Mapping
 
-from lifecycle.node.host.control import Operation
-from lifecycle.plan.model import ParticipantConnections, PlannedNode
-from lifecycle.verify.observation import NodeConfiguration
-from lifecycle.verify.rules import run
-from lifecycle.verify.verdict import Finding, Outcome
+from lifecycle.node import Operation
+from lifecycle.plan import ParticipantConnections, PlannedNode
+from lifecycle.verify import NOT_WIRED, Finding, NodeConfiguration, Outcome, node_of
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -174,11 +172,11 @@ def not_wired(subject: str, message: str) -> Finding:
         subject: fully qualified node name, or the system's name.
         message: a whole sentence with the reason.
     """
-    return run.NOT_WIRED.finding(
+    return NOT_WIRED.finding(
         Outcome.VIOLATED,
         subject=subject,
         expected="wired",
         observed="not wired",
         message=message,
-        node=run.node_of(subject),
+        node=node_of(subject),
     )

@@ -11,15 +11,15 @@ import contextlib
 import os
 
 from lifecycle.errors import BringUpError, MiddlewareError
-from lifecycle.manifest.model import Run, RunKind
+from lifecycle.manifest import Run, RunKind
 from lifecycle.middleware import discovery_server_command, discovery_server_listens
-from lifecycle.plan.model import PlannedProcess, PlannedServer
+from lifecycle.plan import PlannedProcess, PlannedServer
 from lifecycle.supervisor.nodes.bring_up import died
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.process import COMMAND_ESCALATION, ManagedProcess
 from lifecycle.supervisor.processes.spawn import ProcessState, Spawner
-from lifecycle.supervisor.run.failure import DEADLINE, START_FAILED, StepFailedError, finding_of
-from lifecycle.verify.verdict import Finding
+from lifecycle.supervisor.run.failure import StepFailedError, finding_of
+from lifecycle.verify import DEADLINE, START_FAILED, Finding
 
 NAME = "discovery_server"
 """Its process; no node can be called so, as keys of processes are manifest keys."""

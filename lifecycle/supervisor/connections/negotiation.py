@@ -15,42 +15,43 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Collection, Iterable, Iterator, Mapping
 
-from lifecycle.manifest.model import Authority, DataLayerSource, EndpointKind, EndpointPolicy
-from lifecycle.network.connection_url import parse
-from lifecycle.network.medium import CONNECTABLE, RMW_DEFAULT, Medium
-from lifecycle.network.nfe import UniqueRequirement
+from lifecycle.manifest import Authority, DataLayerSource, EndpointKind, EndpointPolicy
+from lifecycle.network import CONNECTABLE, RMW_DEFAULT, Medium, UniqueRequirement, parse
 from lifecycle.plan import (
+    FAST_DDS,
     DataLayerGraph,
     NegotiatedConnection,
     NegotiationProblem,
     ParticipantConnections,
     Party,
+    PartyEndpoint,
     Plan,
     PlannedEndpoint,
     PlannedFlow,
     PlannedNode,
+    contacts_of,
+    endpoint_of,
     hosts_of,
     negotiate,
     party_of_node,
+    ports_of,
     terms_of,
+    transports_of,
     wishes_of,
     with_graph,
 )
-from lifecycle.plan.connections.contacts import contacts_of, ports_of
-from lifecycle.plan.negotiation.data_layer import PartyEndpoint
-from lifecycle.plan.negotiation.parties import FAST_DDS, endpoint_of, transports_of
 from lifecycle.supervisor.connections.desired_state import (
     Instructions,
     not_wired,
     planned_instructions,
 )
-from lifecycle.verify.observation import (
+from lifecycle.verify import (
     ConnectionReport,
     EndpointReport,
+    Finding,
     NodeConfiguration,
     Observation,
 )
-from lifecycle.verify.verdict import Finding
 
 _OWN_FLOW = (UniqueRequirement.STRICTLY_REQUIRED, UniqueRequirement.OPTIONALLY_REQUIRED)
 

@@ -19,15 +19,15 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from lifecycle.errors import LifecycleError
 from lifecycle.graph import set_within
-from lifecycle.plan.model import Plan
+from lifecycle.plan import Plan
 from lifecycle.run_directory import LEDGER_NAME, RunDirectory
 from lifecycle.supervisor.run.events import Emitter, Event, Notice, VerdictChanged
-from lifecycle.supervisor.run.failure import NOT_PROGRAMMED, StepFailedError, Worker, ended
+from lifecycle.supervisor.run.failure import StepFailedError, Worker, ended
 from lifecycle.supervisor.run.options import UpOptions
-from lifecycle.verify.verdict import FlowReport, Verdict
+from lifecycle.verify import NOT_PROGRAMMED, FlowReport, Verdict
 
 if TYPE_CHECKING:
-    from lifecycle.programming.apply import TargetChanges, TargetOptions
+    from lifecycle.programming import TargetChanges, TargetOptions
 
 _T = TypeVar("_T")
 
@@ -287,7 +287,7 @@ class Networks:
         if self._keeper is not None:
             await self._keeper.close(hurry)
         elif (self._directory / LEDGER_NAME).is_file():
-            from lifecycle.programming.apply.programmer import Removal
+            from lifecycle.programming import Removal
 
             await remove(Removal(self._directory), self._tell, hurry, self._worker)
 
@@ -311,7 +311,7 @@ def token_variables(program: Iterable[TargetOptions]) -> frozenset[str]:
     paths = {each.settings for each in program if each.settings}
     if not paths:
         return frozenset()
-    from lifecycle.programming.apply.settings import load_settings
+    from lifecycle.programming import load_settings
 
     found = [load_settings(each) for each in paths]
     tokens = [each.token for file in found for each in (file.nef, file.camara) if each is not None]
@@ -335,7 +335,7 @@ def open_networks(
     path = directory.path
     if not options.program:
         return Networks(plan.system, path, emit)
-    from lifecycle.programming.apply import open_programmer, sweep_orphans
+    from lifecycle.programming import open_programmer, sweep_orphans
 
     programmer = open_programmer(
         plan,
@@ -366,7 +366,7 @@ def remove_programmed(directory: Path, within_s: float | None = None) -> tuple[s
     """
     if not (directory / LEDGER_NAME).is_file():
         return ()
-    from lifecycle.programming.apply import remove_run
+    from lifecycle.programming import remove_run
 
     done = remove_run(directory, within_s=within_s)
     return tuple(each.render(done=True) for each in done if each.changes)

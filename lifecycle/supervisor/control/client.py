@@ -9,8 +9,8 @@ import time
 from pathlib import Path
 
 from lifecycle.errors import ExitCode, UsageError
-from lifecycle.middleware.process.shared_memory import sweep
-from lifecycle.plan.model import Plan
+from lifecycle.middleware import sweep
+from lifecycle.plan import Plan
 from lifecycle.run_directory import RunDirectory, is_held, new_run_id, read_record
 from lifecycle.supervisor.connections.networks import remove_programmed
 from lifecycle.supervisor.control.server import (

@@ -16,8 +16,8 @@ from collections.abc import Collection, Iterable, Iterator
 
 from lifecycle.codec import to_plain
 from lifecycle.errors import BringUpError, ExitCode, UsageError
-from lifecycle.manifest.model import DataLayerSource
-from lifecycle.network.medium import Medium
+from lifecycle.manifest import DataLayerSource
+from lifecycle.network import Medium
 from lifecycle.plan import Plan, PlanDifference, PlannedNode, changes, with_files_of_now
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.processes.spawn import ProcessState

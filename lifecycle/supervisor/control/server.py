@@ -16,12 +16,11 @@ from pathlib import Path
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import UsageError
-from lifecycle.plan.model import Plan
+from lifecycle.plan import Plan
 from lifecycle.run_directory import connect, short_path
 from lifecycle.supervisor.control.orders import Done, Order, OrderKind
 from lifecycle.supervisor.control.status import SystemStatus
-from lifecycle.verify.observation import Observation
-from lifecycle.verify.verdict import Verdict
+from lifecycle.verify import Observation, Verdict
 
 _BURST_S = 0.05
 _CLOSE_S = 1.0

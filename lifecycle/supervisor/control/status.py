@@ -8,13 +8,11 @@ from __future__ import annotations
 
 import dataclasses
 
-from lifecycle.manifest.model import RunKind, UniqueHow
+from lifecycle.manifest import RunKind, UniqueHow
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.processes.spawn import ProcessState
 from lifecycle.supervisor.run.events import Reach
-from lifecycle.verify import not_ok
-from lifecycle.verify.observation import ConnectionReport
-from lifecycle.verify.verdict import Outcome, Verdict
+from lifecycle.verify import ConnectionReport, Outcome, Verdict, not_ok
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

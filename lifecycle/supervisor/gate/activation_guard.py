@@ -12,16 +12,14 @@ import dataclasses
 from collections.abc import Iterable
 
 from lifecycle.errors import BringUpError
-from lifecycle.node.host.control import Operation
-from lifecycle.plan.model import Plan
+from lifecycle.node import Operation
+from lifecycle.plan import Plan
 from lifecycle.supervisor.nodes.driver import ACTIVE
 from lifecycle.supervisor.nodes.remote_nodes import ChangeSource, ObservationSource
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.run.events import Notice, Reach
 from lifecycle.supervisor.run.failure import ended
-from lifecycle.verify.observation import Observation
-from lifecycle.verify.rules.state import ACTIVATED_AT_CLOSED_GATE
-from lifecycle.verify.verdict import Finding, Outcome
+from lifecycle.verify import ACTIVATED_AT_CLOSED_GATE, Finding, Observation, Outcome
 
 TRIES = 5
 """A node that is activated again and again is not deactivated for ever: its finding stays."""

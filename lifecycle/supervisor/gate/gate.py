@@ -12,7 +12,7 @@ import asyncio
 from typing import Protocol
 
 from lifecycle.errors import BringUpError, ExitCode, LifecycleError
-from lifecycle.verify.verdict import Outcome, Verdict
+from lifecycle.verify import Outcome, Verdict
 
 
 class VerificationError(LifecycleError):

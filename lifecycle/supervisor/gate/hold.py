@@ -31,7 +31,7 @@ from lifecycle.supervisor.health.process_monitor import ProcessMonitor
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.run.events import Emitter, Notice
 from lifecycle.supervisor.run.failure import StepFailedError, ended
-from lifecycle.verify.verdict import Stage
+from lifecycle.verify import Stage
 
 
 class Holding:

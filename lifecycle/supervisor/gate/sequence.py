@@ -23,7 +23,7 @@ from collections.abc import Callable, Collection, Coroutine, Iterable, Mapping
 from typing import Any
 
 from lifecycle.errors import BringUpError
-from lifecycle.node.host.control import Operation
+from lifecycle.node import Operation
 from lifecycle.plan import Plan, PlanError, moving_nodes, restarted
 from lifecycle.supervisor.control.orders import (
     ACTIVE,
@@ -40,13 +40,19 @@ from lifecycle.supervisor.nodes.bring_up import BringUp
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.processes.spawn import ProcessState, Spawner
 from lifecycle.supervisor.run.events import Emitter, GateOpened, Notice, Reach, SystemReached
-from lifecycle.supervisor.run.failure import START_FAILED, StepFailedError, together
+from lifecycle.supervisor.run.failure import StepFailedError, together
 from lifecycle.supervisor.run.shutdown import TakeDown
-from lifecycle.verify import not_ok
-from lifecycle.verify.judge import taken_on_trust
-from lifecycle.verify.rules import About, rule
-from lifecycle.verify.rules.nodes import MISSING_NODE
-from lifecycle.verify.verdict import Outcome, Stage, Verdict
+from lifecycle.verify import (
+    MISSING_NODE,
+    START_FAILED,
+    About,
+    Outcome,
+    Stage,
+    Verdict,
+    not_ok,
+    rule,
+    taken_on_trust,
+)
 
 UNCHANGED_S = 5.0
 """Who is discovered at all over TCP is after 0.1–1.6 s, on a machine with both processors busy

@@ -15,8 +15,8 @@ from collections.abc import Callable, Collection, Iterator
 from typing import Protocol
 
 from lifecycle.graph import set_within
-from lifecycle.manifest.model import EndpointKind
-from lifecycle.plan.model import Plan
+from lifecycle.manifest import EndpointKind
+from lifecycle.plan import Plan
 from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.gate.activation_guard import ActivationGuard
 from lifecycle.supervisor.gate.gate import closes
@@ -25,13 +25,20 @@ from lifecycle.supervisor.health.liveliness import NodeArrivals
 from lifecycle.supervisor.nodes.system import ObservedGraph, System
 from lifecycle.supervisor.run.events import Emitter, VerdictChanged
 from lifecycle.supervisor.run.failure import ended
-from lifecycle.verify import verify
-from lifecycle.verify.observation import Observation
-from lifecycle.verify.rules import About, Heals, rule
-from lifecycle.verify.rules.clients import SERVER_OF
-from lifecycle.verify.rules.configuration import MISSING_REPORT
-from lifecycle.verify.rules.outsiders import UNATTRIBUTED_ENDPOINT
-from lifecycle.verify.verdict import Finding, Outcome, Stage, Verdict
+from lifecycle.verify import (
+    MISSING_REPORT,
+    SERVER_OF,
+    UNATTRIBUTED_ENDPOINT,
+    About,
+    Finding,
+    Heals,
+    Observation,
+    Outcome,
+    Stage,
+    Verdict,
+    rule,
+    verify,
+)
 
 PASSING_S = 1.0
 """Discovery shows a newcomer's endpoints before its name, measured 0.02–0.45 s earlier; what nodes

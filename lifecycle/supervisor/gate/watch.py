@@ -11,8 +11,7 @@ from lifecycle.supervisor.gate.verification_loop import SETTLED_S, ChangeCounter
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.process import ManagedProcess
 from lifecycle.supervisor.processes.spawn import ProcessState
-from lifecycle.verify.judge import not_ok
-from lifecycle.verify.verdict import Outcome, Stage
+from lifecycle.verify import Outcome, Stage, not_ok
 
 
 async def first_death(system: System, known: set[str]) -> ManagedProcess:

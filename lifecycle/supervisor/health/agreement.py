@@ -15,9 +15,10 @@ import os
 from collections.abc import Callable, Iterator
 from typing import Protocol
 
-from lifecycle.manifest.model import DiscoveryRange, RunKind
-from lifecycle.node.reporting.machine_id import machine_id
-from lifecycle.plan.comparison import (
+from lifecycle.manifest import DiscoveryRange, RunKind
+from lifecycle.node import machine_id
+from lifecycle.plan import (
+    Plan,
     PlanNotice,
     PlanNoticeError,
     announced_plan,
@@ -28,11 +29,17 @@ from lifecycle.plan.comparison import (
     notice_of,
     plan_checksum,
 )
-from lifecycle.plan.model import Plan
 from lifecycle.supervisor.nodes.system import System
-from lifecycle.verify.observation import Observation
-from lifecycle.verify.rules import nodes, rule, run
-from lifecycle.verify.verdict import Finding, Outcome, Verdict
+from lifecycle.verify import (
+    MISSING_NODE,
+    PLAN_UNKNOWN,
+    PLANS_DIFFER,
+    Finding,
+    Observation,
+    Outcome,
+    Verdict,
+    rule,
+)
 
 ANNOUNCED_S = 5.0
 """A supervisor that is there has announced its plan within so long: with its first matched
@@ -155,7 +162,7 @@ class Agreement:
 
         def explain(finding: Finding) -> Finding:
             machine = machines.get(finding.node)
-            if finding.rule != nodes.MISSING_NODE.id or machine not in gone:
+            if finding.rule != MISSING_NODE.id or machine not in gone:
                 return finding
             why = f" ({gone[machine]})" if gone[machine] else ""
             return dataclasses.replace(
@@ -206,7 +213,7 @@ class Agreement:
                 continue
             who = _who(notice, self._plan.system)
             shown = "; ".join((*found[:_SHOWN], *(("and more",) if found[_SHOWN:] else ())))
-            yield run.PLANS_DIFFER.finding(
+            yield PLANS_DIFFER.finding(
                 Outcome.VIOLATED,
                 subject=who,
                 expected=f"plan {ours}",
@@ -250,7 +257,7 @@ class Agreement:
             if left_s > 0:
                 waits_s.append(left_s)
             who = f"the supervisor of machine {machine!r}"
-            yield run.PLAN_UNKNOWN.finding(
+            yield PLAN_UNKNOWN.finding(
                 Outcome.VIOLATED if left_s > 0 else Outcome.UNVERIFIABLE,
                 subject=who,
                 expected=f"plan {plan_checksum(self._plan)}",

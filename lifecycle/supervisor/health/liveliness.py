@@ -13,7 +13,7 @@ import enum
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING
 
-from lifecycle.middleware.process.busy_timer import Overdue
+from lifecycle.middleware import Overdue
 from lifecycle.supervisor.run.events import (
     Emitter,
     NodeAlive,
@@ -21,10 +21,14 @@ from lifecycle.supervisor.run.events import (
     NodeLeft,
     NodeSilent,
 )
-from lifecycle.verify.observation import Observation
-from lifecycle.verify.rules import run
-from lifecycle.verify.tool_filter import is_hidden_node, is_noise_node
-from lifecycle.verify.verdict import Finding, Outcome
+from lifecycle.verify import (
+    SILENT_NODE,
+    Finding,
+    Observation,
+    Outcome,
+    is_hidden_node,
+    is_noise_node,
+)
 
 if TYPE_CHECKING:
     from lifecycle.supervisor.processes.process import ManagedProcess
@@ -167,7 +171,7 @@ class SilenceMonitor:
     def findings(self) -> tuple[Finding, ...]:
         """Return one finding for each silent node."""
         return tuple(
-            run.SILENT_NODE.finding(
+            SILENT_NODE.finding(
                 Outcome.VIOLATED,
                 subject=name,
                 expected="alive",

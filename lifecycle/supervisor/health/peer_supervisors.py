@@ -14,8 +14,8 @@ from collections.abc import Callable, Coroutine, Iterable, Mapping
 from typing import Any, Protocol
 
 from lifecycle.errors import BringUpError
-from lifecycle.manifest.model import RunKind
-from lifecycle.node.host.control import Operation
+from lifecycle.manifest import RunKind
+from lifecycle.node import Operation
 from lifecycle.supervisor.health.liveliness import Cause
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.control_channel import ControlChannel

@@ -15,9 +15,9 @@ from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterable
 from typing import Any, Protocol, TypeVar
 
 from lifecycle.errors import BringUpError
-from lifecycle.manifest.model import Condition, RunKind
-from lifecycle.node.host.control import HostSpec, Operation
-from lifecycle.plan.model import PlannedNode
+from lifecycle.manifest import Condition, RunKind
+from lifecycle.node import HostSpec, Operation
+from lifecycle.plan import PlannedNode
 from lifecycle.supervisor.gate.gate import Permit
 from lifecycle.supervisor.nodes.driver import ControlDriver, NodeCondition, NodeDriver
 from lifecycle.supervisor.nodes.system import NodeRun, System
@@ -29,14 +29,14 @@ from lifecycle.supervisor.processes.control_channel import (
 from lifecycle.supervisor.processes.process import ManagedProcess
 from lifecycle.supervisor.processes.spawn import ProcessState, Spawner
 from lifecycle.supervisor.run.events import Reach
-from lifecycle.supervisor.run.failure import (
+from lifecycle.supervisor.run.failure import StepFailedError, ended
+from lifecycle.verify import (
     DEADLINE,
     NOT_WIRED,
     PROCESS_DIED,
     START_FAILED,
     TRANSITION_FAILED,
-    StepFailedError,
-    ended,
+    Rule,
 )
 
 T = TypeVar("T")
@@ -388,7 +388,7 @@ class BringUp:
         for condition in conditions:
             await self._system.reached(node, condition, "start")
 
-    async def _step(self, node: NodeRun, doing: Awaitable[T], limit_s: float, *, rule: str) -> T:
+    async def _step(self, node: NodeRun, doing: Awaitable[T], limit_s: float, *, rule: Rule) -> T:
         """Await one step within its limit, and say in whole sentences why it failed.
 
         The end of the node's process ends the step: nothing else would, for a node that is
@@ -398,7 +398,7 @@ class BringUp:
             return await self._stepping(node, doing, limit_s, rule=rule)
 
     async def _stepping(
-        self, node: NodeRun, doing: Awaitable[T], limit_s: float, *, rule: str
+        self, node: NodeRun, doing: Awaitable[T], limit_s: float, *, rule: Rule
     ) -> T:
         step = asyncio.ensure_future(doing)
         waits: set[asyncio.Future[object]] = {step}  # type: ignore[arg-type]

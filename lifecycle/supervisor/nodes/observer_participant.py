@@ -10,15 +10,14 @@ import os
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING
 
-from lifecycle.plan.model import ParticipantConnections, Plan, PlannedNode
+from lifecycle.plan import ParticipantConnections, Plan, PlannedNode
 from lifecycle.supervisor.health.peer_supervisors import Listener
 from lifecycle.supervisor.nodes.driver import NodeDriver, ServiceDriver, ServiceHand
-from lifecycle.verify.observation import NodeConfiguration, Observation
+from lifecycle.verify import NodeConfiguration, Observation
 
 if TYPE_CHECKING:
     from lifecycle.graph import Graph
-    from lifecycle.middleware.discovery.liveliness import AlivePublisher, AliveSubscription
-    from lifecycle.middleware.discovery.plan_notices import PlanNotices
+    from lifecycle.middleware import AlivePublisher, AliveSubscription, PlanNotices
 
 _QUIET_S = 0.005
 _BURST_S = 0.05
@@ -117,48 +116,48 @@ class ObserverParticipant:
 
     def announce_machine(self, system: str, machine: str) -> AlivePublisher:
         """Announce ourselves as the supervisor of a machine, by DDS liveliness."""
-        from lifecycle.middleware.discovery.liveliness import AlivePublisher, machine_topic
+        from lifecycle.middleware import AlivePublisher, machine_topic
 
         return AlivePublisher(self._node, machine_topic(system, machine))
 
     def watch_machine(self, system: str, machine: str, to: Listener) -> AliveSubscription:
         """Watch the liveliness of the supervisor of a machine."""
-        from lifecycle.middleware.discovery.liveliness import machine_topic
+        from lifecycle.middleware import machine_topic
 
         return self._watch(machine_topic(system, machine), to)
 
     def watch_node(self, node: str, to: Listener) -> AliveSubscription:
         """Watch the liveliness of a node that is attached."""
-        from lifecycle.middleware.discovery.liveliness import node_topic
+        from lifecycle.middleware import node_topic
 
         return self._watch(node_topic(node), to)
 
     def plan_notices(self, on_notice: Callable[[str], None]) -> PlanNotices:
         """Take part in the exchange of plans."""
-        from lifecycle.middleware.discovery.plan_notices import PlanNotices
+        from lifecycle.middleware import PlanNotices
 
         return PlanNotices(self._node, on_notice)
 
     def call_out(self, addresses: Iterable[str]) -> None:
         """Make all participants announce themselves, as far as the system's discovery allows."""
-        from lifecycle.middleware.discovery.rediscovery import call_out
+        from lifecycle.middleware import call_out
 
         call_out(self._graph.discovery.domain_id, self._graph.discovery.urls, addresses, os.environ)
 
     def send_again_soon(self) -> None:
         """Have what waits for a link to come back be sent soon when it does."""
-        from lifecycle.middleware.discovery.rediscovery import send_again_soon
+        from lifecycle.middleware import send_again_soon
 
         send_again_soon()
 
     def tell_names(self) -> None:
         """Announce our node to the graph again."""
-        from lifecycle.middleware.discovery.rediscovery import tell_names
+        from lifecycle.middleware import tell_names
 
         tell_names([self._node])
 
     def _watch(self, topic: str, to: Listener) -> AliveSubscription:
-        from lifecycle.middleware.discovery.liveliness import AliveSubscription
+        from lifecycle.middleware import AliveSubscription
 
         return AliveSubscription(
             self._node, topic, on_heard=to.heard, on_left=to.left, on_told=to.told
@@ -166,7 +165,7 @@ class ObserverParticipant:
 
     def prepare_to_leave(self) -> None:
         """Let go of connections that do not answer: all that is sent would wait for their ends."""
-        from lifecycle.middleware.discovery.dead_peers import give_up_dead_connections
+        from lifecycle.middleware import give_up_dead_connections
 
         give_up_dead_connections()
 

@@ -12,10 +12,10 @@ import dataclasses
 from collections.abc import Iterable
 from typing import Protocol
 
-from lifecycle.manifest.model import Condition
-from lifecycle.plan.model import Plan, PlannedNode
+from lifecycle.manifest import Condition
+from lifecycle.plan import Plan, PlannedNode
 from lifecycle.supervisor.nodes.driver import ACTIVE, INACTIVE
-from lifecycle.verify.observation import Observation
+from lifecycle.verify import Observation
 
 ASK_AGAIN_S = 0.2
 """A remote node is asked again so long after, because the event that it connected may be missed:

@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Protocol
 
 from lifecycle.errors import BringUpError
-from lifecycle.manifest.model import Condition, RunKind
-from lifecycle.node.host.control import Event as HostEvent
-from lifecycle.node.host.control import Operation
-from lifecycle.plan.model import Plan, PlannedNode, PlannedProcess
+from lifecycle.manifest import Condition, RunKind
+from lifecycle.node import Event as HostEvent
+from lifecycle.node import Operation
+from lifecycle.plan import Plan, PlannedNode, PlannedProcess
 from lifecycle.supervisor.gate.gate import Permit
 from lifecycle.supervisor.health.liveliness import SilenceMonitor
 from lifecycle.supervisor.nodes.driver import NodeCondition, NodeDriver
@@ -26,7 +26,7 @@ from lifecycle.supervisor.processes.logs import LogDirectory
 from lifecycle.supervisor.processes.process import ManagedProcess
 from lifecycle.supervisor.processes.spawn import ProcessState
 from lifecycle.supervisor.run.events import Emitter, NodeChanged, Notice, Reach, RequestSent
-from lifecycle.verify.observation import NodeConfiguration, Observation
+from lifecycle.verify import NodeConfiguration, Observation
 
 _ORDER = list(Reach)
 _CONDITIONS = {

@@ -24,7 +24,7 @@ import warnings
 from typing import NoReturn
 
 from lifecycle.codec import from_json, to_json
-from lifecycle.middleware.process.control import adopt_orphans
+from lifecycle.middleware import adopt_orphans
 from lifecycle.supervisor.processes.fork_server_protocol import (
     LARGEST_MESSAGE,
     MSG_CMSG_CLOEXEC,
@@ -218,10 +218,10 @@ def _run(argv: tuple[str, ...], control: int | None) -> int:
     """
     if not argv:
         assert control is not None
-        from lifecycle.node.host import host
+        from lifecycle.node import serve
 
         _reseed()
-        return host.serve(socket.socket(fileno=control))
+        return serve(socket.socket(fileno=control))
     if control is not None:
         os.set_inheritable(control, True)
         argv = tuple(word.replace("{control}", str(control)) for word in argv)
@@ -253,9 +253,9 @@ def main() -> int:
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     adopt_orphans()
     if options.preload:
-        from lifecycle.node.host import host
+        from lifecycle.node import preload
 
-        host.preload()
+        preload()
         # Keep the shared pages shared: a child's first collection would touch them all.
         gc.collect()
         gc.freeze()

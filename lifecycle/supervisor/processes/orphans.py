@@ -20,7 +20,7 @@ from typing import Protocol
 
 import psutil
 
-from lifecycle.middleware.process.shared_memory import segments_of
+from lifecycle.middleware import segments_of
 from lifecycle.run_directory import OWN_CHILD, RUN_VARIABLE, RunRecord, boot_id, start_ticks
 
 GRACE_S = 3.0

@@ -13,10 +13,9 @@ import os
 from collections.abc import Callable
 
 from lifecycle.errors import UsageError
-from lifecycle.manifest.model import EndpointPolicy
-from lifecycle.middleware.discovery.probe import peers_environment
-from lifecycle.plan.connections.contacts import reached_hosts
-from lifecycle.plan.model import Plan
+from lifecycle.manifest import EndpointPolicy
+from lifecycle.middleware import peers_environment
+from lifecycle.plan import Plan, reached_hosts
 from lifecycle.run_directory import run_name, runtime_root
 from lifecycle.supervisor.connections.negotiation import Expectation, is_negotiated
 from lifecycle.supervisor.control.client import look, running
@@ -24,11 +23,17 @@ from lifecycle.supervisor.gate.gate import closes
 from lifecycle.supervisor.gate.verification_loop import GracePeriod, with_findings
 from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 from lifecycle.supervisor.run.options import onlooker_connections, own_machines
-from lifecycle.verify import verify
-from lifecycle.verify.observation import NodeConfiguration, Observation
-from lifecycle.verify.rules import Heals, rule
-from lifecycle.verify.tool_filter import tolerating_pattern
-from lifecycle.verify.verdict import Outcome, Stage, Verdict
+from lifecycle.verify import (
+    Heals,
+    NodeConfiguration,
+    Observation,
+    Outcome,
+    Stage,
+    Verdict,
+    rule,
+    tolerating_pattern,
+    verify,
+)
 
 _ASK_AGAIN_S = 0.5
 """Nodes are asked again so long after: their matched counts change without a graph change ..."""

@@ -13,10 +13,9 @@ from collections.abc import Callable
 from typing import ClassVar, Union
 
 from lifecycle.codec import to_plain
-from lifecycle.node.host.control import Operation
+from lifecycle.node import Operation
 from lifecycle.supervisor.processes.spawn import ProcessState
-from lifecycle.verify.report import plain_findings
-from lifecycle.verify.verdict import Stage, Verdict
+from lifecycle.verify import Stage, Verdict, plain_findings
 
 
 class Reach(enum.Enum):

@@ -1,6 +1,6 @@
 """A failed step of bring-up as a finding; concurrent tasks of which the first failure ends all.
 
-Owns: `StepFailedError`, the ids of the `run.*` rules and how failures join a verdict, so that every
+Owns: `StepFailedError`, how failures join a verdict, so that every
 run ends in one verdict that names each cause once; `together`, what asyncio.TaskGroup does, which
 Python 3.10 does not have; `ended`; and `Worker`, a thread for what blocks.
 """
@@ -14,25 +14,26 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
 from lifecycle.errors import BringUpError, ExitCode
-from lifecycle.middleware.process.control import no_room_for_threads
+from lifecycle.middleware import no_room_for_threads
 from lifecycle.supervisor.run.events import Failure
 from lifecycle.supervisor.run.options import UpResult
-from lifecycle.verify.rules import rule, run
-from lifecycle.verify.verdict import NOT_JUDGED, Finding, Outcome, RunEnd, Verdict
-
-PROCESS_DIED = run.PROCESS_DIED.id
-START_FAILED = run.START_FAILED.id
-TRANSITION_FAILED = run.TRANSITION_FAILED.id
-DEADLINE = run.DEADLINE.id
-NOT_PROGRAMMED = run.NOT_PROGRAMMED.id
-NOT_WIRED = run.NOT_WIRED.id
+from lifecycle.verify import (
+    NOT_JUDGED,
+    PROCESS_DIED,
+    Finding,
+    Outcome,
+    Rule,
+    RunEnd,
+    Verdict,
+    node_of,
+)
 
 
 class StepFailedError(BringUpError):
     """A step of bring-up failed, or a process ended that was not asked to.
 
     Attributes:
-        rule: one of the ids above.
+        rule: the `run.*` rule that it breaks.
         subject: fully qualified node name, or the process where no node is to blame.
         process: name of the process concerned; empty if there is none of ours.
         log: the file with all that its process wrote; empty if there is none.
@@ -40,7 +41,7 @@ class StepFailedError(BringUpError):
     """
 
     def __init__(
-        self, message: str, *, rule: str, subject: str, process: str = "", log: str = ""
+        self, message: str, *, rule: Rule, subject: str, process: str = "", log: str = ""
     ) -> None:
         super().__init__(message)
         self.rule = rule
@@ -57,7 +58,7 @@ class StepFailedError(BringUpError):
     @property
     def reason(self) -> str:
         """What failed, in one line that names each cause; the findings say the rest."""
-        return f"failed: {', '.join(f'{each.subject} ({each.rule})' for each in self.every)}"
+        return f"failed: {', '.join(f'{each.subject} ({each.rule.id})' for each in self.every)}"
 
     def joined(self, others: Iterable[StepFailedError]) -> StepFailedError:
         """Return this one with more that failed, but for what it names already."""
@@ -73,7 +74,7 @@ class StepFailedError(BringUpError):
     def event(self, *, ends_run: bool = True) -> Failure:
         """Return the failure as listeners get it."""
         return Failure(
-            rule=self.rule,
+            rule=self.rule.id,
             subject=self.subject,
             message=self.message,
             process=self.process,
@@ -84,15 +85,14 @@ class StepFailedError(BringUpError):
 
 def finding_of(failure: StepFailedError) -> Finding:
     """Return the finding that a failure is."""
-    kind = rule(failure.rule)
-    return kind.finding(
+    return failure.rule.finding(
         Outcome.VIOLATED,
         subject=failure.subject,
         expected="",
         observed="",
         message=failure.message,
-        node=run.node_of(failure.subject),
-        hint=f"{kind.fix}: {failure.log}" if failure.log and kind.names_log else "",
+        node=node_of(failure.subject),
+        hint=f"{failure.rule.fix}: {failure.log}" if failure.log and failure.rule.names_log else "",
     )
 
 

@@ -17,11 +17,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.export.captured import CapturedParameter, CapturedSystem, capture
-from lifecycle.export.picture import Picture, Supervised, build_picture
+from lifecycle.export import (
+    CapturedParameter,
+    CapturedSystem,
+    Picture,
+    Supervised,
+    build_picture,
+    capture,
+)
 from lifecycle.graph import Look, set_within
-from lifecycle.manifest.model import DiscoveryRange
-from lifecycle.plan.model import Plan
+from lifecycle.manifest import DiscoveryRange
+from lifecycle.plan import Plan
 from lifecycle.run_directory import is_held, run_name, runtime_root
 from lifecycle.supervisor.control.client import look
 from lifecycle.supervisor.control.server import SupervisorSnapshot, follow
@@ -29,14 +35,15 @@ from lifecycle.supervisor.control.status import SystemStatus
 from lifecycle.supervisor.processes.spawn import ProcessState
 from lifecycle.supervisor.run.attach import JudgedSystem, following, judge_running
 from lifecycle.supervisor.run.events import Reach
-from lifecycle.verify import Stage, verify
-from lifecycle.verify.observation import (
+from lifecycle.verify import (
     NodeConfiguration,
     Observation,
     ObservedEndpoint,
     ObservedNode,
+    Stage,
+    known_node,
+    verify,
 )
-from lifecycle.verify.tool_filter import known_node
 
 if TYPE_CHECKING:
     from lifecycle.graph import Graph

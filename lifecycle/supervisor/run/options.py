@@ -16,17 +16,13 @@ from typing import TYPE_CHECKING
 import psutil
 
 from lifecycle.errors import ExitCode, UsageError
-from lifecycle.manifest.model import Machine, Manifest
-from lifecycle.network.connection_url import Peer, parse
-from lifecycle.network.medium import Medium
-from lifecycle.plan.model import ParticipantConnections, Plan, PlannedProcess
-from lifecycle.plan.negotiation.parties import urls_of
-from lifecycle.verify.observation import NodeConfiguration
-from lifecycle.verify.verdict import Verdict
-from lifecycle.verify.view import only_shared_memory
+from lifecycle.manifest import Machine, Manifest
+from lifecycle.network import Medium, Peer, parse
+from lifecycle.plan import ParticipantConnections, Plan, PlannedProcess, urls_of
+from lifecycle.verify import NodeConfiguration, Verdict, only_shared_memory
 
 if TYPE_CHECKING:
-    from lifecycle.programming.apply import TargetOptions, Treatment
+    from lifecycle.programming import TargetOptions, Treatment
 
 
 class Until(enum.Enum):

@@ -11,7 +11,7 @@ import contextlib
 import os
 from collections.abc import Iterator
 
-from lifecycle.middleware.process.shared_memory import Creations, segments_of
+from lifecycle.middleware import Creations, segments_of
 from lifecycle.run_directory import ChildRecord, RunDirectory, start_ticks
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.orphans import ProcessFamily

@@ -15,7 +15,7 @@ from collections.abc import AsyncIterator, Coroutine, Iterable, Iterator
 from typing import Any, Protocol
 
 from lifecycle.errors import ExitCode
-from lifecycle.plan.model import PlannedNode
+from lifecycle.plan import PlannedNode
 from lifecycle.run_directory import RunDirectory
 from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.connections.authority import Reaching, authority_of
@@ -53,8 +53,7 @@ from lifecycle.supervisor.run.options import Until, UpOptions, UpResult
 from lifecycle.supervisor.run.records import Records
 from lifecycle.supervisor.run.shutdown import TakeDown
 from lifecycle.supervisor.run.signals import ENDED_BY, Ending
-from lifecycle.verify.judge import missing, not_ok
-from lifecycle.verify.verdict import NOT_JUDGED, Outcome, RunEnd, Stage, Verdict
+from lifecycle.verify import NOT_JUDGED, Outcome, RunEnd, Stage, Verdict, missing, not_ok
 
 _GLANCE_S = 1.0
 """How long `--until connected` looks for a verdict to report; it gates nothing."""

@@ -11,8 +11,8 @@ from collections.abc import Coroutine, Iterable
 from typing import Any
 
 from lifecycle.errors import BringUpError
-from lifecycle.manifest.model import RunKind
-from lifecycle.node.host.control import Operation
+from lifecycle.manifest import RunKind
+from lifecycle.node import Operation
 from lifecycle.supervisor.connections.desired_state import Step
 from lifecycle.supervisor.nodes.driver import ACTIVE, FINALIZED, INACTIVE
 from lifecycle.supervisor.nodes.system import NodeRun, System

@@ -14,14 +14,18 @@ import traceback
 from collections.abc import Awaitable, Callable, Collection, Iterable, Iterator, Mapping
 
 from lifecycle.errors import ExitCode, LifecycleError
-from lifecycle.manifest.model import Authority, DataLayerSource, EndpointPolicy, RunKind
-from lifecycle.middleware.discovery.probe import discovery_peers, peers_environment
-from lifecycle.middleware.fastdds.profiles import discovery_environment
-from lifecycle.middleware.process.control import adopt_orphans, check_threads, exit_after
-from lifecycle.middleware.process.shared_memory import check_room, sweep
-from lifecycle.plan import moved_observer
-from lifecycle.plan.connections.contacts import reached_hosts
-from lifecycle.plan.model import Plan
+from lifecycle.manifest import Authority, DataLayerSource, EndpointPolicy, RunKind
+from lifecycle.middleware import (
+    adopt_orphans,
+    check_room,
+    check_threads,
+    discovery_environment,
+    discovery_peers,
+    exit_after,
+    peers_environment,
+    sweep,
+)
+from lifecycle.plan import Plan, moved_observer, reached_hosts
 from lifecycle.run_directory import (
     RUN_VARIABLE,
     RunDirectory,
@@ -50,7 +54,7 @@ from lifecycle.supervisor.run.options import (
 from lifecycle.supervisor.run.records import Records, noting
 from lifecycle.supervisor.run.session import Session
 from lifecycle.supervisor.run.signals import Ending
-from lifecycle.verify.verdict import NOT_JUDGED
+from lifecycle.verify import NOT_JUDGED
 
 LEAVE_S = 10.0
 """A participant leaves within 0.2 s, over connections that are not answered within 4 s.

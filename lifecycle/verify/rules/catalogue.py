@@ -9,9 +9,8 @@ from __future__ import annotations
 import dataclasses
 import enum
 
-from lifecycle.manifest.diagnostics import Position
-from lifecycle.manifest.model import EndpointKind
-from lifecycle.plan.model import PlannedNode
+from lifecycle.manifest import EndpointKind, Position
+from lifecycle.plan import PlannedNode
 from lifecycle.verify.verdict import Finding, Outcome
 from lifecycle.verify.view import Actual
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 
-from lifecycle.manifest.model import EndpointKind
+from lifecycle.manifest import EndpointKind
 from lifecycle.verify.observation import ObservedEndpoint
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.verdict import Finding, Outcome

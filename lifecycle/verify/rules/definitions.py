@@ -9,8 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 
-from lifecycle.manifest.diagnostics import Position
-from lifecycle.manifest.model import EndpointKind
+from lifecycle.manifest import EndpointKind, Position
 from lifecycle.verify.observation import ObservedEndpoint
 from lifecycle.verify.rules.catalogue import Rule
 from lifecycle.verify.rules.endpoints import MEETS

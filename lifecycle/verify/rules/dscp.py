@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from lifecycle.network.dscp import describe
+from lifecycle.network import describe
 from lifecycle.verify.rules.catalogue import Rule
 from lifecycle.verify.verdict import Finding, Outcome
 from lifecycle.verify.view import View

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from lifecycle.manifest.model import EndpointKind, EndpointPolicy
+from lifecycle.manifest import EndpointKind, EndpointPolicy
 from lifecycle.verify.observation import ObservedEndpoint
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.tool_filter import OFFERS

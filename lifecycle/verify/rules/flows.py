@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from lifecycle.manifest.model import EndpointKind, Quantity, UniqueHow
-from lifecycle.network.medium import Medium
-from lifecycle.network.nfe import (
+from lifecycle.manifest import EndpointKind, Quantity, UniqueHow
+from lifecycle.network import (
     FlowUniqueness,
+    Medium,
     NetworkFlowEndpoint,
     TransportProtocol,
     UniqueRequirement,

@@ -15,8 +15,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-from lifecycle.manifest.model import EndpointKind
-from lifecycle.manifest.qos import Certainty, QosProfile, incompatibilities
+from lifecycle.manifest import Certainty, EndpointKind, QosProfile, incompatibilities
 from lifecycle.verify.observation import EndpointReport
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.verdict import Finding, Outcome

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from lifecycle.manifest.model import EndpointPolicy
+from lifecycle.manifest import EndpointPolicy
 from lifecycle.verify.observation import ObservedEndpoint
 from lifecycle.verify.rules.catalogue import Heals, Rule
 from lifecycle.verify.rules.endpoints import UNDECLARED

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from lifecycle.manifest.model import ParameterValue
-from lifecycle.plan.model import ExpectedParameter, PlannedNode
-from lifecycle.plan.parameters import COMMAND, DEFAULT, GIVEN, NOT_FINITE
+from lifecycle.manifest import ParameterValue
+from lifecycle.plan import COMMAND, DEFAULT, GIVEN, NOT_FINITE, ExpectedParameter, PlannedNode
 from lifecycle.verify.observation import ParameterReport, digest_of
 from lifecycle.verify.rules.catalogue import Heals, Rule
 from lifecycle.verify.verdict import Finding, Outcome

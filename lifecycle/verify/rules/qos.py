@@ -5,18 +5,18 @@ from __future__ import annotations
 import enum
 from collections.abc import Iterator
 
-from lifecycle.manifest.model import EndpointKind
-from lifecycle.manifest.qos import (
+from lifecycle.manifest import (
     BEST_AVAILABLE_NS,
     INFINITE_NS,
     POLICIES,
     Certainty,
+    EndpointKind,
     History,
     Incompatibility,
     QosProfile,
     incompatibilities,
 )
-from lifecycle.plan.model import PlannedEndpoint, PlannedNode
+from lifecycle.plan import PlannedEndpoint, PlannedNode
 from lifecycle.verify.rules.catalogue import Rule
 from lifecycle.verify.verdict import Finding, Outcome
 from lifecycle.verify.view import UNKNOWN_QOS, Actual, SeenEndpoint, View, actual_qos

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from lifecycle.plan.model import PlannedNode
+from lifecycle.plan import PlannedNode
 from lifecycle.verify.observation import NodeConfiguration
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.verdict import Finding, Outcome, Stage

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from lifecycle.manifest.model import FlowTransport
-from lifecycle.network.medium import NETWORK_MEDIA, Medium
+from lifecycle.manifest import FlowTransport
+from lifecycle.network import NETWORK_MEDIA, Medium
 from lifecycle.verify.rules.catalogue import Heals, Rule
 from lifecycle.verify.transport import (
     NONE,

@@ -47,6 +47,7 @@ from lifecycle.supervisor.run.options import UpOptions, UpResult
 from lifecycle.supervisor.run.records import Records
 from lifecycle.supervisor.run.session import Session
 from lifecycle.supervisor.run.signals import Ending
+from lifecycle.verify import rule
 from lifecycle.verify.observation import NodeConfiguration, Observation, ObservedNode
 from lifecycle.verify.verdict import Verdict
 from tests.builders import plan_of, planned_node
@@ -91,7 +92,7 @@ class FakeForkServer(FakeSpawner):
 
     async def ready(self) -> None:
         if self.cannot_start:
-            raise StepFailedError(self.cannot_start, rule="run.start-failed", subject="robot")
+            raise StepFailedError(self.cannot_start, rule=rule("run.start-failed"), subject="robot")
 
 
 class _Connection:
@@ -287,7 +288,7 @@ class FakeNetworks(Networks):
         self._log.append(f"networks programmed ({verdict.verdict.value})")
         await asyncio.sleep(self.takes_s)
         if self.fails:
-            raise StepFailedError(self.fails, rule="run.not-programmed", subject="robot")
+            raise StepFailedError(self.fails, rule=rule("run.not-programmed"), subject="robot")
 
     async def close(self, hurry: asyncio.Event | None = None) -> None:
         del hurry

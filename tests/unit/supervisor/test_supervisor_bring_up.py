@@ -19,6 +19,7 @@ from lifecycle.supervisor.processes.spawn import ProcessExit, ProcessState
 from lifecycle.supervisor.run.events import Notice, ProcessChanged, Reach, RequestSent
 from lifecycle.supervisor.run.failure import StepFailedError, with_failure
 from lifecycle.supervisor.run.shutdown import TakeDown
+from lifecycle.verify import rule
 from lifecycle.verify.observation import Observation, ObservedNode
 from lifecycle.verify.verdict import NOT_JUDGED, Outcome, Stage, Verdict
 from tests.builders import plan_of, planned_node
@@ -187,7 +188,7 @@ def test_a_failed_transition_ends_the_bring_up_with_the_nodes_own_reason(tmp_pat
         world.spawner.ways["/a configure"] = "on_configure raised ValueError: no camera"
         with pytest.raises(StepFailedError) as caught:
             await world.bring_up.connect(LIMIT_S)
-        assert caught.value.rule == "run.transition-failed"
+        assert caught.value.rule.id == "run.transition-failed"
         assert caught.value.subject == "/a"
         assert caught.value.message == (
             "cannot configure '/a': on_configure raised ValueError: no camera"
@@ -206,7 +207,7 @@ def test_a_process_that_dies_says_what_its_node_was_doing_and_its_last_words(
         with pytest.raises(StepFailedError) as caught:
             await world.bring_up.connect(LIMIT_S)
         pid = world.spawner.processes["a"].pid
-        assert caught.value.rule == "run.process-died"
+        assert caught.value.rule.id == "run.process-died"
         assert caught.value.message == (
             f"cannot keep '/a' running: pid {pid} died while connecting: killed by SIGSEGV"
         )
@@ -243,7 +244,7 @@ def test_the_whole_bring_up_has_a_deadline_that_names_what_everybody_was_doing(
         world.spawner.ways["/a configure"] = "hang"
         with pytest.raises(StepFailedError) as caught:
             await world.bring_up.connect(1.5)
-        assert caught.value.rule == "run.deadline"
+        assert caught.value.rule.id == "run.deadline"
         assert caught.value.subject == "/a"
         assert caught.value.message == (
             "cannot bring up 'robot' within 1.5 s: /a is still configuring; "
@@ -365,7 +366,7 @@ def test_every_request_is_told_before_it_is_sent(tmp_path: Path) -> None:
 
 
 def _failed(caught: pytest.ExceptionInfo[StepFailedError]) -> list[tuple[str, str, str]]:
-    return [(each.rule, each.subject, each.message) for each in caught.value.every]
+    return [(each.rule.id, each.subject, each.message) for each in caught.value.every]
 
 
 def test_everything_that_fails_side_by_side_is_named_once_and_no_other_step_begins(
@@ -454,7 +455,7 @@ def test_every_process_that_died_by_then_is_named(tmp_path: Path) -> None:
         with pytest.raises(StepFailedError) as caught:
             await ProcessMonitor(world.system).during(world.bring_up.connect(LIMIT_S))
         await dying
-        assert [(each.rule, each.subject) for each in caught.value.every] == [
+        assert [(each.rule.id, each.subject) for each in caught.value.every] == [
             ("run.process-died", "/a"),
             ("run.process-died", "/b"),
         ]
@@ -491,12 +492,14 @@ def test_a_process_that_is_still_starting_is_ended_at_once_and_not_by_an_interru
 def test_a_failure_is_one_finding_with_the_log_that_says_more() -> None:
     failure = StepFailedError(
         "cannot start '/a': no",
-        rule="run.start-failed",
+        rule=rule("run.start-failed"),
         subject="/a",
         process="a",
         log="/log/a.log",
     )
-    again = StepFailedError("exit status 1", rule="run.process-died", subject="a", process="a")
+    again = StepFailedError(
+        "exit status 1", rule=rule("run.process-died"), subject="a", process="a"
+    )
     verdict = with_failure(NOT_JUDGED, failure.joined([again, failure]))
     (finding,) = verdict.findings
     assert finding.message == "cannot start '/a': no"

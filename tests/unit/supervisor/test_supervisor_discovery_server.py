@@ -116,7 +116,7 @@ def test_one_that_ends_at_once_says_how(tmp_path: Path, nobody: int) -> None:
         with pytest.raises(StepFailedError) as caught:
             await discovery_server.begin(system, _EndsAtOnce(), ours=True)
         await discovery_server.end(system, asyncio.Event())
-        assert (caught.value.rule, caught.value.subject) == (
+        assert (caught.value.rule.id, caught.value.subject) == (
             "run.start-failed",
             "discovery_server",
         )
@@ -136,7 +136,7 @@ def test_the_server_of_another_machine_is_waited_for_with_a_deadline(
         system, spawner = world(served(nobody, "base"), tmp_path)
         with pytest.raises(StepFailedError) as caught:
             await discovery_server.begin(system, spawner, ours=False)
-        assert caught.value.rule == "run.deadline"
+        assert caught.value.rule.id == "run.deadline"
         assert caught.value.message == (
             "cannot reach the discovery server of machine 'base', whose supervisor starts it, at "
             f"tcp 127.0.0.1:{nobody}: nobody listened for 0.1 s"

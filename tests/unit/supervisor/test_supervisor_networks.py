@@ -136,7 +136,7 @@ def test_a_first_failure_ends_the_run_and_names_the_privilege(tmp_path: Path) ->
     error, programs = asyncio.run(run())
 
     assert error.exit_code is ExitCode.BRING_UP_FAILED
-    assert (error.rule, error.subject) == ("run.not-programmed", "s")
+    assert (error.rule.id, error.subject) == ("run.not-programmed", "s")
     assert str(error) == (
         "cannot program networks for 's': cannot write nft table inet flowqos_s: 'nft -f -' needs "
         "CAP_NET_ADMIN in this network namespace; run this command as root"

@@ -243,7 +243,7 @@ def test_a_failed_step_ends_bring_up_and_names_node_connection_endpoint_and_reas
         wiring.world.spawner.ways[what] = "the address is not of this host"
         with pytest.raises(StepFailedError) as caught:
             await wiring.world.bring_up.connect(LIMIT_S)
-        assert (caught.value.rule, caught.value.subject) == ("run.not-wired", "/a")
+        assert (caught.value.rule.id, caught.value.subject) == ("run.not-wired", "/a")
         assert caught.value.message == message
         assert wiring.world.heard(WiringChanged)[-1].error == message
         assert "connect" not in wiring.told("/a")

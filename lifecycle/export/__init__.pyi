@@ -1,0 +1,15 @@
+from .captured import CapturedParameter as CapturedParameter
+from .captured import CapturedSystem as CapturedSystem
+from .captured import capture as capture
+from .manifest_yaml import SUFFIX as SUFFIX
+from .manifest_yaml import to_manifest as to_manifest
+from .manifest_yaml import to_nodl as to_nodl
+from .picture import WRITERS as WRITERS
+from .picture.build import Supervised as Supervised
+from .picture.build import build_picture as build_picture
+from .picture.build import planned_picture as planned_picture
+from .picture.model import Picture as Picture
+from .picture.model import PicturedNodeState as PicturedNodeState
+from .sros2 import OVERRIDE as OVERRIDE
+from .sros2 import Enclave as Enclave
+from .sros2 import documents as documents

@@ -1,0 +1,17 @@
+from .apply.changes import TargetChanges as TargetChanges
+from .apply.errors import PartlyError as PartlyError
+from .apply.programmer import Programmer as Programmer
+from .apply.programmer import Removal as Removal
+from .apply.programmer import Treatment as Treatment
+from .apply.programmer import open_programmer as open_programmer
+from .apply.programmer import remove_run as remove_run
+from .apply.programmer import sweep_orphans as sweep_orphans
+from .apply.settings import load_settings as load_settings
+from .apply.targets import TargetOptions as TargetOptions
+from .apply.tc import parse_queue as parse_queue
+from .apply.tc import parse_rate as parse_rate
+from .rules.registry import EXPORTS as EXPORTS
+from .rules.registry import ExportInput as ExportInput
+from .rules.registry import ExportSettings as ExportSettings
+from .rules.registry import flows_to_csv as flows_to_csv
+from .rules.tc import TcMatch as TcMatch
