@@ -23,7 +23,6 @@ from lifecycle.network.nfe import (
 )
 from lifecycle.node.host.control import Operation
 from lifecycle.supervisor.control.status import NodeStatus, SystemStatus
-from lifecycle.supervisor.processes.spawn import ProcessState
 from lifecycle.supervisor.run.events import (
     Event,
     Failure,
@@ -31,6 +30,7 @@ from lifecycle.supervisor.run.events import (
     LogLine,
     NodeChanged,
     ProcessChanged,
+    ProcessState,
     Reach,
     RequestSent,
     SystemReached,
