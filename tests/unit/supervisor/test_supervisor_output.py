@@ -11,8 +11,8 @@ import pytest
 from rich.console import Console
 
 from lifecycle.cli.up_output import JsonLines, Live, PlainLines
+from lifecycle.cli.verbs.control import status_text
 from lifecycle.cli.verbs.flows import render_flows
-from lifecycle.cli.verbs.status import status_text
 from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import UniqueHow
 from lifecycle.network.nfe import (
