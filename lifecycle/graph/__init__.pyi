@@ -1,10 +1,10 @@
+from .dds import GRAPH_QOS as GRAPH_QOS
+from .dds import DdsTransport as DdsTransport
+from .dds import steady_timer as steady_timer
 from .events import FORGET_AFTER_S as FORGET_AFTER_S
 from .events import SILENT_AFTER_S as SILENT_AFTER_S
 from .events import GraphEvents as GraphEvents
-from .graph import GRAPH_QOS as GRAPH_QOS
-from .graph import DdsTransport as DdsTransport
 from .graph import Graph as Graph
-from .graph import steady_timer as steady_timer
 from .messages import AliveNotice as AliveNotice
 from .messages import ConfigurationChanged as ConfigurationChanged
 from .messages import ConnectionEstablished as ConnectionEstablished
