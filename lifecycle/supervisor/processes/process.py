@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from lifecycle.plan import PlannedProcess
 from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.supervisor.processes.logs import LineReader, LogDirectory, ProcessLog
+from lifecycle.supervisor.processes.patience import own_starved_s
 from lifecycle.supervisor.processes.spawn import (
     Child,
     ProcessExit,
@@ -137,6 +138,10 @@ class ManagedProcess:
             if control is not None:
                 control.close()
         self.child.exited.add_done_callback(self._exited)
+
+    def starved_s(self) -> float:
+        """Return how long it has waited for a processor, and we to hear of it; see patience.py."""
+        return own_starved_s() + (0.0 if self.child is None else self.child.starved_s())
 
     def running(self) -> None:
         """Note that the process does its work: its nodes are there."""

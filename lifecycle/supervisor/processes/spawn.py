@@ -125,6 +125,12 @@ class Child(Protocol):
     def signal(self, number: int) -> None:
         """Send a signal to the process and everything in its group; harmless once it ended."""
 
+    def starved_s(self) -> float:
+        """Return the seconds that its threads have waited for a processor, added up.
+
+        Those of all its descendants count, too; 0 where the kernel does not say.
+        """
+
 
 class Spawner(Protocol):
     """Starts processes."""
