@@ -48,7 +48,7 @@ check-static: $(STAMP)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-check: check-static test test-thorough
+check: check-static test test-thorough docs
 
 # What holds must hold each time: the faults and the gate, TIMES over and without a second try, then bring-ups on a busy machine.
 TIMES ?= 20

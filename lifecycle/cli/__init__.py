@@ -2,7 +2,8 @@
 
 A verb's module is imported only when it is used, so that ROS-free verbs start fast. Each module
 `lifecycle.cli.verbs.NAME` holds one click command named `command` whose function returns an exit
-code (None means 0).
+code (None means 0); the small ones that talk to a running supervisor are together in `control`, as
+`NAME_command`.
 """
 
 from __future__ import annotations
@@ -38,6 +39,9 @@ VERBS: dict[str, str] = {
 }
 
 
+_CONTROL = frozenset({"pause", "resume", "restart", "down", "status"})
+"""Verbs that talk to a running supervisor."""
+
 _PARTICIPANTS = frozenset({"up", "verify", "flows", "graph", "capture", "run"})
 """Verbs that make participants, here or in processes that they start."""
 
@@ -64,11 +68,15 @@ class _Verbs(click.Group):
         ctx: click.Context,  # noqa: ARG002 - click's signature
         cmd_name: str,
     ) -> click.Command | None:
-        """Import `lifecycle.cli.verbs.<cmd_name>`."""
+        """Import the verb's module, see above."""
         if cmd_name not in VERBS:
             return None
-        command: click.Command = importlib.import_module(f"lifecycle.cli.verbs.{cmd_name}").command
-        return command
+        module, name = cmd_name, "command"
+        if cmd_name in _CONTROL:
+            module, name = "control", f"{cmd_name}_command"
+        found = getattr(importlib.import_module(f"lifecycle.cli.verbs.{module}"), name)
+        assert isinstance(found, click.Command)
+        return found
 
     def format_commands(
         self,

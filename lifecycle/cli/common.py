@@ -1,9 +1,14 @@
-"""Options that several verbs share. Owns: `MANIFEST [name:=value …]`, `--format`, loading."""
+"""Options that several verbs share, loading a manifest, and finding a running system.
+
+Owns: `MANIFEST [name:=value …]`, `TARGET [name:=value …]` of the verbs about a running system,
+`--format` and `--timeout`.
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
@@ -13,7 +18,7 @@ from lifecycle.printable import lines
 
 if TYPE_CHECKING:
     from lifecycle.manifest import Loaded, Manifest
-    from lifecycle.plan import Resolution
+    from lifecycle.plan import Plan, Resolution
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -105,3 +110,66 @@ def resolve(manifest: Manifest, machine: str = "") -> Resolution:
 
     own = own_machines(manifest, machine)
     return resolve_programs(manifest, environment=os.environ, is_ours=own.__contains__)
+
+
+def target_arguments(function: F) -> F:
+    """Add `TARGET [NAME:=VALUE …]` and `--machine` to a verb."""
+    function = click.option(
+        "--machine", default="", metavar="NAME", help="As it was given to `lifecycle up`."
+    )(function)
+    function = click.argument("assignments", nargs=-1, metavar="[NAME:=VALUE]...")(function)
+    return click.argument("target", metavar="TARGET")(function)
+
+
+def target_run(
+    environment: Mapping[str, str], target: str, assignments: tuple[str, ...], machine: str
+) -> Path:
+    """Return the run directory that a target names: a manifest's, or a system's by name.
+
+    A manifest that is no longer the one that runs is reported on stderr, and makes no difference.
+
+    Raises:
+        UsageError: no such run.
+        ManifestError: the manifest cannot be loaded, so that its domain is not known.
+    """
+    path, plan = target_plan(environment, target, assignments, machine)
+    if plan is not None:
+        say_differences(path, plan)
+    return path
+
+
+def say_differences(path: Path, plan: Plan) -> None:
+    """Say on stderr where a manifest is not the one that runs."""
+    from lifecycle.supervisor import differences
+
+    if found := differences(path, plan):
+        listed = "\n".join(found)
+        click.echo(
+            f"{plan.manifest_path} is not the manifest that {path.name} runs:\n{listed}", err=True
+        )
+
+
+def target_plan(
+    environment: Mapping[str, str], target: str, assignments: tuple[str, ...], machine: str
+) -> tuple[Path, Plan | None]:
+    """Return the run directory that a target names, and the plan if it is a manifest.
+
+    Raises:
+        UsageError: no such run, or arguments for a system that is named.
+        ManifestError: the manifest cannot be loaded.
+    """
+    from lifecycle.run_directory import run_name, runtime_root
+    from lifecycle.supervisor import find_run
+
+    root = runtime_root(environment)
+    if not os.path.isfile(target):  # noqa: PTH113 - Path.is_file() raises for a name too long
+        if assignments:
+            raise UsageError(
+                f"cannot use {' '.join(assignments)} with the running system {target!r}",
+                hint="arguments belong to a manifest; name its file",
+            )
+        return find_run(root, target), None
+    from lifecycle.plan import build_plan
+
+    plan = build_plan(load_manifest(target, assignments, quiet=True).manifest)
+    return find_run(root, run_name(plan, machine)), plan

@@ -10,9 +10,6 @@ from .control.server import Question as Question
 from .control.status import NodeStatus as NodeStatus
 from .control.status import SystemStatus as SystemStatus
 from .gate.gate import closes as closes
-from .processes.spawn import ProcessState as ProcessState
-from .run.attach import follow_running as follow_running
-from .run.attach import judge_running as judge_running
 from .run.events import Emitter as Emitter
 from .run.events import Event as Event
 from .run.events import Failure as Failure
@@ -25,6 +22,7 @@ from .run.events import NodeChanged as NodeChanged
 from .run.events import NodeSilent as NodeSilent
 from .run.events import Notice as Notice
 from .run.events import ProcessChanged as ProcessChanged
+from .run.events import ProcessState as ProcessState
 from .run.events import Reach as Reach
 from .run.events import RunStarted as RunStarted
 from .run.events import Stopped as Stopped
@@ -38,6 +36,8 @@ from .run.failure import ended_early as ended_early
 from .run.looking import attached_picture as attached_picture
 from .run.looking import attached_pictures as attached_pictures
 from .run.looking import capture_running as capture_running
+from .run.looking import follow_running as follow_running
+from .run.looking import judge_running as judge_running
 from .run.looking import supervised_picture as supervised_picture
 from .run.looking import supervised_pictures as supervised_pictures
 from .run.looking import supervisor_of as supervisor_of

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import graphlib
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -76,6 +77,13 @@ def test_a_name_that_a_room_offers_is_in_the_module_that_its_stub_names(room: st
         if each.name not in _bound(_file(folder.joinpath(*node.module.split("."))))
     ]
     assert missing == []
+
+
+def test_the_api_page_lists_what_the_graph_offers() -> None:
+    listed = re.search(r"members: \[(.*)\]", (ROOT / "docs" / "api.md").read_text())
+    stub = (ROOT / "lifecycle" / "graph" / "__init__.pyi").read_text()
+    assert listed is not None
+    assert sorted(listed[1].split(", ")) == sorted(re.findall(r"import (\w+) as", stub))
 
 
 def _file(module: Path) -> Path:

@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from lifecycle.cli.common import format_option, timeout_option
+from lifecycle.cli.common import format_option, target_arguments, target_run, timeout_option
 from lifecycle.cli.standard_streams import echo_while_read
-from lifecycle.cli.target import target_arguments
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.printable import json_text
 
@@ -87,8 +86,6 @@ def _found(
     target: str, assignments: tuple[str, ...], machine: str
 ) -> tuple[Path | None, Plan | None]:
     """Return the run of a supervisor, or the plan to look for without one."""
-    from lifecycle.cli.target import target_run
-
     if not os.path.isfile(target):  # noqa: PTH113 - Path.is_file() raises for a name too long
         return target_run(os.environ, target, assignments, machine), None
     from lifecycle.cli.common import load_manifest

@@ -20,7 +20,7 @@ from lifecycle.manifest import DataLayerSource
 from lifecycle.network import Medium
 from lifecycle.plan import Plan, PlanDifference, PlannedNode, changes, with_files_of_now
 from lifecycle.supervisor.nodes.system import NodeRun, System
-from lifecycle.supervisor.processes.spawn import ProcessState
+from lifecycle.supervisor.run.events import ProcessState
 from lifecycle.supervisor.run.options import UpOptions, local_processes
 
 ACTIVE = "active"

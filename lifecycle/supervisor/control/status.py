@@ -10,8 +10,7 @@ import dataclasses
 
 from lifecycle.manifest import RunKind, UniqueHow
 from lifecycle.supervisor.nodes.system import NodeRun, System
-from lifecycle.supervisor.processes.spawn import ProcessState
-from lifecycle.supervisor.run.events import Reach
+from lifecycle.supervisor.run.events import ProcessState, Reach
 from lifecycle.verify import ConnectionReport, Outcome, Verdict, not_ok
 
 

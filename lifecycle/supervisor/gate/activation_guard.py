@@ -15,8 +15,7 @@ from lifecycle.errors import BringUpError
 from lifecycle.node import Operation
 from lifecycle.plan import Plan
 from lifecycle.supervisor.nodes.driver import ACTIVE
-from lifecycle.supervisor.nodes.remote_nodes import ChangeSource, ObservationSource
-from lifecycle.supervisor.nodes.system import NodeRun, System
+from lifecycle.supervisor.nodes.system import ChangeSource, NodeRun, ObservationSource, System
 from lifecycle.supervisor.run.events import Notice, Reach
 from lifecycle.supervisor.run.failure import ended
 from lifecycle.verify import ACTIVATED_AT_CLOSED_GATE, Finding, Observation, Outcome

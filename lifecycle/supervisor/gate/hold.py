@@ -1,7 +1,8 @@
-"""Holds a system that is up: watches it, and carries out orders (pause, resume, restart).
+"""Holds a system that is up: judges it at every change, and carries out orders.
 
-Owns: `Holding`: for how long, what ends it, and how orders are received and answered. What an order
-does is sequence.py's.
+Owns: `Watch`, which judges again and again, and `Holding`: for how long, what ends it, and how
+orders (pause, resume, restart) are received and answered. What an order does is sequence.py's. Must
+not import rclpy.
 """
 
 from __future__ import annotations
@@ -25,13 +26,38 @@ from lifecycle.supervisor.control.orders import (
 )
 from lifecycle.supervisor.gate.gate import VerificationError
 from lifecycle.supervisor.gate.sequence import GateSequence
-from lifecycle.supervisor.gate.verification_loop import ChangeCounter, VerificationLoop
-from lifecycle.supervisor.gate.watch import Watch
+from lifecycle.supervisor.gate.verification_loop import SETTLED_S, ChangeCounter, VerificationLoop
 from lifecycle.supervisor.health.process_monitor import ProcessMonitor
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.run.events import Emitter, Notice
 from lifecycle.supervisor.run.failure import StepFailedError, ended
-from lifecycle.verify import Stage
+from lifecycle.verify import Outcome, Stage, not_ok
+
+
+class Watch:
+    """Judges a system again and again while it is held.
+
+    Attributes:
+        violated: what was seen violated for longer than a passing moment; empty if nothing was.
+    """
+
+    def __init__(self, judge: VerificationLoop, changes: ChangeCounter, stage: Stage) -> None:
+        self._judge = judge
+        self._changes = changes
+        self._stage = stage
+        self.violated = ""
+
+    async def run(self) -> None:
+        """Judge at every change, until cancelled."""
+        while True:
+            count = self._changes.count
+            verdict, again_s = await self._judge.settled(self._stage)
+            bad = verdict.verdict is Outcome.VIOLATED and not self.violated
+            wait_s = SETTLED_S if again_s is None and bad else again_s
+            if await self._changes.beyond(count, wait_s):
+                await self._judge.quiet()
+            elif again_s is None:
+                self.violated = not_ok(verdict) or verdict.verdict.value  # no change: it lasts
 
 
 class Holding:

@@ -38,8 +38,15 @@ from lifecycle.supervisor.gate.gate import Gate, Permit, VerificationError, behi
 from lifecycle.supervisor.gate.verification_loop import VerificationLoop
 from lifecycle.supervisor.nodes.bring_up import BringUp
 from lifecycle.supervisor.nodes.system import NodeRun, System
-from lifecycle.supervisor.processes.spawn import ProcessState, Spawner
-from lifecycle.supervisor.run.events import Emitter, GateOpened, Notice, Reach, SystemReached
+from lifecycle.supervisor.processes.process import Spawner
+from lifecycle.supervisor.run.events import (
+    Emitter,
+    GateOpened,
+    Notice,
+    ProcessState,
+    Reach,
+    SystemReached,
+)
 from lifecycle.supervisor.run.failure import StepFailedError, together
 from lifecycle.supervisor.run.shutdown import TakeDown
 from lifecycle.verify import (

@@ -26,9 +26,8 @@ from lifecycle.supervisor.processes.control_channel import (
     ControlChannel,
     HostFailedError,
 )
-from lifecycle.supervisor.processes.process import ManagedProcess
-from lifecycle.supervisor.processes.spawn import ProcessState, Spawner
-from lifecycle.supervisor.run.events import Reach
+from lifecycle.supervisor.processes.process import ManagedProcess, Spawner
+from lifecycle.supervisor.run.events import ProcessState, Reach
 from lifecycle.supervisor.run.failure import StepFailedError, ended
 from lifecycle.verify import (
     DEADLINE,

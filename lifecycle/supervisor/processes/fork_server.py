@@ -19,7 +19,7 @@ from collections.abc import Callable, Mapping
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import BringUpError
 from lifecycle.graph import set_within
-from lifecycle.supervisor.processes.fork_server_protocol import (
+from lifecycle.supervisor.processes.fork_server_main import (
     LARGEST_MESSAGE,
     MSG_CMSG_CLOEXEC,
     SERVES,
@@ -27,7 +27,7 @@ from lifecycle.supervisor.processes.fork_server_protocol import (
     ForkRequest,
 )
 from lifecycle.supervisor.processes.orphans import children, descendants
-from lifecycle.supervisor.processes.spawn import ProcessExit, SpawnRequest
+from lifecycle.supervisor.processes.process import ProcessExit, SpawnRequest
 from lifecycle.supervisor.run.events import Emitter, Notice
 
 _STATUS_WAIT_S = 1.0

@@ -1,29 +1,145 @@
-"""One process of a system: its state, its output, and its bounded end.
+"""One process of a system: how it is started, its states, its output, and its bounded end.
 
-Owns: `ManagedProcess`. How it is forked is fork_server.py's, what the whole system does is
-nodes/system.py's. Must not import rclpy.
+Owns: `ManagedProcess`; the legal changes of process states, whose names are not those of node
+states: only nodes are "active"; and `Spawner`, the interface of what starts processes:
+fork_server.py, or a test. What the whole system does is nodes/system.py's. Must not import rclpy.
 """
 
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import functools
 import os
 import signal
 from collections.abc import Callable, Sequence
+from typing import Protocol
 
 from lifecycle.plan import PlannedProcess
 from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.supervisor.processes.logs import LineReader, LogDirectory, ProcessLog
-from lifecycle.supervisor.processes.spawn import (
-    Child,
-    ProcessExit,
-    ProcessState,
-    Spawner,
-    SpawnRequest,
-    change,
-)
-from lifecycle.supervisor.run.events import Emitter, LogLine, ProcessChanged
+from lifecycle.supervisor.run.events import Emitter, LogLine, ProcessChanged, ProcessState
+
+CHANGES: dict[ProcessState, frozenset[ProcessState]] = {
+    ProcessState.STARTING: frozenset(
+        {ProcessState.RUNNING, ProcessState.STOPPING, ProcessState.EXITED}
+    ),
+    ProcessState.RUNNING: frozenset({ProcessState.STOPPING, ProcessState.EXITED}),
+    ProcessState.STOPPING: frozenset({ProcessState.EXITED}),
+    ProcessState.EXITED: frozenset({ProcessState.BACKOFF, ProcessState.STARTING}),
+    ProcessState.BACKOFF: frozenset({ProcessState.STARTING, ProcessState.EXITED}),
+}
+"""Every legal change; a pair that is missing is a bug of the caller."""
+
+
+def change(old: ProcessState, new: ProcessState) -> ProcessState:
+    """Return `new` if a process may go there from `old`.
+
+    Raises:
+        ValueError: it may not; a bug of the caller.
+    """
+    if new not in CHANGES[old]:
+        allowed = ", ".join(sorted(state.value for state in CHANGES[old]))
+        raise ValueError(
+            f"cannot change a process from {old.value!r} to {new.value!r}; allowed: {allowed}"
+        )
+    return new
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class ProcessExit:
+    """How a process ended.
+
+    Attributes:
+        status: exit status, 0–255; None if a signal ended it or it is not known.
+        signal: number of the signal that ended it; None otherwise.
+    """
+
+    status: int | None = None
+    signal: int | None = None
+
+    @classmethod
+    def from_wait(cls, raw: int) -> ProcessExit:
+        """Decode the status of waitpid(2)."""
+        code = os.waitstatus_to_exitcode(raw)
+        return cls(status=code) if code >= 0 else cls(signal=-code)
+
+    def __str__(self) -> str:
+        if self.signal is not None:
+            try:
+                return f"killed by {signal.Signals(self.signal).name}"
+            except ValueError:
+                return f"killed by signal {self.signal}"
+        if self.status is not None:
+            return f"exit status {self.status}"
+        return "ended, exit status unknown"
+
+
+def _ignore(is_stopped: bool) -> None:
+    """Ignore that it stopped or continues."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class SpawnRequest:
+    """One process to start, in a session of its own.
+
+    Attributes:
+        name: of the planned process, for messages.
+        argv: command line; empty for a process that serves the control channel as our node host.
+        environment: (name, value) on top of the spawner's own environment.
+        working_directory: empty for the spawner's own.
+        stdout: descriptor; the spawner does not close it.
+        stderr: descriptor.
+        control: descriptor of the host's end of the control channel; None for a foreign command.
+        on_stop: called with True when a signal stopped the process (signal(7), Stop), False when it
+            continues.
+    """
+
+    name: str
+    argv: tuple[str, ...]
+    environment: tuple[tuple[str, str], ...]
+    working_directory: str
+    stdout: int
+    stderr: int
+    control: int | None = None
+    on_stop: Callable[[bool], None] = _ignore
+
+
+class Child(Protocol):
+    """A started process, which is the leader of its own session and process group.
+
+    Attributes:
+        pid: process id in our pid namespace.
+        exited: resolves as soon as it ended.
+    """
+
+    pid: int
+    exited: asyncio.Future[ProcessExit]
+
+    def signal(self, number: int) -> None:
+        """Send a signal to the process and everything in its group; harmless once it ended."""
+
+
+class Spawner(Protocol):
+    """Starts processes."""
+
+    async def ready(self) -> None:
+        """Wait, bounded, until processes can be started.
+
+        Raises:
+            BringUpError: they cannot.
+        """
+
+    async def spawn(self, request: SpawnRequest) -> Child:
+        """Start one process.
+
+        Raises:
+            BringUpError: it cannot be started.
+        """
+
+    async def close(self) -> None:
+        """Give up the spawner; its children must have ended."""
+
 
 Escalation = Sequence[tuple[int, float]]
 """Steps to end a process: (signal number, 0 for none; seconds to wait for its end after it)."""
@@ -60,7 +176,7 @@ class ManagedProcess:
 
     Attributes:
         planned: what the plan declares of it.
-        state: see spawn.py.
+        state: see `CHANGES`.
         channel: to our host; None for a foreign command.
         child: None before it was spawned.
         ended: resolves with how it ended.

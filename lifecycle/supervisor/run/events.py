@@ -14,8 +14,17 @@ from typing import ClassVar, Union
 
 from lifecycle.codec import to_plain
 from lifecycle.node import Operation
-from lifecycle.supervisor.processes.spawn import ProcessState
 from lifecycle.verify import Stage, Verdict, plain_findings
+
+
+class ProcessState(enum.Enum):
+    """The life of one operating system process; BACKOFF is the wait before it is started again."""
+
+    STARTING = "starting"
+    RUNNING = "running"
+    BACKOFF = "backoff"
+    STOPPING = "stopping"
+    EXITED = "exited"
 
 
 class Reach(enum.Enum):

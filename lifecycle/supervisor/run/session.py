@@ -31,15 +31,17 @@ from lifecycle.supervisor.gate.verification_loop import ChangeCounter, Verificat
 from lifecycle.supervisor.health import agreement, peer_supervisors
 from lifecycle.supervisor.health.agreement import Agreement
 from lifecycle.supervisor.health.peer_supervisors import PeerSupervisors
-from lifecycle.supervisor.health.process_monitor import ProcessMonitor
-from lifecycle.supervisor.nodes import stale_nodes
+from lifecycle.supervisor.health.process_monitor import (
+    ParticipantRegistry,
+    ProcessMonitor,
+    Sightings,
+    StaleNodes,
+)
 from lifecycle.supervisor.nodes.bring_up import BringUp
 from lifecycle.supervisor.nodes.driver import NodeDriver
-from lifecycle.supervisor.nodes.remote_nodes import RemoteNodes
-from lifecycle.supervisor.nodes.stale_nodes import Sightings, StaleNodes
-from lifecycle.supervisor.nodes.system import ObservedGraph, System
+from lifecycle.supervisor.nodes.system import ObservedGraph, RemoteNodes, System
 from lifecycle.supervisor.processes.orphans import ProcessFamily, end_strays, reap_adopted
-from lifecycle.supervisor.processes.spawn import Spawner
+from lifecycle.supervisor.processes.process import Spawner
 from lifecycle.supervisor.run.events import (
     Emitter,
     LogLine,
@@ -92,7 +94,7 @@ class SessionParticipant(
     peer_supervisors.AliveExchange,
     agreement.PlanExchange,
     Reaching,
-    stale_nodes.ParticipantRegistry,
+    ParticipantRegistry,
     Protocol,
 ):
     """What a session needs of its participant in the graph, see nodes/observer_participant.py.

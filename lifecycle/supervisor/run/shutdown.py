@@ -23,8 +23,7 @@ from lifecycle.supervisor.processes.process import (
     STUCK_ESCALATION,
     ManagedProcess,
 )
-from lifecycle.supervisor.processes.spawn import ProcessState
-from lifecycle.supervisor.run.events import Emitter, Notice, Reach, WiringChanged
+from lifecycle.supervisor.run.events import Emitter, Notice, ProcessState, Reach, WiringChanged
 
 _UNDO = {
     Operation.ACTIVATE: Operation.DEACTIVATE,

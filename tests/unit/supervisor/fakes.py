@@ -23,7 +23,7 @@ from lifecycle.node.host.control import Command, Event, HostSpec, Operation
 from lifecycle.plan.model import Plan, PlannedNode
 from lifecycle.supervisor.nodes.bring_up import BringUp
 from lifecycle.supervisor.nodes.system import System
-from lifecycle.supervisor.processes.spawn import ProcessExit, SpawnRequest
+from lifecycle.supervisor.processes.process import ProcessExit, SpawnRequest
 from lifecycle.supervisor.run.events import Emitter
 from lifecycle.supervisor.run.events import Event as SupervisorEvent
 from lifecycle.verify.observation import (

@@ -25,7 +25,7 @@ from lifecycle.supervisor.health.peer_supervisors import Listener
 from lifecycle.supervisor.nodes.driver import NodeDriver, ServiceDriver, ServiceHand
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.orphans import end_strays
-from lifecycle.supervisor.processes.spawn import ProcessExit
+from lifecycle.supervisor.processes.process import ProcessExit
 from lifecycle.supervisor.run.events import (
     Emitter,
     Event,

@@ -15,8 +15,8 @@ from lifecycle.supervisor.gate.gate import Gate, Permit, VerificationError
 from lifecycle.supervisor.gate.verification_loop import ChangeCounter, VerificationLoop
 from lifecycle.supervisor.health.process_monitor import ProcessMonitor
 from lifecycle.supervisor.nodes.bring_up import ALSO_S
-from lifecycle.supervisor.processes.spawn import ProcessExit, ProcessState
-from lifecycle.supervisor.run.events import Notice, ProcessChanged, Reach, RequestSent
+from lifecycle.supervisor.processes.process import ProcessExit
+from lifecycle.supervisor.run.events import Notice, ProcessChanged, ProcessState, Reach, RequestSent
 from lifecycle.supervisor.run.failure import StepFailedError, with_failure
 from lifecycle.supervisor.run.shutdown import TakeDown
 from lifecycle.verify import rule

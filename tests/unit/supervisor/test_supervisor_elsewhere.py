@@ -10,8 +10,7 @@ import pytest
 
 from lifecycle.manifest.model import Condition
 from lifecycle.plan.model import Plan
-from lifecycle.supervisor.nodes.remote_nodes import RemoteNode, RemoteNodes
-from lifecycle.supervisor.nodes.system import System
+from lifecycle.supervisor.nodes.system import RemoteNode, RemoteNodes, System
 from lifecycle.supervisor.run.failure import ended
 from lifecycle.verify.observation import Observation, ObservedNode
 from tests.builders import configuration, plan_of, planned_node

@@ -13,6 +13,7 @@ import pytest
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.node.host.control import Event
 from lifecycle.plan.model import Plan
+from lifecycle.supervisor.gate.hold import Watch
 from lifecycle.supervisor.gate.verification_loop import (
     PASSING_S,
     ChangeCounter,
@@ -21,14 +22,12 @@ from lifecycle.supervisor.gate.verification_loop import (
     without,
     without_nodes,
 )
-from lifecycle.supervisor.gate.watch import Watch, first_death
 from lifecycle.supervisor.health.liveliness import Cause
+from lifecycle.supervisor.health.process_monitor import first_death
 from lifecycle.supervisor.nodes.driver import NodeCondition
-from lifecycle.supervisor.nodes.remote_nodes import RemoteNode
-from lifecycle.supervisor.nodes.system import System
-from lifecycle.supervisor.processes.process import ManagedProcess
-from lifecycle.supervisor.processes.spawn import ProcessExit, ProcessState
-from lifecycle.supervisor.run.events import NodeJoined, Reach, VerdictChanged
+from lifecycle.supervisor.nodes.system import RemoteNode, System
+from lifecycle.supervisor.processes.process import ManagedProcess, ProcessExit
+from lifecycle.supervisor.run.events import NodeJoined, ProcessState, Reach, VerdictChanged
 from lifecycle.verify.observation import (
     NodeConfiguration,
     NodeParameters,

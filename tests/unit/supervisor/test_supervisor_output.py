@@ -11,8 +11,8 @@ import pytest
 from rich.console import Console
 
 from lifecycle.cli.up_output import JsonLines, Live, PlainLines
+from lifecycle.cli.verbs.control import status_text
 from lifecycle.cli.verbs.flows import render_flows
-from lifecycle.cli.verbs.status import status_text
 from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import UniqueHow
 from lifecycle.network.nfe import (
@@ -23,7 +23,6 @@ from lifecycle.network.nfe import (
 )
 from lifecycle.node.host.control import Operation
 from lifecycle.supervisor.control.status import NodeStatus, SystemStatus
-from lifecycle.supervisor.processes.spawn import ProcessState
 from lifecycle.supervisor.run.events import (
     Event,
     Failure,
@@ -31,6 +30,7 @@ from lifecycle.supervisor.run.events import (
     LogLine,
     NodeChanged,
     ProcessChanged,
+    ProcessState,
     Reach,
     RequestSent,
     SystemReached,

@@ -34,9 +34,13 @@ from lifecycle.supervisor.processes.logs import (
     ros_log_root,
 )
 from lifecycle.supervisor.processes.orphans import end_run
-from lifecycle.supervisor.processes.process import COMMAND_ESCALATION, ManagedProcess
-from lifecycle.supervisor.processes.spawn import ProcessExit, ProcessState, change
-from lifecycle.supervisor.run.events import Emitter, LogLine
+from lifecycle.supervisor.processes.process import (
+    COMMAND_ESCALATION,
+    ManagedProcess,
+    ProcessExit,
+    change,
+)
+from lifecycle.supervisor.run.events import Emitter, LogLine, ProcessState
 from tests.builders import teleop
 
 PYTHON = sys.executable

@@ -8,10 +8,9 @@ from collections.abc import Iterable
 from types import SimpleNamespace
 from typing import Any, cast
 
-from lifecycle.supervisor.nodes.stale_nodes import StaleNodes
+from lifecycle.supervisor.health.process_monitor import StaleNodes
 from lifecycle.supervisor.nodes.system import System
-from lifecycle.supervisor.processes.spawn import ProcessState
-from lifecycle.supervisor.run.events import ProcessChanged
+from lifecycle.supervisor.run.events import ProcessChanged, ProcessState
 
 PREFIX = "010f7f015d3c1b4c00000000"
 ENDED = ProcessChanged(process="camera", state=ProcessState.EXITED, pid=7)

@@ -1,0 +1,241 @@
+"""`lifecycle status`, `down`, `pause`, `resume` and `restart`: the verbs that talk to a supervisor.
+
+Owns: how an order is given and what its outcome is as an exit code; a status as plain text.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+from lifecycle.cli.common import (
+    format_option,
+    load_manifest,
+    say_differences,
+    target_arguments,
+    target_plan,
+    target_run,
+    timeout_option,
+)
+from lifecycle.errors import ExitCode, UsageError
+from lifecycle.printable import json_text, lines, one_line
+
+if TYPE_CHECKING:
+    from lifecycle.supervisor import NodeStatus, SystemStatus
+    from lifecycle.verify import ConnectionReport
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+_HEADS = ("node", "process", "pid", "state", "matched", "unique flows", "")
+
+
+def status_text(status: SystemStatus) -> str:
+    """Return a status as lines: one for the system, one for each node and each connection."""
+    verdict = "not judged yet" if status.verdict is None else status.verdict.value
+    verdict += f" ({status.not_ok})" if status.not_ok else ""
+    rows = [_HEADS, *(tuple(map(one_line, _row(node))) for node in status.nodes)]
+    widths = [max(len(row[index]) for row in rows) for index in range(len(_HEADS))]
+    living = sum(not node.died for node in status.nodes)
+    count = "" if living == len(status.nodes) else f" {living}/{len(status.nodes)}"
+    head = (
+        f"{status.system}: {status.phase}{count}, verdict {verdict}, domain {status.domain_id}, "
+        f"supervisor {status.supervisor}, up for {status.elapsed_s:.1f} s"
+    )
+    text = [one_line(head)]
+    for row, node in zip(rows, (None, *status.nodes), strict=True):
+        cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
+        text.append("  ".join(cells).rstrip())
+        text += [
+            one_line(f"  {connection_text(each)}") for each in (node.connections if node else ())
+        ]
+    return "\n".join(text)
+
+
+def connection_text(connection: ConnectionReport) -> str:
+    """Return one connection in one line: what it is, what it is to and what it carries."""
+    made = "established" if connection.established else "waits for peers"
+    state = f"failed: {connection.error}" if connection.error else made
+    carries = ", ".join(connection.mappings) or "nothing"
+    return f"connection {connection.name} {state}; {', '.join(connection.urls)}; carries {carries}"
+
+
+def _row(node: NodeStatus) -> tuple[str, ...]:
+    process = "not ours" if node.process_state is None else node.process_state.value
+    return (
+        node.node,
+        process,
+        str(node.pid or "–"),
+        "dead" if node.died else (node.state if node.managed else node.reach.value) or "–",
+        f"{node.matched}/{node.endpoints}",
+        f"{node.unique_flows}/{node.flows}",
+        node.died or (f"silent: {node.silent}" if node.silent else node.doing),
+    )
+
+
+@click.command("status")
+@click.argument("target", required=False, metavar="[TARGET]")
+@click.argument("assignments", nargs=-1, metavar="[NAME:=VALUE]...")
+@click.option("--machine", default="", metavar="NAME", help="As it was given to `lifecycle up`.")
+@format_option("text", "json")
+def status_command(
+    target: str | None, assignments: tuple[str, ...], machine: str, format_: str
+) -> int:
+    """Show a running system: its nodes, their processes and states, and the last verdict.
+
+    TARGET is a manifest or the name of a system; without one, all that run are listed. Exits with
+    4 if the last verdict is violated.
+    """
+    from lifecycle.codec import to_json
+    from lifecycle.run_directory import runtime_root
+    from lifecycle.supervisor import running, status
+    from lifecycle.verify import Outcome
+
+    if target is None:
+        names = running(runtime_root(os.environ))
+        if format_ == "json":
+            click.echo(to_json(names).decode())
+        else:
+            click.echo("\n".join(names) or "no system runs")
+        return ExitCode.OK
+    path = target_run(os.environ, target, assignments, machine)
+    try:
+        seen = status(path)
+    except TimeoutError as error:
+        raise UsageError(f"cannot ask {path.name!r}: its supervisor does not answer") from error
+    if format_ == "json":
+        click.echo(json_text(to_json(seen).decode()))
+    else:
+        click.echo(status_text(seen))
+    return ExitCode.VIOLATED if seen.verdict is Outcome.VIOLATED else ExitCode.OK
+
+
+def order_timeout(function: F) -> F:
+    """Add `--timeout` to a verb that orders something."""
+    return timeout_option(60.0, "How long to wait for it.")(function)
+
+
+def give_order(  # noqa: PLR0917 - in the order of the command line
+    verb: str,
+    target: str,
+    assignments: tuple[str, ...],
+    machine: str,
+    timeout: float,
+    node: str = "",
+    *,
+    reload: bool = False,
+) -> int:
+    """Have a running supervisor carry out an order; say why where it does not.
+
+    Args:
+        verb: an order.
+        target: a manifest, or a running system.
+        assignments: `name:=value` of the manifest.
+        machine: as it was given to `up`.
+        timeout: seconds.
+        node: for `restart`, one node; empty for all.
+        reload: for `restart`, take the manifest as it is now.
+
+    Returns:
+        Its exit code: 2 if the order does not fit what the system is doing, 4 or 5 if the gate
+        stays closed, 6 if a step failed or took longer than `timeout` seconds.
+
+    Raises:
+        UsageError: no such run, or no manifest to reload.
+        ManifestError: the manifest cannot be loaded.
+    """
+    from lifecycle.supervisor import ControlRequest, Question, order
+
+    path, plan = target_plan(os.environ, target, assignments, machine)
+    if reload and plan is None:
+        raise UsageError(
+            f"cannot reload {target!r}: it is no manifest", hint="name the manifest's file"
+        )
+    if verb == "pause" and plan is not None:
+        say_differences(path, plan)
+    if reload:
+        load_manifest(target, assignments, quiet=True, machine=machine)
+    question = Question(ask=ControlRequest(verb), node=node, plan=plan, reload=reload)
+    try:
+        answer = order(path, question, timeout)
+    except TimeoutError:
+        click.echo(f"cannot {verb} {path.name!r} within {timeout:g} s; it is still at it", err=True)
+        return ExitCode.BRING_UP_FAILED
+    if answer.error:
+        click.echo(lines(answer.error), err=True)
+    assert answer.exit_code is not None
+    return answer.exit_code
+
+
+@click.command("down")
+@target_arguments
+@timeout_option(60.0, "How long it may take.")
+def down_command(target: str, assignments: tuple[str, ...], machine: str, timeout: float) -> int:
+    """End a running system in reverse order, and wait until nothing of it is left.
+
+    TARGET is a manifest, or the name of a running system as `lifecycle status` shows it. Where the
+    supervisor itself was killed, what it left behind is ended too.
+    """
+    from lifecycle.supervisor import down
+
+    path = target_run(os.environ, target, assignments, machine)
+    try:
+        return down(path, timeout)
+    except TimeoutError:
+        click.echo(f"cannot end {path.name!r} within {timeout:g} s; it still runs", err=True)
+        return ExitCode.BRING_UP_FAILED
+
+
+@click.command("pause")
+@target_arguments
+@order_timeout
+def pause_command(target: str, assignments: tuple[str, ...], machine: str, timeout: float) -> int:
+    """Deactivate every managed node of a running system, in reverse order: data stops.
+
+    Processes, connections and flows stay as they are. TARGET is a manifest, or the name of a
+    running system as `lifecycle status` shows it. Only an active system can be paused; a manifest
+    that has changed since it was started is said, and does not keep it from being paused.
+    """
+    return give_order("pause", target, assignments, machine, timeout)
+
+
+@click.command("resume")
+@target_arguments
+@order_timeout
+def resume_command(target: str, assignments: tuple[str, ...], machine: str, timeout: float) -> int:
+    """Verify a paused system again, and activate it only if the gate opens.
+
+    TARGET is a manifest, or the name of a running system as `lifecycle status` shows it. Exits
+    with 4 if the gate stays closed: then the system stays paused, and can be asked again; with 2 if
+    the manifest is not the one that runs.
+    """
+    return give_order("resume", target, assignments, machine, timeout)
+
+
+@click.command("restart")
+@click.argument("target", metavar="TARGET")
+@click.argument("words", nargs=-1, metavar="[NODE] [NAME:=VALUE]...")
+@click.option("--machine", default="", metavar="NAME", help="As it was given to `lifecycle up`.")
+@click.option(
+    "--reload", is_flag=True, help="Take the manifest as it is now, where it has changed."
+)
+@order_timeout
+def restart_command(
+    *, target: str, words: tuple[str, ...], machine: str, timeout: float, reload: bool
+) -> int:
+    """Take a running system down and bring it up again, or only the process of NODE.
+
+    What comes back is verified together with what stayed, and activated only if the gate opens: in
+    a paused system it stays inactive. NODE is a key of the manifest or a node's full name; other
+    nodes of its process restart with it, all others stay active.
+
+    What is restarted is what was started. A manifest or parameter file that has changed since is
+    refused (exit 2), naming what differs; --reload takes it, for NODE only if nothing else differs.
+    """
+    nodes = [word for word in words if ":=" not in word]
+    if len(nodes) > 1:
+        raise UsageError(f"cannot restart {', '.join(nodes)} at once; name one node, or none")
+    assignments = tuple(word for word in words if ":=" in word)
+    return give_order("restart", target, assignments, machine, timeout, *nodes, reload=reload)
