@@ -63,7 +63,8 @@ if TYPE_CHECKING:
 
 __all__ = ["ERROR", "FAILURE", "SUCCESS", "LifecycleNode", "TransitionCallbackReturn"]
 
-_SPINNING = ("rclpy.executors", "_spin_once_impl")
+_SPINNING = {("rclpy.executors", "_spin_once_impl"), ("lifecycle.node.host.loop", "_turn")}
+"""Where a single-threaded executor calls back: rclpy's, and that of our own processes."""
 
 
 class DeadlockError(LifecycleError):
@@ -104,7 +105,7 @@ def _in_executor() -> bool:
     """
     frame = inspect.currentframe()
     while frame is not None:
-        if (frame.f_globals.get("__name__"), frame.f_code.co_name) == _SPINNING:
+        if (frame.f_globals.get("__name__"), frame.f_code.co_name) in _SPINNING:
             return True
         frame = frame.f_back
     return False
