@@ -5,11 +5,13 @@ Owns: canonical spelling and the scope rules of RFC 4007 and RFC 6890. Pure.
 
 from __future__ import annotations
 
+import functools
 import ipaddress
 
 IpAddress = ipaddress.IPv4Address | ipaddress.IPv6Address
 
 
+@functools.lru_cache(maxsize=4096)
 def parse_address(text: str) -> IpAddress | None:
     """Return the address that `text` spells, else None (empty, a host name, …)."""
     try:
@@ -18,6 +20,7 @@ def parse_address(text: str) -> IpAddress | None:
         return None
 
 
+@functools.lru_cache(maxsize=4096)
 def canonical(text: str) -> str:
     """Return the one spelling of an address (RFC 5952); text that is none is returned unchanged."""
     address = parse_address(text)
@@ -29,12 +32,14 @@ def socket_text(address: str, port: int) -> str:
     return f"[{address}]:{port}" if ":" in address else f"{address}:{port}"
 
 
+@functools.lru_cache(maxsize=4096)
 def is_wildcard(text: str) -> bool:
     """Whether this is `0.0.0.0` or `::`, which means every unicast address of its host."""
     address = parse_address(text)
     return address is not None and address.is_unspecified
 
 
+@functools.lru_cache(maxsize=4096)
 def is_multicast(text: str) -> bool:
     """Whether this is a group, which is the same destination from wherever it is named."""
     address = parse_address(text)

@@ -40,9 +40,8 @@ _HOW = (UniqueHow.NOT, UniqueHow.WEAKLY, UniqueHow.STRONGLY)
 
 def flow_reports(view: View, findings: Sequence[Finding]) -> tuple[FlowReport, ...]:
     """Report every planned flow, in plan order."""
-    uniqueness = Uniqueness(view.reported, view.addresses)
     spoiled = _spoiled(findings)
-    return tuple(_report(view, flow, uniqueness, spoiled) for flow in view.flows)
+    return tuple(_report(view, flow, view.uniqueness, spoiled) for flow in view.flows)
 
 
 _Place = tuple[str, str, EndpointKind | None]

@@ -390,16 +390,13 @@ class Owners:
         namespace, _, base = hidden.rpartition("/")
         if tolerating_pattern(hidden, self._tools):
             return ""  # `_ros2cli_4711` is no participant of a node `ros2cli`
-        return max(
-            (
-                name
-                for name in self._planned
-                if name.rpartition("/")[0] == namespace
-                and base.startswith(f"_{name.rpartition('/')[2]}_")
-            ),
-            key=len,
-            default="",
-        )
+        end = base.rfind("_", 2)
+        while end > 0 and base.startswith("_"):
+            name = f"{namespace}/{base[1:end]}"
+            if name in self._planned:
+                return name  # the longest that fits
+            end = base.rfind("_", 2, end)
+        return ""
 
 
 def is_hidden_node(full_name: str) -> bool:

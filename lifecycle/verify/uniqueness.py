@@ -16,6 +16,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.network.address import canonical, is_multicast, is_wildcard
@@ -24,14 +25,19 @@ from lifecycle.network.nfe import (
     LocatedNfe,
     NetworkFlowEndpoint,
     TransportProtocol,
+    dissimilar,
     is_ip,
-    is_unique_endpoint,
     located,
 )
 from lifecycle.verify.observation import EndpointReport, NodeConfiguration
-from lifecycle.verify.view import Actual
+
+if TYPE_CHECKING:
+    from lifecycle.verify.view import Actual
 
 _SIDES = (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION)
+_SEVERAL = -1
+"""Instead of the one endpoint that has an NFE."""
+
 _Bucket = tuple[EndpointKind, InternetProtocol, TransportProtocol, int]
 
 
@@ -67,7 +73,8 @@ class Uniqueness:
         self._entries: dict[int, _Entry] = {}
         # NFEs with another port or protocol are dissimilar whatever else they hold, so only those
         # of one bucket are ever compared: judging grows with the endpoints, not with their square.
-        self._buckets: dict[_Bucket, list[tuple[_Entry, LocatedNfe]]] = {}
+        # Endpoints of one participant have the same NFEs, so each is kept once, with whose it is.
+        self._buckets: dict[_Bucket, dict[LocatedNfe, int]] = {}
         self._unknown: set[tuple[EndpointKind, tuple[str, int]]] = set()
         self._answers: dict[int, bool | None] = {}
         for configuration in configurations:
@@ -94,7 +101,9 @@ class Uniqueness:
             return
         for each in entry.judged:
             if is_ip(each):
-                self._buckets.setdefault(_bucket(report.kind, each), []).append((entry, each))
+                owners = self._buckets.setdefault(_bucket(report.kind, each), {})
+                if owners.setdefault(each, id(entry)) != id(entry):
+                    owners[each] = _SEVERAL
 
     def nfes(self, ends: Sequence[Actual]) -> tuple[NetworkFlowEndpoint, ...]:
         """Return the NFEs of endpoints, each once, with the DSCP that was read back."""
@@ -122,17 +131,17 @@ class Uniqueness:
     def _judge(self, entry: _Entry) -> bool | None:
         if entry.judged is None:
             return None
-        kind = entry.report.kind
-        others: list[tuple[LocatedNfe, ...] | None] = [
-            (other,)
-            for own in entry.judged
-            if is_ip(own)
-            for owner, other in self._buckets[_bucket(kind, own)]
-            if owner is not entry
-        ]
-        if (kind, entry.process) in self._unknown:
-            others.append(None)
-        return is_unique_endpoint(entry.judged, others)
+        kind, me = entry.report.kind, id(entry)
+        own = [each for each in entry.judged if is_ip(each)]
+        for each in own:
+            owners = self._buckets[_bucket(kind, each)]
+            if owners[each] == _SEVERAL or not all(
+                owner == me or dissimilar(each, other) for other, owner in owners.items()
+            ):
+                return False
+        if not own:
+            return False  # as in `is_unique_endpoint`
+        return None if (kind, entry.process) in self._unknown else True
 
 
 def _that_count(nfes: tuple[LocatedNfe, ...], address: str) -> tuple[LocatedNfe, ...]:

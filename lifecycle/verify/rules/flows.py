@@ -64,7 +64,7 @@ RULES = (NOT_UNIQUE, UNVERIFIABLE, BROKEN_ENDPOINT, NOT_MEASURED)
 
 def check(view: View) -> Iterator[Finding]:
     """Judge every strict endpoint, then every link's demand, then name what is not measured."""
-    uniqueness = Uniqueness(view.reported, view.addresses)
+    uniqueness = view.uniqueness
     for actual in view.actual:
         yield from _broken(actual)
         if actual.planned.unique is UniqueRequirement.STRICTLY_REQUIRED:
