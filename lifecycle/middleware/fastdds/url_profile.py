@@ -24,7 +24,7 @@ from lifecycle.middleware.fastdds.profiles import tcp_locator as _tcp_locator
 from lifecycle.middleware.fastdds.profiles import text as _text
 from lifecycle.network.connection_url import ConnectionUrl, Peer
 from lifecycle.network.medium import Medium
-from lifecycle.network.ports import participant_ports
+from lifecycle.network.ports import LOCALHOST_PEERS_RANGE, participant_ports
 
 LOOPBACK = {Medium.UDPV4: "127.0.0.1", Medium.UDPV6: "::1"}
 """The transports that carry UDP, and where each finds this host."""
@@ -347,9 +347,6 @@ __all__ = [
     "families",
     "leaves_discovery_open",
 ]
-
-LOCALHOST_PEERS_RANGE = 32
-"""Participants looked for on a peer without a port; rmw_fastrtps's own number for LOCALHOST."""
 
 TYPES = {Medium.UDPV4: "UDPv4", Medium.UDPV6: "UDPv6", Medium.TCPV4: "TCPv4", Medium.SHM: "SHM"}
 

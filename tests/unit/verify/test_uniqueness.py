@@ -312,6 +312,9 @@ ENDS = st.tuples(
     st.none() | st.lists(NFES, max_size=3).map(tuple),
 )
 
+ALONE = planned(node("one", publisher("a")))
+(END,) = lay_out(ALONE, perfect(ALONE), Stage.CONNECTED).actual
+
 
 @given(st.lists(ENDS, max_size=8))
 def test_answers_are_those_of_comparing_every_endpoint_with_every_other(ends):
@@ -329,8 +332,6 @@ def test_answers_are_those_of_comparing_every_endpoint_with_every_other(ends):
             # What is not known hides no equal one but in its own process.
             if other != index and side is kind and (each is not None or place == process)
         ]
-        plan = planned(node("one", publisher("a")))
-        (end,) = lay_out(plan, perfect(plan), Stage.CONNECTED).actual
-        end = dataclasses.replace(end, report=reports[index])
+        end = dataclasses.replace(END, report=reports[index])
         expected = is_unique_endpoint(located(nfes, process[0]), others)
         assert uniqueness.is_unique(end) is expected
