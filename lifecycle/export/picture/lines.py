@@ -132,7 +132,7 @@ def _pictured(
             node=nodes[node].id,
             presence=presence,
             notes=(*several, *dict.fromkeys(note for each in same for note in each.notes)),
-            findings=basis.numbers(concerns),
+            findings=basis.numbers(ends[0].name, concerns=concerns),
         )
 
 
@@ -278,13 +278,15 @@ def _declared(
         unique=_UNIQUE[None],
         demands=tuple(_demands(flow)),
         findings=basis.numbers(
-            lambda each: (
+            flow.subject,
+            flow.planned.topic,
+            concerns=lambda each: (
                 each.subject == flow.subject
                 or (
                     each.subject == flow.planned.topic
                     and each.node in (flow.publisher, flow.subscription)
                 )
-            )
+            ),
         ),
     )
     if basis.verdict is None:
