@@ -162,7 +162,16 @@ class DeclaredNames:
 
     @classmethod
     def of(cls, plan: Plan) -> DeclaredNames:
-        """Collect those of a plan."""
+        """Collect those of a plan; those of the last few plans are remembered."""
+        known = _DECLARED.get(id(plan.nodes))
+        if known is None or known[0] is not plan.nodes:
+            if len(_DECLARED) >= _MOST_DECLARED:
+                _DECLARED.clear()
+            known = _DECLARED[id(plan.nodes)] = (plan.nodes, cls._of(plan))
+        return known[1]
+
+    @classmethod
+    def _of(cls, plan: Plan) -> DeclaredNames:
         services = (*NODE_SERVICES, *OUR_SERVICES)
         return cls(
             names=frozenset(
@@ -195,6 +204,11 @@ class DeclaredNames:
         if kind not in OFFERS or (kind, name) in NOISE_TOPICS:
             return False
         return self.has(kind, name) or (kind, name) in self.own
+
+
+_DECLARED: dict[int, tuple[tuple[PlannedNode, ...], DeclaredNames]] = {}
+"""By the identity of a plan's nodes, which are frozen; kept with them, so that it stays theirs."""
+_MOST_DECLARED = 4
 
 
 def known_node(full_name: str) -> str:
