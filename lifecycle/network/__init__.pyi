@@ -61,6 +61,8 @@ from .nfe import meets as meets
 from .nfe import socket_text as socket_text
 from .nfe import uniqueness as uniqueness
 from .ports import DG as DG
+from .ports import LOCALHOST_PARTICIPANTS as LOCALHOST_PARTICIPANTS
+from .ports import LOCALHOST_PEERS_RANGE as LOCALHOST_PEERS_RANGE
 from .ports import MAX_DOMAIN_ID as MAX_DOMAIN_ID
 from .ports import MAX_PORT as MAX_PORT
 from .ports import PARTICIPANTS_PER_DOMAIN as PARTICIPANTS_PER_DOMAIN

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import dataclasses
 import enum
+import functools
 import ipaddress
 from collections.abc import Iterable, Sequence
 
@@ -28,6 +29,7 @@ from lifecycle.network.medium import Medium
 IpAddress = ipaddress.IPv4Address | ipaddress.IPv6Address
 
 
+@functools.lru_cache(maxsize=4096)
 def parse_address(text: str) -> IpAddress | None:
     """Return the address that `text` spells, else None (empty, a host name, …)."""
     try:
@@ -36,6 +38,7 @@ def parse_address(text: str) -> IpAddress | None:
         return None
 
 
+@functools.lru_cache(maxsize=4096)
 def canonical(text: str) -> str:
     """Return the one spelling of an address (RFC 5952); text that is none is returned unchanged."""
     address = parse_address(text)
@@ -47,12 +50,14 @@ def socket_text(address: str, port: int) -> str:
     return f"[{address}]:{port}" if ":" in address else f"{address}:{port}"
 
 
+@functools.lru_cache(maxsize=4096)
 def is_wildcard(text: str) -> bool:
     """Whether this is `0.0.0.0` or `::`, which means every unicast address of its host."""
     address = parse_address(text)
     return address is not None and address.is_unspecified
 
 
+@functools.lru_cache(maxsize=4096)
 def is_multicast(text: str) -> bool:
     """Whether this is a group, which is the same destination from wherever it is named."""
     address = parse_address(text)

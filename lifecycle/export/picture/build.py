@@ -136,7 +136,9 @@ def _node(id_: str, name: str, basis: Basis, supervised: Supervised) -> Pictured
         pid=pid or None,
         notes=tuple(_notes(name, basis, supervised)),
         participants=pictured_participants(basis, id_, name, presence),
-        findings=basis.numbers(lambda each: bool(name) and name in (each.node, each.subject)),
+        findings=basis.numbers(
+            name, concerns=lambda each: bool(name) and name in (each.node, each.subject)
+        ),
     )
 
 

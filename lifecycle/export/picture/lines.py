@@ -57,9 +57,11 @@ def pictured_lines(basis: Basis, nodes: Mapping[str, PicturedNode]) -> Iterable[
     ends = list(_ends(basis))
     number = 0
     for kind, source_kind, target_kind in _KINDS:
-        names = dict.fromkeys(e.name for e in ends if e.kind in (source_kind, target_kind))
-        for name in names:
-            here = [e for e in ends if e.name == name and e.kind in (source_kind, target_kind)]
+        by_name: dict[str, list[_LineEnd]] = {}
+        for end in ends:
+            if end.kind in (source_kind, target_kind):
+                by_name.setdefault(end.name, []).append(end)
+        for name, here in by_name.items():
             sources = [each for each in here if each.kind is source_kind]
             targets = [each for each in here if each.kind is target_kind]
             yield PicturedLine(
@@ -119,8 +121,10 @@ def _pictured(
     basis: Basis, ends: Sequence[_LineEnd], nodes: Mapping[str, PicturedNode]
 ) -> Iterable[PicturedEnd]:
     """One end per node and presence: several endpoints of a node on one name are one end."""
-    for node, presence in dict.fromkeys((each.node, each.presence) for each in ends):
-        same = [each for each in ends if (each.node, each.presence) == (node, presence)]
+    by_place: dict[tuple[str, Presence], list[_LineEnd]] = {}
+    for each in ends:
+        by_place.setdefault((each.node, each.presence), []).append(each)
+    for (node, presence), same in by_place.items():
         several = (f"{len(same)} endpoints",) if len(same) > 1 else ()
 
         def concerns(finding: Finding, node: str = node, end: _LineEnd = same[0]) -> bool:
@@ -134,7 +138,7 @@ def _pictured(
             node=nodes[node].id,
             presence=presence,
             notes=(*several, *dict.fromkeys(note for each in same for note in each.notes)),
-            findings=basis.numbers(concerns),
+            findings=basis.numbers(ends[0].name, concerns=concerns),
         )
 
 
@@ -280,13 +284,15 @@ def _declared(
         unique=_UNIQUE[None],
         demands=tuple(_demands(flow)),
         findings=basis.numbers(
-            lambda each: (
+            flow.subject,
+            flow.planned.topic,
+            concerns=lambda each: (
                 each.subject == flow.subject
                 or (
                     each.subject == flow.planned.topic
                     and each.node in (flow.publisher, flow.subscription)
                 )
-            )
+            ),
         ),
     )
     if basis.verdict is None:
