@@ -1,128 +1,226 @@
-"""How fast ten single-process nodes come up: `lifecycle up` beside the obvious way.
+"""How fast systems of 1 to 100 single-process nodes come up and go: `lifecycle up` beside others.
 
-The obvious way is what one writes without a supervisor: one `python` per node with an
-`rclpy.lifecycle` node, then `change_state` calls one after the other. Both start cold, run the same
-ten nodes with one publisher each, and end everything they started. `lifecycle up` verifies the
-whole graph before it activates; the baseline verifies nothing.
+Four things, in turns, so that a busy moment of the machine hits all of them:
 
-    python benchmarks/bring_up.py [--nodes 10] [--repeat 5] [--domain 40]
+- launch_ros, where it can be imported: a process a node, lifecycle events; verifies nothing
+- Popen + services: one `python` a node, service calls side by side; verifies nothing
+- lifecycle: `lifecycle up`, which verifies the whole graph before it activates
+- floor: a fork server and a control channel, and nothing else (bring_up_floor.py)
 
-prints, for each, the seconds from the command to all nodes being active, and to everything being
-gone again, and the ratio.
+Each starts cold and runs the same nodes; everything it started is measured and ended.
+
+    python benchmarks/bring_up.py [--sizes 1 5 10 20 50 100] [--runs 3] [--shape single|chain]
+        [--only NAME ...] [--markdown]
+
+prints medians: seconds from the command to all nodes being active, CPU seconds of the whole process
+tree until then, its PSS and threads then, and seconds from SIGINT until nothing is left; and the
+ratio of lifecycle to the floor. `--shape chain`: each node has five publishers and five
+subscriptions, those of the node before it. What failed is in the table and named below it, and
+makes the exit code 1.
+
+All talk with `range: subnet`, which holds more participants on one host than `localhost`.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
+import importlib.util
 import json
-import os
 import statistics
-import subprocess
 import sys
 import tempfile
-import time
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import yaml
 
-TOPIC_TYPE = "std_msgs/msg/String"
+sys.path.insert(0, str(Path(__file__).parents[1]))  # as a script, only its own directory is there
+
+from benchmarks.measuring import COLUMNS, FLOOR, OURS, FailedError, Row, Used, render, row, run
+
 HERE = Path(__file__).resolve()
+SIZES = (1, 5, 10, 20, 50, 100)
+CHAIN = 5
+PROGRAMS = {
+    COLUMNS[0]: "bring_up_launch.py",
+    COLUMNS[1]: "bring_up_baseline.py",
+    FLOOR: "bring_up_floor.py",
+}
+MEASURES = {
+    "active_s": "to all active, s",
+    "cpu_s": "CPU until then, s",
+    "pss_mib": "PSS then, MiB",
+    "threads": "threads then",
+    "gone_s": "SIGINT to gone, s",
+}
 
 
-def manifest(nodes: int, domain_id: int) -> str:
+def manifest(nodes: int, shape: str, domain_id: int) -> dict[str, Any]:
     """The system of `nodes` nodes, as a manifest."""
-    return yaml.safe_dump(
-        {
-            "manifest_version": 1,
-            "system": "bring_up",
-            "discovery": {"domain_id": domain_id, "range": "localhost"},
-            "policy": {"unheard": "ignore"},
-            "nodes": {
-                f"node_{index}": {
-                    "run": {"python": "benchmarks.bring_up_node:Ours"},
-                    "interface": {"publishers": [{"name": f"out_{index}", "type": TOPIC_TYPE}]},
-                }
-                for index in range(nodes)
-            },
-        }
-    )
+    made = _chained if shape == "chain" else _single
+    return {
+        "manifest_version": 1,
+        "system": "bring_up",
+        "discovery": {"domain_id": domain_id, "range": "subnet"},
+        "policy": {"unheard": "ignore"},
+        "nodes": {f"node_{index}": made(index) for index in range(nodes)},
+    }
 
 
-def ours(nodes: int, domain_id: int) -> tuple[float, float]:
-    """Run `lifecycle up`; return (seconds to active, seconds in all)."""
+def _endpoint(name: str) -> dict[str, str]:
+    return {"name": name, "type": "std_msgs/msg/String"}
+
+
+def _single(index: int) -> dict[str, Any]:
+    return {
+        "run": {"python": "benchmarks.bring_up_node:Ours"},
+        "interface": {"publishers": [_endpoint(f"out_{index}")]},
+    }
+
+
+def _chained(index: int) -> dict[str, Any]:
+    node: dict[str, Any] = {
+        "run": {"python": "benchmarks.bring_up_node:" + ("Chained" if index else "Ours")},
+        "interface": {
+            "publishers": [_endpoint(f"link_{index}_{number}") for number in range(CHAIN)]
+        },
+    }
+    if index:
+        node["interface"]["subscriptions"] = [_endpoint(f"in_{each}") for each in range(CHAIN)]
+        node["remap"] = {f"in_{each}": f"link_{index - 1}_{each}" for each in range(CHAIN)}
+    return node
+
+
+def measure(name: str, nodes: int, shape: str, domain_id: int) -> Used:
+    """Bring `nodes` nodes up and down once.
+
+    Raises:
+        FailedError: it did not work.
+    """
+    variables = {
+        "ROS_DOMAIN_ID": str(domain_id),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",
+        "PYTHONDONTWRITEBYTECODE": "",
+    }
+    bound_s = 60.0 + 3.0 * nodes
+    if name != OURS:
+        command = [sys.executable, str(HERE.with_name(PROGRAMS[name])), str(nodes), shape]
+        return run(
+            command,
+            is_active=lambda line: line == "active\n",
+            variables=variables,
+            bound_s=bound_s,
+        )
     with tempfile.TemporaryDirectory() as directory:
         file = Path(directory) / "bring_up.lifecycle.yaml"
-        file.write_text(manifest(nodes, domain_id))
-        began = time.monotonic()
-        active = 0.0
-        with subprocess.Popen(
+        file.write_text(yaml.safe_dump(manifest(nodes, shape, domain_id)))
+        return run(
             [
-                *(sys.executable, "-m", "lifecycle.cli", "up", str(file)),
-                *("--stop-after", "0", "--format", "json"),
+                *(sys.executable, "-m", "lifecycle.cli", "up", str(file), "--format", "json"),
+                *("--timeout", str(max(30.0, bound_s))),
             ],
-            cwd=HERE.parents[1],
-            stdout=subprocess.PIPE,
-            text=True,
-        ) as process:
-            assert process.stdout is not None
-            for line in process.stdout:
-                event = json.loads(line)
-                if event.get("event") == "system" and event["reached"] == "active":
-                    active = time.monotonic() - began
-        if process.returncode != 0:
-            raise SystemExit(f"lifecycle up failed with {process.returncode}")
-        return active, time.monotonic() - began
+            is_active=_says_active,
+            variables=variables,
+            bound_s=bound_s,
+        )
 
 
-def baseline(nodes: int, domain_id: int) -> tuple[float, float]:
-    """Run the obvious way in an interpreter of its own; return the same."""
-    environment = {
-        **os.environ,
-        "ROS_DOMAIN_ID": str(domain_id),
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-    }
-    began = time.monotonic()
-    active = 0.0
-    with subprocess.Popen(
-        [sys.executable, str(HERE.with_name("bring_up_baseline.py")), str(nodes)],
-        env=environment,
-        stdout=subprocess.PIPE,
-        text=True,
-    ) as process:
-        assert process.stdout is not None
-        for line in process.stdout:
-            if line == "active\n":
-                active = time.monotonic() - began
-    if process.returncode != 0:
-        raise SystemExit(f"the baseline failed with {process.returncode}")
-    return active, time.monotonic() - began
+def _says_active(line: str) -> bool:
+    event = json.loads(line)
+    return event.get("event") == "system" and event["reached"] == "active"
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="Measure bring-up against the obvious way.")
-    parser.add_argument("--nodes", type=int, default=10)
-    parser.add_argument("--repeat", type=int, default=5)
+def available(only: Iterable[str] = COLUMNS) -> tuple[str, ...]:
+    """Return what can be measured here."""
+    there = importlib.util.find_spec("launch_ros") is not None
+    return tuple(each for each in COLUMNS if each in only and (there or each != COLUMNS[0]))
+
+
+def measure_all(
+    sizes: Sequence[int],
+    runs: int,
+    shape: str,
+    domain_id: int,
+    *,
+    names: Sequence[str],
+    failures: list[str],
+) -> list[Row]:
+    """Measure everything in turns; return the table's lines.
+
+    Args:
+        failures: what failed is added here. It is not tried again with that many nodes.
+    """
+    for name in names:  # what is slow the first time only is not to be measured
+        _once(name, 1, shape, domain_id)
+    rows = []
+    for size in sizes:
+        measured: dict[str, list[Used]] = {name: [] for name in names}
+        failed: dict[str, str] = {}
+        for _ in range(runs):
+            for name in names:
+                if name in failed:
+                    continue
+                found = _once(name, size, shape, domain_id)
+                if isinstance(found, str):
+                    failed[name] = found
+                else:
+                    measured[name].append(found)
+        failures += [f"{name} with {size} nodes: {why}" for name, why in failed.items()]
+        rows += _rows(size, measured, failed)
+    return rows
+
+
+def _once(name: str, size: int, shape: str, domain_id: int) -> Used | str:
+    print(f"{size:4} {shape}: {name:20}", end="\r", file=sys.stderr, flush=True)
+    try:
+        return measure(name, size, shape, domain_id)
+    except FailedError as error:
+        return str(error)
+
+
+def _rows(size: int, measured: dict[str, list[Used]], failed: dict[str, str]) -> list[Row]:
+    rows = []
+    for field, title in MEASURES.items():
+        values: dict[str, float | str] = {
+            name: "failed"
+            if name in failed
+            else statistics.median(dataclasses.asdict(each)[field] for each in found)
+            for name, found in measured.items()
+        }
+        rows.append(row(f"N={size}: {title}", values))
+    return rows
+
+
+def main() -> int:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description="Measure bring-up against others and the floor.")
+    parser.add_argument("--sizes", type=int, nargs="+", default=SIZES, metavar="N")
+    parser.add_argument("--runs", type=int, default=3)
+    parser.add_argument("--shape", choices=("single", "chain"), default="single")
+    parser.add_argument("--only", nargs="+", choices=COLUMNS, default=COLUMNS, metavar="NAME")
     parser.add_argument("--domain", type=int, default=40)
+    parser.add_argument("--markdown", action="store_true", help="as in docs/performance.md")
     options = parser.parse_args()
-    runs = {"baseline": baseline, "lifecycle up": ours}
-    measured: dict[str, list[tuple[float, float]]] = {name: [] for name in runs}
-    for _ in range(options.repeat):
-        # In turns, so that a busy moment of the machine hits both.
-        for name, run in runs.items():
-            measured[name].append(run(options.nodes, options.domain))
-    medians = {
-        name: tuple(statistics.median(column) for column in zip(*values, strict=True))
-        for name, values in measured.items()
-    }
-    print(f"{options.nodes} single-process nodes, cold, median of {options.repeat}, seconds")
-    print(f"{'':14}{'to all active':>15}{'whole command':>15}")
-    for name, values in medians.items():
-        print(f"{name:14}" + "".join(f"{value:15.2f}" for value in values))
-    ratios = (
-        slow / fast for slow, fast in zip(medians["baseline"], medians["lifecycle up"], strict=True)
+    names = available(options.only)
+    if skipped := [each for each in options.only if each not in names]:
+        print(f"skipped, because it cannot be imported: {', '.join(skipped)}")
+    failures: list[str] = []
+    rows = measure_all(
+        options.sizes,
+        options.runs,
+        options.shape,
+        options.domain,
+        names=names,
+        failures=failures,
     )
-    print(f"{'ratio':14}" + "".join(f"{ratio:14.1f}×" for ratio in ratios))
+    print(f"{options.shape}, separate processes, cold, medians of {options.runs} in turns\n")
+    print(render(rows, markdown=options.markdown))
+    for each in failures:
+        print(f"failed: {each}")
+    return 1 if failures else 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
