@@ -18,10 +18,47 @@ import signal
 import socket
 import sys
 
+import lifecycle_msgs.msg
+import lifecycle_msgs.srv
+import rcl_interfaces.msg
+import rcl_interfaces.srv
 import rclpy
+import std_msgs.msg
+import type_description_interfaces.srv
 from bring_up_rclpy import Theirs
 from rclpy.executors import ExternalShutdownException
 from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.type_support import check_is_valid_msg_type, check_is_valid_srv_type
+from rclpy.utilities import get_rmw_implementation_identifier
+
+MESSAGES = (
+    lifecycle_msgs.msg.TransitionEvent,
+    rcl_interfaces.msg.Log,
+    rcl_interfaces.msg.ParameterEvent,
+    std_msgs.msg.String,
+)
+SERVICES = (
+    lifecycle_msgs.srv.ChangeState,
+    lifecycle_msgs.srv.GetAvailableStates,
+    lifecycle_msgs.srv.GetAvailableTransitions,
+    lifecycle_msgs.srv.GetState,
+    rcl_interfaces.srv.DescribeParameters,
+    rcl_interfaces.srv.GetParameterTypes,
+    rcl_interfaces.srv.GetParameters,
+    rcl_interfaces.srv.ListParameters,
+    rcl_interfaces.srv.SetParameters,
+    rcl_interfaces.srv.SetParametersAtomically,
+    type_description_interfaces.srv.GetTypeDescription,
+)
+
+
+def preload() -> None:
+    """Load what every node loads: type supports, and Fast DDS itself."""
+    get_rmw_implementation_identifier()
+    for message in MESSAGES:
+        check_is_valid_msg_type(message)
+    for service in SERVICES:
+        check_is_valid_srv_type(service)
 
 
 def serve(index: int, shape: str, control: socket.socket) -> None:
@@ -50,6 +87,7 @@ def live(node: Theirs, control: socket.socket) -> None:
 def main() -> int:
     nodes, shape = int(sys.argv[1]), sys.argv[2]
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    preload()
     gc.collect()
     gc.freeze()  # a child's first collection would copy the shared pages
     controls: list[socket.socket] = []
