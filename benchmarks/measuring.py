@@ -1,7 +1,7 @@
 """What a process tree uses, CPU, memory and threads, and the table that benchmarks print.
 
-Owns: `Started`, a program that is run until it says that all is active and then ended by SIGINT,
-what its whole tree used meanwhile, and `Table`, as text or as in docs/performance.md.
+Owns: `run`, which runs a program until it says that all is active, measures its whole tree and ends
+it by SIGINT, and `render`, the table as text or as in docs/performance.md.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ def pss_of(pid: int) -> float:
 def threads_of(pid: int) -> int:
     """Return the number of threads of a process."""
     try:
-        return len(os.listdir(f"/proc/{pid}/task"))
+        return sum(1 for _ in Path(f"/proc/{pid}/task").iterdir())
     except OSError:
         return 0
 
@@ -237,7 +237,7 @@ def row(what: str, values: Mapping[str, float | str], *, inverse: bool = False) 
 
 
 def render(rows: Sequence[Row], *, markdown: bool = False) -> str:
-    """Return the table, aligned or as in docs/performance.md; columns without a value are left out."""
+    """Return the table, aligned or as in docs/performance.md, with the columns that have values."""
     columns = [each for each in COLUMNS if any(each in row.values for row in rows)]
     cells = [["", *columns, "ratio"]]
     cells += [

@@ -54,6 +54,11 @@ if TYPE_CHECKING:
     is_flag=True,
     help="Report a process that dies, but do not take the others down.",
 )
+@click.option(
+    "--timings",
+    is_flag=True,
+    help="Say how long each stage of bring-up took, once it is over or has failed.",
+)
 @program_options
 @treatment_options
 def command(
@@ -68,6 +73,7 @@ def command(
     strict: bool,
     machine: str,
     keep_going: bool,
+    timings: bool,
     targets: tuple[str, ...],
     mapping: str,
     flow_labels: bool,
@@ -110,7 +116,8 @@ def command(
                     program=program,
                     treatment=_treatment(targets, mapping=mapping, flow_labels=flow_labels),
                 )
-                with output(format_) as listener, ending.noted():
+                timed = until if timings else ""
+                with output(format_, timings_until=timed) as listener, ending.noted():
 
                     def conclude(result: UpResult) -> ExitCode:
                         return _finished(result, listener, written)
