@@ -14,7 +14,7 @@ Each starts cold and runs the same nodes; everything it started is measured and 
 
 prints medians: seconds from the command to all nodes being active, CPU seconds of the whole process
 tree until then, its PSS and threads then, and seconds from SIGINT until nothing is left; and the
-ratio of lifecycle to the floor. `--shape chain`: each node has five publishers and five
+ratio of lifecycle to the floor; and how long each stage of `lifecycle up` took. `--shape chain`: each node has five publishers and five
 subscriptions, those of the node before it. What failed is in the table and named below it, and
 makes the exit code 1.
 
@@ -27,9 +27,11 @@ import argparse
 import dataclasses
 import importlib.util
 import json
+import math
 import statistics
 import sys
 import tempfile
+import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -38,7 +40,19 @@ import yaml
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # as a script, only its own directory is there
 
-from benchmarks.measuring import COLUMNS, FLOOR, OURS, FailedError, Row, Used, render, row, run
+from benchmarks.measuring import (
+    COLUMNS,
+    FLOOR,
+    OURS,
+    FailedError,
+    Row,
+    Used,
+    aligned,
+    cell,
+    render,
+    row,
+    run,
+)
 
 HERE = Path(__file__).resolve()
 SIZES = (1, 5, 10, 20, 50, 100)
@@ -93,7 +107,20 @@ def _chained(index: int) -> dict[str, Any]:
     return node
 
 
-def measure(name: str, nodes: int, shape: str, domain_id: int) -> Used:
+@dataclasses.dataclass
+class Findings:
+    """What is found besides what the table has.
+
+    Attributes:
+        failures: what failed, in words.
+        stages: seconds of each stage of `lifecycle up`, by the number of nodes.
+    """
+
+    failures: list[str] = dataclasses.field(default_factory=list)
+    stages: dict[int, dict[str, list[float]]] = dataclasses.field(default_factory=dict)
+
+
+def measure(name: str, nodes: int, shape: str, domain_id: int, findings: Findings) -> Used:
     """Bring `nodes` nodes up and down once.
 
     Raises:
@@ -113,23 +140,28 @@ def measure(name: str, nodes: int, shape: str, domain_id: int) -> Used:
             variables=variables,
             bound_s=bound_s,
         )
+    stages = findings.stages.setdefault(nodes, {})
+
+    def is_active(line: str) -> bool:
+        event = json.loads(line)
+        if event.get("event") != "stage":
+            return False
+        stages.setdefault(event["stage"], []).append(event["took_s"])
+        # It comes right after the event that the system is active, also if it is not.
+        return bool(event["stage"] == "total" and len(stages["total"]) == len(stages["active"]))
+
     with tempfile.TemporaryDirectory() as directory:
         file = Path(directory) / "bring_up.lifecycle.yaml"
         file.write_text(yaml.safe_dump(manifest(nodes, shape, domain_id)))
         return run(
             [
                 *(sys.executable, "-m", "lifecycle.cli", "up", str(file), "--format", "json"),
-                *("--timeout", str(max(30.0, bound_s))),
+                *("--timings", "--timeout", str(bound_s)),
             ],
-            is_active=_says_active,
+            is_active=is_active,
             variables=variables,
             bound_s=bound_s,
         )
-
-
-def _says_active(line: str) -> bool:
-    event = json.loads(line)
-    return event.get("event") == "system" and event["reached"] == "active"
 
 
 def available(only: Iterable[str] = COLUMNS) -> tuple[str, ...]:
@@ -145,52 +177,76 @@ def measure_all(
     domain_id: int,
     *,
     names: Sequence[str],
-    failures: list[str],
+    findings: Findings,
+    enough_s: float = math.inf,
 ) -> list[Row]:
     """Measure everything in turns; return the table's lines.
 
+    What failed is not tried again with that many nodes.
+
     Args:
-        failures: what failed is added here. It is not tried again with that many nodes.
+        sizes: numbers of nodes.
+        runs: of each.
+        shape: "single" or "chain".
+        domain_id: of all of them.
+        names: of the things to measure.
+        findings: gets what failed, and the stages.
+        enough_s: on the monotonic clock; from then on each is run once.
     """
     for name in names:  # what is slow the first time only is not to be measured
-        _once(name, 1, shape, domain_id)
+        _once(name, 1, shape, domain_id, Findings())
     rows = []
     for size in sizes:
         measured: dict[str, list[Used]] = {name: [] for name in names}
         failed: dict[str, str] = {}
-        for _ in range(runs):
+        for number in range(runs):
+            if number and time.monotonic() > enough_s:
+                break
             for name in names:
                 if name in failed:
                     continue
-                found = _once(name, size, shape, domain_id)
+                found = _once(name, size, shape, domain_id, findings)
                 if isinstance(found, str):
                     failed[name] = found
                 else:
                     measured[name].append(found)
-        failures += [f"{name} with {size} nodes: {why}" for name, why in failed.items()]
-        rows += _rows(size, measured, failed)
+        findings.failures += [
+            f"{name} with {size} nodes, {shape}: {why}" for name, why in failed.items()
+        ]
+        title = f"N={size}" if shape == "single" else f"{shape} N={size}"
+        rows += _rows(title, measured, failed)
     return rows
 
 
-def _once(name: str, size: int, shape: str, domain_id: int) -> Used | str:
+def _once(name: str, size: int, shape: str, domain_id: int, findings: Findings) -> Used | str:
     print(f"{size:4} {shape}: {name:20}", end="\r", file=sys.stderr, flush=True)
     try:
-        return measure(name, size, shape, domain_id)
+        return measure(name, size, shape, domain_id, findings)
     except FailedError as error:
         return str(error)
 
 
-def _rows(size: int, measured: dict[str, list[Used]], failed: dict[str, str]) -> list[Row]:
+def _rows(title: str, measured: dict[str, list[Used]], failed: dict[str, str]) -> list[Row]:
     rows = []
-    for field, title in MEASURES.items():
+    for field, what in MEASURES.items():
         values: dict[str, float | str] = {
             name: "failed"
             if name in failed
             else statistics.median(dataclasses.asdict(each)[field] for each in found)
             for name, found in measured.items()
         }
-        rows.append(row(f"N={size}: {title}", values))
+        rows.append(row(f"{title}: {what}", values))
     return rows
+
+
+def stage_table(stages: dict[int, dict[str, list[float]]], *, markdown: bool) -> str:
+    """Return how long each stage of `lifecycle up` took, seconds, by the number of nodes."""
+    names = max((tuple(each) for each in stages.values()), key=len, default=())
+    cells = [["stage, s", *(f"N={size}" for size in stages)]]
+    for name in names:
+        found = (stages[size].get(name) for size in stages)
+        cells.append([name, *(cell(statistics.median(each)) if each else "" for each in found)])
+    return aligned(cells, markdown=markdown)
 
 
 def main() -> int:
@@ -206,20 +262,23 @@ def main() -> int:
     names = available(options.only)
     if skipped := [each for each in options.only if each not in names]:
         print(f"skipped, because it cannot be imported: {', '.join(skipped)}")
-    failures: list[str] = []
+    findings = Findings()
     rows = measure_all(
         options.sizes,
         options.runs,
         options.shape,
         options.domain,
         names=names,
-        failures=failures,
+        findings=findings,
     )
     print(f"{options.shape}, separate processes, cold, medians of {options.runs} in turns\n")
     print(render(rows, markdown=options.markdown))
-    for each in failures:
+    if findings.stages:
+        print(f"\nstages of lifecycle up, {options.shape}, likewise\n")
+        print(stage_table(findings.stages, markdown=options.markdown))
+    for each in findings.failures:
         print(f"failed: {each}")
-    return 1 if failures else 0
+    return 1 if findings.failures else 0
 
 
 if __name__ == "__main__":

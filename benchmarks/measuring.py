@@ -58,6 +58,7 @@ def run(
     """Run a program until it is active, measure, and end it.
 
     Args:
+        command: its command line.
         is_active: whether a line of its standard output says that all nodes are.
         variables: set in its environment.
         bound_s: it must be active so soon.
@@ -243,23 +244,29 @@ def render(rows: Sequence[Row], *, markdown: bool = False) -> str:
     cells += [
         [
             each.what,
-            *(_cell(each.values.get(column)) for column in columns),
+            *(cell(each.values.get(column)) for column in columns),
             "" if each.ratio is None else f"{each.ratio:.2f}",
         ]
         for each in rows
     ]
+    return aligned(cells, markdown=markdown)
+
+
+def aligned(cells: Sequence[Sequence[str]], *, markdown: bool = False) -> str:
+    """Return lines of cells as a table; the first line is its head."""
     if markdown:
         lines = [f"| {' | '.join(line)} |" for line in cells]
         return "\n".join([lines[0], "|---" * len(cells[0]) + "|", *lines[1:]])
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     return "\n".join(
         line[0].ljust(widths[0])
-        + "".join(cell.rjust(width + 2) for cell, width in zip(line[1:], widths[1:], strict=True))
+        + "".join(text.rjust(width + 2) for text, width in zip(line[1:], widths[1:], strict=True))
         for line in cells
     )
 
 
-def _cell(value: float | str | None) -> str:
+def cell(value: float | str | None) -> str:
+    """Return a value with three digits or so."""
     if value is None:
         return ""
     if isinstance(value, str):
