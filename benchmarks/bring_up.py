@@ -13,10 +13,10 @@ Each starts cold and runs the same nodes; everything it started is measured and 
         [--only NAME ...] [--markdown]
 
 prints medians: seconds from the command to all nodes being active, CPU seconds of the whole process
-tree until then, its PSS and threads then, and seconds from SIGINT until nothing is left; and the
-ratio of lifecycle to the floor; and how long each stage of `lifecycle up` took. `--shape chain`: each node has five publishers and five
-subscriptions, those of the node before it. What failed is in the table and named below it, and
-makes the exit code 1.
+tree until then, its PSS and threads then, and seconds from SIGINT until nothing is left; the ratio
+of lifecycle to the floor; and how long each stage of `lifecycle up` took. `--shape chain`: each
+node has five publishers and five subscriptions, those of the node before it. What failed is in the
+table and named below it, and makes the exit code 1.
 
 All talk with `range: subnet`, which holds more participants on one host than `localhost`.
 """
@@ -71,13 +71,13 @@ MEASURES = {
 }
 
 
-def manifest(nodes: int, shape: str, domain_id: int) -> dict[str, Any]:
+def manifest(nodes: int, shape: str, domain_id: int, range_: str = "subnet") -> dict[str, Any]:
     """The system of `nodes` nodes, as a manifest."""
     made = _chained if shape == "chain" else _single
     return {
         "manifest_version": 1,
         "system": "bring_up",
-        "discovery": {"domain_id": domain_id, "range": "subnet"},
+        "discovery": {"domain_id": domain_id, "range": range_},
         "policy": {"unheard": "ignore"},
         "nodes": {f"node_{index}": made(index) for index in range(nodes)},
     }
@@ -120,15 +120,31 @@ class Findings:
     stages: dict[int, dict[str, list[float]]] = dataclasses.field(default_factory=dict)
 
 
-def measure(name: str, nodes: int, shape: str, domain_id: int, findings: Findings) -> Used:
+def measure(
+    name: str,
+    nodes: int,
+    shape: str,
+    domain_id: int,
+    findings: Findings,
+    *,
+    range_: str = "subnet",
+) -> Used:
     """Bring `nodes` nodes up and down once.
+
+    Args:
+        name: one of COLUMNS.
+        nodes: how many.
+        shape: "single" or "chain".
+        domain_id: of all of them.
+        findings: gets the stages.
+        range_: of discovery.
 
     Raises:
         FailedError: it did not work.
     """
     variables = {
         "ROS_DOMAIN_ID": str(domain_id),
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": range_.upper(),
         "PYTHONDONTWRITEBYTECODE": "",
     }
     bound_s = 60.0 + 3.0 * nodes
@@ -152,7 +168,7 @@ def measure(name: str, nodes: int, shape: str, domain_id: int, findings: Finding
 
     with tempfile.TemporaryDirectory() as directory:
         file = Path(directory) / "bring_up.lifecycle.yaml"
-        file.write_text(yaml.safe_dump(manifest(nodes, shape, domain_id)))
+        file.write_text(yaml.safe_dump(manifest(nodes, shape, domain_id, range_)))
         return run(
             [
                 *(sys.executable, "-m", "lifecycle.cli", "up", str(file), "--format", "json"),

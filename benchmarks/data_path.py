@@ -99,19 +99,21 @@ def message(runs: int) -> list[Row]:
     found: dict[str, list[float]] = {name: [] for name in NAMES.values()}
     node = Node("sender")
     try:
-        with program("ours", "receive", MESSAGES) as ours:
-            with program("plain", "receive", MESSAGES) as plain:
-                receivers = {"ours": ours, "plain": plain}
-                publishers = {
-                    whose: node.create_publisher(String, f"to_{whose}", 100) for whose in receivers
-                }
-                for whose, publisher in publishers.items():
-                    until_matched(publisher, receivers[whose])
-                for number in range(runs + 1):
-                    for whose, receiver in receivers.items():
-                        used_us = received(publishers[whose], receiver)
-                        if number:  # the first is not measured
-                            found[NAMES[whose]].append(used_us)
+        with (
+            program("ours", "receive", MESSAGES) as ours,
+            program("plain", "receive", MESSAGES) as plain,
+        ):
+            receivers = {"ours": ours, "plain": plain}
+            publishers = {
+                whose: node.create_publisher(String, f"to_{whose}", 100) for whose in receivers
+            }
+            for whose, publisher in publishers.items():
+                until_matched(publisher, receivers[whose])
+            for number in range(runs + 1):
+                for whose, receiver in receivers.items():
+                    used_us = received(publishers[whose], receiver)
+                    if number:  # the first is not measured
+                        found[NAMES[whose]].append(used_us)
     finally:
         node.destroy_node()
     medians = {name: statistics.median(each) for name, each in found.items()}
