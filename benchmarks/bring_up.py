@@ -156,20 +156,20 @@ def measure(
             variables=variables,
             bound_s=bound_s,
         )
-    stages = findings.stages.setdefault(nodes, {})
+    stages: dict[str, float] = {}
 
     def is_active(line: str) -> bool:
         event = json.loads(line)
         if event.get("event") != "stage":
             return False
-        stages.setdefault(event["stage"], []).append(event["took_s"])
-        # It comes right after the event that the system is active, also if it is not.
-        return bool(event["stage"] == "total" and len(stages["total"]) == len(stages["active"]))
+        stages[event["stage"]] = event["took_s"]
+        # The last one comes right after the event that the system is active, or before its end.
+        return event["stage"] == "total" and "active" in stages
 
     with tempfile.TemporaryDirectory() as directory:
         file = Path(directory) / "bring_up.lifecycle.yaml"
         file.write_text(yaml.safe_dump(manifest(nodes, shape, domain_id, range_)))
-        return run(
+        used = run(
             [
                 *(sys.executable, "-m", "lifecycle.cli", "up", str(file), "--format", "json"),
                 *("--timings", "--timeout", str(bound_s)),
@@ -178,6 +178,9 @@ def measure(
             variables=variables,
             bound_s=bound_s,
         )
+    for stage, took_s in stages.items():
+        findings.stages.setdefault(nodes, {}).setdefault(stage, []).append(took_s)
+    return used
 
 
 def available(only: Iterable[str] = COLUMNS) -> tuple[str, ...]:

@@ -19,15 +19,23 @@ import time
 from pathlib import Path
 
 import rclpy
-from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState
+from lifecycle_msgs.msg import State, Transition
+from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.task import Future
 
-AGAIN_S = 2.0
+AGAIN_S = 1.0
 LOOK_S = 0.02
 END_S = 10.0
+STEPS = {
+    State.PRIMARY_STATE_UNCONFIGURED: Transition.TRANSITION_CONFIGURE,
+    State.PRIMARY_STATE_INACTIVE: Transition.TRANSITION_ACTIVATE,
+}
+NEXT = {
+    State.PRIMARY_STATE_UNCONFIGURED: State.PRIMARY_STATE_INACTIVE,
+    State.PRIMARY_STATE_INACTIVE: State.PRIMARY_STATE_ACTIVE,
+}
 PROGRAM = Path(__file__).with_name("bring_up_rclpy.py")
 
 
@@ -36,44 +44,55 @@ class Driver(Node):
 
     def __init__(self, nodes: int) -> None:
         super().__init__("driver")
-        self._calls = [
-            self.create_client(ChangeState, f"/node_{index}/change_state") for index in range(nodes)
-        ]
-        self._steps = [
-            [Transition.TRANSITION_ACTIVATE, Transition.TRANSITION_CONFIGURE] for _ in self._calls
-        ]
-        self._asked_s = [0.0] * nodes
-        self.create_timer(LOOK_S, self._ask)
+        names = [f"/node_{index}" for index in range(nodes)]
+        self._changes = [self.create_client(ChangeState, f"{name}/change_state") for name in names]
+        self._states = [self.create_client(GetState, f"{name}/get_state") for name in names]
+        self._state = [State.PRIMARY_STATE_UNCONFIGURED] * nodes
+        self._asked_s: list[float | None] = [None] * nodes
+        self.create_timer(LOOK_S, self._look)
 
     @property
     def is_done(self) -> bool:
         """Whether all nodes are active."""
-        return not any(self._steps)
+        return all(each == State.PRIMARY_STATE_ACTIVE for each in self._state)
 
-    def _ask(self) -> None:
-        """Ask whoever can be asked; again if there was no answer.
+    def _look(self) -> None:
+        """Ask each node that can be asked; where a reply is late, for its state first.
 
-        A reply is lost while the client is not matched with it yet.
+        A reply is lost while the client is not matched with its writer yet, and a managed node of
+        rclpy ends on a transition that its state does not have.
         """
-        for index, call in enumerate(self._calls):
-            late = time.monotonic() - self._asked_s[index] > AGAIN_S
-            if self._steps[index] and late and call.service_is_ready():
-                self._request(index)
+        for index, asked_s in enumerate(self._asked_s):
+            if self._state[index] == State.PRIMARY_STATE_ACTIVE:
+                continue
+            if asked_s is None:
+                if self._changes[index].service_is_ready():
+                    self._change(index)
+            elif time.monotonic() - asked_s > AGAIN_S and self._states[index].service_is_ready():
+                self._asked_s[index] = time.monotonic()
+                call = self._states[index].call_async(GetState.Request())
+                call.add_done_callback(functools.partial(self._told, index))
 
-    def _request(self, index: int) -> None:
-        step = self._steps[index][-1]
+    def _change(self, index: int) -> None:
+        state = self._state[index]
         request = ChangeState.Request()
-        request.transition.id = step
+        request.transition.id = STEPS[state]
         self._asked_s[index] = time.monotonic()
-        answered = functools.partial(self._answered, index, step)
-        self._calls[index].call_async(request).add_done_callback(answered)
+        call = self._changes[index].call_async(request)
+        call.add_done_callback(functools.partial(self._changed, index, state))
 
-    def _answered(self, index: int, step: int, _: Future) -> None:
-        """Go on, also after a refusal: then an earlier request was carried out."""
-        if self._steps[index] and self._steps[index][-1] == step:
-            self._steps[index].pop()
-            if self._steps[index]:
-                self._request(index)
+    def _changed(self, index: int, before: int, _: Future) -> None:
+        if self._state[index] == before:
+            self._reached(index, NEXT[before])
+
+    def _told(self, index: int, future: Future) -> None:
+        self._reached(index, future.result().current_state.id)
+
+    def _reached(self, index: int, state: int) -> None:
+        if state in (*STEPS, State.PRIMARY_STATE_ACTIVE):
+            self._state[index] = state
+            if state in STEPS:
+                self._change(index)
 
 
 def main() -> None:
