@@ -157,9 +157,12 @@ def measure(
             bound_s=bound_s,
         )
     stages: dict[str, float] = {}
+    failures: list[str] = []
 
     def is_active(line: str) -> bool:
         event = json.loads(line)
+        if event.get("event") == "failure":
+            failures.append(event["message"])
         if event.get("event") != "stage":
             return False
         stages[event["stage"]] = event["took_s"]
@@ -169,15 +172,16 @@ def measure(
     with tempfile.TemporaryDirectory() as directory:
         file = Path(directory) / "bring_up.lifecycle.yaml"
         file.write_text(yaml.safe_dump(manifest(nodes, shape, domain_id, range_)))
-        used = run(
-            [
-                *(sys.executable, "-m", "lifecycle.cli", "up", str(file), "--format", "json"),
-                *("--timings", "--timeout", str(bound_s)),
-            ],
-            is_active=is_active,
-            variables=variables,
-            bound_s=bound_s,
-        )
+        verb = ("up", str(file), "--format", "json", "--timings", "--timeout", str(bound_s))
+        try:
+            used = run(
+                [sys.executable, "-m", "lifecycle.cli", *verb],
+                is_active=is_active,
+                variables=variables,
+                bound_s=bound_s,
+            )
+        except FailedError as error:
+            raise FailedError("; ".join([str(error), *failures[:1]])) from None
     for stage, took_s in stages.items():
         findings.stages.setdefault(nodes, {}).setdefault(stage, []).append(took_s)
     return used

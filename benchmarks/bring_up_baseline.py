@@ -26,6 +26,7 @@ from rclpy.node import Node
 from rclpy.task import Future
 
 AGAIN_S = 1.0
+LOST_S = 20.0
 LOOK_S = 0.02
 END_S = 10.0
 STEPS = {
@@ -49,6 +50,7 @@ class Driver(Node):
         self._states = [self.create_client(GetState, f"{name}/get_state") for name in names]
         self._state = [State.PRIMARY_STATE_UNCONFIGURED] * nodes
         self._asked_s: list[float | None] = [None] * nodes
+        self._sent_s = [0.0] * nodes
         self.create_timer(LOOK_S, self._look)
 
     @property
@@ -59,8 +61,7 @@ class Driver(Node):
     def _look(self) -> None:
         """Ask each node that can be asked; where a reply is late, for its state first.
 
-        A reply is lost while the client is not matched with its writer yet, and a managed node of
-        rclpy ends on a transition that its state does not have.
+        A reply is lost while the client is not matched with its writer yet.
         """
         for index, asked_s in enumerate(self._asked_s):
             if self._state[index] == State.PRIMARY_STATE_ACTIVE:
@@ -77,7 +78,7 @@ class Driver(Node):
         state = self._state[index]
         request = ChangeState.Request()
         request.transition.id = STEPS[state]
-        self._asked_s[index] = time.monotonic()
+        self._asked_s[index] = self._sent_s[index] = time.monotonic()
         call = self._changes[index].call_async(request)
         call.add_done_callback(functools.partial(self._changed, index, state))
 
@@ -86,7 +87,10 @@ class Driver(Node):
             self._reached(index, NEXT[before])
 
     def _told(self, index: int, future: Future) -> None:
-        self._reached(index, future.result().current_state.id)
+        """Ask for a transition again only long after: a node of rclpy ends on a second one."""
+        state = future.result().current_state.id
+        if state > self._state[index] or time.monotonic() - self._sent_s[index] > LOST_S:
+            self._reached(index, state)
 
     def _reached(self, index: int, state: int) -> None:
         if state in (*STEPS, State.PRIMARY_STATE_ACTIVE):
