@@ -13,6 +13,7 @@ import queue
 import select
 import signal
 import subprocess
+import sys
 import tempfile
 import threading
 import time
@@ -20,6 +21,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import psutil
+
+from lifecycle.middleware import segments_of, sweep
 
 ROOT = Path(__file__).resolve().parents[1]
 GONE_S = 60.0
@@ -165,17 +168,23 @@ def _until_active(
 
 @contextlib.contextmanager
 def _ended(process: subprocess.Popen[str]) -> Iterator[None]:
-    """Kill whatever is left of a program's tree."""
+    """Kill whatever is left of a program's tree, and remove its shared memory.
+
+    Who is killed while it holds the mutex of a port would have the next run wait for it for ever.
+    """
     seen: list[psutil.Process] = []
     try:
         yield
     finally:
         with contextlib.suppress(psutil.NoSuchProcess):
             seen = psutil.Process(process.pid).children(recursive=True)
+        segments = segments_of([each.pid for each in seen])
         process.kill()
         for each in seen:
             with contextlib.suppress(psutil.NoSuchProcess):
                 each.kill()
+        psutil.wait_procs(seen, timeout=GONE_S)
+        sweep(segments)
 
 
 @contextlib.contextmanager
