@@ -58,6 +58,11 @@ if TYPE_CHECKING:
     is_flag=True,
     help="Report a process that dies, but do not take the others down.",
 )
+@click.option(
+    "--timings",
+    is_flag=True,
+    help="Say how long each stage of bring-up took, once it is over or has failed.",
+)
 @program_options
 @treatment_options
 def command(
@@ -72,6 +77,7 @@ def command(
     strict: bool,
     machine: str,
     keep_going: bool,
+    timings: bool,
     targets: tuple[str, ...],
     mapping: str,
     flow_labels: bool,
@@ -113,7 +119,8 @@ def command(
                     program=program,
                     treatment=_treatment(targets, mapping=mapping, flow_labels=flow_labels),
                 )
-                with output(format_) as listener, ending.noted():
+                timed = until if timings else ""
+                with output(format_, timings_until=timed) as listener, ending.noted():
 
                     def conclude(result: UpResult) -> ExitCode:
                         return _finished(result, listener, written)
