@@ -308,14 +308,7 @@ def token_variables(program: Iterable[TargetOptions]) -> frozenset[str]:
     Raises:
         SettingsError: a settings file cannot be used.
     """
-    paths = {each.settings for each in program if each.settings}
-    if not paths:
-        return frozenset()
-    from lifecycle.programming import load_settings
-
-    found = [load_settings(each) for each in paths]
-    tokens = [each.token for file in found for each in (file.nef, file.camara) if each is not None]
-    return frozenset(each.env for each in tokens if each is not None and each.env)
+    return frozenset().union(*(each.token_variables() for each in program))
 
 
 def open_networks(
