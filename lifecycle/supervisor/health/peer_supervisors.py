@@ -39,7 +39,7 @@ class AliveReceiver(Protocol):
 class AliveSender(Protocol):
     """One AlivePublisher of lifecycle.middleware."""
 
-    def tell(self, silent: Mapping[str, str]) -> None:
+    def notify(self, silent: Mapping[str, str]) -> None:
         """Say which of our nodes are silent."""
 
     def destroy(self) -> None:
@@ -265,7 +265,7 @@ class PeerSupervisors:
             if silent is not self._said:
                 return
             for voice in self._announcements:
-                voice.tell(silent)
+                voice.notify(silent)
             if pause_s is not None:
                 await asyncio.sleep(pause_s)
 

@@ -160,7 +160,7 @@ class ObserverParticipant:
         from lifecycle.middleware import AliveSubscription
 
         return AliveSubscription(
-            self._node, topic, on_heard=to.heard, on_left=to.left, on_told=to.told
+            self._node, topic, on_liveliness=to.heard, on_left=to.left, on_notice=to.told
         )
 
     def prepare_to_leave(self) -> None:
