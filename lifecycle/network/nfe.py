@@ -394,11 +394,6 @@ class FlowTuple:
     dscp: DscpValue = 0
 
     @property
-    def source_is_known(self) -> bool:
-        """Whether the source address is one address, so that the whole 5-tuple is known."""
-        return not is_wildcard(self.source_address)
-
-    @property
     def source(self) -> str:
         """`10.0.0.1:7411`, `[fd00::1]:7411`."""
         return socket_text(self.source_address, self.source_port)

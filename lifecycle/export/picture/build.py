@@ -153,19 +153,21 @@ def _state(name: str, view: View, presence: Presence, supervised: Supervised) ->
         return PicturedNodeState.MANAGED if view.planned[name].managed else PicturedNodeState.PLAIN
     if supervised.silent:
         return PicturedNodeState.SILENT
-    told = (observed.state if observed else None) or (configuration.state if configuration else "")
-    if told:
-        state = _STATES.get(told, PicturedNodeState.CHANGING)
+    reported = (observed.state if observed else None) or (
+        configuration.state if configuration else ""
+    )
+    if reported:
+        state = _STATES.get(reported, PicturedNodeState.CHANGING)
         connected = configuration is not None and configuration.connected
         return (
             PicturedNodeState.CONNECTED
             if connected and state is PicturedNodeState.INACTIVE
             else state
         )
-    return _untold(None if observed is None else observed.managed, presence)
+    return _unreported_state(None if observed is None else observed.managed, presence)
 
 
-def _untold(managed: bool | None, presence: Presence) -> PicturedNodeState:
+def _unreported_state(managed: bool | None, presence: Presence) -> PicturedNodeState:
     """The state of a node that reports none."""
     if managed is False:
         return PicturedNodeState.PLAIN

@@ -184,19 +184,19 @@ def pictured_participants(
         presence: of the node.
     """
     planned = basis.view.planned.get(name)
-    told = _told(basis.view.configurations.get(name))
+    reported = _reported_participants(basis.view.configurations.get(name))
     own = (OWN, presence, planned.connections.urls if planned else ())
     found: dict[str, tuple[str, Presence, tuple[str, ...]]] = {}
     for each in planned.participants if planned else ():
-        words = [each.reason, *each.connections.urls, *told.get(each.name, ("", ()))[1]]
+        words = [each.reason, *each.connections.urls, *reported.get(each.name, ("", ()))[1]]
         if each.dscp is not None and describe(each.dscp) not in each.reason:
             words.append(describe(each.dscp))
         found[each.name] = (
             each.connection or each.name,
-            Presence.PRESENT if each.name in told else basis.absent,
+            Presence.PRESENT if each.name in reported else basis.absent,
             tuple(dict.fromkeys(filter(None, words))),
         )
-    for base_name, (title, notes) in told.items():
+    for base_name, (title, notes) in reported.items():
         found.setdefault(base_name, (title, Presence.UNDECLARED, notes))
     return tuple(
         PicturedParticipant(id=f"{id_}p{number}", node=id_, name=title, presence=where, notes=notes)
@@ -204,24 +204,26 @@ def pictured_participants(
     )
 
 
-def _told(configuration: NodeConfiguration | None) -> dict[str, tuple[str, tuple[str, ...]]]:
+def _reported_participants(
+    configuration: NodeConfiguration | None,
+) -> dict[str, tuple[str, tuple[str, ...]]]:
     """Hidden participants that a node reports, by base name: title and notes."""
-    told: dict[str, tuple[str, tuple[str, ...]]] = {}
+    reported: dict[str, tuple[str, tuple[str, ...]]] = {}
     for each in configuration.connections if configuration else ():
         if each.node_name:
             words = [*each.urls, "" if each.established else "not established", each.error]
-            told[each.node_name] = (each.name, tuple(filter(None, words)))
+            reported[each.node_name] = (each.name, tuple(filter(None, words)))
     for report in configuration.endpoints if configuration else ():
         if report.participant:
-            told.setdefault(report.participant, (report.participant, ()))
-    return told
+            reported.setdefault(report.participant, (report.participant, ()))
+    return reported
 
 
 def carrier(basis: Basis, node: PicturedNode, ends: Sequence[Actual]) -> PicturedParticipant:
     """Return what carries an end: as reported, else as planned, else the node's own."""
     for end in ends:
-        told = end.report.participant if end.report else ""
-        if found := _participant(node, basis.view.planned.get(end.node.full_name), told):
+        reported = end.report.participant if end.report else ""
+        if found := _participant(node, basis.view.planned.get(end.node.full_name), reported):
             return found
         if end.report is not None and end.report.connection:
             for each in node.participants:

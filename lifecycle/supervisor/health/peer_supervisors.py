@@ -39,7 +39,7 @@ class AliveReceiver(Protocol):
 class AliveSender(Protocol):
     """One AlivePublisher of lifecycle.middleware."""
 
-    def tell(self, silent: Mapping[str, str]) -> None:
+    def notify(self, silent: Mapping[str, str]) -> None:
         """Say which of our nodes are silent."""
 
     def destroy(self) -> None:
@@ -265,7 +265,7 @@ class PeerSupervisors:
             if silent is not self._said:
                 return
             for each in self._announcements:
-                each.tell(silent)
+                each.notify(silent)
             if pause_s is not None:
                 await asyncio.sleep(pause_s)
 

@@ -160,7 +160,7 @@ class ObserverParticipant:
         from lifecycle.middleware import AliveSubscription
 
         return AliveSubscription(
-            self._node, topic, on_heard=to.alive, on_left=to.left, on_told=to.silent
+            self._node, topic, on_liveliness=to.alive, on_left=to.left, on_notice=to.silent
         )
 
     def prepare_to_leave(self) -> None:

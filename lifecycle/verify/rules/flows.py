@@ -246,7 +246,7 @@ WRONG_MEDIUM = Rule(
     " given by its environment",
     concerns_flow=True,
     heals=Heals.WITH_TIME,
-    if_unheard=True,
+    if_undiscovered=True,
 )
 TRANSPORT_RULES = (WRONG_TRANSPORT, WRONG_MEDIUM)
 

@@ -182,7 +182,7 @@ class FakeVoice:
     def __init__(self) -> None:
         self.told: list[Mapping[str, str]] = []
 
-    def tell(self, silent: Mapping[str, str]) -> None:
+    def notify(self, silent: Mapping[str, str]) -> None:
         self.told.append(dict(silent))
 
     def destroy(self) -> None:
