@@ -49,6 +49,7 @@ from benchmarks.measuring import (
     Used,
     aligned,
     cell,
+    end_on_sigterm,
     render,
     row,
     run,
@@ -282,6 +283,7 @@ def main() -> int:
     parser.add_argument("--domain", type=int, default=40)
     parser.add_argument("--markdown", action="store_true", help="as in docs/performance.md")
     options = parser.parse_args()
+    end_on_sigterm()
     names = available(options.only)
     if skipped := [each for each in options.only if each not in names]:
         print(f"skipped, because it cannot be imported: {', '.join(skipped)}")

@@ -34,7 +34,7 @@ from std_msgs.msg import String
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # as a script, only its own directory is there
 
-from benchmarks.measuring import FLOOR, OURS, FailedError, Row, cpu_of, render, row
+from benchmarks.measuring import FLOOR, OURS, FailedError, Row, cpu_of, end_on_sigterm, render, row
 
 PROGRAM = Path(__file__).with_name("data_path_nodes.py")
 BOUND_S = 60.0
@@ -208,6 +208,7 @@ def main() -> int:
     parser.add_argument("--domain", type=int, default=41)
     parser.add_argument("--markdown", action="store_true", help="as in docs/performance.md")
     options = parser.parse_args()
+    end_on_sigterm()
     failures: list[str] = []
     rows = measure_all(options.runs, options.domain, failures)
     print(f"ours and plain rclpy in turns, medians of {options.runs}\n")

@@ -102,6 +102,11 @@ def run(
     )
 
 
+def end_on_sigterm() -> None:
+    """Have SIGTERM end this program as Ctrl-C does, so that it ends what it has started."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+
+
 def tree(pid: int) -> list[int]:
     """Return a process and all that descends from it."""
     try:
@@ -167,10 +172,7 @@ def _until_active(
 
 @contextlib.contextmanager
 def _ended(process: subprocess.Popen[str]) -> Iterator[None]:
-    """Kill whatever is left of a program's tree, and remove its shared memory.
-
-    Who is killed while it holds the mutex of a port would have the next run wait for it for ever.
-    """
+    """Kill whatever is left of a program's tree, and remove its shared memory for the next run."""
     seen: list[psutil.Process] = []
     try:
         yield

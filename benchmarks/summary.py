@@ -16,7 +16,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1]))  # as a script, only its own directory is there
 
 from benchmarks import bring_up, data_path
-from benchmarks.measuring import render
+from benchmarks.measuring import end_on_sigterm, render
 
 ENOUGH_S = 120.0
 
@@ -30,6 +30,7 @@ def main() -> int:
     parser.add_argument("--domain", type=int, default=40)
     parser.add_argument("--markdown", action="store_true", help="as in docs/performance.md")
     options = parser.parse_args()
+    end_on_sigterm()
     began_s = time.monotonic()
     enough_s = began_s + ENOUGH_S
     findings = bring_up.Findings()
