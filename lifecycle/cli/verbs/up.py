@@ -90,12 +90,12 @@ def command(
 
     try:
         with Ending() as ending, ReportFile(report, strict=strict) as written:
-            from lifecycle.supervisor import Forerunner, token_variables
+            from lifecycle.supervisor import Forerunner
 
             # Its imports and ours, and reading the manifest, take as long as each other: side by
             # side.
             program = _networks(targets, **rest)
-            forerunner = Forerunner(without=token_variables(program))
+            forerunner = Forerunner(without=_tokens(program))
             try:
                 from lifecycle.cli.up_output import output
                 from lifecycle.plan import build_plan
@@ -149,6 +149,15 @@ def _networks(targets: tuple[str, ...], **given: Any) -> tuple[TargetOptions, ..
     if not targets and not any(value for name, value in given.items() if name != "match"):
         return ()
     return chosen(targets, option="--program", **given)
+
+
+def _tokens(program: tuple[TargetOptions, ...]) -> frozenset[str]:
+    """Variables with secrets of networks, which nothing that is started shall have."""
+    if not program:
+        return frozenset()
+    from lifecycle.supervisor import token_variables
+
+    return frozenset(token_variables(program))
 
 
 def _treatment(targets: tuple[str, ...], *, mapping: str, flow_labels: bool) -> Treatment | None:

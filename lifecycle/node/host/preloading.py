@@ -5,7 +5,9 @@ Owns: the list of them. Must not make a participant, nor open a socket: neither 
 
 from __future__ import annotations
 
+import contextlib
 import importlib
+from collections.abc import Iterable
 
 from lifecycle import codec
 from lifecycle.manifest import DiscoveryRange
@@ -14,7 +16,6 @@ from lifecycle.node.host.control import Command, HostSpec, Operation
 _PRELOADED = (
     "rclpy.executors",
     "rclpy.node",
-    "rclpy.action",
     "rclpy.lifecycle",
     "rclpy.logging_service",
     "lifecycle_msgs.msg",
@@ -23,10 +24,6 @@ _PRELOADED = (
     "rcl_interfaces.srv",
     "std_msgs.msg",
     "std_srvs.srv",
-    "geometry_msgs.msg",
-    "sensor_msgs.msg",
-    "nav_msgs.msg",
-    "diagnostic_msgs.msg",
     "lifecycle.node.host.hosting",
 )
 _MESSAGES = (
@@ -51,12 +48,16 @@ _SERVICES = (
 """What every node of ours has; their type supports are libraries that load on first use."""
 
 
-def preload() -> None:
+def preload(interfaces: Iterable[str] = ()) -> None:
     """Import everything a host needs, for a process that will fork hosts.
 
     Makes no participant and opens no socket, so a fork afterwards is safe. The only threads are
     those of libraries that a child can do without: LTTng's two listeners, numpy's OpenBLAS pool.
     Call `gc.freeze()` after it to keep the imported pages shared.
+
+    Args:
+        interfaces: types that its nodes declare, `package/msg/Type`; one that cannot be loaded is
+            left to its node, which says so where it is found.
     """
     for name in _PRELOADED:
         importlib.import_module(name)
@@ -68,6 +69,15 @@ def preload() -> None:
         check_is_valid_msg_type(import_interface(message))
     for service in _SERVICES:
         check_is_valid_srv_type(import_interface(service))
+    for interface in interfaces:
+        with contextlib.suppress(Exception):
+            kind = interface.split("/")[1]
+            if kind == "action":
+                importlib.import_module("rclpy.action")
+            check = {"msg": check_is_valid_msg_type, "srv": check_is_valid_srv_type}.get(kind)
+            loaded = import_interface(interface)
+            if check is not None:
+                check(loaded)
     # The codec learns a type's shape at first use.
     spec = HostSpec(
         system="",
