@@ -25,15 +25,10 @@ from collections.abc import Callable, Coroutine, Iterator
 from typing import Any
 
 from rclpy.context import Context
-from rclpy.executors import (
-    ConditionReachedException,
-    ShutdownException,
-    SingleThreadedExecutor,
-    TimeoutException,
-)
+from rclpy.executors import ShutdownException
 from rclpy.node import Node
 
-from lifecycle.middleware import BusySign, hidden_nodes, leave_and_exit, tell_names
+from lifecycle.middleware import BusySign, NodeExecutor, hidden_nodes, leave_and_exit, tell_names
 from lifecycle.node.author.node import LifecycleNode
 from lifecycle.node.lifecycle.execution import hint
 
@@ -105,7 +100,7 @@ class NodeLoop:
     def __init__(self, context: Context, watchdog: Watchdog | None = None) -> None:
         self._context = context
         self._watchdog = watchdog
-        self._executor = SingleThreadedExecutor(context=context)
+        self._executor = NodeExecutor(context=context)
         self._nodes: list[Node] = []
         self._lock = threading.Lock()
         self._stopping = False
@@ -173,21 +168,19 @@ class NodeLoop:
         leave_and_exit(self._code, nodes=self._nodes, contexts=contexts)
 
     def _turn(self) -> None:
-        """Run the next callback, as the executor's own spin_once does, under the watchdog."""
+        """Run the next callback under the watchdog."""
         try:
-            handler, _, _ = self._executor.wait_for_ready_callbacks()
-        except (ShutdownException, TimeoutException, ConditionReachedException):
+            callback = self._executor.next_callback()
+        except ShutdownException:
             return
         if self._watchdog is None:
-            handler()
-        else:
-            self._watchdog.begin()
-            try:
-                handler()
-            finally:
-                self._watchdog.end()
-        if (error := handler.exception()) is not None:
-            raise error
+            callback()
+            return
+        self._watchdog.begin()
+        try:
+            callback()
+        finally:
+            self._watchdog.end()
 
     async def _shut_down(self, reason: str) -> None:
         for node in reversed(self._nodes):

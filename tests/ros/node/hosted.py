@@ -38,6 +38,13 @@ class Stuck(LifecycleNode):
         await self.create_client(Trigger, "/nobody").call_async(Trigger.Request())
 
 
+class Deadlocked(LifecycleNode):
+    """Waits in on_configure for what only its own executor could bring."""
+
+    def on_configure(self) -> None:
+        self.create_client(Trigger, "/nobody").call(Trigger.Request())
+
+
 class Blocking(LifecycleNode):
     """Blocks the executor for ever in on_configure."""
 

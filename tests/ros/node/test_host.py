@@ -99,6 +99,15 @@ def test_an_exception_in_a_callback_is_told_and_its_traceback_is_in_the_log(star
     assert 'raise OSError("no such camera")' in host.log.read_text()
 
 
+def test_a_blocking_call_in_a_hosted_callback_is_an_error_and_not_a_deadlock(start: Start) -> None:
+    host = start(hosted("one", "Deadlocked"))
+    host.until("ready")
+    assert host.do("/one", CONFIGURE).error == (
+        "cannot wait for service '/nobody' in a callback: the answer comes by the executor that "
+        "waits for this callback; write `async def` and `await client.call_async(request)`"
+    )
+
+
 @pytest.mark.parametrize(
     ("class_", "reason"),
     [
