@@ -16,10 +16,7 @@ import itertools
 import json
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from importlib import resources
-from typing import Any
-
-import jsonschema
-from jsonschema.exceptions import ValidationError
+from typing import TYPE_CHECKING, Any
 
 from lifecycle.manifest.diagnostics import Diagnostic
 from lifecycle.manifest.yaml.document import Document, Place, error
@@ -29,6 +26,10 @@ from lifecycle.manifest.yaml.yaml_parser import (
     has_leading_zero,
     quote,
 )
+
+if TYPE_CHECKING:
+    import jsonschema
+    from jsonschema.exceptions import ValidationError
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -305,6 +306,8 @@ def _validator(definition: str) -> jsonschema.Draft202012Validator:
     assert isinstance(schema, dict)
     if definition:
         schema = {"$defs": schema["$defs"], "$ref": f"#/$defs/{definition}"}
+    import jsonschema  # 60 ms, and most who import this room validate nothing
+
     return jsonschema.Draft202012Validator(schema)
 
 

@@ -31,6 +31,7 @@ from .process.shared_memory import leftovers as leftovers
 from .process.shared_memory import segments_of as segments_of
 from .process.shared_memory import sweep as sweep
 from .process.teardown import leave_and_exit as leave_and_exit
+from .rcl.abi import load_rcl as load_rcl
 from .rcl.executor import NodeExecutor as NodeExecutor
 from .rcl.graph import GraphObserver as GraphObserver
 from .rcl.graph_changes import ServerWatch as ServerWatch

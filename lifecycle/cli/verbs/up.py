@@ -101,12 +101,12 @@ def command(
 
     try:
         with Ending() as ending, ReportFile(report, strict=strict) as written:
-            from lifecycle.supervisor import Forerunner, token_variables
+            from lifecycle.supervisor import Forerunner
 
             # Its imports and ours, and reading the manifest, take as long as each other: side by
             # side.
             program = _networks(targets, **rest)
-            forerunner = Forerunner(without=token_variables(program))
+            forerunner = Forerunner(without=_tokens(program))
             try:
                 from lifecycle.cli.up_output import output
                 from lifecycle.plan import build_plan
@@ -163,6 +163,15 @@ def _networks(targets: tuple[str, ...], **given: Any) -> tuple[TargetOptions, ..
     from lifecycle.programming import read_targets
 
     return read_targets(targets, given, option="--program")
+
+
+def _tokens(program: tuple[TargetOptions, ...]) -> frozenset[str]:
+    """Variables with secrets of networks, which nothing that is started shall have."""
+    if not program:
+        return frozenset()
+    from lifecycle.supervisor import token_variables
+
+    return frozenset(token_variables(program))
 
 
 def _treatment(targets: tuple[str, ...], *, mapping: str, flow_labels: bool) -> Treatment | None:

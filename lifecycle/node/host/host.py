@@ -9,9 +9,11 @@ before `serve`.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib
 import os
 import socket
+from collections.abc import Iterable
 from typing import NoReturn
 
 from lifecycle import codec
@@ -21,7 +23,6 @@ from lifecycle.node.host.control import Command, HostChannel, HostSpec, Operatio
 _PRELOADED = (
     "rclpy.executors",
     "rclpy.node",
-    "rclpy.action",
     "rclpy.lifecycle",
     "rclpy.logging_service",
     "lifecycle_msgs.msg",
@@ -30,10 +31,6 @@ _PRELOADED = (
     "rcl_interfaces.srv",
     "std_msgs.msg",
     "std_srvs.srv",
-    "geometry_msgs.msg",
-    "sensor_msgs.msg",
-    "nav_msgs.msg",
-    "diagnostic_msgs.msg",
     "lifecycle.node.host.hosting",
 )
 _MESSAGES = (
@@ -58,23 +55,38 @@ _SERVICES = (
 """What every node of ours has; their type supports are libraries that load on first use."""
 
 
-def preload() -> None:
+def preload(interfaces: Iterable[str] = ()) -> None:
     """Import everything a host needs, for a process that will fork hosts.
 
     Makes no participant and opens no socket, so a fork afterwards is safe. The only threads are
     those of libraries that a child can do without: LTTng's two listeners, numpy's OpenBLAS pool.
     Call `gc.freeze()` after it to keep the imported pages shared.
+
+    Args:
+        interfaces: types that its nodes declare, `package/msg/Type`; one that cannot be loaded is
+            left to its node, which says so where it is found.
     """
     for name in _PRELOADED:
         importlib.import_module(name)
     from rclpy.type_support import check_is_valid_msg_type, check_is_valid_srv_type
 
-    from lifecycle.middleware import import_interface
+    from lifecycle.middleware import import_interface, load_rcl
+
+    load_rcl()
 
     for message in _MESSAGES:
         check_is_valid_msg_type(import_interface(message))
     for service in _SERVICES:
         check_is_valid_srv_type(import_interface(service))
+    for interface in interfaces:
+        with contextlib.suppress(Exception):
+            kind = interface.split("/")[1]
+            if kind == "action":
+                importlib.import_module("rclpy.action")
+            check = {"msg": check_is_valid_msg_type, "srv": check_is_valid_srv_type}.get(kind)
+            loaded = import_interface(interface)
+            if check is not None:
+                check(loaded)
     # The codec learns a type's shape at first use.
     spec = HostSpec(
         system="",

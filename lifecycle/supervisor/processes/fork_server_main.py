@@ -22,10 +22,12 @@ import sys
 import time
 import traceback
 import warnings
+from collections.abc import Iterable
 from typing import NoReturn
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.middleware import adopt_orphans
+from lifecycle.supervisor.processes.forerunner import PRELOAD
 
 LARGEST_MESSAGE = 1 << 18
 """Bytes; a request is one datagram, its argv and variables must fit."""
@@ -117,6 +119,9 @@ class _ForkServer:
             return False
         if not data:
             return False
+        if data.startswith(PRELOAD.encode()):
+            _preload(data.decode().split("\n")[1:])
+            return True
         request = from_json(data, ForkRequest)
         if request == SERVES:
             self._tell(ChildReport(id=request.id))
@@ -280,6 +285,15 @@ def _reseed() -> None:
         numpy_random.seed()
 
 
+def _preload(interfaces: Iterable[str]) -> None:
+    """Import what hosts need, and keep its pages shared: a first collection would touch them."""
+    from lifecycle.node import preload
+
+    preload(interfaces)
+    gc.collect()
+    gc.freeze()
+
+
 def main() -> int:
     """Run the fork server."""
     parser = argparse.ArgumentParser(prog=f"python -m {__spec__.name}")
@@ -292,12 +306,7 @@ def main() -> int:
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     adopt_orphans()
     if options.preload:
-        from lifecycle.node import preload
-
-        preload()
-        # Keep the shared pages shared: a child's first collection would touch them all.
-        gc.collect()
-        gc.freeze()
+        _preload(())
     _ForkServer(socket.socket(fileno=options.socket_fd), again=options.again).serve()
     return 0
 
