@@ -34,6 +34,7 @@ from .rcl.graph_queries import EndpointInfo as EndpointInfo
 from .rcl.graph_queries import endpoints_of as endpoints_of
 from .rcl.hidden_node import hidden_nodes as hidden_nodes
 from .rcl.matched_peers import guid_of as guid_of
+from .rcl.matched_peers import load_libraries as load_libraries
 from .rcl.matched_peers import matched_with as matched_with
 from .rcl.qos import UnknownInterfaceError as UnknownInterfaceError
 from .rcl.qos import from_rclpy as from_rclpy

@@ -174,6 +174,11 @@ class _MatchLibrary:
         return tuple(sorted(each for each in candidates if method(endpoint, bytes.fromhex(each))))
 
 
+def load_libraries() -> None:
+    """Load what every node asks rcl and Fast DDS through, for a process that forks hosts."""
+    _library()
+
+
 @functools.lru_cache(maxsize=1)
 def _library() -> _MatchLibrary | None:
     """Return the functions; None where the libraries are others."""

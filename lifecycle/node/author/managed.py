@@ -9,7 +9,7 @@ other attribute name to themselves.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.exceptions import InvalidHandle
@@ -41,9 +41,11 @@ from lifecycle.node.lifecycle.machine import (
 from lifecycle.node.lifecycle.services import LifecycleServices, Turns
 from lifecycle.node.reporting import configuration
 from lifecycle.node.reporting.configuration import ConfigurationChanges
-from lifecycle.node.reporting.graph_member import GraphMember
 from lifecycle.plan import PlannedNode
 from lifecycle.verify import NodeConfiguration
+
+if TYPE_CHECKING:
+    from lifecycle.node.reporting.graph_member import GraphMember
 
 
 class Undeclared:
@@ -312,6 +314,9 @@ class Managed:
     # Inside.
 
     def _join(self) -> None:
+        # Late: most nodes report to their supervisor only.
+        from lifecycle.node.reporting.graph_member import GraphMember
+
         self._member = GraphMember(self._node, self._infrastructure)
         now = self.configuration_changes.collect()
         self._member.joined(self.state, now.checksum if now is not None else "")

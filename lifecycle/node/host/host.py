@@ -15,9 +15,9 @@ from typing import NoReturn
 from lifecycle import codec
 from lifecycle.manifest import DiscoveryRange
 from lifecycle.node.host.control import HostChannel, HostSpec, give_up
-from lifecycle.node.host.preloading import preload
+from lifecycle.node.host.preloading import needed_by, preload, preload_also
 
-__all__ = ["main", "preload", "serve"]
+__all__ = ["main", "needed_by", "preload", "preload_also", "serve"]
 
 
 def main(control_socket_fd: int) -> NoReturn:

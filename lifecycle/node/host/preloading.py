@@ -5,16 +5,18 @@ Owns: the list of them. Must not make a participant, nor open a socket: neither 
 
 from __future__ import annotations
 
+import contextlib
 import importlib
+from collections.abc import Iterable
 
 from lifecycle import codec
 from lifecycle.manifest import DiscoveryRange
 from lifecycle.node.host.control import Command, HostSpec, Operation
+from lifecycle.plan import PlannedNode
 
 _PRELOADED = (
     "rclpy.executors",
     "rclpy.node",
-    "rclpy.action",
     "rclpy.lifecycle",
     "rclpy.logging_service",
     "lifecycle_msgs.msg",
@@ -23,10 +25,6 @@ _PRELOADED = (
     "rcl_interfaces.srv",
     "std_msgs.msg",
     "std_srvs.srv",
-    "geometry_msgs.msg",
-    "sensor_msgs.msg",
-    "nav_msgs.msg",
-    "diagnostic_msgs.msg",
     "lifecycle.node.host.hosting",
 )
 _MESSAGES = (
@@ -56,13 +54,14 @@ def preload() -> None:
 
     Makes no participant and opens no socket, so a fork afterwards is safe. The only threads are
     those of libraries that a child can do without: LTTng's two listeners, numpy's OpenBLAS pool.
-    Call `gc.freeze()` after it to keep the imported pages shared.
+    Call `gc.freeze()` after it to keep the imported pages shared. What only some nodes need is
+    `preload_also`'s: numpy alone, which most messages with arrays import, takes 60 ms.
     """
     for name in _PRELOADED:
         importlib.import_module(name)
     from rclpy.type_support import check_is_valid_msg_type, check_is_valid_srv_type
 
-    from lifecycle.middleware import import_interface
+    from lifecycle.middleware import import_interface, load_libraries
 
     for message in _MESSAGES:
         check_is_valid_msg_type(import_interface(message))
@@ -79,3 +78,39 @@ def preload() -> None:
     codec.from_json(codec.to_json(spec), HostSpec)
     command = Command(id=0, node="", operation=Operation.CONFIGURE)
     codec.from_json(codec.to_json(command), Command)
+    # Reading which rcl is installed takes most of a host's `connect`.
+    load_libraries()
+
+
+def needed_by(nodes: Iterable[PlannedNode]) -> tuple[str, ...]:
+    """Return what `preload_also` is to import for some nodes: modules and interface types."""
+    names: dict[str, None] = {}
+    for node in nodes:
+        if node.events or node.membership:
+            names["lifecycle.node.reporting.graph_member"] = None
+        for endpoint in node.endpoints:
+            if "/action/" in endpoint.type:
+                names["rclpy.action"] = None
+            names[endpoint.type] = None
+    return tuple(names)
+
+
+def preload_also(names: Iterable[str]) -> None:
+    """Import modules and interface types, `sensor_msgs/msg/Image`, besides; as safe as `preload`.
+
+    What cannot be imported is left to the host that needs it, which reports it.
+    """
+    from rclpy.type_support import check_is_valid_msg_type, check_is_valid_srv_type
+
+    from lifecycle.middleware import import_interface
+
+    for name in names:
+        with contextlib.suppress(Exception):
+            if "/" not in name:
+                importlib.import_module(name)
+                continue
+            found = import_interface(name)
+            if "/msg/" in name:
+                check_is_valid_msg_type(found)
+            elif "/srv/" in name:
+                check_is_valid_srv_type(found)

@@ -272,6 +272,8 @@ class ForkServer:
             environment=request.environment,
             working_directory=request.working_directory,
             control=request.control is not None,
+            # What becomes another program imports for itself.
+            preload=() if argv else request.preload,
         )
         born: asyncio.Future[ForkServerChild] = self._loop.create_future()
         self._pending[message.id] = born, request

@@ -40,6 +40,7 @@ class ForkRequest:
 
     Attributes:
         id: ≥ 1; 0 only asks whether the fork server serves, which answers with the same id.
+        preload: modules and interface types to import before the fork, see node's `preload_also`.
     """
 
     id: int
@@ -47,6 +48,7 @@ class ForkRequest:
     environment: tuple[tuple[str, str], ...]
     working_directory: str
     control: bool
+    preload: tuple[str, ...] = ()
 
 
 SERVES = ForkRequest(id=0, argv=(), environment=(), working_directory="", control=False)
@@ -87,6 +89,7 @@ class _ForkServer:
         self._again = again
         self._selector = selectors.DefaultSelector()
         self._selector.register(sock, selectors.EVENT_READ, None)
+        self._preloaded: set[str] = set()
         self._children: dict[int, tuple[int, int]] = {}  # pid → (request id, pidfd)
         # SIGCHLD notifies a parent that a child was stopped; nothing else does.
         self._signals = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
@@ -121,6 +124,7 @@ class _ForkServer:
         if request == SERVES:
             self._tell(ChildReport(id=request.id))
             return True
+        self._preload(request.preload)
         try:
             with warnings.catch_warnings():
                 # Python 3.12 warns of any other thread. Those here belong to the libraries that
@@ -137,6 +141,16 @@ class _ForkServer:
         if pid > 0:
             self._born(request.id, pid)
         return True
+
+    def _preload(self, names: tuple[str, ...]) -> None:
+        """Import once what a host, and maybe those after it, would each import by itself."""
+        if self._preloaded.issuperset(names):
+            return
+        from lifecycle.node import preload_also
+
+        preload_also(name for name in names if name not in self._preloaded)
+        self._preloaded.update(names)
+        gc.freeze()
 
     def _born(self, request: int, pid: int) -> None:
         pidfd = os.pidfd_open(pid)
