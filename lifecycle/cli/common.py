@@ -36,13 +36,22 @@ def format_option(*formats: str) -> Callable[[F], F]:
     )
 
 
-def timeout_option(default_s: float, help_: str, *, or_0: bool = False) -> Callable[[F], F]:
-    """Add `--timeout SECONDS`, more than 0, or at least 0 with `or_0`."""
+def timeout_option(
+    default_s: float | None, help_: str, *, or_0: bool = False, default: str = ""
+) -> Callable[[F], F]:
+    """Add `--timeout SECONDS`, more than 0, or at least 0 with `or_0`.
+
+    Args:
+        default_s: None where it depends.
+        help_: what it is for.
+        or_0: allow 0.
+        default: on what it depends, for people.
+    """
     return click.option(
         "--timeout",
         type=click.FloatRange(min=0, min_open=not or_0),
         default=default_s,
-        show_default=True,
+        show_default=default or True,
         metavar="SECONDS",
         help=help_,
     )

@@ -26,7 +26,7 @@ OVERRIDE = "ROS_SECURITY_ENCLAVE_OVERRIDE"
 """The variable by which rcl takes an enclave for every context of a process."""
 
 PLANS_TOPIC = "/_lifecycle/plans"
-"""Where supervisors announce their plans (lifecycle.middleware.discovery.plan_notices)."""
+"""Where supervisors announce their plans (lifecycle.middleware.discovery.liveliness)."""
 
 _MANAGED = frozenset(name for name, type_ in NODE_SERVICES.items() if "lifecycle_msgs" in type_)
 _ACTION_SERVICES = ("cancel_goal", "get_result", "send_goal")

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest.message_size import bounded_size
+from lifecycle.manifest.installed_types import bounded_size
 from lifecycle.manifest.model import (
     DiscoveryMode,
     EndpointKind,

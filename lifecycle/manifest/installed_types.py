@@ -1,10 +1,15 @@
-"""Installed packages, interface types and type hashes (REP-2016), read from the ament index.
+"""Installed packages, interface types, type hashes (REP-2016) and upper bounds of message sizes.
 
 Owns: where the ament resource index is and how a resource is found in it, as ament_index_python
 does, but for a prefix that AMENT_PREFIX_PATH need not name: wheels install the index under
 `sys.prefix`. The three answers to "is there a `sensor_msgs/msg/Image`?". The type hash of an
 interface, from the `share/<package>/<kind>/<Type>.json` that rosidl installs beside every
 definition, and how the hashes of a service's and an action's messages are put together.
+
+And the upper bound of a type's serialized size, from the `.idl` file that every interface package
+installs, also for what was written as `.msg`: `struct Name { … }`, its fields and typedefs are read
+as rosidl writes or accepts them
+(https://design.ros2.org/articles/idl_interface_definition.html); all else is skipped.
 
 Imports no message package, so that a manifest is checked without ROS installed or sourced. Reads
 the file system.
@@ -18,8 +23,9 @@ import enum
 import functools
 import json
 import os
+import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
 from lifecycle.manifest.schema import nearest
@@ -160,3 +166,290 @@ def _hashes(path: Path) -> Mapping[str, str]:
         return {str(each["type_name"]): str(each["hash_string"]) for each in listed}
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return {}
+
+
+_WORD = re.compile(
+    r"""//[^\n]*|/\*.*?\*/|\#[^\n]*      # comments and includes
+    |"(?:\\.|[^"\\])*"|'(?:\\.|[^'\\])'  # text of annotations and defaults
+    |[A-Za-z_][\w]*(?:::[A-Za-z_]\w*)*   # names, scoped ones whole
+    |[\d.][\w.+-]*|\S""",
+    re.VERBOSE | re.DOTALL,
+)
+_SKIPPED = ("//", "/*", "#")
+_UNSIGNED = {"short": "uint16", "long": "uint32"}
+
+
+class IdlError(Exception):
+    """The text is not IDL of the kind that is read here."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Field:
+    """One field of a structure, typedefs followed.
+
+    Attributes:
+        type: a primitive's IDL name, `string`, `wstring`, or a scoped name `a::msg::B`.
+        length: number of items of a fixed array, 1 for a single value.
+        is_sequence: of variable length.
+        bound: most items of a sequence; None if it has no bound.
+        string_bound: most characters of a string; None if it has no bound.
+    """
+
+    type: str
+    length: int = 1
+    is_sequence: bool = False
+    bound: int | None = None
+    string_bound: int | None = None
+
+
+def parse_struct(text: str, name: str) -> tuple[Field, ...]:
+    """Return the fields of the structure `name`.
+
+    Raises:
+        IdlError: there is no such structure, or it holds something that is not understood.
+    """
+    return _Parser(text).struct(name)
+
+
+class _Parser:
+    def __init__(self, text: str) -> None:
+        found: list[str] = _WORD.findall(text)
+        self._words: list[str] = [each for each in found if not each.startswith(_SKIPPED)]
+        self._at = 0
+        self._typedefs: dict[str, Field] = {}
+
+    def struct(self, name: str) -> tuple[Field, ...]:
+        while self._at < len(self._words):
+            word = self._next()
+            if word == "@":
+                self._annotation()
+            elif word == "typedef":
+                type_ = self._type()
+                self._typedefs.update(self._declarators(type_))
+            elif word == "struct" and self._peek() == name:
+                self._next()
+                return tuple(self._members())
+        raise IdlError(f"cannot find struct {name!r}")
+
+    def _members(self) -> Iterator[Field]:
+        self._expect("{")
+        while self._peek() != "}":
+            while self._peek() == "@":
+                self._next()
+                self._annotation()
+            yield from self._declarators(self._type()).values()
+
+    def _type(self) -> Field:
+        word = self._next()
+        if word == "sequence":
+            return self._sequence()
+        if word in ("string", "wstring"):
+            bound = None
+            if self._peek() == "<":
+                self._next()
+                bound = self._number()
+                self._expect(">")
+            return Field(type=word, string_bound=bound)
+        if word == "unsigned":
+            word = _UNSIGNED.get(self._next(), "")
+            if word == "uint32" and self._peek() == "long":
+                self._next()
+                word = "uint64"
+        elif word == "long" and self._peek() in ("long", "double"):
+            word = {"long": "int64", "double": "long double"}[self._next()]
+        if word in self._typedefs:
+            return self._typedefs[word]
+        if not word or not (word[0].isalpha() or word[0] == "_"):
+            raise IdlError(f"cannot read a type at {word!r}")
+        return Field(type=word)
+
+    def _sequence(self) -> Field:
+        self._expect("<")
+        item = self._type()
+        bound = None
+        if self._peek() == ",":
+            self._next()
+            bound = self._number()
+        self._expect(">")
+        if item.is_sequence or item.length != 1:
+            raise IdlError("cannot read a sequence of sequences or arrays")
+        return dataclasses.replace(item, is_sequence=True, bound=bound)
+
+    def _declarators(self, type_: Field) -> dict[str, Field]:
+        """Read `name[3][4], other;` after a type."""
+        found: dict[str, Field] = {}
+        while True:
+            name, length = self._next(), 1
+            if not name.isidentifier():
+                raise IdlError(f"cannot read {name!r} as the name of a field")
+            while self._peek() == "[":
+                self._next()
+                length *= self._number()
+                self._expect("]")
+            if length != 1 and type_.is_sequence:
+                raise IdlError("cannot read an array of sequences")
+            found[name] = dataclasses.replace(type_, length=type_.length * length)
+            word = self._next()
+            if word == ";":
+                return found
+            if word != ",":
+                raise IdlError(f"cannot read {word!r} after a name")
+
+    def _annotation(self) -> None:
+        """Skip `@name` or `@name(…)`; the @ is read."""
+        self._next()
+        if self._peek() != "(":
+            return
+        depth = 0
+        while True:
+            word = self._next()
+            depth += {"(": 1, ")": -1}.get(word, 0)
+            if depth == 0:
+                return
+
+    def _number(self) -> int:
+        word = self._next()
+        try:
+            return int(word, 0)
+        except ValueError:
+            raise IdlError(f"cannot use {word!r} as a bound") from None
+
+    def _expect(self, word: str) -> None:
+        if (found := self._next()) != word:
+            raise IdlError(f"cannot read {found!r} where {word!r} must be")
+
+    def _peek(self) -> str:
+        if self._at >= len(self._words):
+            raise IdlError("cannot read on: the text ends")
+        return self._words[self._at]
+
+    def _next(self) -> str:
+        word = self._peek()
+        self._at += 1
+        return word
+
+
+_ENCAPSULATION = 4
+"""Bytes in front of every serialized message (DDSI-RTPS 10)."""
+
+_LENGTH = 4
+_WCHAR = 4
+_PRIMITIVES = {
+    "boolean": 1,
+    "octet": 1,
+    "char": 1,
+    "int8": 1,
+    "uint8": 1,
+    "int16": 2,
+    "uint16": 2,
+    "short": 2,
+    "int32": 4,
+    "uint32": 4,
+    "long": 4,
+    "float": 4,
+    "wchar": _WCHAR,
+    "int64": 8,
+    "uint64": 8,
+    "double": 8,
+}
+_MAX_DEPTH = 32
+_EXACT_ITEMS = 64  # items of an array that are laid out one by one before padding is estimated
+
+
+class _UnboundedError(Exception):
+    """A field has no bound, or its type cannot be read here."""
+
+
+def bounded_size(type_: str, prefixes: Sequence[Path]) -> int | None:
+    """Return the largest serialized size of a message type, bytes; None if it has no bound.
+
+    None also if the type is not installed here or its definition cannot be read. CDR aligns fields
+    by what precedes them, so after a field of variable length the largest padding is counted.
+
+    Args:
+        type_: `package/msg/Type`.
+        prefixes: where to search, from `installed_types.search_prefixes`.
+    """
+    layout = _Layout()
+    try:
+        _add(type_, layout, prefixes, 0)
+    except _UnboundedError:
+        return None
+    return _ENCAPSULATION + layout.offset
+
+
+@dataclasses.dataclass(slots=True)
+class _Layout:
+    """Bytes so far; `exact` while every message of the type has this very offset here."""
+
+    offset: int = 0
+    exact: bool = True
+
+    def align(self, to: int) -> None:
+        self.offset += -self.offset % to if self.exact else to - 1
+
+    def put(self, size: int, count: int = 1) -> None:
+        if count:
+            self.align(size)
+            self.offset += size * count
+
+
+def _add(type_: str, layout: _Layout, prefixes: Sequence[Path], depth: int) -> None:
+    fields = _fields(type_, prefixes) if depth < _MAX_DEPTH else None
+    if fields is None:
+        raise _UnboundedError
+    for field in fields:
+        _add_field(field, layout, prefixes, depth)
+    if not fields:
+        layout.put(1)  # rosidl puts a member into an empty structure
+
+
+def _add_field(field: Field, layout: _Layout, prefixes: Sequence[Path], depth: int) -> None:
+    count = field.length
+    if field.is_sequence:
+        if field.bound is None:
+            raise _UnboundedError
+        layout.put(_LENGTH)
+        count = field.bound
+    if field.type in _PRIMITIVES:
+        layout.put(_PRIMITIVES[field.type], count)
+    elif field.type in ("string", "wstring"):
+        if field.string_bound is None:
+            raise _UnboundedError
+        width = 1 if field.type == "string" else _WCHAR
+        _repeat_text(layout, width * (field.string_bound + 1), count)
+    else:
+        _repeat(field.type, layout, count, prefixes, depth)
+    layout.exact = layout.exact and not field.is_sequence
+
+
+def _repeat_text(layout: _Layout, content: int, count: int) -> None:
+    for _ in range(min(count, 1)):
+        layout.put(_LENGTH)
+        layout.offset += content
+        layout.exact = False
+    layout.offset += max(count - 1, 0) * (_LENGTH + _LENGTH - 1 + content)
+
+
+def _repeat(type_: str, layout: _Layout, count: int, prefixes: Sequence[Path], depth: int) -> None:
+    for _ in range(min(count, _EXACT_ITEMS)):
+        _add(type_, layout, prefixes, depth + 1)
+    if count > _EXACT_ITEMS:
+        one = _Layout(exact=False)
+        _add(type_, one, prefixes, depth + 1)
+        layout.offset += one.offset * (count - _EXACT_ITEMS)
+        layout.exact = False
+
+
+def _fields(type_: str, prefixes: Sequence[Path]) -> tuple[Field, ...] | None:
+    """Return the fields of a type, `a/msg/B` or IDL's `a::msg::B`; None if it cannot be read."""
+    package, _, rest = type_.replace("::", "/").partition("/")
+    index = find_resource("rosidl_interfaces", package, prefixes)
+    if index is None or not rest:
+        return None
+    # <prefix>/share/ament_index/resource_index/rosidl_interfaces/<package>
+    path = index.parents[3] / package / f"{rest}.idl"
+    try:
+        return parse_struct(path.read_text(encoding="utf-8"), rest.rpartition("/")[2])
+    except (OSError, UnicodeDecodeError, IdlError):
+        return None

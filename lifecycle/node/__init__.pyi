@@ -4,11 +4,11 @@ from .author.handlers import on_goal as on_goal
 from .author.handlers import on_message as on_message
 from .author.handlers import on_service as on_service
 from .author.handlers import on_timer as on_timer
+from .author.node import ERROR as ERROR
+from .author.node import FAILURE as FAILURE
+from .author.node import SUCCESS as SUCCESS
 from .author.node import LifecycleNode as LifecycleNode
-from .author.returns import ERROR as ERROR
-from .author.returns import FAILURE as FAILURE
-from .author.returns import SUCCESS as SUCCESS
-from .author.returns import TransitionCallbackReturn as TransitionCallbackReturn
+from .author.node import TransitionCallbackReturn as TransitionCallbackReturn
 from .author.spec import load_class as load_class
 from .connections.connection_status import ConnectionEvent as ConnectionEvent
 from .connections.connection_status import ConnectionEventKind as ConnectionEventKind
@@ -22,4 +22,3 @@ from .host.host import preload as preload
 from .host.host import preload_also as preload_also
 from .host.host import serve as serve
 from .host.standalone import run as run
-from .reporting.machine_id import machine_id as machine_id

@@ -24,8 +24,7 @@ from .rules import Rule as Rule
 from .rules import rule as rule
 from .rules.catalogue import About as About
 from .rules.catalogue import Heals as Heals
-from .rules.clients import SERVER_OF as SERVER_OF
-from .rules.configuration import MISSING_REPORT as MISSING_REPORT
+from .rules.matching import SERVER_OF as SERVER_OF
 from .rules.matching import MatchEnd as MatchEnd
 from .rules.matching import match as match
 from .rules.matching import obstacle as obstacle
@@ -42,6 +41,7 @@ from .rules.run import START_FAILED as START_FAILED
 from .rules.run import TRANSITION_FAILED as TRANSITION_FAILED
 from .rules.run import node_of as node_of
 from .rules.state import ACTIVATED_AT_CLOSED_GATE as ACTIVATED_AT_CLOSED_GATE
+from .rules.state import MISSING_REPORT as MISSING_REPORT
 from .tool_filter import GRAPH_TOPIC as GRAPH_TOPIC
 from .tool_filter import NO_NAMES as NO_NAMES
 from .tool_filter import NODE_SERVICES as NODE_SERVICES

@@ -17,8 +17,7 @@ from lifecycle.verify.matcher import lay_out
 from lifecycle.verify.observation import Observation
 from lifecycle.verify.rules import CHECKS, rule
 from lifecycle.verify.tool_filter import OUR_NODES
-from lifecycle.verify.transport import effective_transport
-from lifecycle.verify.uniqueness import Uniqueness
+from lifecycle.verify.transport import Uniqueness, effective_transport
 from lifecycle.verify.verdict import (
     Finding,
     FlowReport,

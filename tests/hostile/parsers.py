@@ -22,8 +22,7 @@ from lifecycle.graph.messages import GraphMessageError, Joined, encode
 from lifecycle.graph.messages import decode as decode_message
 from lifecycle.manifest import ManifestError, load
 from lifecycle.manifest.diagnostics import Position
-from lifecycle.manifest.installed_types import _hashes
-from lifecycle.manifest.message_size import IdlError, parse_struct
+from lifecycle.manifest.installed_types import IdlError, _hashes, parse_struct
 from lifecycle.manifest.nodl import read_interface
 from lifecycle.node.host.control import Event
 from lifecycle.plan.comparison import PlanNoticeError, announced_plan, notice_of

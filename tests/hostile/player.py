@@ -91,7 +91,7 @@ def main() -> None:
 
 def _say(nodes: list[Node], topic: str, index: int) -> None:
     from lifecycle.graph.dds import GRAPH_QOS
-    from lifecycle.middleware.discovery.plan_notices import _qos
+    from lifecycle.middleware.discovery.liveliness import _qos
     from tests.hostile.answers import MESSAGES
 
     node = Node("_ros2cli_teller", enable_rosout=False)

@@ -40,7 +40,11 @@ if TYPE_CHECKING:
     metavar="SECONDS",
     help="Hold it so long, then shut down; no success if it ended before, or was violated.",
 )
-@timeout_option(30.0, "For everything from the first start to the system being active.")
+@timeout_option(
+    None,
+    "For everything from the first start to the system being active.",
+    default="30, and 1 for each process",
+)
 @report_option
 @click.option("--strict", is_flag=True, help="What cannot be verified keeps the gate closed.")
 @click.option(
@@ -63,7 +67,7 @@ def command(
     format_: str,
     until: str,
     stop_after: float | None,
-    timeout: float,
+    timeout: float | None,
     report: Path | None,
     strict: bool,
     machine: str,

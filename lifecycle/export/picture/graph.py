@@ -1,16 +1,20 @@
-"""Nodes, frames and edge labels that the DOT and Mermaid graphs of a picture share.
+"""A picture as a graph that lays itself out: Graphviz DOT, and Mermaid for Markdown. Pure.
 
-Owns: the texts, and which edges there are; each language's module owns its spelling. Both lay out
-by themselves, so one graph shows what rows and columns show in two. Pure.
+Owns: nodes, frames and edge labels that both share, and the syntax and escapes of each. One graph
+shows what rows and columns show in two.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import json
+import re
 from collections.abc import Callable, Iterator
 
 from lifecycle.export.picture.lines import OWN
 from lifecycle.export.picture.model import (
+    DASHES,
+    LINES,
     STATES,
     LineKind,
     Picture,
@@ -23,6 +27,7 @@ from lifecycle.export.picture.model import (
     remark,
 )
 from lifecycle.export.picture.views import edge_label, is_unique, wrapped
+from lifecycle.printable import one_line
 from lifecycle.verify import Outcome
 
 _LABEL_CHARACTERS = 60
@@ -126,3 +131,121 @@ def _arrow_words(
         if flow.outcome not in (Outcome.OK, None):
             words.append(flow.outcome.value)
     return tuple(filter(None, dict.fromkeys([*words, *arrow.notes])))
+
+
+_STYLES = {
+    Presence.PRESENT: "solid",
+    Presence.MISSING: "dashed",
+    Presence.UNDECLARED: "dotted",
+    Presence.PLANNED: "solid",
+}
+
+
+def picture_to_dot(picture: Picture) -> str:
+    """Return one digraph: nodes by machine and process, edges with their flows.
+
+    States are colours and labels; missing is dashed and red, undeclared is dotted and orange; edges
+    of unique flows are bold.
+    """
+    lines = [
+        f"digraph {'planned' if picture.verdict is None else 'running'} {{",
+        f"  label={_dot_quoted(picture.title)};",
+        "  rankdir=LR; labelloc=t; compound=true;",
+        '  graph [fontname="sans-serif", style=rounded];',
+        '  node [fontname="sans-serif", shape=box];',
+        '  edge [fontname="sans-serif", fontsize=10];',
+        *framed(picture, _dot_opening, "}", _dot_node),
+    ]
+    for number, edge in enumerate(edges(picture)):
+        lines += [f"  {each}" for each in _dot_edge(edge, f"stub{number}")]
+    return "\n".join([*lines, "}"]) + "\n"
+
+
+def _dot_opening(id_: str, title: str) -> str:
+    return f"subgraph cluster_{id_} {{ label={_dot_quoted(title)};"
+
+
+def _dot_node(node: PicturedNode) -> str:
+    look = STATES[node.state]
+    return (
+        f"{node.id} [label={_dot_quoted(*node_words(node))}, "
+        f'style="rounded,filled,{_STYLES[node.presence]}", fillcolor="{look.fill}", '
+        f'fontcolor="{look.ink}", color="{LINES[node.presence]}", penwidth=2];'
+    )
+
+
+def _dot_edge(edge: Edge, stub: str) -> Iterator[str]:
+    """An end without an opposite is drawn towards an empty circle."""
+    if not (edge.source and edge.target):
+        yield f'{stub} [shape=circle, width=0.15, label=""];'
+    head = "normal" if edge.kind is LineKind.TOPIC else "empty"
+    yield (
+        f"{edge.source or stub} -> {edge.target or stub} [label={_dot_quoted(*edge.words)}, "
+        f'arrowhead={head}, style={_STYLES[edge.presence]}, color="{LINES[edge.presence]}"'
+        f"{', penwidth=3' if edge.unique else ''}];"
+    )
+
+
+def _dot_quoted(*words: str) -> str:
+    r"""A quoted label of several lines: `\n` ends one, and a backslash would escape something."""
+    return '"' + r"\n".join(map(_dot_escape, words)) + '"'
+
+
+def _dot_escape(word: str) -> str:
+    return one_line(" ".join(word.replace("\\", "\\\\").replace('"', '\\"').split()))
+
+
+def picture_to_mermaid(picture: Picture) -> str:
+    """Return one flowchart: nodes by machine and process, edges with their flows.
+
+    States are colours and labels; missing is dashed and red, undeclared is dotted and orange; edges
+    of unique flows are thick.
+    """
+    lines = ["---", f"title: {json.dumps(picture.title)}", "---", "flowchart LR"]
+    lines += framed(picture, _mermaid_opening, "end", _mermaid_node)
+    styles: list[str] = []
+    for number, edge in enumerate(edges(picture)):
+        lines.append(f"  {_mermaid_edge(edge, f's{number}(( ))')}")
+        if dash := DASHES[edge.presence]:
+            styles.append(
+                f"  linkStyle {number} stroke:{LINES[edge.presence]},stroke-dasharray:{dash}"
+            )
+    return "\n".join([*lines, *styles, *_classes(picture)]) + "\n"
+
+
+def _mermaid_opening(id_: str, title: str) -> str:
+    return f"subgraph {id_}[{_mermaid_quoted(title)}]"
+
+
+def _mermaid_node(node: PicturedNode) -> str:
+    return f"{node.id}[{_mermaid_quoted(*node_words(node))}]:::{_class(node)}"
+
+
+def _mermaid_edge(edge: Edge, stub: str) -> str:
+    """An end without an opposite is drawn towards an empty circle."""
+    arrow = "==>" if edge.unique else "-->" if edge.kind is LineKind.TOPIC else "-.->"
+    return f"{edge.source or stub} {arrow}|{_mermaid_quoted(*edge.words)}| {edge.target or stub}"
+
+
+def _class(node: PicturedNode) -> str:
+    state = node.state.name.lower()
+    return state if node.presence.as_declared else f"{node.presence.value}_{state}"
+
+
+def _classes(picture: Picture) -> Iterator[str]:
+    """The classes that the picture uses."""
+    for name, node in {_class(node): node for node in picture.nodes()}.items():
+        look = STATES[node.state]
+        dash = DASHES[node.presence]
+        dashed = f",stroke-width:2px,stroke-dasharray:{dash}" if dash else ""
+        colour = LINES[node.presence]
+        yield f"  classDef {name} fill:{look.fill},color:{look.ink},stroke:{colour}{dashed}"
+
+
+def _mermaid_quoted(*words: str) -> str:
+    """A quoted label of several lines; what Mermaid could read as syntax becomes an entity."""
+    return '"' + "<br/>".join(map(_mermaid_escape, words)) + '"'
+
+
+def _mermaid_escape(word: str) -> str:
+    return re.sub(r"[^\w /.,:=()~+→-]", lambda match: f"#{ord(match[0])};", word)

@@ -19,9 +19,9 @@ from lifecycle.manifest.checks.connections import (
     check_connections,
     check_counterparts,
     check_mapped_endpoints,
+    check_qos,
+    check_types,
 )
-from lifecycle.manifest.checks.discovery import check_discovery
-from lifecycle.manifest.checks.flow_transport import check_middleware, check_transport
 from lifecycle.manifest.checks.flows import (
     check_flow_endpoints,
     check_flows,
@@ -29,7 +29,6 @@ from lifecycle.manifest.checks.flows import (
     check_link_uniqueness,
     check_links,
 )
-from lifecycle.manifest.checks.matching import check_qos, check_types
 from lifecycle.manifest.checks.names import check_names, check_remaps
 from lifecycle.manifest.checks.nodes import (
     check_machines,
@@ -39,6 +38,7 @@ from lifecycle.manifest.checks.nodes import (
 )
 from lifecycle.manifest.checks.parameters import check_parameter_files, check_parameters
 from lifecycle.manifest.checks.system import DeclaredSystem, Partial
+from lifecycle.manifest.checks.transport import check_discovery, check_middleware, check_transport
 from lifecycle.manifest.diagnostics import Diagnostic
 from lifecycle.manifest.flows import FlowNeeds
 from lifecycle.manifest.installed_types import search_prefixes

@@ -13,10 +13,9 @@ import re
 from collections.abc import Mapping
 
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest.builders.cursor import Cursor
 from lifecycle.manifest.diagnostics import Diagnostic
 from lifecycle.manifest.schema import did_you_mean
-from lifecycle.manifest.yaml.document import Document, Place, Scalar, Value, error
+from lifecycle.manifest.yaml.document import Cursor, Document, Place, Scalar, Value, error
 from lifecycle.manifest.yaml.yaml_parser import MAX_FINDINGS, quote, resolve
 
 MAX_TEXT = 1 << 20

@@ -12,13 +12,12 @@ import os
 from pathlib import Path
 
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest.builders.cursor import Cursor
-from lifecycle.manifest.builders.node import Findings
+from lifecycle.manifest.building import Findings
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import EndpointKind, Link, Machine, Manifest, Node
 from lifecycle.manifest.names import resolve
 from lifecycle.manifest.schema import did_you_mean
-from lifecycle.manifest.yaml.document import error
+from lifecycle.manifest.yaml.document import Cursor, error
 from lifecycle.manifest.yaml.yaml_parser import quote
 
 MAX_DEPTH = 16

@@ -32,8 +32,8 @@ import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from lifecycle.middleware.discovery.probe import HEADER, Door, doors_of, send
-from lifecycle.middleware.sockets.dscp import own_udp_socket, socket_descriptors
-from lifecycle.middleware.sockets.url_check import open_sockets
+from lifecycle.middleware.fastdds.dscp import own_udp_socket, socket_descriptors
+from lifecycle.middleware.fastdds.url_check import open_sockets
 from lifecycle.network import ConnectionUrl, Medium
 
 _UNANSWERED = 2

@@ -27,8 +27,10 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 import psutil
 
 from lifecycle.errors import MiddlewareError
+from lifecycle.middleware.fastdds.dscp import own_udp_socket
 from lifecycle.middleware.fastdds.participant_profile import default_profile
 from lifecycle.middleware.fastdds.profiles import PROFILE_NAME
+from lifecycle.middleware.fastdds.url_check import open_sockets
 from lifecycle.middleware.fastdds.url_profile import (
     DISCOVERY_GROUP,
     LOCALHOST_PEERS_RANGE,
@@ -37,8 +39,6 @@ from lifecycle.middleware.fastdds.url_profile import (
     families,
     leaves_discovery_open,
 )
-from lifecycle.middleware.sockets.dscp import own_udp_socket
-from lifecycle.middleware.sockets.url_check import open_sockets
 from lifecycle.network import (
     DG,
     PARTICIPANTS_PER_DOMAIN,

@@ -36,13 +36,13 @@ from lifecycle.middleware.discovery.probe import (
     send,
     well_known_doors,
 )
+from lifecycle.middleware.fastdds.dscp import own_udp_socket, socket_descriptors
 from lifecycle.middleware.fastdds.url_profile import (
     DISCOVERY_GROUP,
     UrlTransport,
     families,
     leaves_discovery_open,
 )
-from lifecycle.middleware.sockets.dscp import own_udp_socket, socket_descriptors
 from lifecycle.network import ConnectionUrl, Medium, participant_ports
 
 _PARTICIPANTS = 32

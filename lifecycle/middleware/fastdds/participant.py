@@ -30,20 +30,21 @@ from rclpy.subscription import Subscription
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest import QosProfile
-from lifecycle.middleware.fastdds import default_qos, shared_executor
+from lifecycle.middleware.fastdds import dscp as marks
+from lifecycle.middleware.fastdds import shared_executor
+from lifecycle.middleware.fastdds.dscp import never_wait
+from lifecycle.middleware.fastdds.nfe import get_network_flow_endpoints, has_shared_memory
 from lifecycle.middleware.fastdds.participant_profile import (
     ParticipantSettings,
     endpoint_profiles,
     find_endpoint,
 )
+from lifecycle.middleware.fastdds.settings import with_endpoint_profiles
+from lifecycle.middleware.fastdds.url_check import open_sockets
 from lifecycle.middleware.fastdds.url_profile import LOOPBACK, transport_of
 from lifecycle.middleware.rcl import unique as flows
 from lifecycle.middleware.rcl.hidden_node import forget_hidden, hidden_nodes, quiet_node
 from lifecycle.middleware.rcl.qos import to_rclpy
-from lifecycle.middleware.sockets import dscp as marks
-from lifecycle.middleware.sockets.dscp import never_wait
-from lifecycle.middleware.sockets.nfe import get_network_flow_endpoints, has_shared_memory
-from lifecycle.middleware.sockets.url_check import open_sockets
 from lifecycle.network import ConnectionUrl, Medium, NetworkFlowEndpoint, UniqueRequirement
 from lifecycle.plan import ParticipantConnections
 
@@ -342,7 +343,7 @@ class FlowParticipant:
 
         Half a millisecond. It is called before a publisher or subscription is handed out, and by
         no reading: what reads and marks at once finds every mark in place. No socket of Fast DDS
-        2.14 is known to open later (see `lifecycle.middleware.sockets.dscp`).
+        2.14 is known to open later (see `lifecycle.middleware.fastdds.dscp`).
 
         Raises:
             MiddlewareError: the mark cannot be set.
@@ -431,7 +432,7 @@ class FlowParticipant:
             profile=self.node.resolve_topic_name(topic),
             type_name=f"{package}::{kind}::dds_::{type_.__name__}_",
         )
-        return default_qos.endpoint_profiles(endpoint_profiles([line]))
+        return with_endpoint_profiles(endpoint_profiles([line]))
 
     def _refuse_static(self, what: str, name: str) -> None:
         if self.settings.static_participants:

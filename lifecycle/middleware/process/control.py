@@ -22,6 +22,10 @@ from lifecycle.errors import MiddlewareError
 CLOCK_MONOTONIC = 1
 _NS = 1_000_000_000
 
+MACHINE_ID_VARIABLE = "LIFECYCLE_MACHINE_ID"
+"""Names the machine where the files cannot: containers and network namespaces that are hosts of
+their own share /etc/machine-id or have none, and always share the kernel's boot id."""
+
 
 class TimerSpec(ctypes.Structure):
     """One expiry of a timer, `struct itimerspec`."""
@@ -192,3 +196,22 @@ def _timer_functions() -> tuple[ctypes._NamedFuncPointer, ctypes._NamedFuncPoint
 
 def _failed(call: str) -> MiddlewareError:
     return MiddlewareError(f"cannot use {call}: {os.strerror(ctypes.get_errno())}")
+
+
+@functools.lru_cache(maxsize=1)
+def machine_id() -> str:
+    """Return what distinguishes this machine from others.
+
+    It is $LIFECYCLE_MACHINE_ID where that is set, else /etc/machine-id (machine-id(5)), else the
+    kernel's boot id. Nodes of one id are taken to share memory and loopback.
+    """
+    if given := os.environ.get(MACHINE_ID_VARIABLE):
+        return given
+    for path in ("/etc/machine-id", "/proc/sys/kernel/random/boot_id"):
+        try:
+            found = Path(path).read_text(encoding="ascii").strip()
+        except OSError:
+            continue
+        if found:
+            return found
+    return ""

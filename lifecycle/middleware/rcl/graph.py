@@ -1,7 +1,9 @@
 """ROS graph observer: snapshots of nodes and endpoints as discovery shows them, without polling.
 
 Owns: the observer's participant, and the translation of graph queries into observation types.
-Entities that tools add are left out by `lifecycle.verify.tool_filter`.
+Entities that tools add are left out by `lifecycle.verify.tool_filter`. The type hashes (REP-2016)
+of services are found at their request and reply endpoints, by their DDS names; rmw_fastrtps and
+rmw_cyclonedds announce hashes since Iron.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 import rclpy
 from rclpy.node import Node
 
-from lifecycle.manifest import EndpointKind
+from lifecycle.manifest import EndpointKind, join
 from lifecycle.middleware.discovery.dead_peers import (
     PROCESS_DIGITS,
     give_up_dead_connections,
@@ -27,10 +29,14 @@ from lifecycle.middleware.discovery.dead_peers import (
 from lifecycle.middleware.discovery.probe import knock_for
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.rcl.graph_changes import GraphGuard, on_graph_change
-from lifecycle.middleware.rcl.graph_queries import endpoints_of, endpoints_of_node, topic_endpoints
+from lifecycle.middleware.rcl.graph_queries import (
+    EndpointInfo,
+    endpoints_of,
+    endpoints_of_node,
+    topic_endpoints,
+)
 from lifecycle.middleware.rcl.hidden_node import quiet_node
 from lifecycle.middleware.rcl.stale_node_filter import StaleNodeFilter
-from lifecycle.middleware.rcl.type_hash import with_service_hashes
 from lifecycle.network import Medium
 from lifecycle.plan import ParticipantConnections
 from lifecycle.verify import (
@@ -43,6 +49,68 @@ from lifecycle.verify import (
     known_node,
     without_noise,
 )
+
+
+def with_service_hashes(
+    node: Node, endpoints: Iterable[ObservedEndpoint]
+) -> tuple[ObservedEndpoint, ...]:
+    """Return `endpoints` with the type hashes of services filled in, in the same order.
+
+    The graph lists services by name and type only; their requests and replies are DDS topics like
+    all others, `rq/NAMERequest` and `rr/NAMEReply`, whose endpoints announce the hashes.
+
+    Args:
+        node: that queries.
+        endpoints: topics, servers and clients; the parts of actions not yet folded.
+    """
+    seen: dict[str, _Service] = {}
+    found = []
+    for each in endpoints:
+        if each.kind in (EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT):
+            if each.name not in seen:
+                seen[each.name] = _Service.of(node, each.name)
+            found.append(dataclasses.replace(each, type_hash=seen[each.name].hash_of(each)))
+        else:
+            found.append(each)
+    return tuple(found)
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class _Service:
+    """Endpoints of one service: writers and readers of its requests, then of its replies."""
+
+    clients: tuple[list[EndpointInfo], list[EndpointInfo]]
+    servers: tuple[list[EndpointInfo], list[EndpointInfo]]
+
+    @classmethod
+    def of(cls, node: Node, name: str) -> _Service:
+        requests, replies = f"rq{name}Request", f"rr{name}Reply"
+
+        def publishers(topic: str) -> list[EndpointInfo]:
+            return endpoints_of(node, EndpointKind.PUBLISHER, topic, no_mangle=True)
+
+        def subscriptions(topic: str) -> list[EndpointInfo]:
+            return endpoints_of(node, EndpointKind.SUBSCRIPTION, topic, no_mangle=True)
+
+        return cls(
+            clients=(publishers(requests), subscriptions(replies)),
+            servers=(subscriptions(requests), publishers(replies)),
+        )
+
+    def hash_of(self, endpoint: ObservedEndpoint) -> str | None:
+        """Return the joined hashes of a node's end, empty while only half of it is seen; else None.
+
+        None means that the RMW has no such topics, or that nothing of them is seen.
+        """
+        sides = self.servers if endpoint.kind is EndpointKind.SERVICE_SERVER else self.clients
+        hashes, seen = [], False
+        for side in sides:
+            own = {info.type_hash for info in side if info.node == endpoint.node}
+            seen = seen or bool(own)
+            # A node with several servers or clients of one name is one end: all of them count.
+            hashes.append("" if "" in own else "|".join(sorted(own)))
+        return join(hashes) if seen else None
+
 
 ANSWER_S = 0.15
 """A participant that a probe reaches, on this host or the next one, answers within so long."""

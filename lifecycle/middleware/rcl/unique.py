@@ -26,9 +26,9 @@ from rclpy.validate_topic_name import validate_topic_name
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest import QosProfile
+from lifecycle.middleware.fastdds.nfe import NetworkFlowEndpointsUnsupported, read_handle
 from lifecycle.middleware.rcl import abi
 from lifecycle.middleware.rcl.qos import to_rclpy
-from lifecycle.middleware.sockets.nfe import NetworkFlowEndpointsUnsupported, read_handle
 from lifecycle.network import UniqueRequirement, is_ip
 
 _PUBLISHER_HINT = "give the publisher its own participant, or ask for optionally_required"

@@ -19,7 +19,7 @@ from rclpy.exceptions import InvalidHandle
 from rclpy.task import Future
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.services.server_watch import ServerWatch
+from lifecycle.middleware.rcl.graph_changes import ServerWatch
 
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup

@@ -1,9 +1,10 @@
 """The managed half of a LifecycleNode (`node.lifecycle`): controller, gate, data layer, services.
 
 Owns: putting controller, gate, data layer, parameters, timers and services of one node together;
-and the endpoints that code makes with rclpy's own factories, which are on no interface, so that the
-node configuration can report them. It is reached as `node.lifecycle`, so that authors have every
-other attribute name to themselves.
+its reporter to the ROS graph, whose publisher and timer must work in every state, so that they do
+not pass the gate; and the endpoints that code makes with rclpy's own factories, which are on no
+interface, so that the node configuration can report them. It is reached as `node.lifecycle`, so
+that authors have every other attribute name to themselves.
 """
 
 from __future__ import annotations
@@ -20,13 +21,18 @@ from rclpy.timer import Timer
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest import EndpointKind, EndpointPolicy
+from lifecycle.node import configuration
 from lifecycle.node.author import parameters
 from lifecycle.node.author.declaring import DeclaredInCode
 from lifecycle.node.author.handlers import alternatives
 from lifecycle.node.author.spec import Mode
-from lifecycle.node.connections.connection_status import ConnectionEvent, ConnectionEvents
-from lifecycle.node.connections.data_layer import NodeDataLayer, NodeInterface
-from lifecycle.node.connections.remote_interface import RemoteInterface
+from lifecycle.node.configuration import ConfigurationChanges
+from lifecycle.node.connections.connection_status import (
+    ConnectionEvent,
+    ConnectionEventKind,
+    ConnectionEvents,
+)
+from lifecycle.node.connections.data_layer import NodeDataLayer, NodeInterface, RemoteInterface
 from lifecycle.node.endpoints.making import wire_name
 from lifecycle.node.lifecycle.controller import Controller
 from lifecycle.node.lifecycle.execution import SUCCESS, Result
@@ -39,13 +45,87 @@ from lifecycle.node.lifecycle.machine import (
     TransitionRequest,
 )
 from lifecycle.node.lifecycle.services import LifecycleServices, Turns
-from lifecycle.node.reporting import configuration
-from lifecycle.node.reporting.configuration import ConfigurationChanges
 from lifecycle.plan import PlannedNode
 from lifecycle.verify import NodeConfiguration
 
 if TYPE_CHECKING:
-    from lifecycle.node.reporting.graph_member import GraphMember
+    from rclpy.callback_groups import CallbackGroup
+
+
+class GraphMember:
+    """Reports one node to the graph, from its construction until it is destroyed.
+
+    Args:
+        node: to report; its executor sends the heartbeats.
+        group: reentrant.
+    """
+
+    def __init__(self, node: Node, group: CallbackGroup) -> None:
+        # Late: most nodes report to their supervisor only.
+        from lifecycle.graph import DdsTransport, GraphReporter, steady_timer
+
+        ungated: Any = _Ungated(node)
+        self._transport = DdsTransport(ungated, callback_group=group)
+        self._reporter = GraphReporter(
+            self._transport, str(node.get_fully_qualified_name()), every=steady_timer(ungated)
+        )
+
+    def joined(self, state: NodeState, checksum: str) -> None:
+        """Become part of the graph."""
+        self._reporter.joined(state.seen.label, connected=state.connected, checksum=checksum)
+
+    def state_changed(self, state: NodeState) -> None:
+        """Report the state that the node is in now."""
+        self._reporter.state_changed(state.seen.label, connected=state.connected)
+
+    def configuration_changed(self, checksum: str) -> None:
+        """Report that the configuration is to be read again, if the checksum is another."""
+        self._reporter.configuration_changed(checksum)
+
+    def connection_event(self, event: ConnectionEvent) -> None:
+        """Report what became of a connection or mapping."""
+        kind = event.kind
+        if kind is ConnectionEventKind.CONNECTION_ESTABLISHED:
+            self._reporter.connection_established(event.connection, event.urls)
+        elif kind is ConnectionEventKind.CONNECTION_LOST:
+            error = "" if event.unmade else "an endpoint on it has lost its last peer"
+            self._reporter.connection_lost(event.connection, event.urls, error)
+        elif kind is ConnectionEventKind.MAPPING_ESTABLISHED:
+            self._reporter.mapping_established(
+                event.endpoint, event.connection, matched=event.peers
+            )
+        else:
+            self._reporter.mapping_lost(event.endpoint, event.connection, matched=event.peers)
+
+    def close(self) -> None:
+        """Say farewell."""
+        self._reporter.left()
+        self._transport.close()
+
+
+class _Ungated:
+    """The node's factories as rclpy has them, without the gate."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+
+    def create_publisher(self, *arguments: Any, **options: Any) -> Any:
+        return Node.create_publisher(self._node, *arguments, **options)
+
+    def create_subscription(self, *arguments: Any, **options: Any) -> Any:
+        return Node.create_subscription(self._node, *arguments, **options)
+
+    def create_timer(self, *arguments: Any, **options: Any) -> Any:
+        return Node.create_timer(self._node, *arguments, **options)
+
+    def destroy_publisher(self, publisher: Any) -> Any:
+        return Node.destroy_publisher(self._node, publisher)
+
+    def destroy_subscription(self, subscription: Any) -> Any:
+        return Node.destroy_subscription(self._node, subscription)
+
+    def destroy_timer(self, timer: Any) -> Any:
+        return Node.destroy_timer(self._node, timer)
 
 
 class Undeclared:
@@ -314,9 +394,6 @@ class Managed:
     # Inside.
 
     def _join(self) -> None:
-        # Late: most nodes report to their supervisor only.
-        from lifecycle.node.reporting.graph_member import GraphMember
-
         self._member = GraphMember(self._node, self._infrastructure)
         now = self.configuration_changes.collect()
         self._member.joined(self.state, now.checksum if now is not None else "")

@@ -1,7 +1,7 @@
 """LifecycleNode: the base class of managed nodes, its node interface and gated rclpy factories.
 
 Owns: the node as its author sees it: how it is constructed, its callbacks, and access to what is
-declared; the node interface's signatures for a node's own code (remote_interface.py is the same for
+declared; the node interface's signatures for a node's own code (data_layer.py has the same for
 others, data_layer.py does the work; see *Topological Discovery and Communication Negotiation*,
 "Node Interface"); which of rclpy's factories are overridden, so that what they make is known and
 sends and receives only while active; and the guard that makes a blocking call of a service or
@@ -24,7 +24,7 @@ from rclpy.callback_groups import CallbackGroup
 from rclpy.client import Client
 from rclpy.clock import Clock
 from rclpy.context import Context
-from rclpy.lifecycle import LifecycleState
+from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.logging import LoggingSeverity
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -38,6 +38,7 @@ from rclpy.timer import Timer
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest import EndpointKind
 from lifecycle.network import ConnectionUrl
+from lifecycle.node import configuration
 from lifecycle.node.author import parameters
 from lifecycle.node.author.declarations import Declarations
 from lifecycle.node.author.managed import Managed
@@ -54,12 +55,13 @@ from lifecycle.node.connections.connections import Connection, connections_of
 from lifecycle.node.endpoints.publisher import DeclaredPublisher
 from lifecycle.node.lifecycle.gate import GatedPublisher, GatedTimer, NodeGate
 from lifecycle.node.lifecycle.machine import NodeState
-from lifecycle.node.reporting import configuration
 from lifecycle.verify import ConnectionReport
 
 if TYPE_CHECKING:
     from rclpy.action import ActionClient
 
+
+__all__ = ["ERROR", "FAILURE", "SUCCESS", "LifecycleNode", "TransitionCallbackReturn"]
 
 _SPINNING = {("rclpy.executors", "_spin_once_impl"), ("lifecycle.node.host.loop", "_turn")}
 """Where a single-threaded executor calls back: rclpy's, and that of our own processes."""
@@ -309,7 +311,11 @@ class LocalInterface(Node):  # type: ignore[misc]  # rclpy is not typed
         return self.lifecycle.connection_events.listen(callback)
 
 
-TransitionCallbackReturn = Any
+SUCCESS = TransitionCallbackReturn.SUCCESS
+FAILURE = TransitionCallbackReturn.FAILURE
+ERROR = TransitionCallbackReturn.ERROR
+
+CallbackReturn = Any
 """What a callback may return: rclpy's TransitionCallbackReturn, or None for SUCCESS."""
 
 
@@ -467,26 +473,26 @@ class LifecycleNode(Declarations, LocalInterface, GatedFactories):
 
     # Callbacks of the author.
 
-    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+    def on_configure(self, state: LifecycleState) -> CallbackReturn:
         """Read parameters, take resources. Endpoints are declared but do not exist yet."""
 
-    def on_connect(self, state: LifecycleState) -> TransitionCallbackReturn:
+    def on_connect(self, state: LifecycleState) -> CallbackReturn:
         """The data layer is made: endpoints exist, clients can be used, data does not flow."""
 
-    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+    def on_activate(self, state: LifecycleState) -> CallbackReturn:
         """Start working; data flows once this has succeeded."""
 
-    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+    def on_deactivate(self, state: LifecycleState) -> CallbackReturn:
         """Stop working; data has stopped flowing already."""
 
-    def on_disconnect(self, state: LifecycleState) -> TransitionCallbackReturn:
+    def on_disconnect(self, state: LifecycleState) -> CallbackReturn:
         """The data layer is about to be removed."""
 
-    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+    def on_cleanup(self, state: LifecycleState) -> CallbackReturn:
         """Give back what on_configure took."""
 
-    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+    def on_shutdown(self, state: LifecycleState) -> CallbackReturn:
         """The last call, from any state; endpoints are removed after it."""
 
-    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+    def on_error(self, state: LifecycleState) -> CallbackReturn:
         """A callback ended in ERROR: SUCCESS says the node is as new, FAILURE finalizes it."""

@@ -1,21 +1,127 @@
-"""Entry point of a process that hosts nodes for a supervisor, over the control channel.
+"""Entry point of a process that hosts nodes for a supervisor, and what it imports before it forks.
 
 Owns: the way in: read the HostSpec (control.py), then let hosting.py construct and run the nodes.
 Importing this module has no side effects and is cheap to fork from: `preload()` imports what a node
-needs, and nothing here calls rclpy.init before `serve`.
+needs, without a participant or a socket, as neither survives a fork; nothing here calls rclpy.init
+before `serve`.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import importlib
 import os
 import socket
+from collections.abc import Iterable
 from typing import NoReturn
 
 from lifecycle import codec
 from lifecycle.manifest import DiscoveryRange
-from lifecycle.node.host.control import HostChannel, HostSpec, give_up
-from lifecycle.node.host.preloading import needed_by, preload, preload_also
+from lifecycle.node.host.control import Command, HostChannel, HostSpec, Operation, give_up
+from lifecycle.plan import PlannedNode
+
+_PRELOADED = (
+    "rclpy.executors",
+    "rclpy.node",
+    "rclpy.lifecycle",
+    "rclpy.logging_service",
+    "lifecycle_msgs.msg",
+    "lifecycle_msgs.srv",
+    "rcl_interfaces.msg",
+    "rcl_interfaces.srv",
+    "std_msgs.msg",
+    "std_srvs.srv",
+    "lifecycle.node.host.hosting",
+)
+_MESSAGES = (
+    "rcl_interfaces/msg/ParameterEvent",
+    "lifecycle_msgs/msg/TransitionEvent",
+    "std_msgs/msg/String",
+)
+_SERVICES = (
+    "rcl_interfaces/srv/DescribeParameters",
+    "rcl_interfaces/srv/GetParameterTypes",
+    "rcl_interfaces/srv/GetParameters",
+    "rcl_interfaces/srv/ListParameters",
+    "rcl_interfaces/srv/SetParameters",
+    "rcl_interfaces/srv/SetParametersAtomically",
+    "type_description_interfaces/srv/GetTypeDescription",
+    "lifecycle_msgs/srv/ChangeState",
+    "lifecycle_msgs/srv/GetAvailableStates",
+    "lifecycle_msgs/srv/GetAvailableTransitions",
+    "lifecycle_msgs/srv/GetState",
+    "std_srvs/srv/Trigger",
+)
+"""What every node of ours has; their type supports are libraries that load on first use."""
+
+
+def preload() -> None:
+    """Import everything a host needs, for a process that will fork hosts.
+
+    Makes no participant and opens no socket, so a fork afterwards is safe. The only threads are
+    those of libraries that a child can do without: LTTng's two listeners, numpy's OpenBLAS pool.
+    Call `gc.freeze()` after it to keep the imported pages shared. What only some nodes need is
+    `preload_also`'s: numpy alone, which most messages with arrays import, takes 60 ms.
+    """
+    for name in _PRELOADED:
+        importlib.import_module(name)
+    from rclpy.type_support import check_is_valid_msg_type, check_is_valid_srv_type
+
+    from lifecycle.middleware import import_interface, load_libraries
+
+    for message in _MESSAGES:
+        check_is_valid_msg_type(import_interface(message))
+    for service in _SERVICES:
+        check_is_valid_srv_type(import_interface(service))
+    # The codec learns a type's shape at first use.
+    spec = HostSpec(
+        system="",
+        process="",
+        domain_id=0,
+        discovery_range=DiscoveryRange.SYSTEM_DEFAULT,
+        nodes=(),
+    )
+    codec.from_json(codec.to_json(spec), HostSpec)
+    command = Command(id=0, node="", operation=Operation.CONFIGURE)
+    codec.from_json(codec.to_json(command), Command)
+    # Reading which rcl is installed takes most of a host's `connect`.
+    load_libraries()
+
+
+def needed_by(nodes: Iterable[PlannedNode]) -> tuple[str, ...]:
+    """Return what `preload_also` is to import for some nodes: modules and interface types."""
+    names: dict[str, None] = {}
+    for node in nodes:
+        if node.events or node.membership:
+            names["lifecycle.graph.dds"] = names["lifecycle.graph.reporter"] = None
+        for endpoint in node.endpoints:
+            if "/action/" in endpoint.type:
+                names["rclpy.action"] = None
+            names[endpoint.type] = None
+    return tuple(names)
+
+
+def preload_also(names: Iterable[str]) -> None:
+    """Import modules and interface types, `sensor_msgs/msg/Image`, besides; as safe as `preload`.
+
+    What cannot be imported is left to the host that needs it, which reports it.
+    """
+    from rclpy.type_support import check_is_valid_msg_type, check_is_valid_srv_type
+
+    from lifecycle.middleware import import_interface
+
+    for name in names:
+        with contextlib.suppress(Exception):
+            if "/" not in name:
+                importlib.import_module(name)
+                continue
+            found = import_interface(name)
+            if "/msg/" in name:
+                check_is_valid_msg_type(found)
+            elif "/srv/" in name:
+                check_is_valid_srv_type(found)
+
 
 __all__ = ["main", "needed_by", "preload", "preload_also", "serve"]
 
@@ -40,8 +146,7 @@ def serve(control: socket.socket) -> NoReturn:
         if spec.discovery_range is not DiscoveryRange.SYSTEM_DEFAULT:
             os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = spec.discovery_range.value.upper()
         # Late: these need rclpy, which a process that is about to fork has, and we may not.
-        from lifecycle.node.host.constructing import process_context
-        from lifecycle.node.host.hosting import Host
+        from lifecycle.node.host.hosting import Host, process_context
 
         context = process_context(spec)
     except Exception as error:  # noqa: BLE001 - reported to the supervisor

@@ -1,10 +1,11 @@
-"""Run the nodes of a host process: carry out the supervisor's commands and report back to it.
+"""Construct and run the nodes of a host process: carry out the supervisor's commands, report back.
 
 Owns: the order of a host's life: construct every node, say "ready", obey, and at end of file shut
-down and leave; what is reported without a request; what each Operation of control.py does to the
-nodes, by the same state machines that the lifecycle services drive, and that each command is
-answered exactly once. It holds no state of its nodes. While the user's modules are imported there
-is nothing to shut down: then it ends at once, and silently.
+down and leave; which nodes of a process share a participant, and what a class must be to be hosted;
+what is reported without a request; what each Operation of control.py does to the nodes, by the same
+state machines that the lifecycle services drive, and that each command is answered exactly once. It
+holds no state of its nodes. While the user's modules are imported there is nothing to shut down:
+then it ends at once, and silently.
 """
 
 from __future__ import annotations
@@ -17,15 +18,23 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping
 from typing import NoReturn
 
+import rclpy
 from rclpy.context import Context
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 
 from lifecycle import codec
 from lifecycle.errors import LifecycleError
-from lifecycle.middleware import BusySign, leave_and_exit, send_again_soon
+from lifecycle.middleware import (
+    BusySign,
+    ParticipantSettings,
+    leave_and_exit,
+    participant_settings,
+    send_again_soon,
+)
 from lifecycle.node.author.node import LifecycleNode
+from lifecycle.node.author.spec import Construction, Mode, constructing, load_class, ros_arguments
 from lifecycle.node.connections.data_layer import NodeInterface
-from lifecycle.node.host.constructing import Participants, class_of, construct
 from lifecycle.node.host.control import (
     Command,
     Event,
@@ -36,8 +45,101 @@ from lifecycle.node.host.control import (
 )
 from lifecycle.node.host.loop import NodeLoop, Watchdog, on_signal
 from lifecycle.node.lifecycle.machine import CallbackOutcome
-from lifecycle.plan import PlannedNode
+from lifecycle.plan import PlannedNode, parameter_text
 from lifecycle.verify import NodeConfiguration
+
+
+def process_context(spec: HostSpec) -> Context:
+    """Initialise rclpy for a process and return its default context."""
+    arguments: list[str] = []
+    if len(spec.nodes) == 1 and not spec.nodes[0].managed:
+        # A plain node names itself; only process-wide arguments can give it name and parameters.
+        node = spec.nodes[0]
+        words = ros_arguments(node) or ["--ros-args"]
+        arguments = [*words, "-r", f"__node:={node.name}", "-r", f"__ns:={node.namespace}"]
+        for name, value in node.parameters:
+            arguments += ["-p", f"{name}:={parameter_text(value)}"]
+    rclpy.init(
+        args=arguments,
+        domain_id=spec.domain_id,
+        signal_handler_options=SignalHandlerOptions.NO,
+    )
+    return rclpy.get_default_context()
+
+
+class Participants:
+    """Contexts, and with them participants, for nodes that may share one and nodes that must not.
+
+    Nodes of equal transports, datagram size and connection URLs share. The first ones get the
+    process's default context, which is what code that names none uses.
+    """
+
+    def __init__(self, default: Context) -> None:
+        self._default = default
+        self._made: dict[ParticipantSettings, Context] = {}
+
+    @contextlib.contextmanager
+    def carrying(self, planned: PlannedNode) -> Iterator[Context]:
+        """Yield the context that `planned` is to be constructed on, inside the block.
+
+        Raises:
+            LifecycleError: its participant cannot be made as planned.
+        """
+        settings = ParticipantSettings.of(
+            planned.connections,
+            transports=planned.transports,
+            max_datagram_bytes=planned.max_datagram_bytes,
+        )
+        context = self._made.get(settings)
+        if context is not None:
+            yield context
+            return
+        context = self._default
+        if self._made:
+            context = Context()
+            context.init(args=[], domain_id=self._default.get_domain_id())
+        # The participant is made with the context's first node.
+        with participant_settings(context, settings):
+            yield context
+        self._made[settings] = context
+
+
+def class_of(planned: PlannedNode, *, alone: bool) -> type[Node]:
+    """Import the class of one planned node.
+
+    Args:
+        planned: names it.
+        alone: it is the only node of its process.
+
+    Raises:
+        LifecycleError: the class cannot be used as planned. What its module raises passes.
+    """
+    node_class = load_class(planned.run.python)
+    managed = issubclass(node_class, LifecycleNode)
+    if planned.managed and not managed:
+        raise LifecycleError(
+            f"cannot manage {planned.full_name}: {planned.run.python!r} is not a LifecycleNode",
+            hint="subclass lifecycle.LifecycleNode, or say `managed: false`",
+        )
+    if not managed and not alone:
+        raise LifecycleError(
+            f"cannot host {planned.full_name} beside other nodes: a plain node takes its name "
+            "and remaps from its process",
+            hint="give it a process of its own",
+        )
+    return node_class
+
+
+def construct(planned: PlannedNode, node_class: type[Node], context: Context, system: str) -> Node:
+    """Construct one planned node of a supervised system; what its constructor raises passes."""
+    # Of a plain node the supervisor drives no states.
+    supervisor = system if planned.managed else ""
+    construction = Construction(
+        spec=planned, mode=Mode.MANUAL, context=context, supervisor=supervisor
+    )
+    with constructing(construction):
+        return node_class()
+
 
 _ANSWERED_WITHOUT_CONFIGURATION = frozenset(
     {Operation.ACTIVATE, Operation.DEACTIVATE, Operation.CLEANUP, Operation.SHUTDOWN}

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 from typing import Protocol
 
 from lifecycle.manifest import DiscoveryRange, RunKind
-from lifecycle.node import machine_id
+from lifecycle.middleware import machine_id
 from lifecycle.plan import (
     Plan,
     PlanNotice,

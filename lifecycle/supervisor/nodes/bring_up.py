@@ -26,6 +26,7 @@ from lifecycle.supervisor.processes.control_channel import (
     ControlChannel,
     HostFailedError,
 )
+from lifecycle.supervisor.processes.patience import patient
 from lifecycle.supervisor.processes.process import ManagedProcess, Spawner
 from lifecycle.supervisor.run.events import ProcessState, Reach
 from lifecycle.supervisor.run.failure import StepFailedError, ended
@@ -405,7 +406,7 @@ class BringUp:
             waits.add(node.process.ended)  # type: ignore[arg-type]
         try:
             own_s = _OWN_S if rule is TRANSITION_FAILED else 0.0
-            await asyncio.wait(waits, timeout=limit_s + own_s, return_when=asyncio.FIRST_COMPLETED)
+            await patient(waits, limit_s + own_s, node.starved_s)
             if node.process is not None and node.process.ended.done() and not step.done():
                 # Its last output may still be on the way.
                 await asyncio.wait({step}, timeout=_WORDS_S)

@@ -24,6 +24,7 @@ from lifecycle.supervisor.gate.gate import Permit
 from lifecycle.supervisor.health.liveliness import SilenceMonitor
 from lifecycle.supervisor.nodes.driver import ACTIVE, INACTIVE, NodeCondition, NodeDriver
 from lifecycle.supervisor.processes.logs import LogDirectory
+from lifecycle.supervisor.processes.patience import own_starved_s
 from lifecycle.supervisor.processes.process import ManagedProcess
 from lifecycle.supervisor.run.events import (
     Emitter,
@@ -213,6 +214,10 @@ class NodeRun:
     def name(self) -> str:
         """Fully qualified node name."""
         return self.planned.full_name
+
+    def starved_s(self) -> float:
+        """Return how long its process has waited for a processor, and we to hear of it."""
+        return own_starved_s() if self.process is None else self.process.starved_s()
 
     def has_reached(self, condition: Condition) -> bool:
         """Whether the condition holds; for a node that is not managed all follow its start."""

@@ -27,6 +27,7 @@ from lifecycle.supervisor.processes.fork_server_main import (
     ForkRequest,
 )
 from lifecycle.supervisor.processes.orphans import children, descendants
+from lifecycle.supervisor.processes.patience import starved_s
 from lifecycle.supervisor.processes.process import ProcessExit, SpawnRequest
 from lifecycle.supervisor.run.events import Emitter, Notice
 
@@ -128,6 +129,10 @@ class ForkServerChild:
             # It has not reached setsid yet, or only its pidfd is left of it.
             with contextlib.suppress(ProcessLookupError):
                 signal.pidfd_send_signal(self._pidfd, number)
+
+    def starved_s(self) -> float:
+        """Return how long its threads, and those of its descendants, waited for a processor."""
+        return sum(map(starved_s, {self.pid, *descendants(self.pid)}))
 
     def _ended(self) -> None:
         """The pidfd is readable: it ended. The fork server reports how, unless it is gone."""
@@ -317,9 +322,12 @@ class ForkServer:
         if report.id == SERVES.id:
             self._serves.set()
         elif report.stopped is not None:
-            self._children[report.id].on_stop(report.stopped)
+            if report.id in self._children:
+                self._children[report.id].on_stop(report.stopped)
         elif report.status is not None:
-            self._children.pop(report.id).settle(report.status)
+            # On a loaded machine it may come later than we waited for it.
+            if report.id in self._children:
+                self._children.pop(report.id).settle(report.status)
         else:
             self._born(report, descriptors)
         return True

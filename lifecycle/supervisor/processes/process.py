@@ -19,6 +19,7 @@ from lifecycle.node import needed_by
 from lifecycle.plan import PlannedProcess
 from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.supervisor.processes.logs import LineReader, LogDirectory, ProcessLog
+from lifecycle.supervisor.processes.patience import own_starved_s
 from lifecycle.supervisor.run.events import Emitter, LogLine, ProcessChanged, ProcessState
 
 CHANGES: dict[ProcessState, frozenset[ProcessState]] = {
@@ -121,6 +122,12 @@ class Child(Protocol):
 
     def signal(self, number: int) -> None:
         """Send a signal to the process and everything in its group; harmless once it ended."""
+
+    def starved_s(self) -> float:
+        """Return the seconds that its threads have waited for a processor, added up.
+
+        Those of all its descendants count, too; 0 where the kernel does not say.
+        """
 
 
 class Spawner(Protocol):
@@ -257,6 +264,10 @@ class ManagedProcess:
             if control is not None:
                 control.close()
         self.child.exited.add_done_callback(self._exited)
+
+    def starved_s(self) -> float:
+        """Return how long it has waited for a processor, and we to hear of it; see patience.py."""
+        return own_starved_s() + (0.0 if self.child is None else self.child.starved_s())
 
     def running(self) -> None:
         """Note that the process does its work: its nodes are there."""

@@ -25,6 +25,15 @@ if TYPE_CHECKING:
     from lifecycle.programming import TargetOptions, Treatment
 
 
+TIMEOUT_S = 30.0
+"""For a bring-up, where nobody asks for another; as long again at most for what is in the way at
+the gate."""
+
+STARTING_S = 1.0
+"""More for each process to start: a node costs half a second of a processor, and two starting at
+once cost more than one after the other."""
+
+
 class Until(enum.Enum):
     """How far to bring a system up."""
 
@@ -40,7 +49,8 @@ class UpOptions:
     Attributes:
         stop_after_s: hold it so long, ≥ 0; None holds an active system until it is asked to end,
             and does not hold one that is only connected or verified.
-        timeout_s: for everything from the first start to the system being active, > 0.
+        timeout_s: for everything from the first start to the system being active, > 0; None for
+            one that follows the number of processes, see `bring_up_s` and `gate_s`.
         strict: what cannot be verified keeps the gate closed.
         machine: run only this machine's nodes; empty runs all whose address is local.
         keep_going: report a dead process, but do not take the others down.
@@ -50,12 +60,25 @@ class UpOptions:
 
     until: Until = Until.ACTIVE
     stop_after_s: float | None = None
-    timeout_s: float = 30.0
+    timeout_s: float | None = None
     strict: bool = False
     machine: str = ""
     keep_going: bool = False
     program: tuple[TargetOptions, ...] = ()
     treatment: Treatment | None = None
+
+    def bring_up_s(self, processes: int) -> float:
+        """Return the seconds for all of a bring-up that starts so many processes."""
+        return TIMEOUT_S + processes * STARTING_S if self.timeout_s is None else self.timeout_s
+
+    def gate_s(self, left_s: float) -> float:
+        """Return the seconds that a connected system has until it is active.
+
+        Args:
+            left_s: of the bring-up. Only with a timeout that was asked for may they all be used:
+                what contradicts a large system is not to be waited for longer than in a small one.
+        """
+        return min(left_s, TIMEOUT_S) if self.timeout_s is None else left_s
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

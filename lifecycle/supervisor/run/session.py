@@ -215,7 +215,7 @@ class Session:
             following=self._following,
             spawner=fork_server,
             hurry=self._hurry,
-            timeout_s=options.timeout_s,
+            timeout_s=options.bring_up_s(len(system.processes)),
         )
         self._revisions = Revisions(system, options)
         self._holding = Holding(
@@ -400,14 +400,16 @@ class Session:
 
     async def _phases(self) -> _RunEnd:
         loop = asyncio.get_running_loop()
-        deadline = loop.time() + self._options.timeout_s
+        timeout_s = self._options.bring_up_s(len(self._system.processes))
+        deadline = loop.time() + timeout_s
         async with self._following():
-            await self._process_monitor.during(self._bring_up.connect(self._options.timeout_s))
+            await self._process_monitor.during(self._bring_up.connect(timeout_s))
         self._furthest = "connected"
         self._emit(SystemReached(reached="connected", elapsed_s=self._emit.elapsed_s))
         if self._options.until is Until.CONNECTED:
             await self._process_monitor.during(self._judge.until_clear(Stage.CONNECTED, _GLANCE_S))
             return await self._hold(Stage.CONNECTED)
+        deadline = loop.time() + self._options.gate_s(deadline - loop.time())
         permit = await self._gate_sequence.verify(deadline - loop.time())
         self._furthest = "verified"
         if self._options.until is Until.VERIFIED:

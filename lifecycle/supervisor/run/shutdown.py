@@ -16,6 +16,7 @@ from lifecycle.node import Operation
 from lifecycle.supervisor.connections.desired_state import Step
 from lifecycle.supervisor.nodes.driver import ACTIVE, FINALIZED, INACTIVE
 from lifecycle.supervisor.nodes.system import NodeRun, System
+from lifecycle.supervisor.processes.patience import patient
 from lifecycle.supervisor.processes.process import (
     COMMAND_ESCALATION,
     ESCALATION,
@@ -139,9 +140,7 @@ class TakeDown:
         request = asyncio.ensure_future(doing)
         hurry = asyncio.ensure_future(self._hurry.wait())
         try:
-            await asyncio.wait(
-                {request, hurry}, timeout=limit_s, return_when=asyncio.FIRST_COMPLETED
-            )
+            await patient({request, hurry}, limit_s, node.starved_s)
             if not request.done():
                 node.stuck = True
                 if not self._hurry.is_set():

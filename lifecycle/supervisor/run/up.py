@@ -317,7 +317,7 @@ def _observer_participant(plan: Plan, options: UpOptions, emit: Emitter) -> Obse
     wires = layer.authority is Authority.SUPERVISOR
     planned = connections = observer_connections(plan, options.machine)
     for number in range(OBSERVER_TRIES):
-        with _ends_within(options.timeout_s + LEAVE_S, ExitCode.BRING_UP_FAILED):
+        with _ends_within(options.bring_up_s(0) + LEAVE_S, ExitCode.BRING_UP_FAILED):
             observer_participant = ObserverParticipant.open(
                 plan.domain_id,
                 connections,

@@ -1,15 +1,11 @@
-"""The registry of rules: one module per family, each with its `RULES` and its `check`."""
+"""The registry of rules: families of them, each a tuple of rules and the check that finds them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
 from lifecycle.verify.rules import (
-    clients,
-    configuration,
     connections,
-    definitions,
-    dscp,
     endpoints,
     flows,
     matching,
@@ -19,7 +15,6 @@ from lifecycle.verify.rules import (
     qos,
     run,
     state,
-    transport,
 )
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.verdict import Finding
@@ -27,30 +22,28 @@ from lifecycle.verify.view import View
 
 __all__ = ["CHECKS", "RULES", "About", "Heals", "Rule", "rule"]
 
-_FAMILIES = (
-    nodes,
-    endpoints,
-    definitions,
-    outsiders,
-    qos,
-    matching,
-    clients,
-    state,
-    configuration,
-    parameters,
-    connections,
-    flows,
-    transport,
-    dscp,
-    run,
+_FAMILIES: tuple[tuple[tuple[Rule, ...], Callable[[View], Iterator[Finding]]], ...] = (
+    (nodes.RULES, nodes.check),
+    (endpoints.RULES, endpoints.check),
+    (endpoints.DEFINITION_RULES, endpoints.check_definitions),
+    (outsiders.RULES, outsiders.check),
+    (qos.RULES, qos.check),
+    (matching.RULES, matching.check),
+    (matching.CLIENT_RULES, matching.check_clients),
+    (state.RULES, state.check),
+    (state.REPORT_RULES, state.check_reports),
+    (parameters.RULES, parameters.check),
+    (connections.RULES, connections.check),
+    (flows.RULES, flows.check),
+    (flows.TRANSPORT_RULES, flows.check_transport),
+    (flows.DSCP_RULES, flows.check_dscp),
+    (run.RULES, run.check),
 )
 
-RULES: tuple[Rule, ...] = tuple(each for family in _FAMILIES for each in family.RULES)
+RULES: tuple[Rule, ...] = tuple(rule for rules, _ in _FAMILIES for rule in rules)
 """Every rule, in the order in which findings are reported."""
 
-CHECKS: tuple[Callable[[View], Iterator[Finding]], ...] = tuple(
-    family.check for family in _FAMILIES
-)
+CHECKS: tuple[Callable[[View], Iterator[Finding]], ...] = tuple(check for _, check in _FAMILIES)
 """Every family's check; each yields its findings in a fixed order."""
 
 _BY_ID = {each.id: each for each in RULES}

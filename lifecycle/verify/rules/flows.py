@@ -1,28 +1,42 @@
-"""Rules about the uniqueness of network flows. Pure.
+"""Rules about network flows: uniqueness, the transport that carries them, and DSCP marking. Pure.
 
 What is strictly required, or demanded by a link, must be proven: what cannot be is violated. An
 optionally required endpoint never violates: the requirement is met by trying. `system_default`
 demands nothing either; the flow report has the result.
+
+A network treats only what it sees: a flow that is passed on in shared memory, or inside a process,
+meets no rule of it. NFEs list what an endpoint could use; which one is used is decided in
+`verify.transport`.
+
+The DSCP judged is the one read back from the sender sockets (getsockopt), never the NFE's `dscp`
+field, which Fast DDS always leaves 0. It proves what this host sends, not what routers keep.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-from lifecycle.manifest import EndpointKind, Quantity, UniqueHow
+from lifecycle.manifest import EndpointKind, FlowTransport, Quantity, UniqueHow
 from lifecycle.network import (
+    NETWORK_MEDIA,
     FlowUniqueness,
     Medium,
     NetworkFlowEndpoint,
     TransportProtocol,
     UniqueRequirement,
+    describe,
     meets,
 )
 from lifecycle.verify.rules.catalogue import Heals, Rule
-from lifecycle.verify.rules.configuration import MISSING_REPORT
-from lifecycle.verify.uniqueness import Uniqueness
+from lifecycle.verify.rules.state import MISSING_REPORT
+from lifecycle.verify.transport import (
+    NONE,
+    UNKNOWN,
+    Uniqueness,
+    effective_transport,
+)
 from lifecycle.verify.verdict import Finding, Outcome
-from lifecycle.verify.view import Actual, FlowView, View
+from lifecycle.verify.view import Actual, FlowView, View, connection_of
 
 NOT_UNIQUE = Rule(
     id="flow.not-unique",
@@ -215,3 +229,142 @@ def _spell(nfe: NetworkFlowEndpoint) -> str:
     address = nfe.internet_address
     host = f"[{address}]" if ":" in address else address
     return f"{nfe.transport_protocol.value} {host}:{nfe.transport_port}"
+
+
+WRONG_TRANSPORT = Rule(
+    id="flow.wrong-transport",
+    meaning="a flow that needs the network is carried by something else",
+    outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
+    fix="run both ends in our host and in processes of their own, or drop `transport: network`",
+    concerns_flow=True,
+)
+WRONG_MEDIUM = Rule(
+    id="flow.wrong-medium",
+    meaning="a flow is carried by something else than was negotiated",
+    outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
+    fix="compare the connections of both ends with `lifecycle plan`; see what each process was"
+    " given by its environment",
+    concerns_flow=True,
+    heals=Heals.WITH_TIME,
+    if_unheard=True,
+)
+TRANSPORT_RULES = (WRONG_TRANSPORT, WRONG_MEDIUM)
+
+_WORDS = {
+    **{each.value: each.meaning for each in Medium},
+    NONE: "no transport that both have",
+    UNKNOWN: "not known",
+}
+
+
+def check_transport(view: View) -> Iterator[Finding]:
+    """Judge every flow that must be carried by something."""
+    for flow in view.flows:
+        ends = (*flow.publishers, *flow.subscriptions)
+        if not flow.publishers or not flow.subscriptions:
+            continue
+        if any(end.observed is None and end.report is None for end in ends):
+            continue  # it is missing, and that is said
+        used = effective_transport(view, flow)
+        demanding = [end for end in ends if end.planned.transport is FlowTransport.NETWORK]
+        if demanding and used not in NETWORK_MEDIA:
+            yield _not_by_network(flow, demanding[0], used)
+        elif flow.planned.medium not in ("", used) and _is_decided(view, flow):
+            yield _otherwise(flow, used)
+
+
+def _is_decided(view: View, flow: FlowView) -> bool:
+    """Return whether the medium was asked for; else the plan only has what is expected."""
+    if view.plan.data_layer.at is not None:
+        return True
+    return any(
+        end.planned.transport not in (FlowTransport.ANY, FlowTransport.NETWORK)
+        or connection_of(end.node, end.planned)
+        or end.node.connections.urls
+        for end in (*flow.publishers, *flow.subscriptions)
+    )
+
+
+def _not_by_network(flow: FlowView, demanding: Actual, used: str) -> Finding:
+    unknown = used == UNKNOWN
+    why = "nobody tells what carries it" if unknown else f"what carries it is {_WORDS[used]}"
+    return WRONG_TRANSPORT.finding(
+        Outcome.UNVERIFIABLE if unknown else Outcome.VIOLATED,
+        subject=flow.subject,
+        ends=flow.ends,
+        expected="an IP transport",
+        observed=_WORDS[used],
+        message=f"cannot {'verify' if unknown else 'accept'} the flow {flow.publisher} →"
+        f" {flow.subscription} on {flow.planned.topic}: it needs the network, and {why}",
+        at=demanding.planned.at,
+    )
+
+
+def _otherwise(flow: FlowView, used: str) -> Finding:
+    unknown = used == UNKNOWN
+    planned = _WORDS.get(flow.planned.medium, flow.planned.medium)
+    word = _WORDS.get(used, used)
+    return WRONG_MEDIUM.finding(
+        Outcome.UNVERIFIABLE if unknown else Outcome.VIOLATED,
+        subject=flow.subject,
+        ends=flow.ends,
+        expected=planned,
+        observed=word,
+        message=f"cannot {'verify' if unknown else 'accept'} what carries {flow.publisher} →"
+        f" {flow.subscription} on {flow.planned.topic}: it must be {planned}, and"
+        f" {'nobody tells what it is' if unknown else f'it is {word}'}",
+        at=flow.at,
+    )
+
+
+DSCP_NOT_APPLIED = Rule(
+    id="flow.dscp-not-applied",
+    meaning="the sockets that an endpoint sends from do not carry the declared DSCP",
+    outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
+    fix="see the node's log for the refused socket option; `enforce: false` makes it a warning",
+    concerns_flow=True,
+    may_block=False,
+)
+DSCP_UNVERIFIABLE = Rule(
+    id="flow.dscp-unverifiable",
+    meaning="nobody read back the DSCP of an endpoint that declares one",
+    outcomes=(Outcome.UNVERIFIABLE,),
+    fix="only nodes in our host mark and read back; mark a foreign node's flow in the network",
+    concerns_flow=True,
+)
+DSCP_RULES = (DSCP_NOT_APPLIED, DSCP_UNVERIFIABLE)
+
+
+def check_dscp(view: View) -> Iterator[Finding]:
+    """Judge every endpoint that declares a DSCP and is there.
+
+    A subscription's is that of its acknowledgements.
+    """
+    for actual in view.actual:
+        planned, node, report = actual.planned, actual.node, actual.report
+        wanted = planned.dscp
+        if wanted is None:
+            continue
+        if actual.observed is None and report is None:
+            continue
+        where = f"the {planned.kind.noun} of {planned.resolved} in {node.full_name}"
+        read = report.dscp if report else None
+        if read is None:
+            yield DSCP_UNVERIFIABLE.on_endpoint(
+                Outcome.UNVERIFIABLE,
+                actual,
+                expected=describe(wanted),
+                observed="not read back",
+                message=f"cannot verify the DSCP of {where}: nobody read it back",
+            )
+        elif read != wanted:
+            waived = "" if planned.enforce_dscp else "; the manifest does not enforce it"
+            yield DSCP_NOT_APPLIED.on_endpoint(
+                Outcome.VIOLATED if planned.enforce_dscp else Outcome.UNVERIFIABLE,
+                actual,
+                expected=describe(wanted),
+                observed=describe(read),
+                message=f"cannot accept {where}: its sockets carry {describe(read)}"
+                f" and not {describe(wanted)}{waived}",
+                hint="" if planned.enforce_dscp else "see the node's log for the refused option",
+            )

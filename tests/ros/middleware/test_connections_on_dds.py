@@ -30,7 +30,7 @@ from lifecycle.middleware import (
     get_network_flow_endpoints,
     has_shared_memory,
 )
-from lifecycle.middleware.sockets.url_check import OpenSocket, open_sockets
+from lifecycle.middleware.fastdds.url_check import OpenSocket, open_sockets
 from lifecycle.network.connection_url import ConnectionUrl
 from lifecycle.plan.model import (
     ParticipantConnections,

@@ -12,7 +12,7 @@ import pytest
 from free_ports import free_ports
 
 from lifecycle.middleware import GraphObserver
-from lifecycle.middleware.sockets.url_check import open_sockets
+from lifecycle.middleware.fastdds.url_check import open_sockets
 from lifecycle.plan.model import ParticipantConnections
 
 WaitUntil = Callable[..., None]

@@ -318,7 +318,7 @@ def test_a_participant_without_a_dscp_sends_none(domain_id: int, wait_until: Wai
 
 
 def test_a_mark_that_was_lost_is_set_again(domain_id: int) -> None:
-    from lifecycle.middleware.sockets.dscp import set_dscp
+    from lifecycle.middleware.fastdds.dscp import set_dscp
 
     with FlowParticipant("_flow", "/", domain_id, dscp=46) as participant:
         participant.create_publisher(String, "/flow", QOS)
@@ -330,7 +330,7 @@ def test_a_mark_that_was_lost_is_set_again(domain_id: int) -> None:
 
 
 def test_one_socket_without_the_mark_is_what_is_read(domain_id: int) -> None:
-    from lifecycle.middleware.sockets.dscp import get_dscps, set_dscp
+    from lifecycle.middleware.fastdds.dscp import get_dscps, set_dscp
 
     with FlowParticipant("_flow", "/", domain_id, dscp=46, transports=BOTH) as participant:
         nfes = participant.network_flow_endpoints
@@ -346,7 +346,7 @@ def test_one_socket_without_the_mark_is_what_is_read(domain_id: int) -> None:
 def test_a_mark_that_was_lost_is_set_again_before_a_subscription_is_handed_out(
     domain_id: int,
 ) -> None:
-    from lifecycle.middleware.sockets.dscp import set_dscp
+    from lifecycle.middleware.fastdds.dscp import set_dscp
 
     with FlowParticipant("_flow", "/", domain_id, dscp=46) as participant:
         set_dscp(participant.network_flow_endpoints, 0)
@@ -360,7 +360,7 @@ def test_sockets_that_came_later_are_marked_before_a_publisher_is_handed_out(
     with FlowParticipant("_flow", "/", domain_id, dscp=46) as participant:
         # As if the participant had been made before one of its sockets was there.
         later = participant.network_flow_endpoints
-        from lifecycle.middleware.sockets.dscp import get_dscps, set_dscp
+        from lifecycle.middleware.fastdds.dscp import get_dscps, set_dscp
 
         set_dscp(later[-1:], 0)
         participant._nfes = later[:-1]

@@ -195,7 +195,7 @@ def test_a_node_that_cannot_be_described_says_so_and_lives(
     def broken() -> str:
         raise OSError("no such file")
 
-    monkeypatch.setattr("lifecycle.node.reporting.configuration.machine_id", broken)
+    monkeypatch.setattr("lifecycle.node.configuration.machine_id", broken)
     build(It, planned("it"))
     answer = driver.call(Trigger, "/it/get_configuration", Trigger.Request())
     assert (answer.success, answer.message) == (

@@ -295,9 +295,9 @@ def _found(verdict: Event, rule: str, subject: str = "") -> bool:
 
 
 @contextlib.contextmanager
-def up(manifest: Path, *options: str, runtime: Path) -> Iterator[Up]:
+def up(manifest: Path, *options: str, runtime: Path, through: Sequence[str] = ()) -> Iterator[Up]:
     """Start `lifecycle up`, and end it whatever happens."""
-    running = Up(manifest, *options, runtime=runtime)
+    running = Up(manifest, *options, runtime=runtime, through=through)
     try:
         yield running
     finally:

@@ -61,6 +61,25 @@ def test_a_healthy_system_is_connected_verified_activated_held_and_taken_down(
         assert (logs / "listener.log").read_text() == "heard hello\n"
 
 
+def test_nodes_that_keep_each_other_from_the_processor_are_not_too_late(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    node = {"run": {"python": "tests.ros.supervisor.systems:Quiet"}, "timeouts": {"start_s": 0.5}}
+    document = {
+        "manifest_version": 1,
+        "system": "crowd",
+        "discovery": {"domain_id": fresh_domain, "range": "localhost"},
+        "nodes": {f"node_{index}": node for index in range(12)},
+    }
+    manifest = tmp_path / "crowd.lifecycle.yaml"
+    manifest.write_text(json.dumps(document))
+    one_processor = ("taskset", "--cpu-list", str(min(os.sched_getaffinity(0))))
+    options = ("--until", "connected")
+    with up(manifest, *options, runtime=tmp_path, through=one_processor) as run:
+        assert run.finish() == ExitCode.OK
+        run.assert_nothing_left()
+
+
 @pytest.mark.parametrize("until", ["connected", "verified"])
 def test_until_stops_short_of_activating(tmp_path: Path, fresh_domain: int, until: str) -> None:
     with up(pair(tmp_path, fresh_domain), "--until", until, runtime=tmp_path) as run:

@@ -15,7 +15,7 @@ from lifecycle.cli import cli
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.export.sros2 import OVERRIDE, PLANS_TOPIC, Enclave, documents, enclaves_of
 from lifecycle.manifest import load
-from lifecycle.middleware.discovery import plan_notices
+from lifecycle.middleware.discovery import liveliness
 from lifecycle.middleware.discovery.liveliness import machine_topic, node_topic
 from lifecycle.plan import Plan, build_plan
 
@@ -250,7 +250,7 @@ def test_names_of_topics_are_those_that_the_middleware_uses(tmp_path: Path) -> N
     here = files["enclaves/my_robot/supervisor_here/permissions.xml"]
     mine, others = (f"rt{machine_topic('my-robot', each)}" for each in ("here", "there"))
 
-    assert PLANS_TOPIC == plan_notices.TOPIC
+    assert PLANS_TOPIC == liveliness.PLANS_TOPIC
     assert mine in dds(here, "publish")
     assert others in dds(here, "subscribe")
     assert f"rt{node_topic('/dock')}" in dds(here, "subscribe")

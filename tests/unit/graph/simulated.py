@@ -16,7 +16,7 @@ from lifecycle.graph import (
 )
 from lifecycle.graph.state import Fetch
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.node.reporting.configuration import checksum
+from lifecycle.node.configuration import checksum
 from lifecycle.verify.observation import (
     ConnectionReport,
     EndpointReport,

@@ -10,8 +10,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lifecycle.manifest.installed_types import search_prefixes
-from lifecycle.manifest.message_size import Field, IdlError, bounded_size, parse_struct
+from lifecycle.manifest.installed_types import (
+    Field,
+    IdlError,
+    bounded_size,
+    parse_struct,
+    search_prefixes,
+)
 
 INSTALLED = search_prefixes({})
 
@@ -159,9 +164,9 @@ def test_scalars_take_what_a_c_compiler_gives_them(words: list[str]) -> None:
 
 
 def layout(words: list[str]) -> int:
-    from lifecycle.manifest import message_size
+    from lifecycle.manifest import installed_types
 
-    found = message_size._Layout()
+    found = installed_types._Layout()
     for word in words:
-        message_size._add_field(Field(type=word), found, [], 0)
+        installed_types._add_field(Field(type=word), found, [], 0)
     return found.offset

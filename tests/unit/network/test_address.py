@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from lifecycle.network.address import canonical, is_multicast, is_wildcard, may_be_same
+from lifecycle.network.nfe import canonical, is_multicast, is_wildcard, may_be_same
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import dataclasses
 import pytest
 
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.node.reporting.configuration import checksum
+from lifecycle.node.configuration import checksum
 from lifecycle.verify.observation import (
     ConnectionReport,
     EndpointReport,

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from lifecycle.node.configuration import ConfigurationChanges
 from lifecycle.node.connections.connection_status import (
     ConnectionEvent,
     ConnectionEventKind,
     ConnectionEvents,
 )
-from lifecycle.node.reporting.configuration import ConfigurationChanges
 
 NET = ConnectionEvent(kind=ConnectionEventKind.CONNECTION_ESTABLISHED, connection="net")
 LOST = ConnectionEvent(kind=ConnectionEventKind.CONNECTION_LOST, connection="net")

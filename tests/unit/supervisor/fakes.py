@@ -164,6 +164,10 @@ class FakeProcess:
         if number >= self._spawner.ends_at.get(self._name, 0) or number == signal.SIGKILL:
             self.end(ProcessExit(signal=number))
 
+    def starved_s(self) -> float:
+        share = self._spawner.starves.get(self._name, 0.0)
+        return share * asyncio.get_running_loop().time()
+
     def end(self, how: ProcessExit) -> None:
         if not self.exited.done():
             if self._task is not None:
@@ -268,6 +272,7 @@ class FakeSpawner:
         ways: what goes wrong: such a line → "hang", "die", or the error to answer with.
         takes_s: how long such a line takes.
         unhosted: by process, nodes that cannot be constructed and why, reported 0.1 s apart.
+        starves: by process, for how much of the time its threads wait for a processor, added up.
         ends_at: processes that do not end by themselves, and the signal that ends them.
         processes: by name.
         interfaces: what a node reports, by full name; steps of wiring change it.
@@ -281,6 +286,7 @@ class FakeSpawner:
         self.ways: dict[str, str] = {}
         self.takes_s: dict[str, float] = {}
         self.unhosted: dict[str, dict[str, str]] = {}
+        self.starves: dict[str, float] = {}
         self.ends_at: dict[str, int] = {}
         self.processes: dict[str, FakeProcess] = {}
         self.interfaces: dict[str, NodeConfiguration] = {}

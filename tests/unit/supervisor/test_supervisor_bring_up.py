@@ -232,6 +232,40 @@ def test_a_node_that_hangs_is_given_up_at_its_own_deadline(tmp_path: Path) -> No
     run(main())
 
 
+@pytest.mark.parametrize("step", ["a start", "/a configure"])
+def test_time_that_a_process_waits_for_a_processor_is_not_its_own(
+    tmp_path: Path, step: str
+) -> None:
+    async def main() -> None:
+        timeouts = Timeouts(start_s=2.0, configure_s=2.0)
+        world = _world(tmp_path, planned_node("a", timeouts=timeouts), planned_node("b"))
+        world.spawner.takes_s[step] = 15.0
+        world.spawner.starves["a"] = 3.0  # three of its threads, all the time
+        await world.bring_up.connect(LIMIT_S)
+        assert world.system.nodes["a"].reach is Reach.CONNECTED
+        await _down(world)
+
+    run(main())
+
+
+@pytest.mark.parametrize(("starves", "after_s"), [(0.0, 2.0), (0.5, 4.0), (3.0, 20.0)])
+def test_a_start_that_hangs_is_noticed_on_a_loaded_machine_too(
+    tmp_path: Path, starves: float, after_s: float
+) -> None:
+    async def main() -> None:
+        world = _world(tmp_path, planned_node("a", timeouts=Timeouts(start_s=2.0)))
+        world.spawner.ways["a start"] = "hang"
+        world.spawner.starves["a"] = starves
+        began = asyncio.get_running_loop().time()
+        with pytest.raises(StepFailedError, match="was still starting after 2 s"):
+            await world.bring_up.connect(LIMIT_S)
+        took_s = asyncio.get_running_loop().time() - began
+        assert took_s == pytest.approx(after_s + ALSO_S, abs=1.0)
+        await _down(world)
+
+    run(main())
+
+
 def test_the_whole_bring_up_has_a_deadline_that_names_what_everybody_was_doing(
     tmp_path: Path,
 ) -> None:

@@ -20,7 +20,7 @@ from lifecycle.verify import (
     Stage,
     verify,
 )
-from lifecycle.verify.rules.definitions import differ
+from lifecycle.verify.rules.endpoints import differ
 from lifecycle.verify.rules.nodes import UNDECLARED_NODE
 from tests.builders import (
     endpoint,

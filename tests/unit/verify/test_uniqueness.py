@@ -9,7 +9,7 @@ from lifecycle.network.nfe import InternetProtocol, NetworkFlowEndpoint, Transpo
 from lifecycle.plan import Plan
 from lifecycle.verify import Identity, Stage
 from lifecycle.verify.matcher import lay_out
-from lifecycle.verify.uniqueness import Uniqueness
+from lifecycle.verify.transport import Uniqueness
 from lifecycle.verify.view import Actual
 from tests.builders import endpoint, node, planned, publisher, subscription
 from tests.unit.verify.edits import (

@@ -40,7 +40,7 @@ from lifecycle.verify import (
     Stage,
     verify,
 )
-from lifecycle.verify.rules.definitions import differ
+from lifecycle.verify.rules.endpoints import differ
 from tests.builders import (
     IMAGE,
     at,

@@ -2,7 +2,7 @@
 
 Owns: the call into rmw that rclpy lacks. An NFE list says which network resources an endpoint may
 use, not which transport carried a message; `dscp` and `flow_label` in it are always 0 with
-Fast DDS (see `lifecycle.middleware.sockets.dscp` for the value the kernel really uses).
+Fast DDS (see `lifecycle.middleware.fastdds.dscp` for the value the kernel really uses).
 """
 
 from __future__ import annotations

@@ -35,6 +35,7 @@ from lifecycle.middleware import (
     get_network_flow_endpoints,
     guid_of,
     is_server_matched,
+    machine_id,
     matched_with,
 )
 from lifecycle.network import InternetProtocol, Medium, NetworkFlowEndpoint, TransportProtocol
@@ -45,7 +46,6 @@ from lifecycle.node.connections.data_layer import NodeDataLayer
 from lifecycle.node.endpoints.making import CLIENTS, wire_name
 from lifecycle.node.endpoints.mapping import Mapping, count_peers
 from lifecycle.node.lifecycle.machine import NodeState
-from lifecycle.node.reporting.machine_id import machine_id
 from lifecycle.plan import PARADIGMS, SERIALIZATIONS, PlannedNode
 from lifecycle.verify import ConnectionReport, EndpointReport, Identity, NodeConfiguration
 

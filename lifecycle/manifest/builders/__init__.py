@@ -1,1 +1,0 @@
-"""Validated documents to frozen types."""

@@ -1,1 +1,0 @@
-"""The sockets under participants: network flow endpoints, DSCP, what URLs opened."""

@@ -1,1 +1,0 @@
-"""What a node reports about itself: configuration, graph membership, machine id."""
