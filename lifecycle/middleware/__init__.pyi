@@ -31,7 +31,6 @@ from .process.shared_memory import leftovers as leftovers
 from .process.shared_memory import segments_of as segments_of
 from .process.shared_memory import sweep as sweep
 from .process.teardown import leave_and_exit as leave_and_exit
-from .rcl.abi import load_rcl as load_rcl
 from .rcl.executor import NodeExecutor as NodeExecutor
 from .rcl.graph import GraphObserver as GraphObserver
 from .rcl.graph_changes import ServerWatch as ServerWatch
@@ -40,6 +39,7 @@ from .rcl.graph_queries import EndpointInfo as EndpointInfo
 from .rcl.graph_queries import endpoints_of as endpoints_of
 from .rcl.hidden_node import hidden_nodes as hidden_nodes
 from .rcl.matched_peers import guid_of as guid_of
+from .rcl.matched_peers import load_libraries as load_libraries
 from .rcl.matched_peers import matched_with as matched_with
 from .rcl.qos import UnknownInterfaceError as UnknownInterfaceError
 from .rcl.qos import from_rclpy as from_rclpy

@@ -33,6 +33,7 @@ from lifecycle.middleware.rcl.graph_queries import (
     EndpointInfo,
     endpoints_of,
     endpoints_of_node,
+    service_names,
     topic_endpoints,
 )
 from lifecycle.middleware.rcl.hidden_node import quiet_node
@@ -299,6 +300,14 @@ class GraphObserver:
     def offers(self, node: str, service: str) -> bool:
         """Return whether discovery shows `service` (a fully qualified name) on `node`."""
         return service in self.services_of(node)
+
+    def service_names(self) -> frozenset[str]:
+        """Return the names of all services that have a server or a client, wherever that is.
+
+        Raises:
+            MiddlewareError: the graph cannot be read.
+        """
+        return service_names(self.node)
 
     def services_of(self, node: str) -> frozenset[str]:
         """Return the fully qualified names of the services that discovery shows on `node`."""

@@ -19,7 +19,7 @@ says of each whether it succeeded and why not:
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import TYPE_CHECKING, Any
 
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue, SetParametersResult
@@ -404,17 +404,24 @@ class RemoteInterface:
         log: Callable[[str], None],
         group: CallbackGroup,
     ) -> None:
+        self._node = node
         self._interface = interface
         self._log = log
-        for name, act in (
-            ("connect_to", self._connect_to),
-            ("map_to", self._map_to),
-            ("disconnect", self._disconnect),
-            ("remap", self._remap),
-            ("alias", self._alias),
-        ):
+        self._group = group
+        self._left = {
+            "connect_to": self._connect_to,
+            "map_to": self._map_to,
+            "disconnect": self._disconnect,
+            "remap": self._remap,
+            "alias": self._alias,
+        }
+
+    def serve(self, *, but: Collection[str] = ()) -> None:
+        """Offer the services that are not there yet, without those named; again is harmless."""
+        for name in [each for each in self._left if each not in but]:
+            act = self._served(self._left.pop(name))
             Node.create_service(
-                node, SetParameters, f"~/{name}", self._served(act), callback_group=group
+                self._node, SetParameters, f"~/{name}", act, callback_group=self._group
             )
 
     def _served(self, act: Callable[[Parameter], Any]) -> Callable[[Any, Any], Any]:

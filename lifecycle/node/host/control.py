@@ -49,10 +49,18 @@ class Operation(enum.Enum):
     CONNECT_TO = "connect_to"  # connection, urls
     MAP_TO = "map_to"  # endpoint, connection
     DISCONNECT_FROM = "disconnect_from"  # connection
+    # Make the services of the node interface that are made when a client asks: INTERFACE_ON_DEMAND.
+    SERVE_INTERFACE = "serve_interface"
     # Of the whole process: a link is down, and retransmit soon what was not acknowledged; and
     # announce to the graph anew which nodes are here.
     SEND_AGAIN_SOON = "send_again_soon"
     TELL_NAMES = "tell_names"
+
+
+INTERFACE_ON_DEMAND = ("alias", "connect_to", "disconnect", "remap")
+"""Services that a supervised node offers once a client of one of them is in the graph: each costs
+0.24 MiB, and all others the traffic to discover it. Its supervisor sees such clients, and has
+another way to do the same. `map_to` is always there: with it a node is known to be one of ours."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,7 +108,7 @@ class Event:
         connected: the data layer is made.
         error: the reason, with the exception's last line; the traceback is in the log.
         configuration: for "configuration", and replies that carry it (all but ACTIVATE,
-            DEACTIVATE, CLEANUP and SHUTDOWN).
+            DEACTIVATE, CLEANUP, SHUTDOWN and SERVE_INTERFACE).
     """
 
     kind: str

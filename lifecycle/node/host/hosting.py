@@ -142,7 +142,13 @@ def construct(planned: PlannedNode, node_class: type[Node], context: Context, sy
 
 
 _ANSWERED_WITHOUT_CONFIGURATION = frozenset(
-    {Operation.ACTIVATE, Operation.DEACTIVATE, Operation.CLEANUP, Operation.SHUTDOWN}
+    {
+        Operation.ACTIVATE,
+        Operation.DEACTIVATE,
+        Operation.CLEANUP,
+        Operation.SHUTDOWN,
+        Operation.SERVE_INTERFACE,
+    }
 )
 
 
@@ -182,6 +188,9 @@ class HostCommands:
             return self._reply(command, ok=True)
         if command.operation in self._of_process:
             self._of_process[command.operation]()
+            return self._reply(command, ok=True)
+        if command.operation is Operation.SERVE_INTERFACE:
+            node.lifecycle.serve_interface()
             return self._reply(command, ok=True)
         if command.operation in _NODE_INTERFACE:
             await _NODE_INTERFACE[command.operation](node.lifecycle.interface, command)

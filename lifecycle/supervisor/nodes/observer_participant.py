@@ -96,6 +96,10 @@ class ObserverParticipant:
         """Wait until something changed."""
         await self._graph.wait_change()
 
+    def service_names(self) -> frozenset[str]:
+        """Return the names of all services that have a server or a client."""
+        return self._graph.discovery.service_names()
+
     def put_configuration(self, configuration: NodeConfiguration) -> None:
         """Give what a node reported over its control channel."""
         self._graph.state.put_configuration(configuration)

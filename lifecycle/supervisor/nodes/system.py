@@ -9,6 +9,7 @@ Must not import rclpy.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import dataclasses
 import functools
 from collections.abc import Collection, Iterable
@@ -17,12 +18,13 @@ from typing import Protocol
 
 from lifecycle.errors import BringUpError
 from lifecycle.manifest import Condition, RunKind
+from lifecycle.node import INTERFACE_ON_DEMAND, Operation
 from lifecycle.node import Event as HostEvent
-from lifecycle.node import Operation
 from lifecycle.plan import Plan, PlannedNode, PlannedProcess
 from lifecycle.supervisor.gate.gate import Permit
 from lifecycle.supervisor.health.liveliness import SilenceMonitor
 from lifecycle.supervisor.nodes.driver import ACTIVE, INACTIVE, NodeCondition, NodeDriver
+from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.supervisor.processes.logs import LogDirectory
 from lifecycle.supervisor.processes.patience import own_starved_s
 from lifecycle.supervisor.processes.process import ManagedProcess
@@ -118,6 +120,68 @@ class RemoteNodes:
             await self._changes.beyond(count, ASK_AGAIN_S if there else None)
 
 
+class ServiceNames(Protocol):
+    """What is asked for in the graph, see nodes/observer_participant.py."""
+
+    def service_names(self) -> frozenset[str]:
+        """Return the names of all services that have a server or a client."""
+
+
+class InterfaceOnDemand:
+    """Has nodes of ours offer the services of the node interface that a client waits for.
+
+    They are not there from the start, see node's INTERFACE_ON_DEMAND. Only hosts of ours leave them
+    out, and each has one supervisor.
+    """
+
+    def __init__(self, system: System, graph: ServiceNames, changes: ChangeSource) -> None:
+        self._system = system
+        self._graph = graph
+        self._changes = changes
+        self._offered: dict[str, ControlChannel] = {}
+
+    async def follow(self) -> None:
+        """Look after each change, at most every tenth of a second, until this is cancelled."""
+        while True:
+            count = self._changes.count
+            await self._look()
+            await asyncio.sleep(_DEMAND_S)
+            await self._changes.beyond(count, None)
+
+    async def _look(self) -> None:
+        quiet = {
+            node.name: channel
+            for node in self._system.nodes.values()
+            if (channel := _channel_of(node)) is not None
+            and self._offered.get(node.name) is not channel
+        }
+        if not quiet:
+            return
+        names = self._graph.service_names()
+        asked = [
+            name
+            for name in quiet
+            if any(f"{name}/{service}" in names for service in INTERFACE_ON_DEMAND)
+        ]
+        for name in asked:
+            self._offered[name] = quiet[name]
+        await asyncio.gather(*(_offer(quiet[name], name) for name in asked))
+
+
+def _channel_of(node: NodeRun) -> ControlChannel | None:
+    """Return the channel to a managed node's host, while that runs."""
+    process = node.process
+    if process is None or process.state is not ProcessState.RUNNING or not node.planned.managed:
+        return None
+    return process.channel
+
+
+async def _offer(channel: ControlChannel, node: str) -> None:
+    # A host that hangs or ends is noticed elsewhere.
+    with contextlib.suppress(BringUpError, asyncio.TimeoutError):
+        await asyncio.wait_for(channel.request(node, Operation.SERVE_INTERFACE), _OFFER_S)
+
+
 def _conditions(planned: PlannedNode, observation: Observation) -> Iterable[Condition]:
     name = planned.full_name
     observed = next((each for each in observation.nodes if each.full_name == name), None)
@@ -144,6 +208,9 @@ _CONDITIONS = {
     Condition.CONNECTED: Reach.CONNECTED,
     Condition.ACTIVE: Reach.ACTIVE,
 }
+
+_DEMAND_S = 0.1
+_OFFER_S = 5.0
 
 _REFRESH_S = 1.0
 """A host answers from its executor within a millisecond; this long it is busy or hung."""

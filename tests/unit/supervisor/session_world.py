@@ -118,6 +118,7 @@ class FakeParticipant:
         services: of the nodes in `others`.
         changes: so far.
         dropped: nodes whose reports were forgotten.
+        asked_for: services that have a client.
         while_looking: done once, when the next look has seen everything and is not over yet.
     """
 
@@ -128,6 +129,7 @@ class FakeParticipant:
         self.services = FakeServices(self, hosts.log)
         self.changes = 0
         self.dropped: list[str] = []
+        self.asked_for: set[str] = set()
         self.while_looking: Callable[[], None] | None = None
         self._hosts = hosts
         self._reports: dict[str, NodeConfiguration] = {}
@@ -168,6 +170,9 @@ class FakeParticipant:
 
     def driver(self, node: PlannedNode) -> NodeDriver:
         return ServiceDriver(self.services, node)
+
+    def service_names(self) -> frozenset[str]:
+        return frozenset(self.asked_for)
 
     def node_interface(self, node: str) -> NodeInterfaceClient:
         return NodeInterfaceClient(self.services, node)
