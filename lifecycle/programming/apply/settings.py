@@ -28,6 +28,7 @@ import os
 import stat
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 
 import msgspec
@@ -131,6 +132,11 @@ class ServerSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
             ValueError: a value is not allowed.
         """
         raise NotImplementedError
+
+    def part(self, type_: Any) -> Any:
+        """Return the fields of a dataclass that these settings have, under the same names."""
+        names = {each.name for each in dataclasses.fields(type_)} & {*self.__struct_fields__}
+        return type_(**{name: getattr(self, name) for name in names})
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

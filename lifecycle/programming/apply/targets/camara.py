@@ -63,15 +63,8 @@ class CamaraTargetSettings(ServerSettings, frozen=True, kw_only=True, forbid_unk
         Raises:
             ValueError: a value is not allowed.
         """
-        return CamaraSettings(
-            devices=self.devices,
-            qos_profiles=self.qos_profiles,
-            default_qos_profile=self.default_qos_profile,
-            duration_s=self.duration_s,
-            sink=self.sink,
-            public_addresses=self.public_addresses,
-            device_by_token=self.device_by_token,
-        )
+        asked: CamaraSettings = self.part(CamaraSettings)
+        return asked
 
 
 class CamaraService:

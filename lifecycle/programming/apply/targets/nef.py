@@ -71,15 +71,8 @@ class NefTargetSettings(ServerSettings, frozen=True, kw_only=True, forbid_unknow
         Raises:
             ValueError: a value is not allowed.
         """
-        return NefSettings(
-            notification_destination=self.notification_destination,
-            devices=self.devices,
-            qos_references=self.qos_references,
-            default_qos_reference=self.default_qos_reference,
-            supported_features=self.supported_features,
-            protocol_by_name=self.protocol_by_name,
-            uplink=self.uplink,
-        )
+        asked: NefSettings = self.part(NefSettings)
+        return asked
 
 
 def nef_scope(settings: NefTargetSettings) -> str:
