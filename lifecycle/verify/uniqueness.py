@@ -16,7 +16,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.network.address import canonical, is_multicast, is_wildcard
@@ -31,14 +31,19 @@ from lifecycle.network.nfe import (
 )
 from lifecycle.verify.observation import EndpointReport, NodeConfiguration
 
-if TYPE_CHECKING:
-    from lifecycle.verify.view import Actual
-
 _SIDES = (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION)
 _SEVERAL = -1
 """Instead of the one endpoint that has an NFE."""
 
 _Bucket = tuple[EndpointKind, InternetProtocol, TransportProtocol, int]
+
+
+class ReportedEnd(Protocol):
+    """An endpoint, with what its node says of it; see `Actual`."""
+
+    @property
+    def report(self) -> EndpointReport | None:
+        """None if it says nothing."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -105,13 +110,13 @@ class Uniqueness:
                 if owners.setdefault(each, id(entry)) != id(entry):
                     owners[each] = _SEVERAL
 
-    def nfes(self, ends: Sequence[Actual]) -> tuple[NetworkFlowEndpoint, ...]:
+    def nfes(self, ends: Sequence[ReportedEnd]) -> tuple[NetworkFlowEndpoint, ...]:
         """Return the NFEs of endpoints, each once, with the DSCP that was read back."""
         entries = (self._entries.get(id(end.report)) for end in ends)
         found = (each.nfe for entry in entries if entry for each in entry.nfes or ())
         return tuple(dict.fromkeys(found))
 
-    def is_unique(self, end: Actual) -> bool | None:
+    def is_unique(self, end: ReportedEnd) -> bool | None:
         """Return whether an endpoint is unique; None when its NFEs are not known."""
         key = id(end.report)
         entry = self._entries.get(key)
@@ -121,7 +126,7 @@ class Uniqueness:
             self._answers[key] = self._judge(entry)
         return self._answers[key]
 
-    def all_unique(self, ends: Sequence[Actual]) -> bool | None:
+    def all_unique(self, ends: Sequence[ReportedEnd]) -> bool | None:
         """Return whether each of several endpoints is unique; False if one is certainly not."""
         answers = [self.is_unique(end) for end in ends]
         if False in answers:
