@@ -108,6 +108,8 @@ def _equal(one: IpAddress, other: IpAddress) -> bool:
 class TransportProtocol(enum.Enum):
     """Transport protocol of an NFE (rmw_transport_protocol_t); UNKNOWN covers shared memory."""
 
+    __hash__ = object.__hash__  # members are single; Enum's own is Python, and in every dictionary
+
     UNKNOWN = "unknown"
     UDP = "udp"
     TCP = "tcp"
@@ -115,6 +117,8 @@ class TransportProtocol(enum.Enum):
 
 class InternetProtocol(enum.Enum):
     """Internet protocol of an NFE (rmw_internet_protocol_t); UNKNOWN covers shared memory."""
+
+    __hash__ = object.__hash__  # members are single; Enum's own is Python, and in every dictionary
 
     UNKNOWN = "unknown"
     IPV4 = "ipv4"
