@@ -36,14 +36,6 @@ _SEVERAL = -1
 _Bucket = tuple[EndpointKind, InternetProtocol, TransportProtocol, int]
 
 
-class ReportedEnd(Protocol):
-    """An endpoint, with what its node says of it; see `Actual`."""
-
-    @property
-    def report(self) -> EndpointReport | None:
-        """None if it says nothing."""
-
-
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class _Entry:
     """One endpoint.
