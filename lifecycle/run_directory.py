@@ -15,16 +15,16 @@ import re
 import socket
 import stat
 import struct
-import tempfile
 import threading
 import time
-import uuid
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from lifecycle.codec import from_json, to_json
 from lifecycle.errors import UsageError
-from lifecycle.plan import Plan
+
+if TYPE_CHECKING:
+    from lifecycle.plan import Plan
 
 RUN_VARIABLE = "LIFECYCLE_RUN"
 """Set in every process of a run, with the run's id: what proves that a process is ours."""
@@ -83,7 +83,7 @@ class RunRecord:
 
 def new_run_id() -> str:
     """Return a fresh value for RUN_VARIABLE."""
-    return uuid.uuid4().hex
+    return os.urandom(16).hex()
 
 
 class AlreadyRunningError(UsageError):
@@ -100,6 +100,8 @@ def runtime_root(environment: Mapping[str, str]) -> Path:
     if base and os.path.isdir(base):  # noqa: PTH112 - Path.is_dir() raises for a name too long
         root = Path(base) / "lifecycle"
     else:
+        import tempfile
+
         root = Path(tempfile.gettempdir()) / f"lifecycle-{os.getuid()}"
     _refuse_unsafe_parents(root)
     if os.path.lexists(root):
@@ -222,6 +224,8 @@ class RunDirectory:
 
     def record(self, children: tuple[ChildRecord, ...], segments: Iterable[str] = ()) -> None:
         """Write down what runs, in one piece."""
+        from lifecycle import codec
+
         record = RunRecord(
             run_id=self.run_id,
             boot_id=boot_id(),
@@ -237,7 +241,7 @@ class RunDirectory:
         part.unlink(missing_ok=True)
         new = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _OURS, 0o600)
         with os.fdopen(new, "wb") as file:
-            file.write(to_json(record))
+            file.write(codec.to_json(record))
         part.replace(self.path / "record.json")
 
     def release(self) -> None:
@@ -262,13 +266,17 @@ class RunDirectory:
 
 def read_record(path: Path) -> RunRecord | None:
     """Return the record in a run directory; None if there is none that can be read."""
+    from lifecycle import codec
+
     try:
         # Not blocking: a pipe in its place might have no writer.
         record = os.open(path / "record.json", os.O_RDONLY | os.O_NONBLOCK | _OURS)
         with os.fdopen(record, "rb") as file:
             if not stat.S_ISREG(os.fstat(record).st_mode):
                 return None
-            return from_json(file.read(_LONGEST_RECORD + 1), RunRecord, longest=_LONGEST_RECORD)
+            return codec.from_json(
+                file.read(_LONGEST_RECORD + 1), RunRecord, longest=_LONGEST_RECORD
+            )
     except (OSError, ValueError):
         return None
 

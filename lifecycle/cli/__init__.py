@@ -8,6 +8,7 @@ code (None means 0); the small ones that talk to a running supervisor are togeth
 
 from __future__ import annotations
 
+import gc
 import importlib
 import os
 import signal
@@ -104,6 +105,11 @@ def program() -> int:
         # The interpreter takes a moment to end, and the reported result of the run is final.
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, signal.SIG_IGN)
+    if "rclpy" in sys.modules:
+        # All is written, and the graph was left. Ending the interpreter takes 0.2 s more: it takes
+        # rclpy's objects apart, and Fast DDS sleeps when it is unloaded.
+        gc.collect()  # what an error may have kept of a participant leaves the graph with it
+        os._exit(code)
     return code
 
 

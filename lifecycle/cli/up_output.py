@@ -11,9 +11,11 @@ import asyncio
 import contextlib
 import functools
 import json
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Protocol
 
 import click
@@ -41,6 +43,7 @@ from lifecycle.supervisor import (
     ProcessState,
     Reach,
     RunStarted,
+    StageTimed,
     Stopped,
     Stopping,
     SystemReached,
@@ -78,8 +81,10 @@ class Sink(Protocol):
 
 
 @contextlib.contextmanager
-def output(format_: str) -> Iterator[RunOutput]:
+def output(format_: str, timings_until: str = "") -> Iterator[RunOutput]:
     """Give the output for `format_`, and for text what suits the terminal.
+
+    With `timings_until` it has the time of each stage once the system has come so far.
 
     A run neither waits for who reads it nor ends with him: what happens is in the control socket,
     the log files, the exit code and the report, too.
@@ -92,13 +97,15 @@ def output(format_: str) -> Iterator[RunOutput]:
         encoding=sys.stdout.encoding,
     )
     try:
-        if format_ == "json":
-            yield JsonLines(writer)
-        elif sys.stdout.isatty():
-            with Live(writer=writer) as live:
-                yield live
-        else:
-            yield PlainLines(writer)
+        with contextlib.ExitStack() as stack:
+            shown: RunOutput
+            if format_ == "json":
+                shown = JsonLines(writer)
+            elif sys.stdout.isatty():
+                shown = stack.enter_context(Live(writer=writer))
+            else:
+                shown = PlainLines(writer)
+            yield Timings(shown, until=timings_until) if timings_until else shown
     finally:
         writer.close()
 
@@ -129,6 +136,103 @@ class JsonLines:
         """Write the verdict."""
         self._sink.put(to_json(result.verdict) + "\n")
         self._sink.close()
+
+
+class Timings:
+    """Gives an output how long each stage of bring-up took, once bring-up is over.
+
+    Stages follow each other, but nodes do not wait for each other: a stage is over with the last
+    node, while the first may be two stages further. What was not reached is left out.
+
+    Args:
+        inner: gets every event, and once bring-up is over or has failed a StageTimed a stage.
+        until: the last stage, "connected", "verified" or "active".
+        clock: seconds since the command was started.
+    """
+
+    def __init__(
+        self, inner: RunOutput, *, until: str = "active", clock: Callable[[], float] | None = None
+    ) -> None:
+        self._inner = inner
+        self._until = until
+        self._clock = clock or _since_start_s
+        self._over: dict[str, tuple[float, str]] = {}
+        self._come: dict[str, int] = {}
+        self._reached: set[str] = set()
+        self._done = False
+
+    def watch(self, status: Callable[[], SystemStatus]) -> None:
+        """Pass it on."""
+        self._inner.watch(status)
+
+    def finish(self, result: UpResult) -> None:
+        """Pass it on."""
+        self._inner.finish(result)
+
+    def __call__(self, event: Event) -> None:
+        """Note what the event says of a stage, and pass it on."""
+        reached = isinstance(event, SystemReached) and event.reached == self._until
+        timings: tuple[StageTimed, ...] = ()
+        if not self._done:
+            now_s = self._clock()
+            self._note(event, now_s)
+            if reached or isinstance(event, Stopping):
+                self._done = True
+                timings = tuple(self._stages(now_s))
+        for each in (event, *timings) if reached else (*timings, event):
+            self._inner(each)
+
+    def _note(self, event: Event, now_s: float) -> None:
+        if isinstance(event, RunStarted):
+            self._over["supervisor"] = (now_s, "")
+        elif isinstance(event, NodeChanged):
+            before, come = self._come.get(event.node, 0), _COME.get(event.reach, 0)
+            for reach in tuple(_COME)[before:come]:
+                self._over[_COME_BY_NODES[reach]] = (now_s, event.node)
+            self._come[event.node] = come
+        elif isinstance(event, VerdictChanged) and "connected" in self._reached:
+            self._over.setdefault("observed", (now_s, ""))
+        elif isinstance(event, SystemReached):
+            self._reached.add(event.reached)
+            last = self._over.get(event.reached, (now_s, ""))[1]
+            self._over[event.reached] = (now_s, last)
+
+    def _stages(self, now_s: float) -> Iterator[StageTimed]:
+        before_s = 0.0
+        for stage in _STAGES:
+            if stage in self._over:
+                at_s, last = self._over[stage]
+                took_s = max(0.0, at_s - before_s)
+                yield StageTimed(stage=stage, took_s=took_s, elapsed_s=at_s, last=last)
+                before_s = max(before_s, at_s)
+        yield StageTimed(stage="total", took_s=now_s, elapsed_s=now_s)
+
+
+_STAGES = (
+    "supervisor",
+    "processes",
+    "configured",
+    "connected",
+    "observed",
+    "verified",
+    "active",
+)
+"""In their order; the manifest is read and the supervisor's participant made in the first."""
+
+_COME_BY_NODES = {
+    Reach.STARTED: "processes",
+    Reach.CONFIGURED: "configured",
+    Reach.CONNECTED: "connected",
+    Reach.ACTIVE: "active",
+}
+_COME = {reach: number for number, reach in enumerate(_COME_BY_NODES, start=1)}
+
+
+def _since_start_s() -> float:
+    """Return for how long this process has been running, in seconds: starttime of proc(5)."""
+    fields = Path("/proc/self/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+    began_s = int(fields[19]) / os.sysconf("SC_CLK_TCK")
+    return time.clock_gettime(time.CLOCK_BOOTTIME) - began_s
 
 
 class Rollback:
@@ -302,6 +406,12 @@ def _(event: GateOpened) -> str:
 @_describe.register
 def _(event: SystemReached) -> str:
     return f"system {event.reached} after {event.elapsed_s:.2f} s"
+
+
+@_describe.register
+def _(event: StageTimed) -> str:
+    last = f"  last {event.last}" if event.last else ""
+    return f"stage {event.stage:<10}  {event.took_s:7.3f} s  at {event.elapsed_s:7.3f} s{last}"
 
 
 @_describe.register

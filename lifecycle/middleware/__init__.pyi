@@ -11,9 +11,7 @@ from .discovery.probe import peers_environment as peers_environment
 from .discovery.rediscovery import call_out as call_out
 from .discovery.rediscovery import send_again_soon as send_again_soon
 from .discovery.rediscovery import tell_names as tell_names
-from .fastdds.dscp import get_dscp as get_dscp
 from .fastdds.nfe import SHARED_MEMORY as SHARED_MEMORY
-from .fastdds.nfe import NetworkFlowEndpointsUnsupported as NetworkFlowEndpointsUnsupported
 from .fastdds.nfe import get_network_flow_endpoints as get_network_flow_endpoints
 from .fastdds.nfe import has_shared_memory as has_shared_memory
 from .fastdds.participant import FlowParticipant as FlowParticipant
@@ -37,7 +35,6 @@ from .rcl.executor import NodeExecutor as NodeExecutor
 from .rcl.graph import GraphObserver as GraphObserver
 from .rcl.graph_changes import ServerWatch as ServerWatch
 from .rcl.graph_changes import is_server_matched as is_server_matched
-from .rcl.graph_changes import on_graph_change as on_graph_change
 from .rcl.graph_queries import EndpointInfo as EndpointInfo
 from .rcl.graph_queries import endpoints_of as endpoints_of
 from .rcl.hidden_node import hidden_nodes as hidden_nodes

@@ -20,6 +20,5 @@ from .host.control import HostSpec as HostSpec
 from .host.control import Operation as Operation
 from .host.host import needed_by as needed_by
 from .host.host import preload as preload
-from .host.host import preload_also as preload_also
 from .host.host import serve as serve
 from .host.standalone import run as run

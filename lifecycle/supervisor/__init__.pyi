@@ -10,6 +10,7 @@ from .control.server import Question as Question
 from .control.status import NodeStatus as NodeStatus
 from .control.status import SystemStatus as SystemStatus
 from .gate.gate import closes as closes
+from .processes.forerunner import Forerunner as Forerunner
 from .run.events import Emitter as Emitter
 from .run.events import Event as Event
 from .run.events import Failure as Failure
@@ -25,6 +26,7 @@ from .run.events import ProcessChanged as ProcessChanged
 from .run.events import ProcessState as ProcessState
 from .run.events import Reach as Reach
 from .run.events import RunStarted as RunStarted
+from .run.events import StageTimed as StageTimed
 from .run.events import Stopped as Stopped
 from .run.events import Stopping as Stopping
 from .run.events import SystemReached as SystemReached
@@ -47,5 +49,4 @@ from .run.options import UpResult as UpResult
 from .run.options import own_machines as own_machines
 from .run.signals import Ended as Ended
 from .run.signals import Ending as Ending
-from .run.up import Forerunner as Forerunner
 from .run.up import up as up

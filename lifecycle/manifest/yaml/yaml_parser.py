@@ -20,12 +20,17 @@ import dataclasses
 import math
 import re
 from collections.abc import Iterator, Mapping
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
-import yaml
+import lazy_loader
 
 from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position
 from lifecycle.manifest.yaml.document import Document, Place, Scalar, Value, error, spell_place
+
+if TYPE_CHECKING:
+    import yaml
+else:  # others need no more of this module than how a value is spelled
+    yaml = lazy_loader.load("yaml")
 
 INT64_MIN = -(2**63)
 INT64_MAX = 2**63 - 1
@@ -120,8 +125,6 @@ MAX_FINDINGS = 200
 
 _SHOWN_DEPTH = 8  # steps of a document path in a message that ends the reading
 
-_Loader: type[yaml.SafeLoader | yaml.CSafeLoader] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-
 
 @dataclasses.dataclass(slots=True)
 class _Frame:
@@ -199,7 +202,7 @@ class _Composer:
 
     def _events(self, text: str) -> Iterator[yaml.Event]:
         try:
-            yield from yaml.parse(text, Loader=_Loader)
+            yield from yaml.parse(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
         except yaml.YAMLError as problem:
             mark = getattr(problem, "problem_mark", None) or getattr(problem, "context_mark", None)
             line, column = (mark.line + 1, mark.column + 1) if mark else (1, 1)

@@ -224,7 +224,7 @@ class Managed:
             later=self.call_soon,
             after=self._turns.call_after,
             changed=self.configuration_changes.touch,
-            tell=self._tell_connection,
+            notify=self._report_connection,
         )
         self.declared = DeclaredInCode(
             spec, self.data_layer, node=self.full_name, state=lambda: self.state
@@ -404,16 +404,16 @@ class Managed:
         self._member = GraphMember(self._node, self._infrastructure)
         now = self.configuration_changes.collect()
         self._member.joined(self.state, now.checksum if now is not None else "")
-        self.configuration_changes.listen(self._tell_checksum)
+        self.configuration_changes.listen(self._report_checksum)
 
-    def _tell_checksum(self, now: NodeConfiguration) -> None:
+    def _report_checksum(self, now: NodeConfiguration) -> None:
         if self._member is not None:
             self._member.configuration_changed(now.checksum)
 
-    def _tell_connection(self, event: ConnectionEvent) -> None:
+    def _report_connection(self, event: ConnectionEvent) -> None:
         if self._member is not None and self.spec.events:
             self._member.connection_event(event)
-        self.connection_events.tell(event)
+        self.connection_events.notify(event)
 
     async def _change(self, request: TransitionRequest) -> Result:
         if request is TransitionRequest.ACTIVATE and not self._let_through:

@@ -56,24 +56,27 @@ _SERVICES = (
 """What every node of ours has; their type supports are libraries that load on first use."""
 
 
-def preload() -> None:
+def preload(names: Iterable[str] = ()) -> None:
     """Import everything a host needs, for a process that will fork hosts.
 
     Makes no participant and opens no socket, so a fork afterwards is safe. The only threads are
     those of libraries that a child can do without: LTTng's two listeners, numpy's OpenBLAS pool.
-    Call `gc.freeze()` after it to keep the imported pages shared. What only some nodes need is
-    `preload_also`'s: numpy alone, which most messages with arrays import, takes 60 ms.
+    Call `gc.freeze()` after it to keep the imported pages shared.
+
+    Args:
+        names: what only some nodes need, see `needed_by`; numpy alone, which most messages with
+            arrays import, takes 60 ms. What cannot be imported is left to the host that needs it,
+            which reports it.
     """
     for name in _PRELOADED:
         importlib.import_module(name)
-    from rclpy.type_support import check_is_valid_msg_type, check_is_valid_srv_type
+    from lifecycle.middleware import load_libraries
 
-    from lifecycle.middleware import import_interface, load_libraries
-
-    for message in _MESSAGES:
-        check_is_valid_msg_type(import_interface(message))
-    for service in _SERVICES:
-        check_is_valid_srv_type(import_interface(service))
+    for interface in (*_MESSAGES, *_SERVICES):
+        _load(interface)
+    for name in names:
+        with contextlib.suppress(Exception):
+            _load(name)
     # The codec learns a type's shape at first use.
     spec = HostSpec(
         system="",
@@ -89,8 +92,24 @@ def preload() -> None:
     load_libraries()
 
 
+def _load(name: str) -> None:
+    """Import a module, or an interface with its type support."""
+    if "/" not in name:
+        importlib.import_module(name)
+        return
+    from rclpy.type_support import check_is_valid_msg_type, check_is_valid_srv_type
+
+    from lifecycle.middleware import import_interface
+
+    found = import_interface(name)
+    if "/msg/" in name:
+        check_is_valid_msg_type(found)
+    elif "/srv/" in name:
+        check_is_valid_srv_type(found)
+
+
 def needed_by(nodes: Iterable[PlannedNode]) -> tuple[str, ...]:
-    """Return what `preload_also` is to import for some nodes: modules and interface types."""
+    """Return what `preload` is to import for some nodes: modules and interface types."""
     names: dict[str, None] = {}
     for node in nodes:
         if node.events or node.membership:
@@ -102,28 +121,7 @@ def needed_by(nodes: Iterable[PlannedNode]) -> tuple[str, ...]:
     return tuple(names)
 
 
-def preload_also(names: Iterable[str]) -> None:
-    """Import modules and interface types, `sensor_msgs/msg/Image`, besides; as safe as `preload`.
-
-    What cannot be imported is left to the host that needs it, which reports it.
-    """
-    from rclpy.type_support import check_is_valid_msg_type, check_is_valid_srv_type
-
-    from lifecycle.middleware import import_interface
-
-    for name in names:
-        with contextlib.suppress(Exception):
-            if "/" not in name:
-                importlib.import_module(name)
-                continue
-            found = import_interface(name)
-            if "/msg/" in name:
-                check_is_valid_msg_type(found)
-            elif "/srv/" in name:
-                check_is_valid_srv_type(found)
-
-
-__all__ = ["main", "needed_by", "preload", "preload_also", "serve"]
+__all__ = ["main", "needed_by", "preload", "serve"]
 
 
 def main(control_socket_fd: int) -> NoReturn:

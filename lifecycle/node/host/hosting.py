@@ -347,14 +347,14 @@ class Host:
     def _add(self, planned: PlannedNode, node: Node) -> None:
         if isinstance(node, LifecycleNode):
             self._nodes[planned.full_name] = node
-            node.lifecycle.add_listener(self._tell_state)
-            node.lifecycle.configuration_changes.listen(self._tell_configuration)
+            node.lifecycle.add_listener(self._report_state)
+            node.lifecycle.configuration_changes.listen(self._report_configuration)
         self._loop.add(node)
 
     async def _ready(self) -> None:
         self._channel.write(Event(kind="ready"))
 
-    def _tell_state(self, node: LifecycleNode) -> None:
+    def _report_state(self, node: LifecycleNode) -> None:
         state = node.lifecycle.state
         self._channel.write(
             Event(
@@ -365,7 +365,7 @@ class Host:
             )
         )
 
-    def _tell_configuration(self, configuration: NodeConfiguration) -> None:
+    def _report_configuration(self, configuration: NodeConfiguration) -> None:
         self._channel.write(
             Event(
                 kind="configuration",

@@ -244,7 +244,7 @@ class NodeRun:
         undo: what has to be undone, oldest first.
         stuck: an operation on it was given up: a polite request would wait behind it.
         connections: names of what the authority connected it to, oldest first.
-        tells: its host reports unasked when its configuration changes.
+        reports_changes: its host reports unasked when its configuration changes.
     """
 
     def __init__(self, planned: PlannedNode, emit: Emitter) -> None:
@@ -259,7 +259,7 @@ class NodeRun:
         self.undo: list[Operation] = []
         self.stuck = False
         self.connections: tuple[str, ...] = ()
-        self.tells = False
+        self.reports_changes = False
         self.changed = asyncio.Event()
         self._emit = emit
 
@@ -271,7 +271,7 @@ class NodeRun:
         self.undo = []
         self.stuck = False
         self.connections = ()
-        self.tells = False
+        self.reports_changes = False
         self.doing = ""
         self.connected = False
         self.state = ""
@@ -294,12 +294,12 @@ class NodeRun:
             return self.reach is not Reach.WAITING
         return _ORDER.index(self.reach) >= _ORDER.index(_CONDITIONS[condition])
 
-    def advance(self, reach: Reach, standing: NodeCondition | None = None) -> None:
+    def advance(self, reach: Reach, condition: NodeCondition | None = None) -> None:
         """Note that the node reached `reach`, and notify its listeners and waiters."""
         self.reach = reach
-        if standing is not None:
-            self._take(standing.state, connected=standing.connected)
-            self.learn(standing.configuration)
+        if condition is not None:
+            self._take(condition.state, connected=condition.connected)
+            self.learn(condition.configuration)
         self._tell()
 
     def learn(self, configuration: NodeConfiguration | None) -> None:
@@ -308,7 +308,7 @@ class NodeRun:
         Of a node whose host reports, every configuration has been taken in the order of its channel
         by now (System.on_host_event): what a reply carried may be older than what came since.
         """
-        if configuration is not None and not self.tells:
+        if configuration is not None and not self.reports_changes:
             self.configuration = configuration
 
     def report(self, state: str, *, connected: bool) -> None:
@@ -498,7 +498,7 @@ class System:
             return
         if event.configuration is not None:
             node.configuration = event.configuration
-            node.tells = node.tells or event.kind == "configuration"
+            node.reports_changes = node.reports_changes or event.kind == "configuration"
         if event.kind == "reply":
             return
         if event.state:
@@ -547,7 +547,7 @@ class System:
             and not node.stuck
             and node.name not in self.liveliness.silent
         ]
-        await asyncio.gather(*(self._refresh(node) for node in nodes if not node.tells))
+        await asyncio.gather(*(self._refresh(node) for node in nodes if not node.reports_changes))
         for node in nodes:
             if node.configuration is not None:
                 observer.put_configuration(node.configuration)

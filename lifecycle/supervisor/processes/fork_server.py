@@ -1,6 +1,6 @@
 """The supervisor's side of a fork server: a `Spawner` over a socket.
 
-Owns: starting `fork_server_main`, also anew when it was killed, and following its children by
+Owns: asking it to fork, starting it anew when it was killed, and following its children by
 pidfd, so that an end is noticed at once. Children of a fork server that died become this process's
 own, which then learns by itself how they end and whether they are stopped. Must not import rclpy.
 """
@@ -12,13 +12,13 @@ import contextlib
 import os
 import signal
 import socket
-import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import BringUpError
 from lifecycle.graph import set_within
+from lifecycle.supervisor.processes.forerunner import CLOSE_S, ForkServerProcess
 from lifecycle.supervisor.processes.fork_server_main import (
     LARGEST_MESSAGE,
     MSG_CMSG_CLOEXEC,
@@ -42,64 +42,12 @@ _SOON_S = 2.0
 
 _TRIES = 3
 
-_CLOSE_S = 1.0
-"""A fork server whose children have ended ends within milliseconds of its socket."""
-
 _STOPS = os.WSTOPPED | os.WCONTINUED | os.WNOHANG
 
-_MAIN = "lifecycle.supervisor.processes.fork_server_main"
 _HOST = "lifecycle.node.host.host"
 
 _FRESH_INTERPRETER = ("PYTHON", "LD_", "RMW_IMPLEMENTATION", "VIRTUAL_ENV")
 """Variables that act while an interpreter starts; a fork of a running one would ignore them."""
-
-
-class ForkServerProcess:
-    """The operating system process of a fork server; can be started before there is an event loop.
-
-    Args:
-        preload: import rclpy and the message packages, to fork Python nodes.
-        environment: complete environment of the fork server, which its children inherit.
-    """
-
-    def __init__(
-        self, *, preload: bool, environment: Mapping[str, str], again: bool = False
-    ) -> None:
-        self._preload = preload
-        self._environment = dict(environment)
-        self.socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        argv = [sys.executable, "-m", _MAIN, str(theirs.fileno())]
-        argv += ["--preload"] * preload + ["--again"] * again
-        try:
-            self.popen = subprocess.Popen(
-                argv,
-                stdin=subprocess.DEVNULL,
-                env=self._environment,
-                pass_fds=[theirs.fileno()],
-                start_new_session=True,
-            )
-        except OSError as error:
-            self.socket.close()
-            raise BringUpError(f"cannot start the fork server: {error.strerror}") from error
-        finally:
-            theirs.close()
-
-    def again(self) -> ForkServerProcess:
-        """Start another one in the place of this one, which has died.
-
-        Raises:
-            BringUpError: it cannot be started.
-        """
-        return ForkServerProcess(preload=self._preload, environment=self._environment, again=True)
-
-    def close(self, grace_s: float = _CLOSE_S) -> None:
-        """End the fork server; it ends by itself when its socket closes and no child is left."""
-        self.socket.close()
-        try:
-            self.popen.wait(grace_s)
-        except subprocess.TimeoutExpired:
-            self.popen.kill()
-            self.popen.wait()
 
 
 class ForkServerChild:
@@ -277,8 +225,6 @@ class ForkServer:
             environment=request.environment,
             working_directory=request.working_directory,
             control=request.control is not None,
-            # What becomes another program imports for itself.
-            preload=() if argv else request.preload,
         )
         born: asyncio.Future[ForkServerChild] = self._loop.create_future()
         self._pending[message.id] = born, request
@@ -398,6 +344,6 @@ class ForkServer:
         self._how = "is ended"
         self._loop.remove_reader(self._process.socket)
         self._process.socket.close()
-        if not await set_within(self._gone, _CLOSE_S):
+        if not await set_within(self._gone, CLOSE_S):
             self._process.popen.kill()
             await self._gone.wait()

@@ -22,10 +22,12 @@ import sys
 import time
 import traceback
 import warnings
+from collections.abc import Iterable
 from typing import NoReturn
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.middleware import adopt_orphans
+from lifecycle.supervisor.processes.forerunner import PRELOAD
 
 LARGEST_MESSAGE = 1 << 18
 """Bytes; a request is one datagram, its argv and variables must fit."""
@@ -40,7 +42,6 @@ class ForkRequest:
 
     Attributes:
         id: ≥ 1; 0 only asks whether the fork server serves, which answers with the same id.
-        preload: modules and interface types to import before the fork, see node's `preload_also`.
     """
 
     id: int
@@ -48,7 +49,6 @@ class ForkRequest:
     environment: tuple[tuple[str, str], ...]
     working_directory: str
     control: bool
-    preload: tuple[str, ...] = ()
 
 
 SERVES = ForkRequest(id=0, argv=(), environment=(), working_directory="", control=False)
@@ -89,7 +89,6 @@ class _ForkServer:
         self._again = again
         self._selector = selectors.DefaultSelector()
         self._selector.register(sock, selectors.EVENT_READ, None)
-        self._preloaded: set[str] = set()
         self._children: dict[int, tuple[int, int]] = {}  # pid → (request id, pidfd)
         # SIGCHLD notifies a parent that a child was stopped; nothing else does.
         self._signals = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
@@ -120,11 +119,13 @@ class _ForkServer:
             return False
         if not data:
             return False
+        if data.startswith(PRELOAD.encode()):
+            _preload(data.decode().split("\n")[1:])
+            return True
         request = from_json(data, ForkRequest)
         if request == SERVES:
             self._tell(ChildReport(id=request.id))
             return True
-        self._preload(request.preload)
         try:
             with warnings.catch_warnings():
                 # Python 3.12 warns of any other thread. Those here belong to the libraries that
@@ -141,16 +142,6 @@ class _ForkServer:
         if pid > 0:
             self._born(request.id, pid)
         return True
-
-    def _preload(self, names: tuple[str, ...]) -> None:
-        """Import once what a host, and maybe those after it, would each import by itself."""
-        if self._preloaded.issuperset(names):
-            return
-        from lifecycle.node import preload_also
-
-        preload_also(name for name in names if name not in self._preloaded)
-        self._preloaded.update(names)
-        gc.freeze()
 
     def _born(self, request: int, pid: int) -> None:
         pidfd = os.pidfd_open(pid)
@@ -294,6 +285,15 @@ def _reseed() -> None:
         numpy_random.seed()
 
 
+def _preload(names: Iterable[str]) -> None:
+    """Import what hosts need, and keep its pages shared: a first collection would touch them."""
+    from lifecycle.node import preload
+
+    preload(names)
+    gc.collect()
+    gc.freeze()
+
+
 def main() -> int:
     """Run the fork server."""
     parser = argparse.ArgumentParser(prog=f"python -m {__spec__.name}")
@@ -306,12 +306,7 @@ def main() -> int:
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     adopt_orphans()
     if options.preload:
-        from lifecycle.node import preload
-
-        preload()
-        # Keep the shared pages shared: a child's first collection would touch them all.
-        gc.collect()
-        gc.freeze()
+        _preload(())
     _ForkServer(socket.socket(fileno=options.socket_fd), again=options.again).serve()
     return 0
 

@@ -15,7 +15,6 @@ import signal
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
-from lifecycle.node import needed_by
 from lifecycle.plan import PlannedProcess
 from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.supervisor.processes.logs import LineReader, LogDirectory, ProcessLog
@@ -93,7 +92,6 @@ class SpawnRequest:
         stdout: descriptor; the spawner does not close it.
         stderr: descriptor.
         control: descriptor of the host's end of the control channel; None for a foreign command.
-        preload: modules and interface types that it will import.
         on_stop: called with True when a signal stopped the process (signal(7), Stop), False when it
             continues.
     """
@@ -105,7 +103,6 @@ class SpawnRequest:
     stdout: int
     stderr: int
     control: int | None = None
-    preload: tuple[str, ...] = ()
     on_stop: Callable[[bool], None] = _ignore
 
 
@@ -254,7 +251,6 @@ class ManagedProcess:
                     stdout=ends[0],
                     stderr=ends[1],
                     control=None if control is None else control.fileno(),
-                    preload=() if channel is None else needed_by(channel.spec.nodes),
                     on_stop=self.on_stop,
                 )
             )

@@ -482,7 +482,7 @@ class Session:
         left = await self._worker.run(end_strays, self._directory.run_id, self._fork_server)
         if left:
             self._emit(Notice(message=f"ended processes that were left behind: {_listed(left)}"))
-        self._system.logs.tell_lost()
+        self._system.logs.report_lost()
         if not self._stop.done():
             self._stop.cancel()
         elif not self._stop.cancelled():

@@ -11,7 +11,7 @@ import contextlib
 import dataclasses
 import os
 import traceback
-from collections.abc import Awaitable, Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
 
 from lifecycle.errors import ExitCode, LifecycleError
 from lifecycle.manifest import Authority, DataLayerSource, EndpointPolicy, RunKind
@@ -25,12 +25,11 @@ from lifecycle.middleware import (
     peers_environment,
     sweep,
 )
-from lifecycle.plan import Plan, moved_observer, reached_hosts
+from lifecycle.node import needed_by
+from lifecycle.plan import Plan, PlannedProcess, moved_observer, reached_hosts
 from lifecycle.run_directory import (
-    RUN_VARIABLE,
     RunDirectory,
     RunRecord,
-    new_run_id,
     run_name,
     runtime_root,
 )
@@ -39,7 +38,8 @@ from lifecycle.supervisor.connections.networks import open_networks, token_varia
 from lifecycle.supervisor.control.status import SystemStatus
 from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 from lifecycle.supervisor.nodes.system import System
-from lifecycle.supervisor.processes.fork_server import ForkServer, ForkServerProcess
+from lifecycle.supervisor.processes.forerunner import Forerunner
+from lifecycle.supervisor.processes.fork_server import ForkServer
 from lifecycle.supervisor.processes.logs import check_log_root, log_directory
 from lifecycle.supervisor.processes.orphans import end_run
 from lifecycle.supervisor.run.events import Emitter, Event, Listener, Notice, RunStarted
@@ -69,29 +69,6 @@ OBSERVER_TRIES = 4
 
 
 Conclude = Callable[[UpResult], ExitCode]
-
-
-class Forerunner:
-    """A fork server that is started before the manifest is read, to import while we do.
-
-    Args:
-        preload: see ForkServerProcess.
-        without: variables of our environment that nothing it starts shall have.
-
-    Attributes:
-        run_id: of the run that it is for.
-    """
-
-    def __init__(self, *, preload: bool = True, without: Collection[str] = ()) -> None:
-        self.run_id = new_run_id()
-        environment = {name: text for name, text in os.environ.items() if name not in without}
-        self.process = ForkServerProcess(
-            preload=preload, environment={**environment, RUN_VARIABLE: self.run_id}
-        )
-
-    def close(self) -> None:
-        """End it; harmless if a run has ended it already."""
-        self.process.close()
 
 
 def up(
@@ -187,8 +164,7 @@ def _up(
     emit = Emitter()
     for listener in listeners:
         emit.listen(listener)
-    python = any(each.run.kind is RunKind.PYTHON for each in processes)
-    forerunner = forerunner or Forerunner(preload=python, without=token_variables(options.program))
+    forerunner = _preloading(forerunner, plan, options, processes)
     try:
         directory = RunDirectory.acquire(
             runtime_root(os.environ),
@@ -283,6 +259,22 @@ async def _leaving_last(
     finally:
         with _ends_within(LEAVE_S, exit_code):
             await leaving.aclose()
+
+
+def _preloading(
+    forerunner: Forerunner | None,
+    plan: Plan,
+    options: UpOptions,
+    processes: Iterable[PlannedProcess],
+) -> Forerunner:
+    """Have a fork server load what our Python nodes need, once for all of them."""
+    python = [each for each in processes if each.run.kind is RunKind.PYTHON]
+    if forerunner is None:
+        without = token_variables(options.program)
+        forerunner = Forerunner(preload=bool(python), without=without)
+    nodes = (plan.node(key) for process in python for key in process.nodes)
+    forerunner.process.preload(needed_by(nodes))
+    return forerunner
 
 
 def _sweep(records: Records | None, emit: Emitter | None = None) -> None:

@@ -40,7 +40,7 @@ def test_an_interrupt_while_the_manifest_is_read_is_told(
 ) -> None:
     manifest = tmp_path / "m.lifecycle.yaml"
     manifest.write_text("manifest_version: 1\nsystem: s\n")
-    monkeypatch.setattr("lifecycle.supervisor.run.up.Forerunner", _NoForerunner)
+    monkeypatch.setattr("lifecycle.supervisor.processes.forerunner.Forerunner", _NoForerunner)
     monkeypatch.setattr(up, "load_manifest", lambda *_, **__: signal.raise_signal(number))
     report = tmp_path / "report.json"
     words = [str(manifest), "--report", str(report)]
@@ -54,7 +54,9 @@ def test_an_interrupt_while_the_manifest_is_read_is_told(
 def test_a_report_that_cannot_be_written_is_refused_before_anything_is_started(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("lifecycle.supervisor.run.up.Forerunner", lambda: pytest.fail("it started"))
+    monkeypatch.setattr(
+        "lifecycle.supervisor.processes.forerunner.Forerunner", lambda: pytest.fail("it started")
+    )
     words = [str(tmp_path / "m.lifecycle.yaml"), "--report", str(tmp_path / "no" / "report.xml")]
     with pytest.raises(UsageError, match=r"cannot write report .*: No such file or directory"):
         CliRunner().invoke(up.command, words, standalone_mode=False, catch_exceptions=False)

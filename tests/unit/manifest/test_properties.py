@@ -161,7 +161,7 @@ def test_what_only_yaml_1_2_counts_among_numbers_is_one(text: str, number: float
 def test_the_c_parser_and_the_python_parser_agree(
     loader: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("lifecycle.manifest.yaml.yaml_parser._Loader", getattr(yaml, loader))
+    monkeypatch.setattr(yaml, "CSafeLoader", getattr(yaml, loader))
     text = "a: [1, 'x', &n {b: on}]\nc: *n\nd: |\n  text\ne:\n"
     document, found = compose(text, file="f")
     assert found == ()

@@ -22,7 +22,7 @@ from lifecycle.run_directory import RunDirectory, short_path
 from lifecycle.supervisor.connections.networks import Networks
 from lifecycle.supervisor.control.server import Answer, ControlRequest, Question
 from lifecycle.supervisor.health.peer_supervisors import Listener
-from lifecycle.supervisor.nodes.driver import NodeDriver, ServiceDriver, ServiceHand
+from lifecycle.supervisor.nodes.driver import NodeDriver, NodeInterfaceClient, ServiceDriver
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.orphans import end_strays
 from lifecycle.supervisor.processes.process import ProcessExit
@@ -69,7 +69,7 @@ class FakeForkServer(FakeSpawner):
 
     def __init__(self) -> None:
         super().__init__()
-        self.tells = True
+        self.reports_changes = True
         self.cannot_start = ""
         self.lingers_s = 0.0
 
@@ -174,8 +174,8 @@ class FakeParticipant:
     def service_names(self) -> frozenset[str]:
         return frozenset(self.asked_for)
 
-    def node_interface(self, node: str) -> ServiceHand:
-        return ServiceHand(self.services, node)
+    def node_interface(self, node: str) -> NodeInterfaceClient:
+        return NodeInterfaceClient(self.services, node)
 
     def participants_of(
         self, pid: int, *, nodes: Iterable[str], reported: Iterable[str]
