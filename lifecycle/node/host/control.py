@@ -19,6 +19,7 @@ import socket
 import sys
 import threading
 import traceback
+from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import NoReturn
@@ -121,6 +122,8 @@ class Event:
     configuration: NodeConfiguration | None = None
 
 
+_AT_ONCE_BYTES = 1 << 16
+
 _OURS = f"{Path(__file__).parents[1]}{os.sep}"
 """Where the host's own modules are."""
 
@@ -136,22 +139,42 @@ class HostChannel:
         control.setblocking(True)
         self._control = control
         try:
-            self._first, found, _, _ = socket.recv_fds(control, 1, SIGN_DESCRIPTORS)
+            first, found, _, _ = socket.recv_fds(control, 1, SIGN_DESCRIPTORS)
         except ConnectionError:  # as at end of file
-            self._first, found = b"", []
+            first, found = b"", []
+        self._received = bytearray(first)
         self.descriptors = tuple(found)
         for descriptor in found:
             os.set_inheritable(descriptor, False)
-        self._reader = control.makefile("rb")
         self._lock = threading.Lock()
 
+    def fileno(self) -> int:
+        """Return the descriptor that is readable when `receive` is worth a call."""
+        return self._control.fileno()
+
     def read(self) -> bytes | None:
-        """Return the next line, or None at end of file."""
+        """Wait for the next line and return it, or None at end of file."""
+        while b"\n" not in self._received:
+            if not self.receive():
+                return None
+        line, _, rest = self._received.partition(b"\n")
+        self._received = rest
+        return bytes(line)
+
+    def receive(self) -> bool:
+        """Wait for more and keep it for `lines`; False at end of file."""
         try:
-            first, self._first = self._first, b""
-            return first + self._reader.readline() or None
+            data = self._control.recv(_AT_ONCE_BYTES)
         except OSError:  # a supervisor that was killed resets the connection
-            return None
+            return False
+        self._received += data
+        return bool(data)
+
+    def lines(self) -> Iterator[bytes]:
+        """Yield the whole lines that have been received."""
+        while b"\n" in self._received:
+            line, _, self._received = self._received.partition(b"\n")
+            yield bytes(line)
 
     def write(self, event: Event) -> None:
         """Send one event; a supervisor that has gone is noticed by the reader, not here."""

@@ -274,8 +274,9 @@ class Host:
     def run(self) -> NoReturn:
         """Construct, say ready, obey; never returns."""
         # Both before any constructor of the user's: whatever it does, the process can be ended.
-        threading.Thread(target=self._obey, name="control", daemon=True).start()
-        with on_signal(lambda number: self._end(number.name)):
+        self._obey()
+        beside = (self._channel.fileno(), self._receive)
+        with on_signal(lambda number: self._end(number.name), beside=beside):
             participants = Participants(self._context)
             for index, planned in enumerate(self._spec.nodes):
                 failure: Exception | None = None
@@ -375,9 +376,17 @@ class Host:
             )
         )
 
+    def _receive(self) -> bool:
+        """Take what the supervisor sends; False once it has ended the channel."""
+        if not self._channel.receive():
+            self._end("end of the control channel")
+            return False
+        self._obey()
+        return True
+
     def _obey(self) -> None:
-        """Read commands until the supervisor ends the channel; runs in its own thread."""
-        while (line := self._channel.read()) is not None:
+        """Have the commands carried out that have arrived."""
+        for line in self._channel.lines():
             try:
                 command = codec.from_json(line, Command)
             except ValueError:
@@ -385,7 +394,6 @@ class Host:
                 logging.getLogger(__name__).exception("cannot read command %r", line)
                 continue
             self._loop.call_soon(self._execute, command)
-        self._end("end of the control channel")
 
     async def _execute(self, command: Command) -> None:
         self._channel.write(await self._commands.execute(command))
