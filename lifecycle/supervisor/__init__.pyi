@@ -40,6 +40,7 @@ from .run.looking import attached_pictures as attached_pictures
 from .run.looking import capture_running as capture_running
 from .run.looking import follow_running as follow_running
 from .run.looking import judge_running as judge_running
+from .run.looking import running_plan as running_plan
 from .run.looking import supervised_picture as supervised_picture
 from .run.looking import supervised_pictures as supervised_pictures
 from .run.looking import supervisor_of as supervisor_of

@@ -19,6 +19,7 @@ from lifecycle.cli.common import (
     format_option,
     load_manifest,
     manifest_arguments,
+    target_plan,
     targets_option,
     timeout_option,
     treatment_options,
@@ -178,8 +179,13 @@ class Export:
                 click.echo(lines(f"left out: {each}"), err=True)
 
 
+_NOBODY_S = 1.5
+"""Some node of what runs is seen within so long; a system without any is waited for if asked."""
+
+
 @click.command("flows", cls=NetworkCommand)
-@manifest_arguments
+@click.argument("target", metavar="TARGET")
+@click.argument("assignments", nargs=-1, metavar="[NAME:=VALUE]...")
 @format_option("text", "json", "csv")
 @click.option("--watch", is_flag=True, help="Show them again whenever they change; Ctrl-C ends.")
 @timeout_option(5.0, "How long flows that are not complete may still become so.")
@@ -191,7 +197,7 @@ class Export:
 @treatment_options
 def _show(
     *,
-    manifest: str,
+    target: str,
     assignments: tuple[str, ...],
     format_: str,
     watch: bool,
@@ -201,11 +207,12 @@ def _show(
 ) -> int:
     """Show every publisher → subscription pair of a running system.
 
+    TARGET is a manifest, or the name of a system that a supervisor runs on this host.
+
     One line per network flow: its 5-tuple, on IPv6 its flow label, DSCP and TOS byte, how unique it
     is, what was required and the verdict. Exits as `lifecycle verify` does.
     """
-    from lifecycle.plan import build_plan
-    from lifecycle.supervisor import follow_running, judge_running
+    from lifecycle.supervisor import follow_running, judge_running, supervisor_of
 
     exporter = None
     if export is not None:
@@ -217,14 +224,17 @@ def _show(
             "cannot say how to treat flows that are only shown",
             hint="give --export, or use lifecycle flows apply",
         )
-    plan = build_plan(load_manifest(manifest, assignments).manifest)
+    plan = _plan_of(target, assignments)
 
     def show(verdict: Verdict) -> None:
         click.echo(render_flows(verdict.flows, format_))
 
     if watch:
         follow_running(plan, lambda seen: echo_while_read(render_flows(seen.flows, format_)))
-    seen = judge_running(plan, timeout_s=timeout, strict=False)
+    asked = click.get_current_context().get_parameter_source("timeout")
+    waits = asked is not click.core.ParameterSource.DEFAULT or supervisor_of(os.environ, plan, "")
+    nobody_s = None if waits else _NOBODY_S
+    seen = judge_running(plan, timeout_s=timeout, strict=False, nobody_s=nobody_s)
     if seen.where:
         click.echo(lines(seen.where), err=True)
     if exporter is not None:
@@ -232,6 +242,18 @@ def _show(
     else:
         show(seen.verdict)
     return exit_code(seen.verdict, strict=False)
+
+
+def _plan_of(target: str, assignments: tuple[str, ...]) -> Plan:
+    """Return the plan of a manifest, or that of a running system of this name."""
+    if os.path.isfile(target):  # noqa: PTH113 - Path.is_file() raises for a name too long
+        from lifecycle.plan import build_plan
+
+        return build_plan(load_manifest(target, assignments).manifest)
+    from lifecycle.supervisor import running_plan
+
+    path, _ = target_plan(os.environ, target, assignments, "")
+    return running_plan(path)
 
 
 def apply(

@@ -94,19 +94,37 @@ class JudgedSystem:
         return "" if somebody else where(self.plan, self.rmw)
 
 
-def judge_running(plan: Plan, *, timeout_s: float, strict: bool) -> JudgedSystem:
+def judge_running(
+    plan: Plan, *, timeout_s: float, strict: bool, nobody_s: float | None = None
+) -> JudgedSystem:
     """Judge what runs against the plan, as an active system.
 
     Args:
         plan: what should run.
         timeout_s: seconds, > 0, to wait for a verdict that is ok.
         strict: wait for what is unverifiable too.
+        nobody_s: seconds, > 0, after which a graph without any node is not waited for; None waits
+            as long for a system to be started as for anything else.
 
     Raises:
         MiddlewareError: no participant can be made.
     """
     with _looking(plan) as observer_participant:
-        return asyncio.run(_judge(plan, observer_participant, timeout_s, strict=strict))
+        return asyncio.run(
+            _judge(plan, observer_participant, timeout_s, strict=strict, nobody_s=nobody_s)
+        )
+
+
+def running_plan(path: Path) -> Plan:
+    """Return the plan of the system that the supervisor of a run directory runs.
+
+    Raises:
+        UsageError: it runs no more, or does not answer.
+    """
+    try:
+        return look(path).plan
+    except TimeoutError as error:
+        raise UsageError(f"cannot ask {path.name!r}: its supervisor does not answer") from error
 
 
 async def following(plan: Plan, on_look: Callable[[JudgedSystem], None]) -> None:
@@ -193,13 +211,21 @@ async def _see(plan: Plan, observer_participant: ObserverParticipant) -> JudgedS
 
 
 async def _judge(
-    plan: Plan, observer_participant: ObserverParticipant, timeout_s: float, *, strict: bool
+    plan: Plan,
+    observer_participant: ObserverParticipant,
+    timeout_s: float,
+    *,
+    strict: bool,
+    nobody_s: float | None,
 ) -> JudgedSystem:
     loop = asyncio.get_running_loop()
-    deadline = loop.time() + timeout_s
+    began = loop.time()
     while True:
         seen = await _see(plan, observer_participant)
-        left_s = deadline - loop.time()
+        limit_s = timeout_s
+        if nobody_s is not None and seen.where:
+            limit_s = min(nobody_s, timeout_s)
+        left_s = began + limit_s - loop.time()
         if left_s <= 0 or not _worth_waiting(seen.verdict, strict=strict):
             return seen
         await _change(observer_participant, min(left_s, _ASK_AGAIN_S))

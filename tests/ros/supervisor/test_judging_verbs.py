@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import socket
+import time
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -26,7 +27,7 @@ def test_a_running_system_is_judged_from_outside(tmp_path: Path, fresh_domain: i
         )
         assert (judged.returncode, judged.stderr) == (ExitCode.OK, "")
         assert json.loads(judged.stdout)["verdict"] == "ok"
-        flows = verb("flows", str(manifest), "--format", "csv", runtime=tmp_path)
+        flows = verb("flows", "pair", "--format", "csv", runtime=tmp_path)
         assert flows.returncode == ExitCode.OK
         rows = list(csv.DictReader(io.StringIO(flows.stdout)))
         assert [(row["topic"], row["publisher"], row["subscription"]) for row in rows] == [
@@ -74,6 +75,9 @@ def test_a_flow_over_ipv6_shows_its_3_tuple_and_that_no_label_is_set(
         assert f"    udp {source} → {destination} flow_label unset\n" in judged.stdout
 
 
+_WAITED_S = 5.0
+"""Of `--timeout`, by default; starting and looking take another second."""
+
 _CHATTER = {"topic": "/chatter", "from": "talker", "to": "listener"}
 _THIRD = {"run": {"attach": True}, "managed": False}
 
@@ -86,6 +90,11 @@ def test_an_empty_graph_says_where_it_looked(tmp_path: Path, fresh_domain: int) 
         f"no node in the graph; looked in ROS domain {fresh_domain} with rmw_fastrtps_cpp, "
         "discovery range localhost\n"
     )
+    # A system that is not there is not waited for where flows are only shown.
+    began = time.monotonic()
+    shown = verb("flows", str(manifest), runtime=tmp_path)
+    assert (shown.returncode, shown.stderr) == (ExitCode.VIOLATED, judged.stderr)
+    assert time.monotonic() - began < _WAITED_S
 
 
 def test_the_report_of_a_failed_run_names_the_failure(tmp_path: Path, fresh_domain: int) -> None:
