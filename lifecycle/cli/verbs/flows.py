@@ -246,10 +246,9 @@ def _show(
 
 def _plan_of(target: str, assignments: tuple[str, ...]) -> Plan:
     """Return the plan of a manifest, or that of a running system of this name."""
-    if os.path.isfile(target):  # noqa: PTH113 - Path.is_file() raises for a name too long
-        from lifecycle.plan import build_plan
-
-        return build_plan(load_manifest(target, assignments).manifest)
+    # Path.is_file() raises for a name too long.
+    if os.path.isfile(target) or target.endswith((".yaml", ".yml")):  # noqa: PTH113
+        return _plan(target, assignments)
     from lifecycle.supervisor import running_plan
 
     path, _ = target_plan(os.environ, target, assignments, "")
