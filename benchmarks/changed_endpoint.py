@@ -89,7 +89,9 @@ def measure(nodes: int, domain_id: int, changes: int) -> tuple[float, float]:
                 text=True,
             ) as tool,
         ):
-            assert supervisor.stdout and tool.stdin and tool.stdout
+            assert supervisor.stdout is not None
+            assert tool.stdin is not None
+            assert tool.stdout is not None
             try:
                 for line in supervisor.stdout:
                     event = json.loads(line)

@@ -1,6 +1,6 @@
 """Verifies the running system at every change: level-triggered, debounced, with a grace period.
 
-Owns: when `verify` is called again, how long a verdict that closes the gate is waited out, and
+Owns: when the system is judged again, how long a verdict that closes the gate is waited out, and
 `GracePeriod`: which findings may pass by themselves while a system is watched, because the facts of
 one change arrive one by one, and for how long a verdict that is worse by these alone is kept back.
 The gate itself has no grace period. Nothing is polled: the graph, or a node over its control
@@ -36,8 +36,8 @@ from lifecycle.verify import (
     Outcome,
     Stage,
     Verdict,
+    Verifier,
     rule,
-    verify,
 )
 
 PASSING_S = 1.0
@@ -245,7 +245,7 @@ class VerificationLoop:
         emit: Emitter,
         *,
         strict: bool,
-        verify_: Callable[..., Verdict] = verify,
+        verify_: Callable[..., Verdict] | None = None,
         looker: Looker | None = None,
         agreement: Agreement | None = None,
         guard: ActivationGuard | None = None,
@@ -255,7 +255,7 @@ class VerificationLoop:
         self._changes = changes
         self._emit = emit
         self._strict = strict
-        self._verify = verify_
+        self._verify = verify_ or Verifier().verify
         self._looker = looker
         self._agreement = agreement
         self._guard = guard
