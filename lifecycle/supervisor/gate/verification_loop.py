@@ -264,6 +264,7 @@ class VerificationLoop:
         self.seen = Observation()
         self._presence = NodeArrivals(emit)
         self._grace_period = GracePeriod()
+        self._asked_of: tuple[Plan, frozenset[str], Plan] | None = None
         self.ahead: frozenset[str] = frozenset()
 
     async def once(self, stage: Stage) -> Verdict:
@@ -314,7 +315,7 @@ class VerificationLoop:
 
     async def _look(self, stage: Stage) -> Verdict:
         await self._system.refresh(self._observer)
-        asked = without_nodes(self._system.plan, self._system.liveliness.silent)
+        asked = self._asked()
         observation = without(await self._observer.observe(asked), self._system.dead())
         self.seen = observation
         self._presence.see(observation)
@@ -339,6 +340,13 @@ class VerificationLoop:
             verdict = self._agreement.explained(verdict)
             verdict = with_findings(verdict, self._agreement.findings(observation))
         return with_findings(verdict, discovery_server.findings(self._system))
+
+    def _asked(self) -> Plan:
+        """Return the plan without silent nodes; the same object while that is the same."""
+        of = self._system.plan, frozenset(self._system.liveliness.silent)
+        if self._asked_of is None or self._asked_of[0] is not of[0] or self._asked_of[1] != of[1]:
+            self._asked_of = (*of, without_nodes(*of))
+        return self._asked_of[2]
 
     async def until_clear(
         self, stage: Stage, timeout_s: float, *, unchanged_s: float | None = None
