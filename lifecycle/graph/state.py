@@ -76,6 +76,7 @@ class Record:
         )
         self.reading: object | None = None
         """Token of the reading that is under way."""
+        self._taken: tuple[NodeConfiguration, NodeView] | None = None
         self._announced = member.checksum
         self._doubtful = member.checksum is None
         self._again = False
@@ -97,6 +98,16 @@ class Record:
             self._doubtful = True
         else:
             self._again = True
+
+    def holds(self, configuration: NodeConfiguration) -> bool:
+        """Whether this object was taken last, and nothing changed since."""
+        return (
+            self._taken is not None
+            and self._taken[0] is configuration
+            and self._taken[1] is self.view
+            and self.reading is None
+            and not self._doubtful
+        )
 
     def begin(self) -> object:
         """Begin to read; return the token of this reading."""
@@ -126,6 +137,7 @@ class Record:
             state=configuration.state,
             connected=configuration.connected,
         )
+        self._taken = configuration, self.view
         announced = False
         for message in meanwhile:
             announced |= isinstance(message, ConfigurationChanged | Heartbeat | Joined)
@@ -328,7 +340,10 @@ class GraphState:
         name = configuration.name
         with self._lock:
             held = self._given.get(name)
+            record = self._records.get(name)
             if held is not None and held == configuration:
+                if record is not None and record.holds(held):
+                    return  # it is known already, and nothing came after it
                 configuration = held
             else:
                 self._given = {**self._given, name: configuration}

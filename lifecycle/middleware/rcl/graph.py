@@ -557,7 +557,7 @@ class GraphObserver:
             listed = endpoints_of_node(self.node, kind, full_name)
             if listed is None:
                 return None
-            found.append((kind, tuple(listed)))
+            found.append((kind, listed))
         return tuple(found)
 
     def _services_of(

@@ -56,7 +56,7 @@ class _Strings(ctypes.Structure):
     )
 
     def all(self) -> tuple[bytes, ...]:
-        return tuple(self.data[index] or b"" for index in range(self.size))
+        return tuple([each or b"" for each in self.data[: self.size]])
 
 
 class _NamesAndTypes(ctypes.Structure):
@@ -86,6 +86,10 @@ class _Info(ctypes.Structure):
         ("topic_type", ctypes.c_char_p),
         ("announced", _Announced),
     )
+
+
+_Named = tuple[tuple[bytes, tuple[bytes, ...]], ...]
+"""Names, and the types of each."""
 
 
 class _Infos(ctypes.Structure):
@@ -179,7 +183,7 @@ def endpoints_of(
 
 def endpoints_of_node(
     node: Node, kind: EndpointKind, full_name: str
-) -> list[tuple[str, str]] | None:
+) -> tuple[tuple[str, str], ...] | None:
     """Return name and type of a node's publishers, subscriptions, servers or clients.
 
     Returns:
@@ -196,9 +200,13 @@ def endpoints_of_node(
         return int(function(handle, library.allocator, *arguments, result))
 
     found = _names_and_types(node, query, "")
-    if found is None:
-        return None
-    return [(_text(each), _text(type_)) for each, types in found for type_ in types]
+    return None if found is None else _as_text(found)
+
+
+@functools.lru_cache(maxsize=1 << 10)
+def _as_text(found: _Named) -> tuple[tuple[str, str], ...]:
+    """Return name and type as text; the same object for the same bytes."""
+    return tuple((_text(each), _text(type_)) for each, types in found for type_ in types)
 
 
 def full_name(name: str, namespace: str) -> str:
@@ -270,9 +278,7 @@ def _nanoseconds(duration: Any) -> int | None:
     return value if 0 < value < _INFINITE_NS else None
 
 
-def _names_and_types(
-    node: Node, query: Callable[[int, object], int], what: str
-) -> list[tuple[bytes, tuple[bytes, ...]]] | None:
+def _names_and_types(node: Node, query: Callable[[int, object], int], what: str) -> _Named | None:
     """Return what `query` fills in; None if it fails and `what` does not say what of."""
     library = _library()
     found = _NamesAndTypes()
@@ -283,9 +289,11 @@ def _names_and_types(
                 library.take_error()
                 return None
             library.check(status, what)
-            return [
-                (name, found.types[index].all()) for index, name in enumerate(found.names.all())
-            ]
+            size = found.names.size
+            types = found.types[:size] if size else []
+            return tuple(
+                [(n, each.all()) for n, each in zip(found.names.all(), types, strict=True)]
+            )
         finally:
             library.names_and_types_fini(ctypes.byref(found))
 
