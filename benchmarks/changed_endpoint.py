@@ -1,7 +1,7 @@
 """What one changed endpoint costs a supervisor: `python benchmarks/changed_endpoint.py`.
 
 Under `lifecycle up` there are nodes with ten endpoints each, a chain, ten to a process so that one
-host can run 200 of them. A tool beside them (`ros2 topic echo` is one) makes a subscription of a
+host can run many of them. A tool beside them (`ros2 topic echo` is one) makes a subscription of a
 topic of its own, and destroys it, again and again; each is one changed endpoint of the graph, at
 which the supervisor looks and judges. Printed is the CPU time of the supervisor for each of these
 changes, in milliseconds, beyond what it uses while nothing changes. What its DDS threads do with
