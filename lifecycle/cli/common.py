@@ -1,7 +1,7 @@
 """Options that several verbs share, loading a manifest, and finding a running system.
 
 Owns: `MANIFEST [name:=value …]`, `TARGET [name:=value …]` of the verbs about a running system,
-`--format` and `--timeout`.
+`--format`, `--timeout`, and the options that say which networks to program and what flows get.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
+from click.core import ParameterSource
 
 from lifecycle.errors import UsageError
 from lifecycle.printable import lines
@@ -182,3 +183,78 @@ def target_plan(
 
     plan = build_plan(load_manifest(target, assignments, quiet=True).manifest)
     return find_run(root, run_name(plan, machine)), plan
+
+
+def targets_option(flag: str, help_: str) -> Callable[[F], F]:
+    """Add the option that chooses networks to program; what each needs is NetworkCommand's."""
+    from lifecycle.programming import TARGETS
+
+    return click.option(flag, "targets", type=click.Choice(TARGETS), multiple=True, help=help_)
+
+
+class NetworkCommand(click.Command):
+    """A command that also takes every option of every network target, see programming.TARGETS.
+
+    What programs networks takes long to import, so they are looked up only for a command line that
+    has an option which is none of the command's own. Only those that were given are passed on.
+    """
+
+    _looks_up = True
+
+    def get_params(self, ctx: click.Context) -> list[click.Parameter]:
+        """Insert them behind the option that says which networks."""
+        params = super().get_params(ctx)
+        if self._looks_up:
+            behind = next(
+                index for index, each in enumerate(params, 1) if each.name in ("targets", "export")
+            )
+            params[behind:behind] = _network_options()
+        return params
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Look the options up if there are any."""
+        own = {flag for each in self.params for flag in each.opts}
+        self._looks_up = any(
+            each.startswith("-") and each.partition("=")[0] not in own for each in args
+        )
+        try:
+            rest = super().parse_args(ctx, args)
+            others = {each.name for each in self.params}
+            for name in [*ctx.params]:
+                is_given = ctx.get_parameter_source(name) is not ParameterSource.DEFAULT
+                if name not in others and not is_given:
+                    del ctx.params[name]
+        finally:
+            self._looks_up = True
+        return rest
+
+
+def _network_options() -> list[click.Option]:
+    from lifecycle.programming import target_options
+
+    return [
+        click.Option(
+            [each.flag, each.name],
+            metavar=each.metavar or None,
+            type=click.Choice(each.choices) if each.choices else None,
+            default=None if each.multiple else each.default,
+            show_default=bool(each.default),
+            multiple=each.multiple,
+            help=each.help,
+        )
+        for each in target_options()
+    ]
+
+
+def treatment_options(function: F) -> F:
+    """Add what flows get beyond the manifest; collect with `read_treatment`."""
+    function = click.option(
+        "--flow-labels", is_flag=True, help="Give each IPv6 flow a flow label of its own."
+    )(function)
+    return click.option(
+        "--dscp-from-5qi",
+        "mapping",
+        metavar="NAME|FILE",
+        default="",
+        help="Mark flows that have a 5QI and no DSCP by this mapping.",
+    )(function)

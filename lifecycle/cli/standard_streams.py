@@ -236,7 +236,7 @@ class Writer:
         self._lost = _NOTHING  # before its first
         self._telling = _NOTHING  # what a text that is being written says of them
         self._why = ""
-        self._told = False
+        self._reported = False
         self._full = False
         self._torn = False
         self._gone = False
@@ -374,7 +374,7 @@ class Writer:
 
     def _failed(self, error: OSError, lost: _Lost) -> None:
         message = f"{self._name} was closed by its reader; the run goes on without it"
-        told, self._told = self._told, True
+        reported, self._reported = self._reported, True
         with self._changed:
             if error.errno in _FULL:
                 self._full, self._why = True, error.strerror or "the disk is full"
@@ -384,10 +384,10 @@ class Writer:
                     "is counted"
                 )
             else:
-                told, self._gone = False, True
+                reported, self._gone = False, True
                 self._queue.clear()
                 self._bytes = 0
-        if not told:
+        if not reported:
             self._say(message)
 
     def _marked(self, lost: _Lost, why: str) -> bytes:

@@ -86,7 +86,7 @@ class CapturedNode:
         managed: it offers the lifecycle services.
         state: lifecycle_msgs/State label; empty if not known.
         parameters: None where it did not answer.
-        tells: its own configuration has more than discovery does.
+        has_configuration: its own configuration has more than discovery does.
         gaps: what is not known of it, one phrase each.
     """
 
@@ -99,7 +99,7 @@ class CapturedNode:
     endpoints: tuple[CapturedEndpoint, ...]
     repeated: tuple[CapturedEndpoint, ...]
     parameters: tuple[CapturedParameter, ...] | None
-    tells: bool
+    has_configuration: bool
     process_id: int | None
     gaps: tuple[str, ...]
 
@@ -348,7 +348,7 @@ def _node(
         else tuple(
             sorted((each for each in parameters if _is_own(each)), key=lambda each: each.name)
         ),
-        tells=configuration is not None,
+        has_configuration=configuration is not None,
         process_id=configuration.identity.process_id if configuration else None,
         gaps=tuple(gaps),
     )
@@ -366,10 +366,10 @@ def _endpoint(endpoint: ObservedEndpoint, reports: Iterable[EndpointReport]) -> 
     report = _report_of(endpoint, reports)
     qos = endpoint.qos
     if qos is not None and report is not None and report.qos is not None:
-        told = qos.history is not History.UNKNOWN
+        known = qos.history is not History.UNKNOWN
         qos = (
             qos
-            if told
+            if known
             else dataclasses.replace(qos, history=report.qos.history, depth=report.qos.depth)
         )
     return CapturedEndpoint(

@@ -130,7 +130,7 @@ _WIDTH = 100
 _ANNOUNCED = "history and depth are not announced"
 _NOW = "its value now; the default is not told"
 _SERVICES = "the graph does not show the QoS of services"
-_UNTOLD = "SYSTEM_DEFAULT"
+_UNKNOWN_POLICY = "SYSTEM_DEFAULT"
 
 
 def to_manifest(system: CapturedSystem, *, references: Mapping[str, str] | None = None) -> str:
@@ -168,7 +168,7 @@ def _comments(text: str) -> Iterable[str]:
 
 def _gaps(system: CapturedSystem) -> Iterable[str]:
     yield from system.gaps
-    foreign = [each.full_name for each in system.nodes if not each.tells]
+    foreign = [each.full_name for each in system.nodes if not each.has_configuration]
     if foreign:
         yield (
             "not ours, so that machine, process, flows, DSCP, history and depth are not told: "
@@ -281,14 +281,16 @@ def _endpoint(endpoint: CapturedEndpoint) -> Tree:
         tree["qos"] = _qos(endpoint.qos, endpoint.kind)
     elif endpoint.kind in (EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT):
         policies = ("history", "reliability", "durability", "liveliness")
-        tree["qos"] = Noted(value=dict.fromkeys(policies, _UNTOLD), note=f"gap: {_SERVICES}")
+        tree["qos"] = Noted(
+            value=dict.fromkeys(policies, _UNKNOWN_POLICY), note=f"gap: {_SERVICES}"
+        )
     return tree
 
 
 def _qos(qos: QosProfile, kind: EndpointKind) -> dict[str, Tree]:
     tree: dict[str, Tree] = {}
     if qos.history is History.UNKNOWN:
-        tree["history"] = Noted(value=_UNTOLD, note=f"gap: {_ANNOUNCED}")
+        tree["history"] = Noted(value=_UNKNOWN_POLICY, note=f"gap: {_ANNOUNCED}")
     else:
         tree["history"] = qos.history.value
         if qos.history is History.KEEP_LAST:
@@ -309,7 +311,7 @@ def _qos(qos: QosProfile, kind: EndpointKind) -> dict[str, Tree]:
 
 def _policy_value(value: str) -> Tree:
     if value == "UNKNOWN":
-        return Noted(value=_UNTOLD, note="gap: not announced")
+        return Noted(value=_UNKNOWN_POLICY, note="gap: not announced")
     return value
 
 

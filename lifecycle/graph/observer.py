@@ -160,7 +160,7 @@ class Observer:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._due: Remove | None = None
         self._closed = False
-        events.on_message(self._message_came)
+        events.on_message(self._message_received)
         self._remove = discovery.on_change(self._discovery_changed)
         if follows:
             events.scheduler.post(self._follow)
@@ -342,7 +342,7 @@ class Observer:
         self.changes += 1
         self._changed.set()
 
-    def _message_came(self, message: GraphMessage) -> None:
+    def _message_received(self, message: GraphMessage) -> None:
         """Take it as a change, unless it reports only what is known of its node.
 
         A node whose configuration is put into the state reports its changes that way; a heartbeat

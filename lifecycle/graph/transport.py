@@ -11,9 +11,10 @@ from __future__ import annotations
 import random
 import typing
 from collections.abc import Callable, Iterable
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
-from lifecycle.graph.scheduler import Remove, Scheduler
+if TYPE_CHECKING:  # it imports asyncio, which a node that only reports has no use for
+    from lifecycle.graph.scheduler import Remove, Scheduler
 
 
 class GraphTransport(Protocol):
@@ -91,7 +92,7 @@ class InMemoryNetwork:
         parted, self._islands = self._islands, {}
         if parted:
             for transport in tuple(self._transports):
-                self._scheduler.post(transport.peer_came)
+                self._scheduler.post(transport.peer_joined)
 
     def carry(self, sender: InMemoryTransport, message: bytes) -> None:
         """Deliver a message to every receiver on its sender's island, with accidents."""
@@ -114,7 +115,7 @@ class InMemoryNetwork:
         island = self._islands.get(receiver, 0)
         for transport in tuple(self._transports):
             if transport is not receiver and self._islands.get(transport, 0) == island:
-                self._scheduler.post(transport.peer_came)
+                self._scheduler.post(transport.peer_joined)
 
     def leave(self, transport: InMemoryTransport) -> None:
         """Forget a transport."""
@@ -170,7 +171,7 @@ class InMemoryTransport:
             for callback in tuple(self._callbacks.values()):
                 callback(message)
 
-    def peer_came(self) -> None:
+    def peer_joined(self) -> None:
         """Notify that a receiver is reached; called by the network."""
         if not self._closed:
             for callback in tuple(self._peer_callbacks.values()):

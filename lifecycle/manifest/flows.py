@@ -229,8 +229,8 @@ class ResolvedNeed:
         max_datagram_bytes: what its participant must not exceed so that IP does not fragment it;
             None if that cannot happen or is not known.
         transports: all that its participant may use; empty for any.
-        told_apart: every subscription of its topic asks for an NFE of its own, which identifies the
-            flow (weakly unique) whatever the publisher has.
+        identified_by_receiver: every subscription of its topic asks for an NFE of its own, which
+            identifies the flow (weakly unique) whatever the publisher has.
     """
 
     need: FlowNeed
@@ -242,7 +242,7 @@ class ResolvedNeed:
     max_message_size: int | None = None
     max_datagram_bytes: int | None = None
     transports: tuple[Medium, ...] = ()
-    told_apart: bool = False
+    identified_by_receiver: bool = False
 
     @property
     def dscp(self) -> int | None:
@@ -297,7 +297,7 @@ class FlowNeeds:
                     link.max_delay_ms, self._delays.get(place, link.max_delay_ms)
                 )
         self._sizes: dict[str, int | None] = {}
-        self._told_apart = _told_apart(manifest)
+        self._identified_by_receiver = _identified_by_receiver(manifest)
         resolved = {
             (node.key, need.kind, need.name): self._resolve(node, need)
             for node in manifest.nodes
@@ -352,7 +352,7 @@ class FlowNeeds:
                 if each.dscp is not None:
                     _add_subscription(found, each, each.transports or own[2])
                 continue
-            five_qi = None if each.unique or each.told_apart else each.five_qi
+            five_qi = None if each.unique or each.identified_by_receiver else each.five_qi
             transports = each.transports or own[2]
             class_ = (each.dscp, five_qi, transports, each.need.non_blocking_send)
             if not each.unique and class_ == own and each.max_datagram_bytes is None:
@@ -384,7 +384,7 @@ class FlowNeeds:
             max_delay_ms=delay,
             max_message_size=size,
             transports=self._transports(node) if self._by_participant(need) else (),
-            told_apart=topic in self._told_apart,
+            identified_by_receiver=topic in self._identified_by_receiver,
         )
 
     def _max_delay_ms(self, node: Node, need: FlowNeed, topic: str) -> float | None:
@@ -458,7 +458,7 @@ def _topic(node: Node, kind: EndpointKind, name: str) -> str:
         return ""
 
 
-def _told_apart(manifest: Manifest) -> frozenset[str]:
+def _identified_by_receiver(manifest: Manifest) -> frozenset[str]:
     """Topics whose every subscription gets an NFE of its own."""
     answers: dict[str, bool] = {}
     for node in manifest.nodes:

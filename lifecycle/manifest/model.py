@@ -26,6 +26,8 @@ from lifecycle.network import (
 class EndpointKind(enum.Enum):
     """The six kinds of endpoint; values are NoDL v2's list names."""
 
+    __hash__ = object.__hash__  # members are single; Enum's own is Python, and in every dictionary
+
     PUBLISHER = "publishers"
     SUBSCRIPTION = "subscriptions"
     SERVICE_SERVER = "service_servers"

@@ -27,8 +27,8 @@ from lifecycle.manifest.yaml.yaml_parser import (
     quote,
 )
 
-if TYPE_CHECKING:
-    import jsonschema
+if TYPE_CHECKING:  # it costs 60 ms, and who only asks for a similar name needs none of it
+    from jsonschema import Draft202012Validator
     from jsonschema.exceptions import ValidationError
 
 
@@ -301,14 +301,14 @@ def validate(
 
 
 @functools.cache
-def _validator(definition: str) -> jsonschema.Draft202012Validator:
+def _validator(definition: str) -> Draft202012Validator:
     schema = _resolved_only(read_schema(MANIFEST))
     assert isinstance(schema, dict)
     if definition:
         schema = {"$defs": schema["$defs"], "$ref": f"#/$defs/{definition}"}
-    import jsonschema  # 60 ms, and most who import this room validate nothing
+    from jsonschema import Draft202012Validator
 
-    return jsonschema.Draft202012Validator(schema)
+    return Draft202012Validator(schema)
 
 
 def _resolved_only(schema: object) -> object:

@@ -11,9 +11,7 @@ from .discovery.probe import peers_environment as peers_environment
 from .discovery.rediscovery import call_out as call_out
 from .discovery.rediscovery import send_again_soon as send_again_soon
 from .discovery.rediscovery import tell_names as tell_names
-from .fastdds.dscp import get_dscp as get_dscp
 from .fastdds.nfe import SHARED_MEMORY as SHARED_MEMORY
-from .fastdds.nfe import NetworkFlowEndpointsUnsupported as NetworkFlowEndpointsUnsupported
 from .fastdds.nfe import get_network_flow_endpoints as get_network_flow_endpoints
 from .fastdds.nfe import has_shared_memory as has_shared_memory
 from .fastdds.participant import FlowParticipant as FlowParticipant
@@ -33,16 +31,15 @@ from .process.shared_memory import leftovers as leftovers
 from .process.shared_memory import segments_of as segments_of
 from .process.shared_memory import sweep as sweep
 from .process.teardown import leave_and_exit as leave_and_exit
-from .rcl.abi import load_rcl as load_rcl
 from .rcl.executor import NodeExecutor as NodeExecutor
 from .rcl.graph import GraphObserver as GraphObserver
 from .rcl.graph_changes import ServerWatch as ServerWatch
 from .rcl.graph_changes import is_server_matched as is_server_matched
-from .rcl.graph_changes import on_graph_change as on_graph_change
 from .rcl.graph_queries import EndpointInfo as EndpointInfo
 from .rcl.graph_queries import endpoints_of as endpoints_of
 from .rcl.hidden_node import hidden_nodes as hidden_nodes
 from .rcl.matched_peers import guid_of as guid_of
+from .rcl.matched_peers import load_libraries as load_libraries
 from .rcl.matched_peers import matched_with as matched_with
 from .rcl.qos import UnknownInterfaceError as UnknownInterfaceError
 from .rcl.qos import from_rclpy as from_rclpy

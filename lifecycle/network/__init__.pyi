@@ -15,7 +15,6 @@ from .dscp import TransportPriorityMapping as TransportPriorityMapping
 from .dscp import code_points as code_points
 from .dscp import describe as describe
 from .dscp import dscp_name as dscp_name
-from .dscp import dscp_of_tos as dscp_of_tos
 from .dscp import map_priority as map_priority
 from .dscp import parse_dscp as parse_dscp
 from .dscp import tos as tos
@@ -27,7 +26,6 @@ from .five_qi import check_class as check_class
 from .five_qi import dscp_mapping as dscp_mapping
 from .five_qi import dscp_mappings as dscp_mappings
 from .five_qi import five_qi_of as five_qi_of
-from .five_qi import five_qis as five_qis
 from .five_qi import parse_mapping as parse_mapping
 from .five_qi import propose as propose
 from .medium import BUILTIN_TRANSPORTS as BUILTIN_TRANSPORTS
@@ -61,6 +59,8 @@ from .nfe import meets as meets
 from .nfe import socket_text as socket_text
 from .nfe import uniqueness as uniqueness
 from .ports import DG as DG
+from .ports import LOCALHOST_PARTICIPANTS as LOCALHOST_PARTICIPANTS
+from .ports import LOCALHOST_PEERS_RANGE as LOCALHOST_PEERS_RANGE
 from .ports import MAX_DOMAIN_ID as MAX_DOMAIN_ID
 from .ports import MAX_PORT as MAX_PORT
 from .ports import PARTICIPANTS_PER_DOMAIN as PARTICIPANTS_PER_DOMAIN
@@ -75,7 +75,6 @@ from .ports import domain_base as domain_base
 from .ports import domain_of as domain_of
 from .ports import ephemeral_range as ephemeral_range
 from .ports import max_participants as max_participants
-from .ports import max_unique_subscriptions as max_unique_subscriptions
 from .ports import overflows as overflows
 from .ports import overlaps as overlaps
 from .ports import owner_of as owner_of

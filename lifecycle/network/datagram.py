@@ -16,12 +16,6 @@ ETHERNET_MTU = 1500
 SAFE_DATAGRAM_BYTES = 1400
 """What we ask of a transport: leaves room below an Ethernet MTU for tunnels on the way."""
 
-MIN_DATAGRAM_BYTES = 1200
-"""Every IPv6 link carries it (1280 bytes of packet, RFC 8200); discovery needs about as much."""
-
-MAX_DATAGRAM_BYTES = 65500
-"""What Fast DDS takes for UDP (65507 bytes are what IPv4 has)."""
-
 _UDP_HEADER = 8
 _IP_HEADER = {False: 20, True: 40}
 

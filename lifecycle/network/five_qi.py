@@ -319,10 +319,6 @@ class DscpMapping:
         """Return the DSCP of a 5QI; None if the mapping has none."""
         return next((dscp for each, dscp in self.values if each == value), None)
 
-    def five_qis_for(self, dscp: int) -> tuple[int, ...]:
-        """Return the 5QIs that a DSCP may mean: several share one."""
-        return tuple(each for each, code in self.values if code == dscp)
-
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class _File:

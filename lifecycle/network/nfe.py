@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import dataclasses
 import enum
+import functools
 import ipaddress
 from collections.abc import Iterable, Sequence
 
@@ -28,6 +29,7 @@ from lifecycle.network.medium import Medium
 IpAddress = ipaddress.IPv4Address | ipaddress.IPv6Address
 
 
+@functools.lru_cache(maxsize=4096)
 def parse_address(text: str) -> IpAddress | None:
     """Return the address that `text` spells, else None (empty, a host name, …)."""
     try:
@@ -36,6 +38,7 @@ def parse_address(text: str) -> IpAddress | None:
         return None
 
 
+@functools.lru_cache(maxsize=4096)
 def canonical(text: str) -> str:
     """Return the one spelling of an address (RFC 5952); text that is none is returned unchanged."""
     address = parse_address(text)
@@ -47,12 +50,14 @@ def socket_text(address: str, port: int) -> str:
     return f"[{address}]:{port}" if ":" in address else f"{address}:{port}"
 
 
+@functools.lru_cache(maxsize=4096)
 def is_wildcard(text: str) -> bool:
     """Whether this is `0.0.0.0` or `::`, which means every unicast address of its host."""
     address = parse_address(text)
     return address is not None and address.is_unspecified
 
 
+@functools.lru_cache(maxsize=4096)
 def is_multicast(text: str) -> bool:
     """Whether this is a group, which is the same destination from wherever it is named."""
     address = parse_address(text)
@@ -103,6 +108,8 @@ def _equal(one: IpAddress, other: IpAddress) -> bool:
 class TransportProtocol(enum.Enum):
     """Transport protocol of an NFE (rmw_transport_protocol_t); UNKNOWN covers shared memory."""
 
+    __hash__ = object.__hash__  # members are single; Enum's own is Python, and in every dictionary
+
     UNKNOWN = "unknown"
     UDP = "udp"
     TCP = "tcp"
@@ -110,6 +117,8 @@ class TransportProtocol(enum.Enum):
 
 class InternetProtocol(enum.Enum):
     """Internet protocol of an NFE (rmw_internet_protocol_t); UNKNOWN covers shared memory."""
+
+    __hash__ = object.__hash__  # members are single; Enum's own is Python, and in every dictionary
 
     UNKNOWN = "unknown"
     IPV4 = "ipv4"
@@ -387,11 +396,6 @@ class FlowTuple:
     destination_port: PortOrNone
     flow_label: FlowLabel = 0
     dscp: DscpValue = 0
-
-    @property
-    def source_is_known(self) -> bool:
-        """Whether the source address is one address, so that the whole 5-tuple is known."""
-        return not is_wildcard(self.source_address)
 
     @property
     def source(self) -> str:

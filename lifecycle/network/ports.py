@@ -35,6 +35,15 @@ MAX_DOMAIN_ID = 232
 PARTICIPANTS_PER_DOMAIN = (DG - D1) // PG
 """Participants until the unicast ports reach the next domain's multicast ports: 120."""
 
+LOCALHOST_PEERS_RANGE = 32
+"""Participants of a host that one looks for with ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST.
+
+rmw_fastrtps takes multicast away then and gives 127.0.0.1 as a peer without a port, for which Fast
+DDS tries the ports of participants 0 to 31 (maxInitialPeersRange of the transport)."""
+LOCALHOST_PARTICIPANTS = LOCALHOST_PEERS_RANGE + 1
+"""Participants of a host that all find each other so: one beyond the range finds all that are in
+it, and these answer; two beyond it never find each other (measured with Fast DDS 2.14)."""
+
 EPHEMERAL_RANGE_FILE = "/proc/sys/net/ipv4/ip_local_port_range"
 
 

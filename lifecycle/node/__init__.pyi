@@ -13,10 +13,12 @@ from .author.spec import load_class as load_class
 from .connections.connection_status import ConnectionEvent as ConnectionEvent
 from .connections.connection_status import ConnectionEventKind as ConnectionEventKind
 from .connections.connections import Connection as Connection
+from .host.control import INTERFACE_ON_DEMAND as INTERFACE_ON_DEMAND
 from .host.control import Command as Command
 from .host.control import Event as Event
 from .host.control import HostSpec as HostSpec
 from .host.control import Operation as Operation
+from .host.host import needed_by as needed_by
 from .host.host import preload as preload
 from .host.host import serve as serve
 from .host.standalone import run as run

@@ -216,7 +216,7 @@ class Goals:
                 self._words.error(traceback.format_exc())
                 self._words.error(
                     f"cannot decide on a goal of {self._words.subject}, so it is rejected: "
-                    f"{_told(error)}"
+                    f"{_error_text(error)}"
                 )
                 return False
             if not isinstance(answer, bool):
@@ -251,7 +251,7 @@ class Goals:
                 self._words.error(run.trace)
                 self._words.error(
                     f"cannot go on with a goal of {self._words.subject}: its handler raised "
-                    f"{_told(run.failure)}"
+                    f"{_error_text(run.failure)}"
                 )
             return None
         returned = run.returned
@@ -269,7 +269,7 @@ class Goals:
         return returned
 
 
-def _told(error: Exception) -> str:
+def _error_text(error: Exception) -> str:
     todo = hint(error)
     return f"{type(error).__name__}: {error}" + (f"; {todo}" if todo else "")
 

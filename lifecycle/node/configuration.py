@@ -166,8 +166,8 @@ def connection_reports(
             name=each.name,
             urls=each.urls or (spec.connections.urls if each is connections.own else ()),
             node_name=each.node_name,
-            established=data_layer.standing.established(each),
-            mappings=tuple(mapping.spelling for mapping in data_layer.standing.on(each)),
+            established=data_layer.status.established(each),
+            mappings=tuple(mapping.spelling for mapping in data_layer.status.on(each)),
         )
         for each in (connections.own, *connections.named)
     )
@@ -350,9 +350,9 @@ class ConfigurationChanges:
     def touch(self) -> None:
         """Something of the configuration has changed, match counts included."""
         if self._listeners and not self._scheduled:
-            self._scheduled = bool(self._later(self._tell))
+            self._scheduled = bool(self._later(self._notify))
 
-    def _tell(self) -> None:
+    def _notify(self) -> None:
         self._scheduled = False
         configuration = self.collect()
         if configuration is None:

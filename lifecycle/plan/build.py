@@ -10,13 +10,14 @@ Pure but for the environment, for finding executables and for reading parameter 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import os
-from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 from lifecycle.errors import UsageError
 from lifecycle.manifest import (
+    After,
     Diagnostic,
     Discovery,
     DiscoveryMode,
@@ -55,6 +56,7 @@ from lifecycle.plan.model import (
     PlannedProcess,
     declared,
 )
+from lifecycle.plan.negotiation.parties import ANY, LinksByPair
 from lifecycle.plan.parameters import ParameterFiles
 from lifecycle.plan.participants import command_line, place_flows
 
@@ -81,18 +83,19 @@ def dependency_levels(nodes: Sequence[Node]) -> tuple[tuple[str, ...], ...]:
 
 def _settle(root: Node, by_key: dict[str, Node], depth: dict[str, int]) -> None:
     """Find the level of `root` and of all it waits for; iterative, so depth has no limit."""
-    path: list[str] = [root.key]
+    path: dict[str, Iterator[After]] = {root.key: iter(root.after)}
     while path:
-        node = by_key[path[-1]]
+        key = next(reversed(path))
         open_dependency = ""
-        for after in node.after:
+        for after in path[key]:
             if after.node not in by_key:
                 raise PlanError(
                     f"cannot wait for node {after.node!r}: the manifest declares no such node",
                     at=after.at,
                 )
             if after.node in path:
-                cycle = " → ".join([*path[path.index(after.node) :], after.node])
+                keys = [*path]
+                cycle = " → ".join([*keys[keys.index(after.node) :], after.node])
                 raise PlanError(
                     f"cannot order the nodes: they wait for each other, {cycle}", at=after.at
                 )
@@ -100,14 +103,11 @@ def _settle(root: Node, by_key: dict[str, Node], depth: dict[str, int]) -> None:
                 open_dependency = after.node
                 break
         if open_dependency:
-            path.append(open_dependency)
+            path[open_dependency] = iter(by_key[open_dependency].after)
             continue
-        depth[node.key] = 1 + max((depth[after.node] for after in node.after), default=-1)
-        path.pop()
+        depth[key] = 1 + max((depth[after.node] for after in by_key[key].after), default=-1)
+        del path[key]
 
-
-ANY = "*"
-"""A link's `from` or `to` that matches every node."""
 
 _STRENGTH = {UniqueHow.NOT: 0, UniqueHow.WEAKLY: 1, UniqueHow.STRONGLY: 2}
 
@@ -130,7 +130,8 @@ def planned_flows(nodes: Sequence[PlannedNode], links: Sequence[Link]) -> tuple[
     for link in links:
         if ANY not in (link.from_node, link.to_node):
             pairs.setdefault((link.topic, link.from_node, link.to_node), None)
-    return tuple(_flow(pair, links) for pair in pairs)
+    by_pair = LinksByPair(links)
+    return tuple(_flow(pair, by_pair.of(*pair)) for pair in pairs)
 
 
 def _topics(node: PlannedNode, kind: EndpointKind) -> Iterable[str]:
@@ -138,15 +139,8 @@ def _topics(node: PlannedNode, kind: EndpointKind) -> Iterable[str]:
     return dict.fromkeys(each.resolved for each in node.endpoints if each.kind is kind)
 
 
-def _flow(pair: tuple[str, str, str], links: Sequence[Link]) -> PlannedFlow:
+def _flow(pair: tuple[str, str, str], named: Sequence[Link]) -> PlannedFlow:
     topic, publisher, subscription = pair
-    named = [
-        link
-        for link in links
-        if link.topic == topic
-        and link.from_node in (publisher, ANY)
-        and link.to_node in (subscription, ANY)
-    ]
     told = [link.transport for link in named if link.transport is not FlowTransport.ANY]
     delays = [link.max_delay_ms for link in named if link.max_delay_ms is not None]
     return PlannedFlow(
@@ -315,7 +309,8 @@ def _wired(
     prefixes = search_prefixes(variables)
     needs = FlowNeeds(manifest, prefixes)
     files = ParameterFiles(manifest.path)
-    nodes = tuple(_planned_node(node, needs, prefixes, files) for node in manifest.nodes)
+    hash_of = functools.cache(functools.partial(installed_hash, prefixes=prefixes))
+    nodes = tuple(_planned_node(node, needs, hash_of, files) for node in manifest.nodes)
     return wire(
         manifest,
         nodes,
@@ -391,12 +386,10 @@ def effective_range(discovery: Discovery, environment: Mapping[str, str]) -> Dis
 
 
 def _planned_node(
-    node: Node, needs: FlowNeeds, prefixes: Sequence[Path], files: ParameterFiles
+    node: Node, needs: FlowNeeds, hash_of: Callable[[str], str], files: ParameterFiles
 ) -> PlannedNode:
     endpoints = tuple(
-        _planned_endpoint(
-            node, endpoint, needs.of(node.key, endpoint.kind, endpoint.name), prefixes
-        )
+        _planned_endpoint(node, endpoint, needs.of(node.key, endpoint.kind, endpoint.name), hash_of)
         for endpoint in node.interface.endpoints
     )
     # Only a node in our own host can be given more participants; what others start keeps its own.
@@ -434,7 +427,7 @@ def _planned_file(files: tuple[str, ...], place: str, written: str) -> PlannedFi
 
 
 def _planned_endpoint(
-    node: Node, endpoint: Endpoint, need: ResolvedNeed | None, prefixes: Sequence[Path]
+    node: Node, endpoint: Endpoint, need: ResolvedNeed | None, hash_of: Callable[[str], str]
 ) -> PlannedEndpoint:
     resolved = resolve(
         endpoint.name,
@@ -446,7 +439,7 @@ def _planned_endpoint(
     planned = PlannedEndpoint(
         **declared(Endpoint, endpoint),
         resolved=resolved,
-        type_hash=installed_hash(endpoint.type, prefixes),
+        type_hash=hash_of(endpoint.type),
     )
     if need is None:
         return planned

@@ -26,6 +26,7 @@ from .run.events import ProcessChanged as ProcessChanged
 from .run.events import ProcessState as ProcessState
 from .run.events import Reach as Reach
 from .run.events import RunStarted as RunStarted
+from .run.events import StageTimed as StageTimed
 from .run.events import Stopped as Stopped
 from .run.events import Stopping as Stopping
 from .run.events import SystemReached as SystemReached

@@ -47,13 +47,11 @@ from .tool_filter import NO_NAMES as NO_NAMES
 from .tool_filter import NODE_SERVICES as NODE_SERVICES
 from .tool_filter import OUR_SERVICES as OUR_SERVICES
 from .tool_filter import DeclaredNames as DeclaredNames
-from .tool_filter import action_part as action_part
 from .tool_filter import fold_actions as fold_actions
 from .tool_filter import is_hidden_node as is_hidden_node
 from .tool_filter import is_noise_endpoint as is_noise_endpoint
 from .tool_filter import is_noise_node as is_noise_node
 from .tool_filter import known_node as known_node
-from .tool_filter import our_nodes as our_nodes
 from .tool_filter import tolerating_pattern as tolerating_pattern
 from .tool_filter import without_noise as without_noise
 from .transport import NONE as NONE

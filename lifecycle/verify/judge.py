@@ -17,7 +17,8 @@ from lifecycle.verify.matcher import lay_out
 from lifecycle.verify.observation import Observation
 from lifecycle.verify.rules import CHECKS, rule
 from lifecycle.verify.tool_filter import OUR_NODES
-from lifecycle.verify.transport import Uniqueness, effective_transport
+from lifecycle.verify.transport import effective_transport
+from lifecycle.verify.uniqueness import Uniqueness
 from lifecycle.verify.verdict import (
     Finding,
     FlowReport,
@@ -34,9 +35,8 @@ _HOW = (UniqueHow.NOT, UniqueHow.WEAKLY, UniqueHow.STRONGLY)
 
 def flow_reports(view: View, findings: Sequence[Finding]) -> tuple[FlowReport, ...]:
     """Report every planned flow, in plan order."""
-    uniqueness = Uniqueness(view.reported, view.addresses)
     spoiled = _spoiled(findings)
-    return tuple(_report(view, flow, uniqueness, spoiled) for flow in view.flows)
+    return tuple(_report(view, flow, view.uniqueness, spoiled) for flow in view.flows)
 
 
 _Place = tuple[str, str, EndpointKind | None]

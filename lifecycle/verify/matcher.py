@@ -7,7 +7,7 @@ what is left over. All rules read the result, so that they agree on what is the 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 
 from lifecycle.manifest import EndpointKind
 from lifecycle.plan import Plan, PlannedEndpoint, PlannedFlow, PlannedNode
@@ -27,6 +27,7 @@ from lifecycle.verify.tool_filter import (
     known_node,
     tolerating_pattern,
 )
+from lifecycle.verify.uniqueness import Uniqueness
 from lifecycle.verify.verdict import Stage
 from lifecycle.verify.view import (
     Actual,
@@ -40,6 +41,9 @@ from lifecycle.verify.view import (
 
 _Pools = dict[tuple[EndpointKind, str], list[ObservedEndpoint]]
 """One node's endpoints by kind and name."""
+
+_End = tuple[str, EndpointKind, str]
+"""Full name of a node, kind and resolved name of what it declares."""
 
 _TURNS = ((True, True), (True, False), (False, False))
 """Who chooses first among a node's endpoints: those whose type discovery shows as declared, those
@@ -113,8 +117,17 @@ def lay_out(
             (*endpoints, *(each.observed for each in actual if each.unseen and each.observed)),
             actual,
         ),
-        flows=tuple(_flow(each, plan, by_node) for each in plan.flows),
+        flows=_flows(plan, actual),
+        uniqueness=Uniqueness(reported, declared_addresses(plan)),
     )
+
+
+def declared_addresses(plan: Plan) -> dict[str, str]:
+    """Return the declared address of each node's machine, by full node name, where there is one."""
+    machines = {each.name: each.address for each in plan.machines if each.address}
+    return {
+        node.full_name: machines[node.machine] for node in plan.nodes if node.machine in machines
+    }
 
 
 def _by_identity(observation: Observation) -> tuple[NodeConfiguration, ...]:
@@ -216,7 +229,7 @@ def _match_node(
     beyond: bool,
 ) -> tuple[list[Actual], list[ObservedEndpoint]]:
     """Match one node's declarations to what is seen of it; return them and what is left over."""
-    reports = list(configuration.endpoints) if configuration else []
+    reports = _Reports(configuration.endpoints if configuration else ())
     pools = {place: list(endpoints) for place, endpoints in places.items()}
     matched: dict[int, Actual] = {}
     used: set[tuple[EndpointKind, str]] = set()
@@ -225,7 +238,8 @@ def _match_node(
             if index in matched:
                 continue
             place = (planned.kind, planned.resolved)
-            report = _pick_report(planned, reports, exact=exact_report)
+            picked = reports.pick(planned, exact=exact_report)
+            report = reports.get(picked)
             observed = _pick_observed(planned, report, pools.get(place, []), exact=exact_observed)
             if exact_report and (observed if exact_observed else report) is None:
                 continue  # its turn comes
@@ -236,8 +250,7 @@ def _match_node(
                 used.add(place)  # found by name only: it represents any number of them
             elif unseen and report is not None and _is_there(report, planned.resolved):
                 observed = _as_observed(node, report, report.resolved)
-            if report is not None:
-                reports.remove(report)
+            reports.take(picked)
             matched[index] = Actual(
                 node=node,
                 planned=planned,
@@ -258,7 +271,7 @@ def _match_node(
     ]
     rest += [
         _as_observed(node, report, report.resolved)
-        for report in reports
+        for report in reports.left
         if (report.kind, report.resolved) not in places
         and not is_noise_endpoint(
             report.kind, node.full_name, report.resolved, report.type, ours=True
@@ -267,22 +280,41 @@ def _match_node(
     return [matched[index] for index in range(len(node.endpoints))], rest
 
 
-def _pick_report(
-    planned: PlannedEndpoint, reports: Sequence[EndpointReport], *, exact: bool
-) -> EndpointReport | None:
-    """Choose the report on a declared endpoint: by its declared name, else by its resolved one."""
-    for report in reports:
-        if report.kind is planned.kind and report.name == planned.name:
-            return report
-    for report in reports:
-        if (
-            report.kind is planned.kind
-            and report.resolved == planned.resolved
-            and (not exact or report.type == planned.type)
-            and not report.name
-        ):
-            return report
-    return None
+class _Reports:
+    """What a node reports, in its order; each report is of one declared endpoint."""
+
+    def __init__(self, endpoints: Iterable[EndpointReport]) -> None:
+        self._left = dict(enumerate(endpoints))
+        self._named: dict[tuple[EndpointKind, str], list[int]] = {}
+        self._nameless: dict[tuple[EndpointKind, str], list[int]] = {}
+        for index, each in self._left.items():
+            self._named.setdefault((each.kind, each.name), []).append(index)
+            if not each.name:
+                self._nameless.setdefault((each.kind, each.resolved), []).append(index)
+
+    @property
+    def left(self) -> Iterable[EndpointReport]:
+        """Those that were not taken."""
+        return self._left.values()
+
+    def pick(self, planned: PlannedEndpoint, *, exact: bool) -> int | None:
+        """Choose the report on a declared endpoint: by its declared name, else its resolved one."""
+        for index in self._named.get((planned.kind, planned.name), ()):
+            if index in self._left:
+                return index
+        for index in self._nameless.get((planned.kind, planned.resolved), ()):
+            if index in self._left and (not exact or self._left[index].type == planned.type):
+                return index
+        return None
+
+    def get(self, index: int | None) -> EndpointReport | None:
+        """Return a report that was picked."""
+        return None if index is None else self._left[index]
+
+    def take(self, index: int | None) -> None:
+        """Leave out a report from now on: it belongs to a declared endpoint."""
+        if index is not None:
+            del self._left[index]
 
 
 def _pick_observed(
@@ -395,20 +427,21 @@ def _type_hash(endpoint: ObservedEndpoint, report: EndpointReport | None) -> str
     return report.type_hash
 
 
-def _flow(planned: PlannedFlow, plan: Plan, by_node: dict[str, tuple[Actual, ...]]) -> FlowView:
-    publisher = plan.node(planned.publisher).full_name
-    subscription = plan.node(planned.subscription).full_name
-    publishers, subscriptions = (
-        tuple(
-            each
-            for each in by_node[name]
-            if each.planned.kind is kind and each.planned.resolved == planned.topic
-        )
-        for name, kind in (
-            (publisher, EndpointKind.PUBLISHER),
-            (subscription, EndpointKind.SUBSCRIPTION),
-        )
-    )
+def _flows(plan: Plan, actual: Iterable[Actual]) -> tuple[FlowView, ...]:
+    names = {node.key: node.full_name for node in reversed(plan.nodes)}
+    ends: dict[_End, tuple[Actual, ...]] = {}
+    for each in actual:
+        place = (each.node.full_name, each.planned.kind, each.planned.resolved)
+        ends[place] = (*ends.get(place, ()), each)
+    return tuple(_flow(each, names, ends) for each in plan.flows)
+
+
+def _flow(
+    planned: PlannedFlow, names: Mapping[str, str], ends: Mapping[_End, tuple[Actual, ...]]
+) -> FlowView:
+    publisher, subscription = names[planned.publisher], names[planned.subscription]
+    publishers = ends.get((publisher, EndpointKind.PUBLISHER, planned.topic), ())
+    subscriptions = ends.get((subscription, EndpointKind.SUBSCRIPTION, planned.topic), ())
     return FlowView(
         planned=planned,
         publisher=publisher,

@@ -160,7 +160,16 @@ class DeclaredNames:
 
     @classmethod
     def of(cls, plan: Plan) -> DeclaredNames:
-        """Collect those of a plan."""
+        """Collect those of a plan; those of the last few plans are remembered."""
+        known = _DECLARED.get(id(plan.nodes))
+        if known is None or known[0] is not plan.nodes:
+            if len(_DECLARED) >= _MOST_DECLARED:
+                _DECLARED.clear()
+            known = _DECLARED[id(plan.nodes)] = (plan.nodes, cls._of(plan))
+        return known[1]
+
+    @classmethod
+    def _of(cls, plan: Plan) -> DeclaredNames:
         services = (*NODE_SERVICES, *OUR_SERVICES)
         return cls(
             names=frozenset(
@@ -193,6 +202,11 @@ class DeclaredNames:
         if kind not in OFFERS or (kind, name) in NOISE_TOPICS:
             return False
         return self.has(kind, name) or (kind, name) in self.own
+
+
+_DECLARED: dict[int, tuple[tuple[PlannedNode, ...], DeclaredNames]] = {}
+"""By the identity of a plan's nodes, which are frozen; kept with them, so that it stays theirs."""
+_MOST_DECLARED = 4
 
 
 def known_node(full_name: str) -> str:
@@ -388,16 +402,13 @@ class Owners:
         namespace, _, base = hidden.rpartition("/")
         if tolerating_pattern(hidden, self._tools):
             return ""  # `_ros2cli_4711` is no participant of a node `ros2cli`
-        return max(
-            (
-                name
-                for name in self._planned
-                if name.rpartition("/")[0] == namespace
-                and base.startswith(f"_{name.rpartition('/')[2]}_")
-            ),
-            key=len,
-            default="",
-        )
+        end = base.rfind("_", 2)
+        while end > 0 and base.startswith("_"):
+            name = f"{namespace}/{base[1:end]}"
+            if name in self._planned:
+                return name  # the longest that fits
+            end = base.rfind("_", 2, end)
+        return ""
 
 
 def is_hidden_node(full_name: str) -> bool:

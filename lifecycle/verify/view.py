@@ -30,6 +30,7 @@ from lifecycle.verify.observation import (
     ObservedNode,
 )
 from lifecycle.verify.tool_filter import DeclaredNames
+from lifecycle.verify.uniqueness import Uniqueness
 from lifecycle.verify.verdict import Stage
 
 UNKNOWN_QOS = QosProfile(
@@ -158,6 +159,7 @@ class View:
         of_tools: their endpoints, housekeeping left out, sorted.
         seen: every publisher and subscription of the graph, tools left out, sorted.
         flows: every planned flow, in plan order.
+        uniqueness: which of the reported endpoints have a flow of their own.
     """
 
     plan: Plan
@@ -179,6 +181,7 @@ class View:
     of_tools: tuple[ObservedEndpoint, ...]
     seen: tuple[SeenEndpoint, ...]
     flows: tuple[FlowView, ...]
+    uniqueness: Uniqueness
 
     @property
     def seen_of_tools(self) -> tuple[SeenEndpoint, ...]:
@@ -214,16 +217,6 @@ class View:
     def brings_up(self, node: PlannedNode) -> bool:
         """Return whether the caller brings this node up, and so knows the state it must be in."""
         return self.machines is None or node.machine in self.machines
-
-    @property
-    def addresses(self) -> dict[str, str]:
-        """Declared address of each node's machine, by full node name; only where there is one."""
-        machines = {each.name: each.address for each in self.plan.machines if each.address}
-        return {
-            name: machines[node.machine]
-            for name, node in self.planned.items()
-            if node.machine in machines
-        }
 
     def identity(self, full_name: str) -> Identity | None:
         """Return the identity that a node reports; None if it reports none."""

@@ -218,9 +218,10 @@ def _settings(make: Make, place: Place) -> None:
     check(in_process(*words, variables={"XDG_RUNTIME_DIR": str(folder)}))
     from lifecycle.errors import LifecycleError
     from lifecycle.programming.apply.settings import load_settings
+    from lifecycle.programming.apply.targets.registry import settings_types
 
     try:
-        load_settings(folder / "targets.json")
+        load_settings(folder / "targets.json", settings_types())
     except LifecycleError as error:
         if "\n" in str(error) or not str(error).isprintable():
             raise Unhandled(repr(str(error))) from error

@@ -28,10 +28,11 @@ from lifecycle.node.host.control import Event
 from lifecycle.plan.comparison import PlanNoticeError, announced_plan, notice_of
 from lifecycle.plan.comparison import decode as decode_notice
 from lifecycle.plan.comparison import encode as encode_notice
-from lifecycle.programming.apply.errors import ProgrammingError
 from lifecycle.programming.apply.ledger import Ledger
-from lifecycle.programming.apply.nft import root_qdiscs
 from lifecycle.programming.apply.settings import load_settings
+from lifecycle.programming.apply.target import ProgrammingError
+from lifecycle.programming.apply.targets.nft import root_qdiscs
+from lifecycle.programming.apply.targets.registry import settings_types
 from lifecycle.programming.apply.tool import HostTool, ToolOutput
 from lifecycle.programming.rules.nftables import parse_managed_comment
 from lifecycle.run_directory import read_record
@@ -100,7 +101,7 @@ def _printed(data: bytes, folder: Path) -> object:
 
 
 def _tc(data: bytes, folder: Path) -> object:
-    from lifecycle.programming.apply.tc import TcTarget
+    from lifecycle.programming.apply.targets.tc import TcTarget
     from lifecycle.programming.rules.tc import TcSettings
 
     tool = FakeTool(("tc", ToolOutput(returncode=0, stdout=_text(data), stderr="")))
@@ -182,7 +183,7 @@ READERS: dict[str, Reader] = {
     ),
     "settings of a server": Reader(
         good=json.dumps({"nef": nef_settings("https://nef.test")}).encode(),
-        read=_file("targets.json", lambda path: load_settings(str(path))),
+        read=_file("targets.json", lambda path: load_settings(str(path), settings_types())),
         errors=(LifecycleError,),
     ),
     "nft listing": Reader(

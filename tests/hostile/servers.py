@@ -17,7 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from lifecycle.programming.apply.errors import PartlyError
+from lifecycle.programming.apply.target import PartlyError
 from tests.hostile.attack import (
     Attack,
     HostileClass,

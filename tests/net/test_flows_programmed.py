@@ -40,9 +40,6 @@ _ASKS: Mapping[str, Any] = {
 _VERB = """
 import sys
 from lifecycle.cli import main
-from lifecycle.cli.verbs import flows, flows_program
-if not hasattr(flows.command, "commands"):
-    flows.command = flows_program.with_subcommands(flows.command)
 sys.exit(main(["flows", *sys.argv[1:]]))
 """
 

@@ -10,10 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.programming.apply.changes import ChangeKind
-from lifecycle.programming.apply.errors import NotOursError, PrivilegeError
 from lifecycle.programming.apply.ledger import Ledger
-from lifecycle.programming.apply.nft import NftTarget
+from lifecycle.programming.apply.target import ChangeKind, NotOursError, PrivilegeError
+from lifecycle.programming.apply.targets.nft import NftTarget
 from lifecycle.programming.apply.tool import HostTool
 from lifecycle.programming.rules.rules import FlowRule
 from tests.net.hosts import Host, Hosts, lacking

@@ -11,16 +11,17 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.programming.apply import tc
-from lifecycle.programming.apply.changes import ChangeKind, TargetChanges
-from lifecycle.programming.apply.errors import (
+from lifecycle.programming.apply.ledger import Ledger
+from lifecycle.programming.apply.target import (
+    ChangeKind,
     MissingFeatureError,
     NotOursError,
     PrivilegeError,
     ProgrammingError,
+    TargetChanges,
 )
-from lifecycle.programming.apply.ledger import Ledger
-from lifecycle.programming.apply.tc import TcTarget, probe_features
+from lifecycle.programming.apply.targets import tc
+from lifecycle.programming.apply.targets.tc import TcTarget, probe_features
 from lifecycle.programming.apply.tool import HostTool, ToolOutput
 from lifecycle.programming.rules.rules import FlowRule
 from lifecycle.programming.rules.tc import TcFeatures, TcMatch, TcSettings

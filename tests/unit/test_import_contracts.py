@@ -20,7 +20,7 @@ PURE_ROOMS = (
     "verify",
     "export",
     "run_directory",
-    "programming.rules",
+    "programming.rules.registry",
     "codec",
     "errors",
 )
@@ -57,7 +57,9 @@ def test_networks_are_programmed_without_ros_and_loaded_without_httpx() -> None:
     code = (
         "import sys\n"
         "sys.modules['rclpy'] = sys.modules['httpx'] = None\n"
-        "import lifecycle.programming.apply\n"
+        "import lifecycle.programming.apply.programmer\n"
+        "from lifecycle.programming import target_options\n"
+        "assert target_options()\n"
     )
     result = subprocess.run(
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False

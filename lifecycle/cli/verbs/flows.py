@@ -1,30 +1,33 @@
-"""`lifecycle flows`: show every network flow and how unique it is, or export them (`--export`).
+"""`lifecycle flows`: show every network flow and how unique it is, export them, program networks.
 
-Owns: flows as a table, JSON or CSV: the columns of the table, and how unknown values read; and for
-`--export` the step from options to what an export needs, and its refusals. The exported texts are
-from `programming.rules`; `apply`, `diff` and `remove`, which program networks, are in
-flows_program.py.
+Owns: flows as a table, JSON or CSV: the columns of the table, and how unknown values read; for
+`--export` the step from options to what an export needs, and its refusals; and the subcommands
+`apply`, `diff` and `remove`. The exported texts and what is done to networks are programming's.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+import shlex
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from lifecycle.cli.common import format_option, load_manifest, target_plan, timeout_option
-from lifecycle.cli.standard_streams import echo_while_read
-from lifecycle.cli.verbs.flows_program import (
-    chosen,
-    network_options,
-    treatment_of,
+from lifecycle.cli.common import (
+    NetworkCommand,
+    format_option,
+    load_manifest,
+    manifest_arguments,
+    target_plan,
+    targets_option,
+    timeout_option,
     treatment_options,
-    with_subcommands,
 )
+from lifecycle.cli.standard_streams import echo_while_read
+from lifecycle.cli.verbs.verify import exit_code
 from lifecycle.codec import to_json
-from lifecycle.errors import UsageError
+from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest import UniqueHow
 from lifecycle.network import NetworkFlowEndpoint, describe
 from lifecycle.printable import json_text, lines, one_line
@@ -32,11 +35,9 @@ from lifecycle.programming import flows_to_csv
 from lifecycle.verify import FlowReport
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from lifecycle.plan import Plan
-    from lifecycle.programming import ExportSettings, TargetOptions, Treatment
-    from lifecycle.verify import FlowReport
+    from lifecycle.programming import Programmer, TargetChanges, TargetOptions, Treatment
+    from lifecycle.verify import FlowReport, Verdict
 
 
 _HEADS = (
@@ -121,33 +122,37 @@ def _ends(nfes: Sequence[NetworkFlowEndpoint]) -> str:
 
 NAMES = ("nft", "nft-json", "tc", "nef", "camara", "fastdds-pro", "zenoh", "csv")
 
-_SETTINGS = {
-    "tc": "give --device eth0",
-    "nef": "give --config FILE",
-    "camara": "give --config FILE",
-}
-"""What exports that need more than flows get it from."""
-
 
 class Export:
     """One export, with its options checked before anything is looked at.
 
     Args:
         name: of NAMES.
-        mapping, flow_labels: see flows_program.treatment_options.
-        given: see flows_program.network_options.
+        mapping, flow_labels: see common.treatment_options.
+        given: see common.NetworkCommand.
 
     Raises:
         UsageError: the options do not fit.
     """
 
     def __init__(self, name: str, *, mapping: str, flow_labels: bool, **given: Any) -> None:
+        from lifecycle.programming import (
+            TARGETS,
+            ExportSettings,
+            read_targets,
+            read_treatment,
+            target_kind,
+        )
+
         self._name = name
         # Such an export takes what programming that network takes; it says itself if it needs any.
-        some = any(value for option, value in given.items() if option != "match")
-        options = chosen((name,) if some and name in _SETTINGS else (), option="--export", **given)
-        self._settings = _settings(options)
-        self._treatment: Treatment = treatment_of(mapping=mapping, flow_labels=flow_labels)
+        kind = target_kind(name) if name in TARGETS else None
+        self._hint = "" if kind is None else kind.hint
+        takes = kind is not None and kind.takes and any(given.values())
+        options = read_targets((name,) if takes else (), given, option="--export")
+        exported = [each.exported() for each in options]
+        self._settings = ExportSettings(**(exported[0] if exported else {}))
+        self._treatment = read_treatment(mapping, label_flows=flow_labels)
 
     def write(self, plan: Plan, flows: Sequence[FlowReport]) -> None:
         """Print the text; flows that are not in it, and why, go to stderr.
@@ -167,32 +172,18 @@ class Export:
         try:
             text = EXPORTS[self._name](given)
         except ValueError as error:
-            raise UsageError(str(error), hint=_SETTINGS.get(self._name, "")) from error
+            raise UsageError(str(error), hint=self._hint) from error
         click.echo(text, nl=not text.endswith("\n"))
         if self._name != "csv":
             for each in given.rules.left_out:
                 click.echo(lines(f"left out: {each}"), err=True)
 
 
-def _settings(options: Sequence[TargetOptions]) -> ExportSettings:
-    from lifecycle.programming import ExportSettings, load_settings
-
-    for each in options:
-        if each.kind == "tc":
-            return ExportSettings(tc=each.tc())
-        settings = load_settings(each.settings)
-        return ExportSettings(
-            nef=None if settings.nef is None else settings.nef.asked(),
-            camara=None if settings.camara is None else settings.camara.asked(),
-        )
-    return ExportSettings()
-
-
 _NOBODY_S = 1.5
 """Some node of what runs is seen within so long; a system without any is waited for if asked."""
 
 
-@click.command("flows")
+@click.command("flows", cls=NetworkCommand)
 @click.argument("target", metavar="TARGET")
 @click.argument("assignments", nargs=-1, metavar="[NAME:=VALUE]...")
 @format_option("text", "json", "csv")
@@ -203,7 +194,6 @@ _NOBODY_S = 1.5
     type=click.Choice(NAMES),
     help="Print the verified flows as rules, settings or request bodies of another system instead.",
 )
-@network_options
 @treatment_options
 def _show(
     *,
@@ -222,21 +212,19 @@ def _show(
     One line per network flow: its 5-tuple, on IPv6 its flow label, DSCP and TOS byte, how unique it
     is, what was required and the verdict. Exits as `lifecycle verify` does.
     """
-    from lifecycle.cli.verbs.verify import exit_code
     from lifecycle.supervisor import follow_running, judge_running, supervisor_of
-    from lifecycle.verify import Verdict
 
     exporter = None
     if export is not None:
         if watch:
             raise UsageError("cannot use --export with --watch; export once")
         exporter = Export(export, **rest)
-    elif any(value for name, value in rest.items() if name != "match"):
+    elif any(rest.values()):
         raise UsageError(
             "cannot say how to treat flows that are only shown",
             hint="give --export, or use lifecycle flows apply",
         )
-    plan = _plan(target, assignments)
+    plan = _plan_of(target, assignments)
 
     def show(verdict: Verdict) -> None:
         click.echo(render_flows(verdict.flows, format_))
@@ -256,16 +244,225 @@ def _show(
     return exit_code(seen.verdict, strict=False)
 
 
-def _plan(target: str, assignments: tuple[str, ...]) -> Plan:
+def _plan_of(target: str, assignments: tuple[str, ...]) -> Plan:
     """Return the plan of a manifest, or that of a running system of this name."""
-    if os.path.isfile(target):  # noqa: PTH113 - Path.is_file() raises for a name too long
-        from lifecycle.plan import build_plan
-
-        return build_plan(load_manifest(target, assignments).manifest)
+    # Path.is_file() raises for a name too long.
+    if os.path.isfile(target) or target.endswith((".yaml", ".yml")):  # noqa: PTH113
+        return _plan(target, assignments)
     from lifecycle.supervisor import running_plan
 
     path, _ = target_plan(os.environ, target, assignments, "")
     return running_plan(path)
 
 
-command = with_subcommands(_show)
+def apply(
+    plan: Plan,
+    flows: Sequence[FlowReport],
+    options: Sequence[TargetOptions],
+    *,
+    dry_run: bool,
+    treatment: Treatment | None = None,
+) -> int:
+    """Program the networks with the verified flows, and say what was done.
+
+    What is made stays until `remove`, or until the system is brought down.
+    """
+    from lifecycle.programming import PartlyError
+
+    programmer = _open(plan, options, treatment)
+    try:
+        if dry_run:
+            click.echo(programmer.dry_run(flows), nl=False)
+        else:
+            try:
+                _show_changes(programmer.update(flows), done=True)
+            except PartlyError as error:
+                if error.done:
+                    error.hint = f"take back what was done: lifecycle flows remove {_spell(plan)}"
+                raise
+        _show_left_out(programmer)
+    finally:
+        programmer.release()
+    return ExitCode.OK
+
+
+def diff(
+    plan: Plan,
+    flows: Sequence[FlowReport],
+    options: Sequence[TargetOptions],
+    *,
+    treatment: Treatment | None = None,
+) -> int:
+    """Say what `apply` would do.
+
+    Returns:
+        VIOLATED if a network is not as the verified flows want it.
+    """
+    programmer = _open(plan, options, treatment)
+    try:
+        changes = programmer.diff(flows)
+        _show_changes(changes, done=False)
+        _show_left_out(programmer)
+    finally:
+        programmer.release()
+    return ExitCode.VIOLATED if any(each.pending for each in changes) else ExitCode.OK
+
+
+def remove(plan: Plan) -> int:
+    """Remove everything of the system from every network that it was applied to."""
+    changes = _open(plan, ()).close()
+    if changes:
+        _show_changes(changes, done=True)
+    else:
+        click.echo(f"nothing of system {plan.system} is in any network")
+    return ExitCode.OK
+
+
+@click.command("apply", cls=NetworkCommand)
+@manifest_arguments
+@targets_option("--target", "Network to program; may be given several times.")
+@treatment_options
+@click.option("--dry-run", is_flag=True, help="Print what would be sent; check it if possible.")
+@timeout_option(5.0, "How long flows that are not complete may still become so.")
+def apply_command(
+    *,
+    manifest: str,
+    assignments: tuple[str, ...],
+    targets: tuple[str, ...],
+    dry_run: bool,
+    timeout: float,
+    mapping: str,
+    flow_labels: bool,
+    **rest: Any,
+) -> int:
+    """Program networks with the verified flows of a running system.
+
+    Only flows whose verdict is ok; only what is ours is touched; a second time changes nothing.
+    """
+    options, treatment = _asked(targets, rest, mapping, flow_labels=flow_labels)
+    plan, verdict = _judged(manifest, assignments, timeout)
+    done = apply(plan, verdict.flows, options, dry_run=dry_run, treatment=treatment)
+    return done or exit_code(verdict, strict=False)
+
+
+@click.command("diff", cls=NetworkCommand)
+@manifest_arguments
+@targets_option("--target", "Network to program; may be given several times.")
+@treatment_options
+@timeout_option(5.0, "How long flows that are not complete may still become so.")
+def diff_command(
+    *,
+    manifest: str,
+    assignments: tuple[str, ...],
+    targets: tuple[str, ...],
+    timeout: float,
+    mapping: str,
+    flow_labels: bool,
+    **rest: Any,
+) -> int:
+    """Compare networks with the verified flows; exits with 4 where they differ."""
+    options, treatment = _asked(targets, rest, mapping, flow_labels=flow_labels)
+    plan, verdict = _judged(manifest, assignments, timeout)
+    return diff(plan, verdict.flows, options, treatment=treatment) or exit_code(
+        verdict, strict=False
+    )
+
+
+@click.command("remove")
+@manifest_arguments
+def remove_command(manifest: str, assignments: tuple[str, ...]) -> int:
+    """Remove from networks everything that was applied for a system, running or not."""
+    return remove(_plan(manifest, assignments))
+
+
+def _asked(
+    targets: tuple[str, ...], given: Mapping[str, Any], mapping: str, *, flow_labels: bool
+) -> tuple[tuple[TargetOptions, ...], Treatment]:
+    from lifecycle.programming import TARGETS, read_targets, read_treatment
+
+    options = read_targets(targets, given)
+    if not options:
+        raise UsageError(f"cannot program no network; give --target {'|'.join(TARGETS)}")
+    return options, read_treatment(mapping, label_flows=flow_labels)
+
+
+def _plan(manifest: str, assignments: tuple[str, ...]) -> Plan:
+    from lifecycle.plan import build_plan
+
+    return build_plan(load_manifest(manifest, assignments).manifest)
+
+
+def _judged(manifest: str, assignments: tuple[str, ...], timeout_s: float) -> tuple[Plan, Verdict]:
+    from lifecycle.supervisor import judge_running
+
+    seen = judge_running(_plan(manifest, assignments), timeout_s=timeout_s, strict=False)
+    if seen.where:
+        click.echo(lines(seen.where), err=True)
+    return seen.plan, seen.verdict
+
+
+def _spell(plan: Plan) -> str:
+    return shlex.quote(plan.manifest_path)
+
+
+def _open(
+    plan: Plan, options: Sequence[TargetOptions], treatment: Treatment | None = None
+) -> Programmer:
+    from lifecycle.programming import open_programmer
+
+    return open_programmer(plan, options, environment=os.environ, treatment=treatment)
+
+
+def _show_changes(changes: Iterable[TargetChanges], *, done: bool) -> None:
+    for each in changes:
+        click.echo(each.render(done=done))
+
+
+def _show_left_out(programmer: Programmer) -> None:
+    """On stderr, beside a ruleset or bodies that go to a file."""
+    for each in programmer.left_out:
+        click.echo(lines(f"left out: {each}"), err=True)
+
+
+class _WithSubcommands(click.Group):
+    """`flows apply …` is a subcommand, `flows MANIFEST …` is the command itself."""
+
+    def __init__(self, show: click.Command, subcommands: Sequence[click.Command]) -> None:
+        super().__init__(
+            show.name, params=[], help=show.help, commands=list(subcommands), add_help_option=True
+        )
+        self._show = show
+
+    def make_context(
+        self,
+        info_name: str | None,
+        args: list[str],
+        parent: click.Context | None = None,
+        **extra: Any,
+    ) -> click.Context:
+        """Choose by the first argument."""
+        if args and args[0] in (*self.commands, "-h", "--help"):
+            return super().make_context(info_name, args, parent=parent, **extra)
+        return self._show.make_context(info_name, args, parent=parent, **extra)
+
+    def format_usage(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Show the command's own usage first."""
+        self._show.format_usage(ctx, formatter)
+        formatter.write_usage(ctx.command_path, "apply|diff|remove ...")
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Show the command's own options, then the subcommands."""
+        self._show.format_options(ctx, formatter)
+        self.format_commands(ctx, formatter)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run what the context was made for; below another group, click does so itself."""
+        return super().invoke(ctx) if ctx.command is self else ctx.command.invoke(ctx)
+
+
+def with_subcommands(show: click.Command) -> click.Group:
+    """Return `lifecycle flows`: `show`, and beside it apply, diff and remove."""
+    return _WithSubcommands(show, (apply_command, diff_command, remove_command))
+
+
+command = _WithSubcommands(_show, (apply_command, diff_command, remove_command))

@@ -16,6 +16,7 @@ from lifecycle.codec import to_json
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest import Discovery
 from lifecycle.network import (
+    LOCALHOST_PARTICIPANTS,
     Capacity,
     EphemeralRange,
     ParticipantPorts,
@@ -62,6 +63,7 @@ class PortsReport:
 
     Attributes:
         safe_domains: first and last id of each run.
+        localhost_participants: so many of one host all find each other with `range: localhost`.
         unique_subscription_ports: first and last.
         needs: one per host of the manifest, or one for `--participants`.
     """
@@ -74,6 +76,7 @@ class PortsReport:
     ephemeral: EphemeralRange
     safe_domains: tuple[tuple[int, int], ...]
     capacity: Capacity
+    localhost_participants: int
     unique_subscription_ports: tuple[int, int]
     needs: tuple[Need, ...]
 
@@ -124,6 +127,7 @@ def command(
             ephemeral=ephemeral,
             safe_domains=tuple((run[0], run[-1]) for run in safe_domains(ephemeral)),
             capacity=max_participants(domain, ephemeral),
+            localhost_participants=LOCALHOST_PARTICIPANTS,
             unique_subscription_ports=(unique_flow_ports()[0], unique_flow_ports()[-1]),
             needs=_judged(_needs(plan, participants), domain, ephemeral),
         )
@@ -200,6 +204,7 @@ def _lines(report: PortsReport) -> list[str]:
             f"  fit in domain {report.domain_id:<8}{capacity.participants} participants per host, "
             f"then {capacity.limit}"
         ),
+        f"  find each other       {report.localhost_participants} with 'range: localhost'",
     ]
     for need in report.needs:
         lines += _need_lines(need)

@@ -6,14 +6,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from lifecycle.cli.common import format_option, load_manifest, manifest_arguments, timeout_option
-from lifecycle.cli.report import ReportFile, report_option, written_or_said
-from lifecycle.cli.verbs.flows_program import (
-    chosen,
-    program_options,
-    treatment_of,
+from lifecycle.cli.common import (
+    NetworkCommand,
+    format_option,
+    load_manifest,
+    manifest_arguments,
+    targets_option,
+    timeout_option,
     treatment_options,
 )
+from lifecycle.cli.report import ReportFile, report_option, written_or_said
 from lifecycle.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
@@ -24,7 +26,7 @@ if TYPE_CHECKING:
     from lifecycle.supervisor import UpResult
 
 
-@click.command("up")
+@click.command("up", cls=NetworkCommand)
 @manifest_arguments
 @format_option("text", "json")
 @click.option(
@@ -58,7 +60,15 @@ if TYPE_CHECKING:
     is_flag=True,
     help="Report a process that dies, but do not take the others down.",
 )
-@program_options
+@click.option(
+    "--timings",
+    is_flag=True,
+    help="Say how long each stage of bring-up took, once it is over or has failed.",
+)
+@targets_option(
+    "--program",
+    "Program this network with the verified flows while active; may be given several times.",
+)
 @treatment_options
 def command(
     *,
@@ -72,6 +82,7 @@ def command(
     strict: bool,
     machine: str,
     keep_going: bool,
+    timings: bool,
     targets: tuple[str, ...],
     mapping: str,
     flow_labels: bool,
@@ -113,7 +124,8 @@ def command(
                     program=program,
                     treatment=_treatment(targets, mapping=mapping, flow_labels=flow_labels),
                 )
-                with output(format_) as listener, ending.noted():
+                timed = until if timings else ""
+                with output(format_, timings_until=timed) as listener, ending.noted():
 
                     def conclude(result: UpResult) -> ExitCode:
                         return _finished(result, listener, written)
@@ -146,9 +158,11 @@ def _finished(result: UpResult, listener: RunOutput, written: ReportFile) -> Exi
 
 def _networks(targets: tuple[str, ...], **given: Any) -> tuple[TargetOptions, ...]:
     """What programs networks takes long to import, so only where it is asked for."""
-    if not targets and not any(value for name, value in given.items() if name != "match"):
+    if not targets and not any(given.values()):
         return ()
-    return chosen(targets, option="--program", **given)
+    from lifecycle.programming import read_targets
+
+    return read_targets(targets, given, option="--program")
 
 
 def _tokens(program: tuple[TargetOptions, ...]) -> frozenset[str]:
@@ -162,7 +176,9 @@ def _tokens(program: tuple[TargetOptions, ...]) -> frozenset[str]:
 
 def _treatment(targets: tuple[str, ...], *, mapping: str, flow_labels: bool) -> Treatment | None:
     if targets:
-        return treatment_of(mapping=mapping, flow_labels=flow_labels)
+        from lifecycle.programming import read_treatment
+
+        return read_treatment(mapping, label_flows=flow_labels)
     if mapping or flow_labels:
         raise UsageError("cannot use --dscp-from-5qi or --flow-labels without --program")
     return None

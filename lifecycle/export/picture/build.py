@@ -136,7 +136,9 @@ def _node(id_: str, name: str, basis: Basis, supervised: Supervised) -> Pictured
         pid=pid or None,
         notes=tuple(_notes(name, basis, supervised)),
         participants=pictured_participants(basis, id_, name, presence),
-        findings=basis.numbers(lambda each: bool(name) and name in (each.node, each.subject)),
+        findings=basis.numbers(
+            name, concerns=lambda each: bool(name) and name in (each.node, each.subject)
+        ),
     )
 
 
@@ -151,19 +153,21 @@ def _state(name: str, view: View, presence: Presence, supervised: Supervised) ->
         return PicturedNodeState.MANAGED if view.planned[name].managed else PicturedNodeState.PLAIN
     if supervised.silent:
         return PicturedNodeState.SILENT
-    told = (observed.state if observed else None) or (configuration.state if configuration else "")
-    if told:
-        state = _STATES.get(told, PicturedNodeState.CHANGING)
+    reported = (observed.state if observed else None) or (
+        configuration.state if configuration else ""
+    )
+    if reported:
+        state = _STATES.get(reported, PicturedNodeState.CHANGING)
         connected = configuration is not None and configuration.connected
         return (
             PicturedNodeState.CONNECTED
             if connected and state is PicturedNodeState.INACTIVE
             else state
         )
-    return _untold(None if observed is None else observed.managed, presence)
+    return _unreported_state(None if observed is None else observed.managed, presence)
 
 
-def _untold(managed: bool | None, presence: Presence) -> PicturedNodeState:
+def _unreported_state(managed: bool | None, presence: Presence) -> PicturedNodeState:
     """The state of a node that reports none."""
     if managed is False:
         return PicturedNodeState.PLAIN

@@ -57,9 +57,11 @@ def pictured_lines(basis: Basis, nodes: Mapping[str, PicturedNode]) -> Iterable[
     ends = list(_ends(basis))
     number = 0
     for kind, source_kind, target_kind in _KINDS:
-        names = dict.fromkeys(e.name for e in ends if e.kind in (source_kind, target_kind))
-        for name in names:
-            here = [e for e in ends if e.name == name and e.kind in (source_kind, target_kind)]
+        by_name: dict[str, list[_LineEnd]] = {}
+        for end in ends:
+            if end.kind in (source_kind, target_kind):
+                by_name.setdefault(end.name, []).append(end)
+        for name, here in by_name.items():
             sources = [each for each in here if each.kind is source_kind]
             targets = [each for each in here if each.kind is target_kind]
             yield PicturedLine(
@@ -119,8 +121,10 @@ def _pictured(
     basis: Basis, ends: Sequence[_LineEnd], nodes: Mapping[str, PicturedNode]
 ) -> Iterable[PicturedEnd]:
     """One end per node and presence: several endpoints of a node on one name are one end."""
-    for node, presence in dict.fromkeys((each.node, each.presence) for each in ends):
-        same = [each for each in ends if (each.node, each.presence) == (node, presence)]
+    by_place: dict[tuple[str, Presence], list[_LineEnd]] = {}
+    for each in ends:
+        by_place.setdefault((each.node, each.presence), []).append(each)
+    for (node, presence), same in by_place.items():
         several = (f"{len(same)} endpoints",) if len(same) > 1 else ()
 
         def concerns(finding: Finding, node: str = node, end: _LineEnd = same[0]) -> bool:
@@ -134,7 +138,7 @@ def _pictured(
             node=nodes[node].id,
             presence=presence,
             notes=(*several, *dict.fromkeys(note for each in same for note in each.notes)),
-            findings=basis.numbers(concerns),
+            findings=basis.numbers(ends[0].name, concerns=concerns),
         )
 
 
@@ -180,19 +184,19 @@ def pictured_participants(
         presence: of the node.
     """
     planned = basis.view.planned.get(name)
-    told = _told(basis.view.configurations.get(name))
+    reported = _reported_participants(basis.view.configurations.get(name))
     own = (OWN, presence, planned.connections.urls if planned else ())
     found: dict[str, tuple[str, Presence, tuple[str, ...]]] = {}
     for each in planned.participants if planned else ():
-        words = [each.reason, *each.connections.urls, *told.get(each.name, ("", ()))[1]]
+        words = [each.reason, *each.connections.urls, *reported.get(each.name, ("", ()))[1]]
         if each.dscp is not None and describe(each.dscp) not in each.reason:
             words.append(describe(each.dscp))
         found[each.name] = (
             each.connection or each.name,
-            Presence.PRESENT if each.name in told else basis.absent,
+            Presence.PRESENT if each.name in reported else basis.absent,
             tuple(dict.fromkeys(filter(None, words))),
         )
-    for base_name, (title, notes) in told.items():
+    for base_name, (title, notes) in reported.items():
         found.setdefault(base_name, (title, Presence.UNDECLARED, notes))
     return tuple(
         PicturedParticipant(id=f"{id_}p{number}", node=id_, name=title, presence=where, notes=notes)
@@ -200,24 +204,26 @@ def pictured_participants(
     )
 
 
-def _told(configuration: NodeConfiguration | None) -> dict[str, tuple[str, tuple[str, ...]]]:
+def _reported_participants(
+    configuration: NodeConfiguration | None,
+) -> dict[str, tuple[str, tuple[str, ...]]]:
     """Hidden participants that a node reports, by base name: title and notes."""
-    told: dict[str, tuple[str, tuple[str, ...]]] = {}
+    reported: dict[str, tuple[str, tuple[str, ...]]] = {}
     for each in configuration.connections if configuration else ():
         if each.node_name:
             words = [*each.urls, "" if each.established else "not established", each.error]
-            told[each.node_name] = (each.name, tuple(filter(None, words)))
+            reported[each.node_name] = (each.name, tuple(filter(None, words)))
     for report in configuration.endpoints if configuration else ():
         if report.participant:
-            told.setdefault(report.participant, (report.participant, ()))
-    return told
+            reported.setdefault(report.participant, (report.participant, ()))
+    return reported
 
 
 def carrier(basis: Basis, node: PicturedNode, ends: Sequence[Actual]) -> PicturedParticipant:
     """Return what carries an end: as reported, else as planned, else the node's own."""
     for end in ends:
-        told = end.report.participant if end.report else ""
-        if found := _participant(node, basis.view.planned.get(end.node.full_name), told):
+        reported = end.report.participant if end.report else ""
+        if found := _participant(node, basis.view.planned.get(end.node.full_name), reported):
             return found
         if end.report is not None and end.report.connection:
             for each in node.participants:
@@ -280,13 +286,15 @@ def _declared(
         unique=_UNIQUE[None],
         demands=tuple(_demands(flow)),
         findings=basis.numbers(
-            lambda each: (
+            flow.subject,
+            flow.planned.topic,
+            concerns=lambda each: (
                 each.subject == flow.subject
                 or (
                     each.subject == flow.planned.topic
                     and each.node in (flow.publisher, flow.subscription)
                 )
-            )
+            ),
         ),
     )
     if basis.verdict is None:

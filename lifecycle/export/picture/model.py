@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import enum
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 from lifecycle.codec import DomainId, Positive
 from lifecycle.verify import Finding, FlowReport, Outcome, Verdict, View
@@ -329,18 +329,24 @@ class Basis:
         view: plan and observation; the observation is empty for the picture of a plan.
         verdict: on the two; None without an observation, which makes it the picture of a plan.
         reports: the verdict's, by topic, publisher and subscription.
+        numbered: numbers of the findings, by what they are about and by their node.
     """
 
     view: View
     verdict: Verdict | None
     reports: Mapping[tuple[str, str, str], FlowReport]
+    numbered: Mapping[str, Sequence[int]]
 
     @classmethod
     def of(cls, view: View, verdict: Verdict | None) -> Basis:
         """Return the basis of the picture of a view."""
         flows = verdict.flows if verdict else ()
         reports = {(each.topic, each.publisher, each.subscription): each for each in flows}
-        return cls(view=view, verdict=verdict, reports=reports)
+        numbered: dict[str, list[int]] = {}
+        for number, finding in enumerate(verdict.findings if verdict else (), start=1):
+            for name in {finding.subject, finding.node}:
+                numbered.setdefault(name, []).append(number)
+        return cls(view=view, verdict=verdict, reports=reports, numbered=numbered)
 
     @property
     def absent(self) -> Presence:
@@ -352,9 +358,15 @@ class Basis:
         """All findings; elements call them by their place here, from 1."""
         return () if self.verdict is None else self.verdict.findings
 
-    def numbers(self, concerns: Callable[[Finding], bool]) -> tuple[int, ...]:
-        """Return the numbers of the findings that concern something."""
-        return tuple(n for n, each in enumerate(self.findings, start=1) if concerns(each))
+    def numbers(self, *names: str, concerns: Callable[[Finding], bool]) -> tuple[int, ...]:
+        """Return the numbers of the findings that concern something.
+
+        Args:
+            names: subjects and nodes; a finding about none of them does not concern it.
+            concerns: whether one of these findings does.
+        """
+        found = {number for name in names for number in self.numbered.get(name, ())}
+        return tuple(each for each in sorted(found) if concerns(self.findings[each - 1]))
 
     def outcome(self, name: str, source: str, target: str) -> Outcome | None:
         """What the verdict is on two ends that belong together; None in the picture of a plan."""
@@ -362,5 +374,6 @@ class Basis:
             return None
         report = self.reports.get((name, source, target))
         subject = f"{name}: {source} → {target}"
-        found = [each.outcome for each in self.findings if each.subject == subject]
+        numbers = self.numbers(subject, concerns=lambda each: each.subject == subject)
+        found = [self.findings[each - 1].outcome for each in numbers]
         return Outcome.worst([*found, *([report.outcome] if report else [])])

@@ -341,9 +341,9 @@ def _line(line: PicturedLine, names: dict[str, str]) -> Row:
     ends = [*((e, False) for e in line.sources), *((e, True) for e in line.targets)]
     for end, _ in ends:
         if not end.presence.as_declared or end.notes or end.findings:
-            notes.append((_said(end, names), f"quiet {end.presence.value}"))
+            notes.append((_end_text(end, names), f"quiet {end.presence.value}"))
     if not (line.sources and line.targets):
-        notes.append((_NOBODY[line.kind, bool(line.targets)], "quiet alone"))
+        notes.append((_WITHOUT_PEER[line.kind, bool(line.targets)], "quiet alone"))
     return Row(
         id=line.id,
         title=line.name,
@@ -354,7 +354,7 @@ def _line(line: PicturedLine, names: dict[str, str]) -> Row:
                 column=end.node,
                 arrives=arrives,
                 style=end.presence.value,
-                words=f"{_said(end, names)} · {line.name}",
+                words=f"{_end_text(end, names)} · {line.name}",
             )
             for end, arrives in ends
         ),
@@ -364,14 +364,14 @@ def _line(line: PicturedLine, names: dict[str, str]) -> Row:
                 target=arrow.target,
                 style=f"{arrow.presence.value} {line.kind.value} {_outcome(arrow.outcome)}",
                 words=f"{names[arrow.source]} → {names[arrow.target]}: "
-                f"{_told(arrow.presence, arrow.outcome)}",
+                f"{_outcome_text(arrow.presence, arrow.outcome)}",
             )
             for arrow in line.arrows
         ),
     )
 
 
-_NOBODY = {
+_WITHOUT_PEER = {
     (LineKind.TOPIC, False): "nobody subscribes to it",
     (LineKind.TOPIC, True): "nobody publishes it",
     (LineKind.SERVICE, False): "nobody serves it",
@@ -382,7 +382,7 @@ _NOBODY = {
 """Who is missing, by whether there is a target."""
 
 
-def _said(end: PicturedEnd, names: dict[str, str]) -> str:
+def _end_text(end: PicturedEnd, names: dict[str, str]) -> str:
     words = end_words(end)
     return f"{names[end.node]}: {', '.join(words)}" if words else names[end.node]
 
@@ -392,7 +392,7 @@ def end_words(end: PicturedEnd) -> tuple[str, ...]:
     return (*remark(end.presence), *end.notes, *filter(None, [numbers(end.findings)]))
 
 
-def _told(presence: Presence, outcome: Outcome | None) -> str:
+def _outcome_text(presence: Presence, outcome: Outcome | None) -> str:
     return ", ".join([PRESENCE_WORDS[presence], *([outcome.value] if outcome else [])])
 
 
@@ -422,7 +422,7 @@ def _flow(flow: PicturedFlow) -> Row:
                 target=flow.subscription,
                 style=f"{flow.presence.value} {_outcome(flow.outcome)}"
                 f"{' unique' if is_unique(flow) else ''}",
-                words=f"{' → '.join(flow.names)}: {_told(flow.presence, flow.outcome)}",
+                words=f"{' → '.join(flow.names)}: {_outcome_text(flow.presence, flow.outcome)}",
                 label=edge_label(flow),
             ),
         ),

@@ -1,8 +1,9 @@
 """Checks of where and in which order nodes start: machines, processes, domain, ports, `after`.
 
 Owns: check.unknown-machine, check.process-machine, check.process-run, check.process-environment,
-check.process-name, check.domain, check.ports, check.after-unknown, check.after-self,
-check.after-cycle, check.after-unmanaged. Port arithmetic is in `lifecycle.network`. Pure.
+check.process-name, check.domain, check.ports, check.localhost, check.after-unknown,
+check.after-self, check.after-cycle, check.after-unmanaged. Port arithmetic is in
+`lifecycle.network`. Pure.
 """
 
 from __future__ import annotations
@@ -10,13 +11,25 @@ from __future__ import annotations
 import functools
 from collections.abc import Collection, Iterator, Mapping
 
-from lifecycle.manifest.checks.system import DeclaredSystem, spell
+from lifecycle.manifest.checks.system import DeclaredSystem, rmw_of, spell
 from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.flows import FlowNeeds
-from lifecycle.manifest.model import After, Condition, EndpointKind, Machine, Node, RunKind
+from lifecycle.manifest.model import (
+    After,
+    Condition,
+    DiscoveryMode,
+    DiscoveryRange,
+    EndpointKind,
+    FlowTransport,
+    Machine,
+    Node,
+    RunKind,
+)
 from lifecycle.manifest.schema import did_you_mean
 from lifecycle.manifest.yaml.document import error, warning
 from lifecycle.network import (
+    LOCALHOST_PARTICIPANTS,
+    LOCALHOST_PEERS_RANGE,
     MAX_DOMAIN_ID,
     EphemeralRange,
     Platform,
@@ -92,9 +105,10 @@ def _apart(node: Node, other: Node, at: Position) -> Iterator[Diagnostic]:
 def check_ports(
     system: DeclaredSystem, needs: FlowNeeds, environment: Mapping[str, str]
 ) -> Iterator[Diagnostic]:
-    """Yield findings about the domain, and about room for the ports of all participants.
+    """Yield findings about the domain, and about room for all participants.
 
-    `environment` is asked for ROS_DOMAIN_ID, which holds where the manifest names no domain.
+    `environment` is asked for ROS_DOMAIN_ID, which holds where the manifest names no domain, and
+    for ROS_AUTOMATIC_DISCOVERY_RANGE, which holds where it leaves the range to the system.
     """
     discovery = system.manifest.discovery
     domain = discovery.domain_id
@@ -116,6 +130,7 @@ def check_ports(
         yield warning("check.domain", at, message, f"use domain {domains}")
     for host in _hosts(system):
         yield from _crowded(system, needs, host, domain, discovery.at or host[0].at)
+        yield from _beyond_localhost(system, needs, host, environment)
 
 
 def _hosts(system: DeclaredSystem) -> list[list[Machine]]:
@@ -129,9 +144,7 @@ def _hosts(system: DeclaredSystem) -> list[list[Machine]]:
 def _crowded(
     system: DeclaredSystem, needs: FlowNeeds, host: list[Machine], domain: int, at: Position
 ) -> Iterator[Diagnostic]:
-    names = {machine.name: None for machine in host}
-    nodes = [node for node in system.manifest.nodes if node.machine in names]
-    used = dict.fromkeys(node.machine for node in nodes)
+    nodes = _nodes_on(system, host)
     over = functools.partial(
         overflows,
         domain,
@@ -141,7 +154,7 @@ def _crowded(
             for node in nodes
             for each in needs.of_node(node)
         ),
-        host=f"machine{'s' * (len(used) > 1)} {', '.join(map(repr, used))}",
+        host=_spell_host(nodes),
     )
     refused = over(ephemeral=_NO_EPHEMERAL)
     for each in refused:
@@ -154,6 +167,72 @@ def _crowded(
             yield warning("check.ports", at, message, hint)
 
 
+def _nodes_on(system: DeclaredSystem, host: list[Machine]) -> list[Node]:
+    names = {machine.name for machine in host}
+    return [node for node in system.manifest.nodes if node.machine in names]
+
+
+def _spell_host(nodes: list[Node]) -> str:
+    used = dict.fromkeys(node.machine for node in nodes)
+    return f"machine{'s' * (len(used) > 1)} {', '.join(map(repr, used))}"
+
+
+_RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+_OTHERWISE_FOUND = frozenset(
+    {
+        _RANGE,
+        "FASTDDS_DEFAULT_PROFILES_FILE",
+        "FASTRTPS_DEFAULT_PROFILES_FILE",
+        "ROS_DISCOVERY_SERVER",
+        "ROS_DOMAIN_ID",
+    }
+)
+"""Variables of a process by which it may find others in another way than its system."""
+
+
+def _beyond_localhost(
+    system: DeclaredSystem, needs: FlowNeeds, host: list[Machine], environment: Mapping[str, str]
+) -> Iterator[Diagnostic]:
+    """Yield a finding where participants of a host could not all find each other on localhost.
+
+    Counted is what certainly looks for others in the way of rmw_fastrtps: the supervisor's
+    participant, and those of processes that it starts.
+    """
+    discovery = system.manifest.discovery
+    if discovery.mode is not DiscoveryMode.DYNAMIC or discovery.transport not in _BY_UDP:
+        return
+    said = "'range: localhost'"
+    if discovery.range is DiscoveryRange.SYSTEM_DEFAULT:
+        said = f"{_RANGE}={environment.get(_RANGE, '')}"
+        if environment.get(_RANGE, "") != DiscoveryRange.LOCALHOST.name:
+            return
+    elif discovery.range is not DiscoveryRange.LOCALHOST:
+        return
+    profiles = _OTHERWISE_FOUND - {_RANGE, "ROS_DOMAIN_ID"}
+    nodes = [
+        node
+        for node in _nodes_on(system, host)
+        if node.run.kind is not RunKind.ATTACH
+        and rmw_of(node, environment).startswith("rmw_fastrtps")
+        and not _OTHERWISE_FOUND & {name for name, _ in node.run.environment}
+        and not any(environment.get(name) for name in profiles)
+    ]
+    participants = _SUPERVISOR + _participants(nodes, needs)
+    if participants <= LOCALHOST_PARTICIPANTS:
+        return
+    message = (
+        f"cannot run {participants} participants with {said} on {_spell_host(nodes)}: at most "
+        f"{LOCALHOST_PARTICIPANTS} all find each other, because each looks for participants 0 to "
+        f"{LOCALHOST_PEERS_RANGE - 1} of its host only"
+    )
+    hint = "use 'range: subnet', or give several nodes one 'process:'"
+    yield error("check.localhost", discovery.at or nodes[0].at, message, hint)
+
+
+_BY_UDP = (FlowTransport.ANY, FlowTransport.UDPV4, FlowTransport.UDPV6)
+"""Transports of own participants that are looked for at the ports of the DDS formula."""
+
+
 def _participants(nodes: list[Node], needs: FlowNeeds) -> int:
     """Count DDS participants as the planner makes them.
 
@@ -161,7 +240,14 @@ def _participants(nodes: list[Node], needs: FlowNeeds) -> int:
     publishers that need their own.
     """
     shared = {(node.process or f"\0{node.key}", needs.node_transports(node)) for node in nodes}
-    extra = sum(len(needs.groups(node)) for node in nodes if node.run.kind is RunKind.PYTHON)
+    extra = 0
+    for node in nodes:
+        if node.run.kind is RunKind.PYTHON:
+            on_connections = {entry for each in node.connections for entry in each.map}
+            extra += sum(
+                any((group.kind, name) not in on_connections for name in group.names)
+                for group in needs.groups(node)
+            )
     return len(shared) + extra
 
 

@@ -43,12 +43,12 @@ from std_msgs.msg import Empty, String
 
 from lifecycle.codec import from_json
 
-UNHEARD_S = 0.85
+LEASE_S = 0.85
 """A participant whose liveliness was not asserted for so long is lost: within a second with all
 that follows."""
 
 ASSERTED_EACH_S = 0.06
-"""Fourteen fit into UNHEARD_S. At 30 % loss all of them are lost once in thousands of runs of ten
+"""Fourteen fit into LEASE_S. At 30 % loss all of them are lost once in thousands of runs of ten
 minutes; one takes about 150 bytes to each participant that has discovered us."""
 
 _LONGEST_NOTICE = 1 << 16
@@ -69,7 +69,7 @@ def node_topic(full_name: str) -> str:
     return f"{full_name}/_alive"
 
 
-_TOLD = QoSProfile(
+_NOTICES = QoSProfile(
     depth=1,
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
@@ -79,10 +79,9 @@ _PULSES = functools.partial(
     depth=1,
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.VOLATILE,
-    liveliness_lease_duration=Duration(nanoseconds=round(UNHEARD_S * 1e9)),
+    liveliness_lease_duration=Duration(nanoseconds=round(LEASE_S * 1e9)),
 )
 _ASSERTED = _PULSES(liveliness=LivelinessPolicy.MANUAL_BY_TOPIC)
-_HEARD = _PULSES(liveliness=LivelinessPolicy.AUTOMATIC)  # whatever kind the writer offers
 _no_publisher_events = functools.partial(PublisherEventCallbacks, use_default_callbacks=False)
 _no_subscription_events = functools.partial(SubscriptionEventCallbacks, use_default_callbacks=False)
 
@@ -111,11 +110,11 @@ class AlivePublisher:
             node,
             String,
             topic,
-            _TOLD,
+            _NOTICES,
             event_callbacks=_no_publisher_events(matched=self._matched),
         )
 
-    def tell(self, silent: Mapping[str, str]) -> None:
+    def notify(self, silent: Mapping[str, str]) -> None:
         """Publish which of our nodes are silent, and why each is; from any thread.
 
         Present and later subscribers receive it. A message may be lost for some seconds: publish
@@ -196,9 +195,9 @@ class AliveSubscription:
     Args:
         node: an executor spins it; callbacks run in that executor's thread.
         topic: of the publisher.
-        on_heard: called with True when it is alive, False when its lease has expired.
+        on_liveliness: called with True when it is alive, False when its lease has expired.
         on_left: called when it left properly.
-        on_told: called with what `AlivePublisher.tell` published.
+        on_notice: called with what `AlivePublisher.notify` published.
     """
 
     def __init__(
@@ -206,21 +205,21 @@ class AliveSubscription:
         node: Node,
         topic: str,
         *,
-        on_heard: Callable[[bool], None],
+        on_liveliness: Callable[[bool], None],
         on_left: Callable[[], None],
-        on_told: Callable[[Mapping[str, str]], None],
+        on_notice: Callable[[Mapping[str, str]], None],
     ) -> None:
         def changed(info: QoSLivelinessChangedInfo) -> None:
             if info.alive_count > 0:
-                on_heard(True)
+                on_liveliness(True)
             elif info.not_alive_count > 0:
-                on_heard(False)
+                on_liveliness(False)
             else:
                 on_left()
 
-        def told(message: String) -> None:
+        def received(message: String) -> None:
             try:
-                on_told(from_json(message.data, dict[str, str], longest=_LONGEST_NOTICE))
+                on_notice(from_json(message.data, dict[str, str], longest=_LONGEST_NOTICE))
             except ValueError as error:
                 # Any participant may write the topic, and no executor thread may end by it.
                 _logger.warning("cannot read what is silent: %s", error)
@@ -235,7 +234,7 @@ class AliveSubscription:
                 event_callbacks=_no_subscription_events(liveliness=changed),
             ),
             node.create_subscription(
-                String, topic, told, _TOLD, event_callbacks=_no_subscription_events()
+                String, topic, received, _NOTICES, event_callbacks=_no_subscription_events()
             ),
         )
 

@@ -22,7 +22,7 @@ from lifecycle.middleware.fastdds.profiles import child as _child
 from lifecycle.middleware.fastdds.profiles import locator as _locator
 from lifecycle.middleware.fastdds.profiles import tcp_locator as _tcp_locator
 from lifecycle.middleware.fastdds.profiles import text as _text
-from lifecycle.network import ConnectionUrl, Medium, Peer, participant_ports
+from lifecycle.network import LOCALHOST_PEERS_RANGE, ConnectionUrl, Medium, Peer, participant_ports
 
 LOOPBACK = {Medium.UDPV4: "127.0.0.1", Medium.UDPV6: "::1"}
 """The transports that carry UDP, and where each finds this host."""
@@ -345,9 +345,6 @@ __all__ = [
     "families",
     "leaves_discovery_open",
 ]
-
-LOCALHOST_PEERS_RANGE = 32
-"""Participants looked for on a peer without a port; rmw_fastrtps's own number for LOCALHOST."""
 
 TYPES = {Medium.UDPV4: "UDPv4", Medium.UDPV6: "UDPv6", Medium.TCPV4: "TCPv4", Medium.SHM: "SHM"}
 

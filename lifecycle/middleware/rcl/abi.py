@@ -8,7 +8,6 @@ rcutils/{allocator,error_handling}.h.
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import functools
 import importlib.metadata
@@ -261,15 +260,6 @@ def load() -> Rcl:
         MiddlewareError: a library or symbol is missing, or is not laid out as rcl 9.
     """
     return Rcl()
-
-
-def load_rcl() -> None:
-    """Load and check them in a process that will be forked: its children have it done then.
-
-    What is wrong with them is said where they are used.
-    """
-    with contextlib.suppress(MiddlewareError):
-        load()
 
 
 def rcl_version() -> str:

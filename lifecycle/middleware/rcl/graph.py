@@ -33,6 +33,7 @@ from lifecycle.middleware.rcl.graph_queries import (
     EndpointInfo,
     endpoints_of,
     endpoints_of_node,
+    service_names,
     topic_endpoints,
 )
 from lifecycle.middleware.rcl.hidden_node import quiet_node
@@ -118,7 +119,7 @@ ANSWER_S = 0.15
 PATIENCE_S = 3.5
 """What Fast DDS lost on the way it sends again every 3 s."""
 
-_UNASKED_S = 1.5
+_UNPROBED_S = 1.5
 """Within so long all are seen where none can be asked, over shared memory or TCP.
 
 They announce themselves each 0.5 s, and TCP may lose the first of it (measured: up to 1.2 s).
@@ -128,7 +129,7 @@ _UNCOUNTED_S = 0.6
 """Within so long a probed participant is discovered, if we may not receive its answer (measured: up
 to 0.3 s)."""
 
-_TOLD_S = 2.5
+_ANNOUNCED_BY_SERVER_S = 2.5
 """Within so long a discovery server has announced all (measured: up to 1.6 s)."""
 
 _AGREED_S = 5.0
@@ -192,7 +193,9 @@ class GraphObserver:
             self._guard = GraphGuard(node, self._changed)
             self._unwatch = self._guard.stop
             self._knocks = knock_for(domain_id, settings.urls, os.environ)
-            self._limit_s = _TOLD_S if any(url.server for url in settings.urls) else _UNASKED_S
+            self._limit_s = (
+                _ANNOUNCED_BY_SERVER_S if any(url.server for url in settings.urls) else _UNPROBED_S
+            )
         else:
             self._unwatch = on_graph_change(node, self._changed)
             self._knocks = ()
@@ -256,16 +259,16 @@ class GraphObserver:
         endpoints = [
             each for each in self._topic_endpoints(declared, names) if each.node not in ourselves
         ]
-        nodes, untold = [], {""}
+        nodes, unreported = [], {""}
         for name in sorted(name for name in counts if known_node(name) and name not in ourselves):
             services = self._services(name)
             nodes.append(
                 ObservedNode(full_name=name, count=counts[name], managed=_managed(name, services))
             )
             if services is None:
-                untold.add(name)
+                unreported.add(name)
             endpoints += services or ()
-        endpoints += self._services_of_others(names, untold)
+        endpoints += self._services_of_others(names, unreported)
         wanted = without_noise(each for each in endpoints if each.node in declared)
         others = without_noise((each for each in endpoints if each.node not in declared), but=names)
         kept = self._located(fold_actions(with_service_hashes(self.node, (*wanted, *others))))
@@ -297,6 +300,14 @@ class GraphObserver:
     def offers(self, node: str, service: str) -> bool:
         """Return whether discovery shows `service` (a fully qualified name) on `node`."""
         return service in self.services_of(node)
+
+    def service_names(self) -> frozenset[str]:
+        """Return the names of all services that have a server or a client, wherever that is.
+
+        Raises:
+            MiddlewareError: the graph cannot be read.
+        """
+        return service_names(self.node)
 
     def services_of(self, node: str) -> frozenset[str]:
         """Return the fully qualified names of the services that discovery shows on `node`."""
@@ -412,7 +423,7 @@ class GraphObserver:
             )
 
     def _services_of_others(
-        self, names: DeclaredNames, untold: Collection[str]
+        self, names: DeclaredNames, unreported: Collection[str]
     ) -> Iterator[ObservedEndpoint]:
         """Yield the endpoints of declared services on nodes that rcl does not show.
 
@@ -438,7 +449,7 @@ class GraphObserver:
             ):
                 for info in endpoints_of(self.node, side, topic, no_mangle=True):
                     node = known_node(info.node)
-                    if node not in untold or (kind, info.gid[:_PREFIX_DIGITS]) in shown:
+                    if node not in unreported or (kind, info.gid[:_PREFIX_DIGITS]) in shown:
                         continue
                     if self._stale_node_filter.ignores(info.gid):
                         continue

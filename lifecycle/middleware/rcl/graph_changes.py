@@ -215,13 +215,13 @@ def _let_go() -> None:
         followers.close()
 
 
-_TELLING = ("rmw_fastrtps_cpp", "rmw_fastrtps_dynamic_cpp")
+_COUNTING_BOTH_WAYS = ("rmw_fastrtps_cpp", "rmw_fastrtps_dynamic_cpp")
 """Others answer from the graph alone, or were not looked at."""
 
 
 def is_server_matched(client: AnyClient) -> bool | None:
     """Return whether a server is matched with a client both ways; None if the RMW cannot say."""
-    return _is_ready(client) if get_rmw_implementation_identifier() in _TELLING else None
+    return _is_ready(client) if get_rmw_implementation_identifier() in _COUNTING_BOTH_WAYS else None
 
 
 @typing.final

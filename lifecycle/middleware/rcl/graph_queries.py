@@ -143,6 +143,16 @@ def topic_endpoints(node: Node) -> Iterator[tuple[EndpointKind, str, EndpointInf
                 yield kind, _text(topic), info
 
 
+def service_names(node: Node) -> frozenset[str]:
+    """Return the fully qualified names of all services that have a server or a client."""
+    library = _library()
+
+    def query(handle: int, result: object) -> int:
+        return int(library.services(handle, library.allocator, result))
+
+    return frozenset(_text(name) for name, _ in _names_and_types(node, query, "services") or ())
+
+
 def endpoints_of(
     node: Node, kind: EndpointKind, topic: str, *, no_mangle: bool = False
 ) -> list[EndpointInfo]:
@@ -272,6 +282,9 @@ class _Library:
         self.topics = abi.bind(
             *("rcl", "rcl_get_topic_names_and_types", ctypes.c_int),
             (pointer, pointer, flag, pointer),
+        )
+        self.services = abi.bind(
+            "rcl", "rcl_get_service_names_and_types", ctypes.c_int, (pointer,) * 3
         )
         self.names_and_types_fini = abi.bind(
             "rcl", "rcl_names_and_types_fini", ctypes.c_int, (pointer,)

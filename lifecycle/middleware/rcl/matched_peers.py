@@ -9,6 +9,7 @@ name through ctypes, on objects that are found by GUID and recognised by GUID an
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import functools
 from collections.abc import Iterable
@@ -17,6 +18,7 @@ from typing import Any
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 
+from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.rcl import abi
 
 _FASTDDS = "libfastrtps.so.2.14"
@@ -172,6 +174,13 @@ class _MatchLibrary:
         if method is None:
             return None
         return tuple(sorted(each for each in candidates if method(endpoint, bytes.fromhex(each))))
+
+
+def load_libraries() -> None:
+    """Load what every node asks rcl and Fast DDS through, for a process that forks hosts."""
+    # What is wrong with them is said where they are used.
+    with contextlib.suppress(MiddlewareError):
+        _library()
 
 
 @functools.lru_cache(maxsize=1)

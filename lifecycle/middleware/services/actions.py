@@ -158,9 +158,9 @@ class _Held:
 
     def send_on(self) -> None:
         """Send it."""
-        self._send().add_done_callback(self._tell)
+        self._send().add_done_callback(self._report)
 
-    def _tell(self, sent: Future) -> None:
+    def _report(self, sent: Future) -> None:
         error = sent.exception()
         if error is not None:
             self.promised.set_exception(error)

@@ -7,7 +7,6 @@ this process too. Nodes that serve no parameters have none of these services.
 from __future__ import annotations
 
 import array
-import asyncio
 from collections.abc import Collection
 from typing import TYPE_CHECKING, Any
 
@@ -82,6 +81,7 @@ async def _read(
     calls: ServiceCalls, node: str, names: Collection[str] | None, timeout_s: float
 ) -> list[tuple[str, Any, Any]]:
     """Return name, descriptor (None if unknown) and value of parameters, sorted by name."""
+    import asyncio  # late: a host, which needs `parameter_value` only, has no use for it
 
     async def ask(service: str, type_: type[Any], request: object) -> Any:
         name = f"{node}/{service}"

@@ -20,7 +20,6 @@ from rclpy.task import Future
 from rclpy.timer import Timer
 
 from lifecycle.errors import LifecycleError
-from lifecycle.graph import DdsTransport, GraphReporter, steady_timer
 from lifecycle.manifest import EndpointKind, EndpointPolicy
 from lifecycle.node import configuration
 from lifecycle.node.author import parameters
@@ -35,6 +34,7 @@ from lifecycle.node.connections.connection_status import (
 )
 from lifecycle.node.connections.data_layer import NodeDataLayer, NodeInterface, RemoteInterface
 from lifecycle.node.endpoints.making import wire_name
+from lifecycle.node.host.control import INTERFACE_ON_DEMAND
 from lifecycle.node.lifecycle.controller import Controller
 from lifecycle.node.lifecycle.execution import SUCCESS, Result
 from lifecycle.node.lifecycle.gate import NodeGate
@@ -62,6 +62,9 @@ class GraphMember:
     """
 
     def __init__(self, node: Node, group: CallbackGroup) -> None:
+        # Late: most nodes report to their supervisor only.
+        from lifecycle.graph import DdsTransport, GraphReporter, steady_timer
+
         ungated: Any = _Ungated(node)
         self._transport = DdsTransport(ungated, callback_group=group)
         self._reporter = GraphReporter(
@@ -221,7 +224,7 @@ class Managed:
             later=self.call_soon,
             after=self._turns.call_after,
             changed=self.configuration_changes.touch,
-            tell=self._tell_connection,
+            notify=self._report_connection,
         )
         self.declared = DeclaredInCode(
             spec, self.data_layer, node=self.full_name, state=lambda: self.state
@@ -239,6 +242,8 @@ class Managed:
         self._remote = RemoteInterface(
             node, self.interface, log=node.get_logger().error, group=self._infrastructure
         )
+        # A supervisor sees who asks for the others, and has them made.
+        self._remote.serve(but=INTERFACE_ON_DEMAND if supervisor else ())
         if spec.events or spec.membership:
             self._join()
 
@@ -309,6 +314,10 @@ class Managed:
             await self.bring_up()
 
         timer = self._turns.timer(0.0, once)
+
+    def serve_interface(self) -> None:
+        """Offer all services of the node interface: a client asks for one."""
+        self._remote.serve()
 
     def sleep(self, seconds: float) -> Future:
         """Return what is done in `seconds`, in every state."""
@@ -395,16 +404,16 @@ class Managed:
         self._member = GraphMember(self._node, self._infrastructure)
         now = self.configuration_changes.collect()
         self._member.joined(self.state, now.checksum if now is not None else "")
-        self.configuration_changes.listen(self._tell_checksum)
+        self.configuration_changes.listen(self._report_checksum)
 
-    def _tell_checksum(self, now: NodeConfiguration) -> None:
+    def _report_checksum(self, now: NodeConfiguration) -> None:
         if self._member is not None:
             self._member.configuration_changed(now.checksum)
 
-    def _tell_connection(self, event: ConnectionEvent) -> None:
+    def _report_connection(self, event: ConnectionEvent) -> None:
         if self._member is not None and self.spec.events:
             self._member.connection_event(event)
-        self.connection_events.tell(event)
+        self.connection_events.notify(event)
 
     async def _change(self, request: TransitionRequest) -> Result:
         if request is TransitionRequest.ACTIVATE and not self._let_through:

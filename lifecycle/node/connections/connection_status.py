@@ -81,7 +81,7 @@ class ConnectionEvents:
 
         return remove
 
-    def tell(self, event: ConnectionEvent) -> None:
+    def notify(self, event: ConnectionEvent) -> None:
         """Have the listeners called soon."""
         if not self._listeners:
             return
@@ -106,18 +106,18 @@ class ConnectionStatus:
     Args:
         connections: of the node.
         mappings: every declared endpoint, as it is at any time.
-        tell: called with each event.
+        notify: called with each event.
     """
 
     def __init__(
         self,
         connections: Connections,
         mappings: AbstractMapping[Key, Mapping],
-        tell: Callable[[ConnectionEvent], None],
+        notify: Callable[[ConnectionEvent], None],
     ) -> None:
         self._connections = connections
         self._mappings = mappings
-        self._tell = tell
+        self._notify = notify
         self._established: set[Connection] = set()
 
     def on(self, connection: Connection) -> tuple[Mapping, ...]:
@@ -141,7 +141,7 @@ class ConnectionStatus:
     def closed(self, connection: Connection) -> None:
         """A connection with a name was removed."""
         self._established.discard(connection)
-        self._tell(
+        self._notify(
             ConnectionEvent(
                 kind=ConnectionEventKind.CONNECTION_LOST,
                 connection=connection.name,
@@ -153,13 +153,13 @@ class ConnectionStatus:
     def mapped(self, mapping: Mapping) -> None:
         """An endpoint was mapped."""
         self._count(mapping)
-        self._tell_mapping(mapping, ConnectionEventKind.MAPPING_ESTABLISHED)
+        self._notify_mapping(mapping, ConnectionEventKind.MAPPING_ESTABLISHED)
         assert mapping.connection is not None
         self._judge(mapping.connection, lost=False)
 
     def unmapped(self, mapping: Mapping, connection: Connection) -> None:
         """An endpoint was taken off a connection."""
-        self._tell(
+        self._notify(
             ConnectionEvent(
                 kind=ConnectionEventKind.MAPPING_LOST,
                 connection=connection.name,
@@ -179,7 +179,7 @@ class ConnectionStatus:
         kind = ConnectionEventKind.MAPPING_ESTABLISHED
         if now < before:
             kind = ConnectionEventKind.MAPPING_LOST
-        self._tell_mapping(mapping, kind)
+        self._notify_mapping(mapping, kind)
         self._judge(mapping.connection, lost=now < before)
 
     def _known(self, connection: Connection) -> Connection:
@@ -190,10 +190,10 @@ class ConnectionStatus:
         if mapping.endpoint.kind.is_topic and mapping.placement is not None:
             mapping.peers = sum(count_peers(each) for each in mapping.placement.entities)
 
-    def _tell_mapping(self, mapping: Mapping, kind: ConnectionEventKind) -> None:
+    def _notify_mapping(self, mapping: Mapping, kind: ConnectionEventKind) -> None:
         connection = mapping.connection
         assert connection is not None
-        self._tell(
+        self._notify(
             ConnectionEvent(
                 kind=kind,
                 connection=connection.name,
@@ -220,4 +220,4 @@ class ConnectionStatus:
             self._established.discard(known)
             kind = ConnectionEventKind.CONNECTION_LOST
         if established or lost:
-            self._tell(ConnectionEvent(kind=kind, connection=known.name, urls=known.urls))
+            self._notify(ConnectionEvent(kind=kind, connection=known.name, urls=known.urls))

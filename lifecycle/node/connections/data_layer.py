@@ -19,7 +19,7 @@ says of each whether it succeeded and why not:
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import TYPE_CHECKING, Any
 
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue, SetParametersResult
@@ -66,12 +66,12 @@ class NodeDataLayer:
         later: runs a coroutine function in the node's executor.
         after: calls back once in the node's executor.
         changed: called when the node configuration has changed, match counts included.
-        tell: called with each connection event.
+        notify: called with each connection event.
 
     Attributes:
         endpoints: what is declared.
         connections: what endpoints may be mapped onto.
-        standing: which of them have peers.
+        status: which of them have peers.
     """
 
     def __init__(
@@ -84,7 +84,7 @@ class NodeDataLayer:
         later: Later,
         after: After,
         changed: Callable[[], None],
-        tell: Callable[[ConnectionEvent], None],
+        notify: Callable[[ConnectionEvent], None],
     ) -> None:
         self._name = node.get_fully_qualified_name()
         self._changed = changed
@@ -93,14 +93,14 @@ class NodeDataLayer:
         self.endpoints = EndpointTable(node, gate, changed)
         mappings = self.endpoints.mappings
         self.connections = Connections(node)
-        self.standing = ConnectionStatus(self.connections, mappings, tell)
+        self.status = ConnectionStatus(self.connections, mappings, notify)
         self._mapper = Mapper(
             node,
             Placer(node, self._maker, gate=gate, event_group=event_group, later=later, after=after),
             mappings=mappings,
             handles=self.endpoints.handles,
             connections=self.connections,
-            standing=self.standing,
+            status=self.status,
             after=after,
             changed=changed,
         )
@@ -109,7 +109,7 @@ class NodeDataLayer:
             mappings=mappings,
             connections=self.connections,
             mapper=self._mapper,
-            standing=self.standing,
+            status=self.status,
         )
 
     @property
@@ -209,7 +209,7 @@ class NodeDataLayer:
             connection = self.connections.connect_to(name, how, self._places.planned(name))
         finally:
             self._changed()
-        self.standing.opened(connection)
+        self.status.opened(connection)
         return connection
 
     def map_to(self, spelling: str, connection: Connection | str) -> Future:
@@ -404,17 +404,24 @@ class RemoteInterface:
         log: Callable[[str], None],
         group: CallbackGroup,
     ) -> None:
+        self._node = node
         self._interface = interface
         self._log = log
-        for name, act in (
-            ("connect_to", self._connect_to),
-            ("map_to", self._map_to),
-            ("disconnect", self._disconnect),
-            ("remap", self._remap),
-            ("alias", self._alias),
-        ):
+        self._group = group
+        self._left = {
+            "connect_to": self._connect_to,
+            "map_to": self._map_to,
+            "disconnect": self._disconnect,
+            "remap": self._remap,
+            "alias": self._alias,
+        }
+
+    def serve(self, *, but: Collection[str] = ()) -> None:
+        """Offer the services that are not there yet, without those named; again is harmless."""
+        for name in [each for each in self._left if each not in but]:
+            act = self._served(self._left.pop(name))
             Node.create_service(
-                node, SetParameters, f"~/{name}", self._served(act), callback_group=group
+                self._node, SetParameters, f"~/{name}", act, callback_group=self._group
             )
 
     def _served(self, act: Callable[[Parameter], Any]) -> Callable[[Any, Any], Any]:

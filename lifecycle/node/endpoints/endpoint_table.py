@@ -142,7 +142,7 @@ class PlannedPlaces:
         mappings: every declared endpoint, as it is at any time.
         connections: of the node.
         mapper: maps single endpoints.
-        standing: notified of connections.
+        status: notified of connections.
 
     Attributes:
         spec: what the node was planned to be; None before anything is declared.
@@ -155,13 +155,13 @@ class PlannedPlaces:
         mappings: AbstractMapping[Key, Mapping],
         connections: Connections,
         mapper: Mapper,
-        standing: ConnectionStatus,
+        status: ConnectionStatus,
     ) -> None:
         self._name = node
         self._mappings = mappings
         self._connections = connections
         self._mapper = mapper
-        self._standing = standing
+        self._status = status
         self.spec: PlannedNode | None = None
 
     @property
@@ -187,7 +187,7 @@ class PlannedPlaces:
         try:
             for planned in spec.participants:
                 if planned.connection:
-                    self._standing.opened(self._connections.carrier(planned))
+                    self._status.opened(self._connections.carrier(planned))
             for current in self._mappings.values():
                 if current.placement is None:
                     self._mapper.map(current, self.default(current.endpoint))

@@ -34,7 +34,7 @@ class Mapper:
         mappings: every declared endpoint, as it is at any time.
         handles: of its publishers, likewise.
         connections: of the node.
-        standing: notified of each change.
+        status: notified of each change.
         after: calls back once in the node's executor.
         changed: called when the node configuration has changed.
     """
@@ -47,7 +47,7 @@ class Mapper:
         mappings: AbstractMapping[Key, Mapping],
         handles: AbstractMapping[str, DeclaredPublisher],
         connections: Connections,
-        standing: ConnectionStatus,
+        status: ConnectionStatus,
         after: After,
         changed: Callable[[], None],
     ) -> None:
@@ -56,7 +56,7 @@ class Mapper:
         self._mappings = mappings
         self._handles = handles
         self._connections = connections
-        self._standing = standing
+        self._status = status
         self._after = after
         self._changed = changed
         self._handovers: dict[Key, tuple[Handover, Placement]] = {}
@@ -72,7 +72,7 @@ class Mapper:
         """Map an endpoint that is mapped nowhere; raises LifecycleError."""
         placement = mapping.placement = self._place(mapping, connection)
         self._attach(mapping, placement)
-        self._standing.mapped(mapping)
+        self._status.mapped(mapping)
         self._changed()
 
     def unmap(self, mapping: Mapping) -> None:
@@ -86,7 +86,7 @@ class Mapper:
             handle.detach()
         mapping.placement = mapping.peers = None
         self._placer.unplace(mapping, placement)
-        self._standing.unmapped(mapping, placement.connection)
+        self._status.unmapped(mapping, placement.connection)
 
     def take_off(self, mapping: Mapping, connection: Connection) -> None:
         """Take an endpoint off a connection, on which it may be no longer alone."""
@@ -129,7 +129,7 @@ class Mapper:
             overlap = self._placer.overlap(mapping, old, new)
             mapping.placement = new
             self._take_over(mapping, old, new, overlap)
-            self._standing.mapped(mapping)
+            self._status.mapped(mapping)
         self._changed()
 
     def realias(self, mapping: Mapping, aliases: tuple[str, ...]) -> None:
@@ -139,14 +139,14 @@ class Mapper:
             self._placer.realias(mapping, mapping.placement, aliases, matched=self._match)
             mapping.aliases = aliases
             self._attach(mapping, mapping.placement)
-            self._standing.matched(mapping)
+            self._status.matched(mapping)
         mapping.aliases = aliases
         self._changed()
 
     def close(self, connection: Connection) -> None:
         """Unmake a connection that nothing is mapped onto."""
         self._connections.close(connection)
-        self._standing.closed(connection)
+        self._status.closed(connection)
 
     def tidy(self) -> None:
         """Unmake participants of single flows that carry nothing any more."""
@@ -196,7 +196,7 @@ class Mapper:
         lives_on = bool(peers) if kind.is_topic else kind in CLIENTS
         handover = Handover(peers_before=peers or 1, after=self._after, finish=finish)
         self._handovers[mapping.key] = (handover, old)
-        self._standing.mapped(mapping)
+        self._status.mapped(mapping)
         if not lives_on or self._node.executor is None:
             handover.end()
         else:
@@ -209,14 +209,14 @@ class Mapper:
         self._placer.switch(mapping, old, new, overlap)
         self._attach(mapping, new)
         self._placer.unplace(mapping, old)
-        self._standing.unmapped(mapping, old.connection)
+        self._status.unmapped(mapping, old.connection)
 
     def _match(self, mapping: Mapping) -> None:
         """Some entity of a mapping has been matched or unmatched."""
         if mapping.endpoint.kind in CLIENTS:
             self._changed()  # their peers are not counted
             return
-        self._standing.matched(mapping)
+        self._status.matched(mapping)
         running = self._handovers.get(mapping.key)
         if running is not None:
             running[0].peers_changed(mapping.peers or 0)

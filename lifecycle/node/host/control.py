@@ -19,6 +19,7 @@ import socket
 import sys
 import threading
 import traceback
+from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import NoReturn
@@ -49,10 +50,18 @@ class Operation(enum.Enum):
     CONNECT_TO = "connect_to"  # connection, urls
     MAP_TO = "map_to"  # endpoint, connection
     DISCONNECT_FROM = "disconnect_from"  # connection
+    # Make the services of the node interface that are made when a client asks: INTERFACE_ON_DEMAND.
+    SERVE_INTERFACE = "serve_interface"
     # Of the whole process: a link is down, and retransmit soon what was not acknowledged; and
     # announce to the graph anew which nodes are here.
     SEND_AGAIN_SOON = "send_again_soon"
     TELL_NAMES = "tell_names"
+
+
+INTERFACE_ON_DEMAND = ("alias", "connect_to", "disconnect", "remap")
+"""Services that a supervised node offers once a client of one of them is in the graph: each costs
+0.24 MiB, and all others the traffic to discover it. Its supervisor sees such clients, and has
+another way to do the same. `map_to` is always there: with it a node is known to be one of ours."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,7 +109,7 @@ class Event:
         connected: the data layer is made.
         error: the reason, with the exception's last line; the traceback is in the log.
         configuration: for "configuration", and replies that carry it (all but ACTIVATE,
-            DEACTIVATE, CLEANUP and SHUTDOWN).
+            DEACTIVATE, CLEANUP, SHUTDOWN and SERVE_INTERFACE).
     """
 
     kind: str
@@ -112,6 +121,8 @@ class Event:
     error: str = ""
     configuration: NodeConfiguration | None = None
 
+
+_AT_ONCE_BYTES = 1 << 16
 
 _OURS = f"{Path(__file__).parents[1]}{os.sep}"
 """Where the host's own modules are."""
@@ -128,22 +139,42 @@ class HostChannel:
         control.setblocking(True)
         self._control = control
         try:
-            self._first, found, _, _ = socket.recv_fds(control, 1, SIGN_DESCRIPTORS)
+            first, found, _, _ = socket.recv_fds(control, 1, SIGN_DESCRIPTORS)
         except ConnectionError:  # as at end of file
-            self._first, found = b"", []
+            first, found = b"", []
+        self._received = bytearray(first)
         self.descriptors = tuple(found)
         for descriptor in found:
             os.set_inheritable(descriptor, False)
-        self._reader = control.makefile("rb")
         self._lock = threading.Lock()
 
+    def fileno(self) -> int:
+        """Return the descriptor that is readable when `receive` is worth a call."""
+        return self._control.fileno()
+
     def read(self) -> bytes | None:
-        """Return the next line, or None at end of file."""
+        """Wait for the next line and return it, or None at end of file."""
+        while b"\n" not in self._received:
+            if not self.receive():
+                return None
+        line, _, rest = self._received.partition(b"\n")
+        self._received = rest
+        return bytes(line)
+
+    def receive(self) -> bool:
+        """Wait for more and keep it for `lines`; False at end of file."""
         try:
-            first, self._first = self._first, b""
-            return first + self._reader.readline() or None
+            data = self._control.recv(_AT_ONCE_BYTES)
         except OSError:  # a supervisor that was killed resets the connection
-            return None
+            return False
+        self._received += data
+        return bool(data)
+
+    def lines(self) -> Iterator[bytes]:
+        """Yield the whole lines that have been received."""
+        while b"\n" in self._received:
+            line, _, self._received = self._received.partition(b"\n")
+            yield bytes(line)
 
     def write(self, event: Event) -> None:
         """Send one event; a supervisor that has gone is noticed by the reader, not here."""

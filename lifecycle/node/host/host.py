@@ -19,6 +19,7 @@ from typing import NoReturn
 from lifecycle import codec
 from lifecycle.manifest import DiscoveryRange
 from lifecycle.node.host.control import Command, HostChannel, HostSpec, Operation, give_up
+from lifecycle.plan import PlannedNode
 
 _PRELOADED = (
     "rclpy.executors",
@@ -55,7 +56,7 @@ _SERVICES = (
 """What every node of ours has; their type supports are libraries that load on first use."""
 
 
-def preload(interfaces: Iterable[str] = ()) -> None:
+def preload(names: Iterable[str] = ()) -> None:
     """Import everything a host needs, for a process that will fork hosts.
 
     Makes no participant and opens no socket, so a fork afterwards is safe. The only threads are
@@ -63,30 +64,19 @@ def preload(interfaces: Iterable[str] = ()) -> None:
     Call `gc.freeze()` after it to keep the imported pages shared.
 
     Args:
-        interfaces: types that its nodes declare, `package/msg/Type`; one that cannot be loaded is
-            left to its node, which says so where it is found.
+        names: what only some nodes need, see `needed_by`; numpy alone, which most messages with
+            arrays import, takes 60 ms. What cannot be imported is left to the host that needs it,
+            which reports it.
     """
     for name in _PRELOADED:
         importlib.import_module(name)
-    from rclpy.type_support import check_is_valid_msg_type, check_is_valid_srv_type
+    from lifecycle.middleware import load_libraries
 
-    from lifecycle.middleware import import_interface, load_rcl
-
-    load_rcl()
-
-    for message in _MESSAGES:
-        check_is_valid_msg_type(import_interface(message))
-    for service in _SERVICES:
-        check_is_valid_srv_type(import_interface(service))
-    for interface in interfaces:
+    for interface in (*_MESSAGES, *_SERVICES):
+        _load(interface)
+    for name in names:
         with contextlib.suppress(Exception):
-            kind = interface.split("/")[1]
-            if kind == "action":
-                importlib.import_module("rclpy.action")
-            check = {"msg": check_is_valid_msg_type, "srv": check_is_valid_srv_type}.get(kind)
-            loaded = import_interface(interface)
-            if check is not None:
-                check(loaded)
+            _load(name)
     # The codec learns a type's shape at first use.
     spec = HostSpec(
         system="",
@@ -98,9 +88,40 @@ def preload(interfaces: Iterable[str] = ()) -> None:
     codec.from_json(codec.to_json(spec), HostSpec)
     command = Command(id=0, node="", operation=Operation.CONFIGURE)
     codec.from_json(codec.to_json(command), Command)
+    # Reading which rcl is installed takes most of a host's `connect`.
+    load_libraries()
 
 
-__all__ = ["main", "preload", "serve"]
+def _load(name: str) -> None:
+    """Import a module, or an interface with its type support."""
+    if "/" not in name:
+        importlib.import_module(name)
+        return
+    from rclpy.type_support import check_is_valid_msg_type, check_is_valid_srv_type
+
+    from lifecycle.middleware import import_interface
+
+    found = import_interface(name)
+    if "/msg/" in name:
+        check_is_valid_msg_type(found)
+    elif "/srv/" in name:
+        check_is_valid_srv_type(found)
+
+
+def needed_by(nodes: Iterable[PlannedNode]) -> tuple[str, ...]:
+    """Return what `preload` is to import for some nodes: modules and interface types."""
+    names: dict[str, None] = {}
+    for node in nodes:
+        if node.events or node.membership:
+            names["lifecycle.graph.dds"] = names["lifecycle.graph.reporter"] = None
+        for endpoint in node.endpoints:
+            if "/action/" in endpoint.type:
+                names["rclpy.action"] = None
+            names[endpoint.type] = None
+    return tuple(names)
+
+
+__all__ = ["main", "needed_by", "preload", "serve"]
 
 
 def main(control_socket_fd: int) -> NoReturn:

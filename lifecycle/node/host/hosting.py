@@ -142,7 +142,13 @@ def construct(planned: PlannedNode, node_class: type[Node], context: Context, sy
 
 
 _ANSWERED_WITHOUT_CONFIGURATION = frozenset(
-    {Operation.ACTIVATE, Operation.DEACTIVATE, Operation.CLEANUP, Operation.SHUTDOWN}
+    {
+        Operation.ACTIVATE,
+        Operation.DEACTIVATE,
+        Operation.CLEANUP,
+        Operation.SHUTDOWN,
+        Operation.SERVE_INTERFACE,
+    }
 )
 
 
@@ -182,6 +188,9 @@ class HostCommands:
             return self._reply(command, ok=True)
         if command.operation in self._of_process:
             self._of_process[command.operation]()
+            return self._reply(command, ok=True)
+        if command.operation is Operation.SERVE_INTERFACE:
+            node.lifecycle.serve_interface()
             return self._reply(command, ok=True)
         if command.operation in _NODE_INTERFACE:
             await _NODE_INTERFACE[command.operation](node.lifecycle.interface, command)
@@ -265,8 +274,9 @@ class Host:
     def run(self) -> NoReturn:
         """Construct, say ready, obey; never returns."""
         # Both before any constructor of the user's: whatever it does, the process can be ended.
-        threading.Thread(target=self._obey, name="control", daemon=True).start()
-        with on_signal(lambda number: self._end(number.name)):
+        self._obey()
+        beside = (self._channel.fileno(), self._receive)
+        with on_signal(lambda number: self._end(number.name), beside=beside):
             participants = Participants(self._context)
             for index, planned in enumerate(self._spec.nodes):
                 failure: Exception | None = None
@@ -337,14 +347,14 @@ class Host:
     def _add(self, planned: PlannedNode, node: Node) -> None:
         if isinstance(node, LifecycleNode):
             self._nodes[planned.full_name] = node
-            node.lifecycle.add_listener(self._tell_state)
-            node.lifecycle.configuration_changes.listen(self._tell_configuration)
+            node.lifecycle.add_listener(self._report_state)
+            node.lifecycle.configuration_changes.listen(self._report_configuration)
         self._loop.add(node)
 
     async def _ready(self) -> None:
         self._channel.write(Event(kind="ready"))
 
-    def _tell_state(self, node: LifecycleNode) -> None:
+    def _report_state(self, node: LifecycleNode) -> None:
         state = node.lifecycle.state
         self._channel.write(
             Event(
@@ -355,7 +365,7 @@ class Host:
             )
         )
 
-    def _tell_configuration(self, configuration: NodeConfiguration) -> None:
+    def _report_configuration(self, configuration: NodeConfiguration) -> None:
         self._channel.write(
             Event(
                 kind="configuration",
@@ -366,9 +376,17 @@ class Host:
             )
         )
 
+    def _receive(self) -> bool:
+        """Take what the supervisor sends; False once it has ended the channel."""
+        if not self._channel.receive():
+            self._end("end of the control channel")
+            return False
+        self._obey()
+        return True
+
     def _obey(self) -> None:
-        """Read commands until the supervisor ends the channel; runs in its own thread."""
-        while (line := self._channel.read()) is not None:
+        """Have the commands carried out that have arrived."""
+        for line in self._channel.lines():
             try:
                 command = codec.from_json(line, Command)
             except ValueError:
@@ -376,7 +394,6 @@ class Host:
                 logging.getLogger(__name__).exception("cannot read command %r", line)
                 continue
             self._loop.call_soon(self._execute, command)
-        self._end("end of the control channel")
 
     async def _execute(self, command: Command) -> None:
         self._channel.write(await self._commands.execute(command))

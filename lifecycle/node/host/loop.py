@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import select
 import signal
 import socket
 import sys
@@ -204,8 +205,17 @@ class NodeLoop:
 
 
 @contextlib.contextmanager
-def on_signal(handler: Callable[[signal.Signals], None]) -> Iterator[None]:
+def on_signal(
+    handler: Callable[[signal.Signals], None],
+    *,
+    beside: tuple[int, Callable[[], bool]] | None = None,
+) -> Iterator[None]:
     """Call `handler` in a thread of its own for each SIGINT and SIGTERM.
+
+    Args:
+        handler: takes the signal.
+        beside: a descriptor that this thread reads, too: the function is called whenever it is
+            readable, until it returns False.
 
     A Python signal handler runs only when the main thread runs Python, and the main thread sits
     in rcl's wait. The wake-up descriptor is written by the C handler, so a thread can read it.
@@ -217,10 +227,22 @@ def on_signal(handler: Callable[[signal.Signals], None]) -> Iterator[None]:
     before_descriptor = signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
 
     def read() -> None:
-        while data := receiver.recv(16):
-            for number in data:
-                if number in _SIGNALS:
-                    handler(signal.Signals(number))
+        poll = select.poll()
+        poll.register(receiver, select.POLLIN)
+        if beside is not None:
+            poll.register(beside[0], select.POLLIN)
+        while True:
+            for descriptor, _ in poll.poll():
+                if beside is not None and descriptor == beside[0]:
+                    if not beside[1]():
+                        poll.unregister(descriptor)
+                    continue
+                data = receiver.recv(16)
+                if not data:
+                    return
+                for number in data:
+                    if number in _SIGNALS:
+                        handler(signal.Signals(number))
 
     reader = threading.Thread(target=read, name="signals", daemon=True)
     reader.start()

@@ -42,12 +42,12 @@ from lifecycle.node.host.loop import NodeLoop, Watchdog, on_signal
 from lifecycle.node.lifecycle.machine import CallbackOutcome
 from lifecycle.plan import PlannedNode
 
-_SAID_AGAIN_S = (0.1, 0.3)
+_REPEATED_AFTER_S = (0.1, 0.3)
 """Fast DDS repeats what was lost after up to 3 s: too late for a silence."""
 
 
 @typing.final
-class Heard:
+class OwnLiveliness:
     """The liveliness of one process without a supervisor.
 
     Args:
@@ -63,7 +63,7 @@ class Heard:
         self._silent: dict[str, str] = {}
         self._publisher: AlivePublisher | None = None
         self._name = ""
-        self.watchdog = Watchdog(self._sign, lambda _: self._tell(""))
+        self.watchdog = Watchdog(self._sign, lambda _: self._announce(""))
 
     def open(self, node: LifecycleNode, tell_names: Callable[[], None]) -> None:
         """Assert its liveliness from now on.
@@ -80,30 +80,30 @@ class Heard:
         while select.select([self._sign], [], []):
             why = self._sign.overdue()
             if why is Overdue.HANGS:
-                self._tell(
+                self._announce(
                     f"a callback in its process (pid {os.getpid()}) has been running for "
                     f"{self._sign.limit_s:g} s"
                 )
             elif why is Overdue.UNSERVED and not self._silent:
-                self._tell(
+                self._announce(
                     f"its process (pid {os.getpid()}) gets no processor for its callback: the "
                     "machine is overloaded"
                 )
 
-    def _tell(self, why: str) -> None:
+    def _announce(self, why: str) -> None:
         with self._lock:
             silent = self._silent = {self._name: why} if why else {}
-        self._say(silent)
-        for again_s in _SAID_AGAIN_S:
-            timer = threading.Timer(again_s, self._say, (silent,))
+        self._publish(silent)
+        for again_s in _REPEATED_AFTER_S:
+            timer = threading.Timer(again_s, self._publish, (silent,))
             timer.daemon = True
             timer.start()
 
-    def _say(self, silent: dict[str, str]) -> None:
+    def _publish(self, silent: dict[str, str]) -> None:
         with self._lock:
             # Only what still holds is said again.
             if silent is self._silent and self._publisher is not None:
-                self._publisher.tell(silent)
+                self._publisher.notify(silent)
 
 
 def run(
@@ -136,7 +136,7 @@ def run(
     Exit codes: 0 after SIGTERM, `interrupted` after Ctrl-C, 1 when a callback raised an exception,
     6 when the node could not be brought up.
     """
-    tell = functools.partial(_tell, say or _print)
+    report = functools.partial(_report_line, say or _print)
     mode = parse_mode(lifecycle) if lifecycle is not None else None
     rclpy.init(
         args=sys.argv if arguments is None else arguments,
@@ -144,41 +144,41 @@ def run(
         signal_handler_options=SignalHandlerOptions.NO,
     )
     context = rclpy.get_default_context()
-    heard = Heard((spec.timeouts if spec is not None else Timeouts()).silent_s)
-    loop = NodeLoop(context, heard.watchdog)
-    with on_signal(lambda number: _on_signal(number, loop, tell, interrupted)):
+    liveliness = OwnLiveliness((spec.timeouts if spec is not None else Timeouts()).silent_s)
+    loop = NodeLoop(context, liveliness.watchdog)
+    with on_signal(lambda number: _on_signal(number, loop, report, interrupted)):
         construction = Construction(
             spec=spec, mode=mode, context=context, use_global_arguments=True
         )
         with constructing(construction), participant_settings(context, _settings(spec)):
             node = node_class()
         loop.add(node)
-        heard.open(node, loop.tell_names)
-        node.lifecycle.add_listener(lambda each: tell(f"{_name(each)}: {_state(each)}"))
-        tell(f"{_name(node)}: {_state(node)}")
+        liveliness.open(node, loop.tell_names)
+        node.lifecycle.add_listener(lambda each: report(f"{_name(each)}: {_state(each)}"))
+        report(f"{_name(node)}: {_state(node)}")
         if node.lifecycle.mode is Mode.AUTO:
-            loop.call_soon(_bring_up, node, loop, tell)
+            loop.call_soon(_bring_up, node, loop, report)
         loop.spin_and_exit()
     raise AssertionError("spin_and_exit returned")
 
 
-async def _bring_up(node: LifecycleNode, loop: NodeLoop, tell: Callable[[str], None]) -> None:
+async def _bring_up(node: LifecycleNode, loop: NodeLoop, report: Callable[[str], None]) -> None:
     try:
         result = await node.lifecycle.bring_up()
     except Exception as error:  # noqa: BLE001 - shown, then the process ends
         traceback.print_exc()
-        tell(f"cannot bring up {_name(node)}: {error}")
+        report(f"cannot bring up {_name(node)}: {error}")
     else:
         if result.outcome is CallbackOutcome.SUCCESS:
             return
-        tell(f"cannot bring up {_name(node)}: {result.error}")
+        report(f"cannot bring up {_name(node)}: {result.error}")
     loop.stop("a failed bring-up", code=ExitCode.BRING_UP_FAILED)
 
 
 def _on_signal(
-    number: signal.Signals, loop: NodeLoop, tell: Callable[[str], None], interrupted: ExitCode
+    number: signal.Signals, loop: NodeLoop, report: Callable[[str], None], interrupted: ExitCode
 ) -> None:
-    tell(f"{number.name}: shutting down")
+    report(f"{number.name}: shutting down")
     loop.stop(number.name, code=interrupted if number is signal.SIGINT else ExitCode.OK)
 
 
@@ -200,7 +200,7 @@ def _state(node: LifecycleNode) -> str:
     return node.lifecycle.state.value
 
 
-def _tell(say: Callable[[str], None], line: str) -> None:
+def _report_line(say: Callable[[str], None], line: str) -> None:
     """Print `line` if it is still read: a closed pipe does not end a node."""
     with contextlib.suppress(BrokenPipeError):
         say(line)

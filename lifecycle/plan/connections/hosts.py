@@ -91,6 +91,7 @@ class PortPool:
     def __init__(self, first: int, taken: Mapping[str, Iterable[int]] | None = None) -> None:
         self._first = first
         self._taken = {host: set(ports) for host, ports in (taken or {}).items()}
+        self._lowest: dict[str, int] = {}  # from `first` to below it, all of a host's are taken
 
     def take(self, host: str, count: int = 1) -> tuple[int, ...]:
         """Give out the lowest free ports of a host.
@@ -100,7 +101,7 @@ class PortPool:
         """
         taken = self._taken.setdefault(host, set())
         found: list[int] = []
-        for port in range(self._first, MAX_PORT + 1):
+        for port in range(self._lowest.get(host, self._first), MAX_PORT + 1):
             if len(found) == count:
                 break
             if port not in taken:
@@ -112,6 +113,7 @@ class PortPool:
                 hint="lower 'discovery.first_port'",
             )
         taken.update(found)
+        self._lowest[host] = max(found, default=self._first - 1) + 1
         return tuple(found)
 
     def take_everywhere(self, hosts: Sequence[str], first: int) -> int:

@@ -48,10 +48,16 @@ from lifecycle.plan.model import (
     PlannedParticipant,
     PlannedServer,
 )
-from lifecycle.plan.negotiation.data_layer import DataLayerGraph, Party
+from lifecycle.plan.negotiation.data_layer import (
+    DataLayerGraph,
+    NegotiatedConnection,
+    NegotiatedFlow,
+    Party,
+)
 from lifecycle.plan.negotiation.media import carried
 from lifecycle.plan.negotiation.negotiate import negotiate
 from lifecycle.plan.negotiation.parties import (
+    LinksByPair,
     endpoint_of,
     make_terms,
     party_of_node,
@@ -239,11 +245,7 @@ def wire(
         )
         graph = negotiate(tuple(parties.values()), wishes_of(flows), terms)
         found += _unconnectable(graph, nodes, manifest)
-        nodes = tuple(
-            place_negotiated(node, [each for each in graph.connections if each.node == node.key])
-            for node in nodes
-        )
-        flows = [_with_medium(flow, graph) for flow in flows]
+        nodes, flows = _with_graph(nodes, flows, graph)
     found += infeasible(nodes, parties, negotiated=static)
     if found:
         raise PlanError.of(tuple(found))
@@ -270,13 +272,27 @@ def with_graph(plan: Plan, graph: DataLayerGraph) -> Plan:
             is made from node configurations.
         graph: what was negotiated; what it gives to nodes that the plan does not know is left out.
     """
-    return dataclasses.replace(
-        plan,
-        nodes=tuple(
-            place_negotiated(node, [each for each in graph.connections if each.node == node.key])
-            for node in plan.nodes
+    nodes, flows = _with_graph(plan.nodes, plan.flows, graph)
+    return dataclasses.replace(plan, nodes=nodes, flows=flows)
+
+
+def _with_graph(
+    nodes: Sequence[PlannedNode], flows: Sequence[PlannedFlow], graph: DataLayerGraph
+) -> tuple[tuple[PlannedNode, ...], tuple[PlannedFlow, ...]]:
+    """Return nodes with the connections, and flows with the media, that a graph gives them."""
+    connections: dict[str, list[NegotiatedConnection]] = {}
+    for each in graph.connections:
+        connections.setdefault(each.node, []).append(each)
+    negotiated: dict[tuple[str, str, str], list[NegotiatedFlow]] = {}
+    for flow in graph.flows:
+        place = (flow.topic, flow.publisher, flow.subscription)
+        negotiated.setdefault(place, []).append(flow)
+    return (
+        tuple(place_negotiated(node, connections.get(node.key, ())) for node in nodes),
+        tuple(
+            _with_medium(flow, negotiated.get((flow.topic, flow.publisher, flow.subscription), ()))
+            for flow in flows
         ),
-        flows=tuple(_with_medium(flow, graph) for flow in plan.flows),
     )
 
 
@@ -328,33 +344,23 @@ def _unconnectable(
 ) -> Iterator[Diagnostic]:
     """Yield what cannot be connected, at the link or else the publisher that asks."""
     start = Position(file=manifest.path, line=1, column=1)
+    links = LinksByPair(each for each in manifest.links if each.transport is not FlowTransport.ANY)
+    endpoints: dict[tuple[str, str], Position] = {}
+    for node in nodes:
+        for each in node.endpoints:
+            if each.kind is EndpointKind.PUBLISHER:
+                endpoints.setdefault((node.key, each.resolved), _at(node, each))
     for problem in graph.problems:
-        links = [
-            link.at
-            for link in manifest.links
-            if link.topic == problem.topic
-            and link.from_node in (problem.publisher, "*")
-            and link.to_node in (problem.subscription, "*")
-            and link.transport is not FlowTransport.ANY
-        ]
-        endpoints = [
-            each.at or node.at
-            for node in nodes
-            if node.key == problem.publisher
-            for each in node.endpoints
-            if each.kind is EndpointKind.PUBLISHER and each.resolved == problem.topic
-        ]
-        at = next(iter((*links, *endpoints)), None) or start
+        asking = links.of(problem.topic, problem.publisher, problem.subscription)
+        if asking:
+            at: Position | None = asking[0].at
+        else:
+            at = endpoints.get((problem.publisher, problem.topic))
+        at = at or start
         yield error("plan.unconnectable", at, problem.message, problem.hint)
 
 
-def _with_medium(flow: PlannedFlow, graph: DataLayerGraph) -> PlannedFlow:
-    found = [
-        each
-        for each in graph.flows
-        if (each.topic, each.publisher, each.subscription)
-        == (flow.topic, flow.publisher, flow.subscription)
-    ]
+def _with_medium(flow: PlannedFlow, found: Sequence[NegotiatedFlow]) -> PlannedFlow:
     if not found:
         return flow
     media = dict.fromkeys(each.medium for each in found)
@@ -388,7 +394,9 @@ def place_declared(
         for entry in connection.map
     }
     placed = tuple(
-        dataclasses.replace(each, participant=places.get((each.kind, each.name), each.participant))
+        dataclasses.replace(each, participant=places[each.kind, each.name])
+        if (each.kind, each.name) in places
+        else each
         for each in endpoints
     )
     left = tuple(

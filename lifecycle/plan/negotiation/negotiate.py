@@ -400,15 +400,17 @@ def _choose(
     """Choose on each host first: whether a publisher uses a group decides what others can have."""
     groups: set[_Key] = set()
     choices: dict[int, Choice] = {}
+    writers = [_writer(pair) for pair in pairs]
+    listeners = _listeners(pairs, writers)
     for near in (True, False):
         for index, pair in enumerate(pairs):
             if pair.same_host is not near:
                 continue
-            writer = _writer(pair)
+            writer = writers[index]
             choices[index] = choose(
                 pair,
                 by_multicast=writer in groups,
-                listeners=_listeners(pair, pairs),
+                listeners=len(listeners.get(writer, ())),
                 max_datagram_bytes=terms.max_datagram_bytes,
             )
             if choices[index].medium == Medium.UDPM:
@@ -431,15 +433,13 @@ def _reader(pair: Pair) -> _Key:
     return pair.subscription.key, EndpointKind.SUBSCRIPTION, pair.reader.name
 
 
-def _listeners(pair: Pair, pairs: Sequence[Pair]) -> int:
-    """Count processes of the publisher's host, but its own, that subscribe to its topic."""
-    return len(
-        {
-            each.subscription.process
-            for each in pairs
-            if _writer(each) == _writer(pair) and each.same_host and not each.same_process
-        }
-    )
+def _listeners(pairs: Sequence[Pair], writers: Sequence[_Key]) -> dict[_Key, set[str]]:
+    """Return, by publisher, the processes of its host, but its own, that subscribe to its topic."""
+    found: dict[_Key, set[str]] = {}
+    for pair, writer in zip(pairs, writers, strict=True):
+        if pair.same_host and not pair.same_process:
+            found.setdefault(writer, set()).add(pair.subscription.process)
+    return found
 
 
 def _problem(pair: Pair, message: str, hint: str = "") -> NegotiationProblem:
@@ -478,9 +478,10 @@ class _PairCarriers:
         self._ends: dict[_Key, tuple[Party, PartyEndpoint]] = {}
         self._needs: dict[_Key, set[str]] = {}
         for pair, choice in self._chosen:
-            self._ends[_writer(pair)] = pair.publisher, pair.writer
-            self._ends[_reader(pair)] = pair.subscription, pair.reader
-            for key in (_writer(pair), _reader(pair)):
+            ends = (_writer(pair), _reader(pair))
+            self._ends[ends[0]] = pair.publisher, pair.writer
+            self._ends[ends[1]] = pair.subscription, pair.reader
+            for key in ends:
                 found = self._needs.setdefault(key, set())
                 if choice.medium != Medium.INTRAPROCESS:
                     found.add(_token(pair, choice.medium))
@@ -500,6 +501,8 @@ class _PairCarriers:
                     stuck[index] = None
         # A pair that was stuck, or held, may not be so any more after others have moved.
         for index, (pair, choice) in enumerate(self._chosen):
+            if not self._moved and index not in stuck:
+                continue  # it held, and nothing has changed since
             impossible = any(self._impossible(key) for key in (_writer(pair), _reader(pair)))
             if self._holds(pair, choice) and not impossible:
                 continue
@@ -581,24 +584,25 @@ class _PairCarriers:
 
     def wanted(self) -> tuple[Wanted, ...]:
         """Return what each node must have, with those whom each connection must find."""
+        partners = self._partners()
         return tuple(
             Wanted(
                 party=self._ends[key][0],
                 endpoint=self._ends[key][1],
                 transports=tuple(sorted(transports)),
-                partners=tuple(sorted(self._partners(key))),
+                partners=tuple(sorted(partners.get(key, ()))),
             )
             for key, transports in sorted(self._moved.items(), key=lambda each: _order(each[0]))
         )
 
-    def _partners(self, key: _Key) -> set[tuple[str, str, str]]:
-        """Return (party, kind, endpoint) of all that an endpoint exchanges data with."""
-        found = set()
-        for pair, _ in self._chosen:
+    def _partners(self) -> dict[_Key, set[tuple[str, str, str]]]:
+        """Return (party, kind, endpoint) of all that each moved endpoint exchanges data with."""
+        found: dict[_Key, set[tuple[str, str, str]]] = {}
+        for pair, _ in self._chosen if self._moved else ():
             ends = (_writer(pair), _reader(pair))
-            if key in ends:
-                other = ends[1] if ends[0] == key else ends[0]
-                found.add((other[0], other[1].value, other[2]))
+            for key, other in (ends, ends[::-1]):
+                if key in self._moved:
+                    found.setdefault(key, set()).add((other[0], other[1].value, other[2]))
         return found
 
 

@@ -22,8 +22,8 @@ from typing import Any, NoReturn, Protocol
 from urllib.parse import quote, unquote, urlsplit
 
 from lifecycle.network import is_loopback
-from lifecycle.programming.apply.errors import HttpError, MissingFeatureError, SettingsError
 from lifecycle.programming.apply.settings import Token
+from lifecycle.programming.apply.target import HttpError, MissingFeatureError, SettingsError
 from lifecycle.programming.apply.tool import Deadline
 
 try:

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import UsageError
-from lifecycle.programming.apply.errors import ProgrammingError
+from lifecycle.programming.apply.target import ProgrammingError
 from lifecycle.run_directory import (
     LEDGER_LOCK_NAME,
     LEDGER_NAME,

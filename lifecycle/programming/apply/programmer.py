@@ -18,13 +18,12 @@ from typing import TypeVar
 
 import psutil
 
-from lifecycle.errors import LifecycleError
-from lifecycle.network import DscpMapping, canonical, is_loopback
+from lifecycle.errors import LifecycleError, UsageError
+from lifecycle.network import DscpMapping, canonical, dscp_mapping, is_loopback, parse_mapping
 from lifecycle.plan import Plan, PlannedNode
-from lifecycle.programming.apply.changes import Target, TargetChanges
-from lifecycle.programming.apply.errors import PartlyError
 from lifecycle.programming.apply.ledger import Ledger, has_ledger, owner_is_dead
-from lifecycle.programming.apply.targets import TargetOptions, Targets
+from lifecycle.programming.apply.target import PartlyError, Target, TargetChanges
+from lifecycle.programming.apply.targets.registry import TargetOptions, Targets, target_kind
 from lifecycle.programming.apply.tool import Deadline
 from lifecycle.programming.rules.rules import FlowRule, LeftOut, RuleSet, SourceAddress, flow_rules
 from lifecycle.run_directory import is_held, run_name, runtime_root
@@ -45,6 +44,26 @@ class Treatment:
 
     mapping: DscpMapping | None = None
     label_flows: bool = False
+
+
+def read_treatment(mapping: str, *, label_flows: bool) -> Treatment:
+    """Return what a person asked for.
+
+    Args:
+        mapping: name or file of a mapping; empty for none.
+        label_flows: see Treatment.
+
+    Raises:
+        UsageError: no such mapping, or its file cannot be used.
+    """
+    if not mapping:
+        return Treatment(label_flows=label_flows)
+    try:
+        file = Path(mapping)
+        found = parse_mapping(file.read_bytes()) if file.is_file() else dscp_mapping(mapping)
+    except (OSError, ValueError) as error:
+        raise UsageError(str(error)) from error
+    return Treatment(mapping=found, label_flows=label_flows)
 
 
 class RouteSources:
@@ -254,7 +273,7 @@ def open_programmer(
     ledger = ledger_of(plan, environment, machine=machine, owned=owned)
     targets = Targets(ledger)
     try:
-        made = [targets.make(each) for each in options]
+        made = [each.open(targets) for each in options]
     except LifecycleError:
         targets.close()
         raise
@@ -285,7 +304,7 @@ def remove_all(
     try:
         with own.deadline.within(within_s), ledger.locked():
             records = ledger.read().targets
-            return _each(records, lambda record: own.restore(record).remove())
+            return _each(records, lambda each: target_kind(each.target).restore(each, own).remove())
     finally:
         if targets is None:
             own.close()

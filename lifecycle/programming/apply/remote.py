@@ -7,20 +7,37 @@ was lost. What a thing is and how it is asked for is the service's.
 
 from __future__ import annotations
 
+import abc
 import dataclasses
 import json
-from collections.abc import Sequence
-from typing import Protocol
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Generic, Protocol, TypeVar, cast
 
-from lifecycle.errors import LifecycleError
-from lifecycle.programming.apply.changes import ChangeKind, FlowChange, TargetChanges, describe_rule
-from lifecycle.programming.apply.errors import HttpError, PartlyError
+from lifecycle.errors import LifecycleError, UsageError
+from lifecycle.programming.apply.http import Api
 from lifecycle.programming.apply.ledger import (
     Entry,
     EntryState,
     Ledger,
     TargetRecord,
     digest_of,
+)
+from lifecycle.programming.apply.settings import ServerSettings, Settings, load_settings
+from lifecycle.programming.apply.target import (
+    ChangeKind,
+    FlowChange,
+    HttpError,
+    PartlyError,
+    SettingsError,
+    TargetChanges,
+    describe_rule,
+)
+from lifecycle.programming.apply.targets.registry import (
+    TargetOption,
+    TargetOptions,
+    Targets,
+    settings_types,
 )
 from lifecycle.programming.rules.mobile import B, Requests
 from lifecycle.programming.rules.rules import FlowRule
@@ -324,3 +341,98 @@ def _entry(change: FlowChange, body: Body, made: Made | None) -> Entry:
         expires_s=None if made is None else made.expires_s,
         body=text,
     )
+
+
+_S = TypeVar("_S", bound=ServerSettings)
+
+
+class ServerOptions(TargetOptions, Generic[_S]):
+    """The options of one server: a settings file, in which its kind is a key.
+
+    Args:
+        path: of the file.
+    """
+
+    hint = "give --config FILE"
+    takes = (
+        TargetOption(
+            flag="--config",
+            metavar="FILE",
+            help="nef, camara: where the server is and where the token is.",
+        ),
+    )
+
+    def __init__(self, path: str) -> None:
+        self.path = path
+
+    @classmethod
+    @abc.abstractmethod
+    def url(cls, settings: _S) -> str:
+        """Return what the server is told apart from others by, and where it is asked."""
+
+    @classmethod
+    @abc.abstractmethod
+    def service(cls, settings: _S, api: Api) -> Service:
+        """Return what asks it."""
+
+    @classmethod
+    def read(cls, given: Mapping[str, Any]) -> ServerOptions[_S]:
+        """Take the path."""
+        if not given.get("config"):
+            raise UsageError(
+                f"cannot program {cls.kind} without settings: where it is and who we are",
+                hint=cls.hint,
+            )
+        return cls(given["config"])
+
+    @classmethod
+    def restore(cls, record: TargetRecord, means: Targets) -> RemoteTarget:
+        """Return the server of a record, if it is still that of the settings file."""
+        settings = load_settings(record.settings, settings_types())
+        own = cls._of(settings)
+        scope = "" if own is None else cls.url(own)
+        if scope != record.scope:
+            raise SettingsError(
+                f"cannot remove what is at {record.scope}: settings {record.settings!r} are "
+                f"{f'of {scope}' if scope else f'without {record.target}'} now"
+            )
+        return cls._open(settings, means)
+
+    def open(self, means: Targets) -> RemoteTarget:
+        """Return the server."""
+        return self._open(load_settings(self.path, settings_types()), means)
+
+    def exported(self) -> Mapping[str, Any]:
+        """Return what goes into bodies."""
+        servers = load_settings(self.path, settings_types()).servers
+        return {name: each.asked() for name, each in servers.items()}
+
+    def token_variables(self) -> frozenset[str]:
+        """Return those of every server of the file."""
+        tokens = [
+            each.token for each in load_settings(self.path, settings_types()).servers.values()
+        ]
+        return frozenset(each.env for each in tokens if each is not None and each.env)
+
+    @classmethod
+    def _of(cls, settings: Settings) -> _S | None:
+        return cast("_S | None", settings.servers.get(cls.kind))
+
+    @classmethod
+    def _open(cls, settings: Settings, means: Targets) -> RemoteTarget:
+        own = cls._of(settings)
+        if own is None:
+            raise SettingsError(
+                f"cannot program {cls.kind}: settings {settings.path!r} have no key {cls.kind!r}"
+            )
+        api = Api(
+            cls.url(own),
+            token=own.token,
+            timeout_s=own.timeout_s,
+            ca_file=own.ca_file and str(Path(settings.path).parent / own.ca_file),
+            patience=means.patience,
+            clock=means.clock,
+            deadline=means.deadline,
+        )
+        means.keep(api)
+        return RemoteTarget(cls.service(own, api), means.ledger, settings.path)

@@ -1,8 +1,9 @@
 """The settings file of the targets that are reached over HTTP.
 
-Owns: its keys, their ranges and how it is read. Never holds a credential, only where one is: tokens
-are read from the environment or a file at the moment they are needed, so that a rotated one is
-taken up, and no object here holds one that a log or a traceback could show.
+Owns: the keys that all of them have, and how it is read; the others are their targets'. Never
+holds a credential, only where one is: tokens are read from the environment or a file at the moment
+they are needed, so that a rotated one is taken up, and no object here holds one that a log or a
+traceback could show.
 
     nef:
       url: https://nef.example.net
@@ -21,22 +22,20 @@ taken up, and no object here holds one that a log or a traceback could show.
 
 from __future__ import annotations
 
+import dataclasses
 import errno
 import os
-import re
 import stat
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TypeVar
+from typing import Any
 from urllib.parse import urlsplit
 
 import msgspec
 import yaml
 
 from lifecycle.network import is_loopback
-from lifecycle.programming.apply.errors import SettingsError
-from lifecycle.programming.rules.camara import CamaraSettings
-from lifecycle.programming.rules.nef import NefSettings, UplinkFilter
+from lifecycle.programming.apply.target import SettingsError
 
 _MAX_BYTES = 256 * 1024
 _MAX_TOKEN_BYTES = 64 * 1024
@@ -98,28 +97,17 @@ class Token(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         return token
 
 
-class NefTargetSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How to reach a 3GPP NEF and what to ask it for (TS 29.122, release 17).
+class ServerSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How to reach a server; what it is asked for is its target's.
 
     Attributes:
-        url: API root, before `/3gpp-as-session-with-qos/v1`.
-        scs_as_id: who we are to the operator.
-        notification_destination, devices, qos_references, default_qos_reference,
-            supported_features, protocol_by_name, uplink: see rules.nef.NefSettings.
+        url: of its interface.
         token: None sends none.
         ca_file: certificates that the server is checked against; empty for the system's.
         timeout_s: of one request, > 0.
     """
 
     url: str
-    scs_as_id: str
-    notification_destination: str
-    devices: tuple[str, ...]
-    qos_references: dict[int, str] = {}
-    default_qos_reference: str = ""
-    supported_features: str = "0"
-    protocol_by_name: bool = False
-    uplink: UplinkFilter = UplinkFilter.IN
     token: Token | None = None
     ca_file: str = ""
     timeout_s: float = 10.0
@@ -127,96 +115,56 @@ class NefTargetSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     def __post_init__(self) -> None:
         _check_url(self.url, token=self.token)
         _check_positive(self.timeout_s, "timeout_s")
-        if not re.fullmatch(r"[A-Za-z0-9._~-]+", self.scs_as_id):
-            raise ValueError(
-                f"cannot use scs_as_id {self.scs_as_id!r}; use letters, digits and . _ ~ -"
-            )
+        self.check()
         self.asked()
 
-    def asked(self) -> NefSettings:
+    def check(self) -> None:
+        """Refuse what is not allowed of the target's own keys.
+
+        Raises:
+            ValueError: a value is not allowed.
+        """
+
+    def asked(self) -> object:
         """Return what goes into bodies.
 
         Raises:
             ValueError: a value is not allowed.
         """
-        return NefSettings(
-            notification_destination=self.notification_destination,
-            devices=self.devices,
-            qos_references=self.qos_references,
-            default_qos_reference=self.default_qos_reference,
-            supported_features=self.supported_features,
-            protocol_by_name=self.protocol_by_name,
-            uplink=self.uplink,
-        )
+        raise NotImplementedError
+
+    def part(self, type_: Any) -> Any:
+        """Return the fields of a dataclass that these settings have, under the same names."""
+        names = {each.name for each in dataclasses.fields(type_)} & {*self.__struct_fields__}
+        return type_(**{name: getattr(self, name) for name in names})
 
 
-class CamaraTargetSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How to reach a CAMARA QualityOnDemand 1.1.0 interface and what to ask it for.
-
-    Attributes:
-        url: everything before `/sessions`.
-        devices, qos_profiles, default_qos_profile, duration_s, sink, public_addresses,
-            device_by_token: see rules.camara.CamaraSettings.
-        token: None sends none.
-        ca_file: certificates that the server is checked against; empty for the system's.
-        timeout_s: of one request, > 0.
-        wait_s: how long a session may take to become available; 0 does not wait.
-    """
-
-    url: str
-    devices: tuple[str, ...]
-    qos_profiles: dict[int, str] = {}
-    default_qos_profile: str = ""
-    duration_s: int = 3600
-    sink: str = ""
-    public_addresses: dict[str, str] = {}
-    device_by_token: bool = False
-    token: Token | None = None
-    ca_file: str = ""
-    timeout_s: float = 10.0
-    wait_s: float = 10.0
-
-    def __post_init__(self) -> None:
-        _check_url(self.url, token=self.token)
-        _check_positive(self.timeout_s, "timeout_s")
-        self.asked()
-
-    def asked(self) -> CamaraSettings:
-        """Return what goes into bodies.
-
-        Raises:
-            ValueError: a value is not allowed.
-        """
-        return CamaraSettings(
-            devices=self.devices,
-            qos_profiles=self.qos_profiles,
-            default_qos_profile=self.default_qos_profile,
-            duration_s=self.duration_s,
-            sink=self.sink,
-            public_addresses=self.public_addresses,
-            device_by_token=self.device_by_token,
-        )
-
-
-class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Settings:
     """The whole file.
 
     Attributes:
-        path: of the file; empty if it was made in memory.
+        path: of the file.
+        servers: by the names of their targets; of those that the file has.
     """
 
-    nef: NefTargetSettings | None = None
-    camara: CamaraTargetSettings | None = None
-    path: str = ""
+    path: str
+    servers: Mapping[str, ServerSettings]
 
 
-def load_settings(path: str | Path) -> Settings:
+def load_settings(path: str | Path, types: Mapping[str, type[ServerSettings]]) -> Settings:
     """Read a settings file, YAML or JSON.
+
+    Args:
+        path: of the file.
+        types: of its keys, see registry.settings_types.
 
     Raises:
         SettingsError: it cannot be read, or a key or value is not allowed; says which.
     """
     file = Path(path)
+    keys = [(name, type_ | None, None) for name, type_ in types.items()]
+    file_type = msgspec.defstruct("Settings", keys, frozen=True, forbid_unknown_fields=True)
     try:
         data = read_file(file, _MAX_BYTES + 1)
     except OSError as error:
@@ -226,7 +174,7 @@ def load_settings(path: str | Path) -> Settings:
     try:
         # JSON is YAML, and the keys of a JSON object are converted like those of YAML.
         plain = yaml.safe_load(data)
-        found = msgspec.convert(plain, Settings, strict=False)
+        found = msgspec.convert(plain, file_type, strict=False)
     except yaml.YAMLError as error:
         # Only where: the library's own text quotes the line, which may hold a pasted token.
         mark = getattr(error, "problem_mark", None)
@@ -240,21 +188,17 @@ def load_settings(path: str | Path) -> Settings:
             f"cannot read settings {str(path)!r}: it is nested too deep, or has a number or date "
             "that is none"
         ) from None
-    return msgspec.structs.replace(
-        found,
-        nef=_beside(found.nef, file),
-        camara=_beside(found.camara, file),
+    servers = {name: getattr(found, name) for name in types}
+    return Settings(
         path=str(file.absolute()),
+        servers={name: _beside(each, file) for name, each in servers.items() if each is not None},
     )
 
 
-_T = TypeVar("_T", NefTargetSettings, CamaraTargetSettings)
-
-
-def _beside(settings: _T | None, file: Path) -> _T | None:
+def _beside(settings: ServerSettings, file: Path) -> ServerSettings:
     """Make a relative token file one beside the settings file."""
-    token = None if settings is None else settings.token
-    if settings is None or token is None or not token.file:
+    token = settings.token
+    if token is None or not token.file:
         return settings
     placed = str(file.absolute().parent / token.file)
     return msgspec.structs.replace(settings, token=Token(file=placed))

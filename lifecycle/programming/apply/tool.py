@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Protocol
 
 from lifecycle.codec import from_json
-from lifecycle.programming.apply.errors import (
+from lifecycle.programming.apply.target import (
     MissingFeatureError,
     PrivilegeError,
     ProgrammingError,

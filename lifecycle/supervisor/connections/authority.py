@@ -87,7 +87,7 @@ CALM_S = 10.0
 class Reaching(Protocol):
     """How nodes that are not ours are reached, see ObserverParticipant."""
 
-    def node_interface(self, node: str) -> Hand:
+    def node_interface(self, node: str) -> NodeInterface:
         """Return what drives the node interface of any node that has one, by full name."""
 
 
@@ -98,7 +98,7 @@ def authority_of(system: System, emit: Emitter, reaching: Reaching) -> Connectio
         return None
     dynamic = layer.source is DataLayerSource.DYNAMIC
     source = NegotiatedSource(system.plan) if dynamic else PlannedSource(system.plan)
-    return ConnectionAuthority(system, source, emit, hand_of=reaching.node_interface)
+    return ConnectionAuthority(system, source, emit, interface_of=reaching.node_interface)
 
 
 class Source(Protocol):
@@ -119,7 +119,7 @@ class Source(Protocol):
         """Take the plan as it is now that these nodes are started again."""
 
 
-class Hand(Protocol):
+class NodeInterface(Protocol):
     """How one node is instructed, see nodes/driver.py."""
 
     async def interface(self) -> NodeConfiguration | None:
@@ -154,7 +154,7 @@ class PlannedSource:
 class _Wiring:
     """What the authority knows of one node that it wires."""
 
-    told: ActualState = dataclasses.field(default_factory=ActualState)
+    actual: ActualState = dataclasses.field(default_factory=ActualState)
     ours: list[str] = dataclasses.field(default_factory=list)
     settled: tuple[Instructions, str] | None = None  # with this configuration nothing was missing
     rounds: int = 0
@@ -170,16 +170,21 @@ class ConnectionAuthority:
         system: whose nodes.
         source: what they must have.
         emit: where events go.
-        hand_of: the interface to a node that is not declared, by full name.
+        interface_of: the interface to a node that is not declared, by full name.
     """
 
     def __init__(
-        self, system: System, source: Source, emit: Emitter, *, hand_of: Callable[[str], Hand]
+        self,
+        system: System,
+        source: Source,
+        emit: Emitter,
+        *,
+        interface_of: Callable[[str], NodeInterface],
     ) -> None:
         self._system = system
         self._source = source
         self._emit = emit
-        self._hand_of = hand_of
+        self._interface_of = interface_of
         self._wirings: dict[str, _Wiring] = {}
         self._others: dict[str, NodeConfiguration] = {}
         self._instructions: Mapping[str, Instructions] = {}
@@ -215,10 +220,10 @@ class ConnectionAuthority:
                 )
             return  # it makes its endpoints itself
         wiring = self._wirings.setdefault(node.name, _Wiring())
-        wiring.told = wired(configuration)
-        there = {connection for connection, _ in wiring.told.connections}
+        wiring.actual = wired(configuration)
+        there = {connection for connection, _ in wiring.actual.connections}
         wiring.ours = [connection for connection in wiring.ours if connection in there]
-        await self._make(wiring, node.driver, steps(wanted, wiring.told), node)
+        await self._make(wiring, node.driver, steps(wanted, wiring.actual), node)
 
     def replan(self, plan: Plan, names: Collection[str]) -> None:
         """Forget what these nodes were instructed: they are started again, by this plan."""
@@ -278,8 +283,8 @@ class ConnectionAuthority:
         for name, wiring in self._wirings.items():
             if self._system.node_named(name) is not None or name not in self._others:
                 continue
-            unmade = steps(Instructions(node=name), wiring.told, ours=wiring.ours)
-            making = self._make(wiring, self._hand_of(name), unmade, None)
+            unmade = steps(Instructions(node=name), wiring.actual, ours=wiring.ours)
+            making = self._make(wiring, self._interface_of(name), unmade, None)
             try:
                 await asyncio.wait_for(making, RELEASE_S)
             except (BringUpError, asyncio.TimeoutError):
@@ -309,14 +314,14 @@ class ConnectionAuthority:
         """Wire every node that lacks something; return after how many seconds to try again."""
         waits = [
             again
-            for name, hand, node, configuration in self._wirable()
-            if (again := await self._repair_node(name, hand, node, configuration)) is not None
+            for name, interface, node, configuration in self._wirable()
+            if (again := await self._repair_node(name, interface, node, configuration)) is not None
         ]
         return min(waits, default=None)
 
     def _wirable(
         self,
-    ) -> Iterable[tuple[str, Hand, NodeRun | None, NodeConfiguration]]:
+    ) -> Iterable[tuple[str, NodeInterface, NodeRun | None, NodeConfiguration]]:
         dead = self._system.dead()
         for name in self._instructions:
             node = self._system.node_named(name)
@@ -329,24 +334,28 @@ class ConnectionAuthority:
             elif name in self._others and name not in self._remote():
                 configuration = self._others[name]
                 if configuration.state in (INACTIVE, ACTIVE):
-                    yield name, self._hand_of(name), None, configuration
+                    yield name, self._interface_of(name), None, configuration
 
     def _remote(self) -> frozenset[str]:
         """Nodes of the plan that another supervisor wires."""
         return frozenset(each.name for each in self._system.remote.values())
 
     async def _repair_node(
-        self, name: str, hand: Hand, node: NodeRun | None, configuration: NodeConfiguration
+        self,
+        name: str,
+        interface: NodeInterface,
+        node: NodeRun | None,
+        configuration: NodeConfiguration,
     ) -> float | None:
         wanted = self._instructions[name]
         wiring = self._wirings.setdefault(name, _Wiring())
         if wiring.settled == (wanted, configuration.checksum):
             return None
-        has = wired(configuration) if self._repairs or node is None else wiring.told
+        has = wired(configuration) if self._repairs or node is None else wiring.actual
         missing = steps(wanted, has, ours=wiring.ours)
         if not missing:
             wiring.settled = (wanted, configuration.checksum)
-            wiring.told, wiring.error = has, ""
+            wiring.actual, wiring.error = has, ""
             return None
         now_s = asyncio.get_running_loop().time()
         if wiring.rounds >= TRIES:
@@ -361,9 +370,9 @@ class ConnectionAuthority:
         self._tell_lost(wiring, has, name)
         wiring.rounds += 1
         wiring.last_s = now_s
-        wiring.told = has
+        wiring.actual = has
         try:
-            await self._make(wiring, hand, missing, node)
+            await self._make(wiring, interface, missing, node)
         except BringUpError as error:
             wiring.error = error.message
         else:
@@ -377,16 +386,20 @@ class ConnectionAuthority:
     def _tell_lost(self, wiring: _Wiring, has: ActualState, name: str) -> None:
         """Say what the node had been given and has no more."""
         there = {connection for connection, _ in has.connections}
-        for connection, _ in wiring.told.connections:
+        for connection, _ in wiring.actual.connections:
             if connection in wiring.ours and connection not in there:
                 self._emit(WiringLost(node=name, connection=connection))
         mapped = dict(has.mappings)
-        for endpoint, connection in wiring.told.mappings:
+        for endpoint, connection in wiring.actual.mappings:
             if endpoint not in mapped and (connection in there or not connection):
                 self._emit(WiringLost(node=name, connection=connection, endpoint=endpoint))
 
     async def _make(
-        self, wiring: _Wiring, hand: Hand, missing: Iterable[Step], node: NodeRun | None
+        self,
+        wiring: _Wiring,
+        interface: NodeInterface,
+        missing: Iterable[Step],
+        node: NodeRun | None,
     ) -> None:
         """Make steps in order; the first that fails ends it."""
         for step in missing:
@@ -401,14 +414,14 @@ class ConnectionAuthority:
             if node is not None:
                 node.doing = f"is told to {step}"
             try:
-                configuration = await hand.wire(step)
+                configuration = await interface.wire(step)
             except BringUpError as error:
                 self._emit(dataclasses.replace(event, error=error.message))
                 raise
             finally:
                 if node is not None:
                     node.doing = ""
-            wiring.told = wiring.told.after(step)
+            wiring.actual = wiring.actual.after(step)
             if step.operation is Operation.CONNECT_TO and step.connection not in wiring.ours:
                 wiring.ours.append(step.connection)
             elif step.operation is Operation.DISCONNECT_FROM and step.connection in wiring.ours:

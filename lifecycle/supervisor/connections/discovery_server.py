@@ -27,7 +27,7 @@ NAME = "discovery_server"
 START_S = 10.0
 """It listens within 50 ms; a loaded machine takes longer."""
 
-KNOCK_S = 0.02
+LOOK_AGAIN_S = 0.02
 """Between two looks whether it listens: a process that is not ours to change does not notify us."""
 
 
@@ -46,7 +46,7 @@ async def begin(system: System, spawner: Spawner, *, ours: bool) -> None:
     if planned is None:
         return
     if not ours:
-        await _heard(planned, None)
+        await _until_it_listens(planned, None)
         return
     if discovery_server_listens(planned):
         # Fast DDS's server goes on without the port, and its owner seems to be the server.
@@ -80,7 +80,7 @@ async def begin(system: System, spawner: Spawner, *, ours: bool) -> None:
         raise StepFailedError(
             f"cannot start the discovery server: {error}", rule=START_FAILED, subject=NAME
         ) from error
-    await _heard(planned, process)
+    await _until_it_listens(planned, process)
     process.running()
 
 
@@ -103,7 +103,7 @@ def findings(system: System) -> tuple[Finding, ...]:
     return (finding_of(died(server)),)
 
 
-async def _heard(planned: PlannedServer, process: ManagedProcess | None) -> None:
+async def _until_it_listens(planned: PlannedServer, process: ManagedProcess | None) -> None:
     """Wait until it listens.
 
     Over UDP nothing shows that from another machine: then there is nothing to wait for.
@@ -142,7 +142,7 @@ async def _heard(planned: PlannedServer, process: ManagedProcess | None) -> None
 async def _listening(planned: PlannedServer, pid: int) -> None:
     """Wait until its port is open, as the kernel says; it has no way to notify us."""
     while not discovery_server_listens(planned, pid):  # noqa: ASYNC110 - there is no event
-        await asyncio.sleep(KNOCK_S)
+        await asyncio.sleep(LOOK_AGAIN_S)
 
 
 async def _answering(planned: PlannedServer) -> None:
@@ -154,7 +154,7 @@ async def _answering(planned: PlannedServer) -> None:
             with contextlib.suppress(OSError):
                 await writer.wait_closed()
             return
-        await asyncio.sleep(KNOCK_S)
+        await asyncio.sleep(LOOK_AGAIN_S)
 
 
 def _where(planned: PlannedServer) -> str:

@@ -174,18 +174,18 @@ class NegotiatedSource:
             for key in process.nodes
         }
         self.graph = DataLayerGraph() if before is None else before
-        self._heard: frozenset[tuple[str, str]] | None = None
-        self._told: Mapping[str, Instructions] = {}
+        self._judged: frozenset[tuple[str, str]] | None = None
+        self._instructions: Mapping[str, Instructions] = {}
         self.expected = plan
         self.problems: tuple[str, ...] = ()
 
     def instructions(self, known: Mapping[str, NodeConfiguration]) -> Mapping[str, Instructions]:
         """Return what each node must have, by full name, given what nodes report."""
         known = {name: each for name, each in known.items() if self._takes_part(name)}
-        heard = frozenset((each.name, each.checksum) for each in known.values())
-        if heard == self._heard:
-            return self._told
-        self._heard = heard
+        seen = frozenset((each.name, each.checksum) for each in known.values())
+        if seen == self._judged:
+            return self._instructions
+        self._judged = seen
         parties = [self._party(node, known.get(node.full_name)) for node in self._plan.nodes]
         places = self._places(known)
         guests = [each for name, each in known.items() if name not in self._planned]
@@ -196,15 +196,15 @@ class NegotiatedSource:
         before, self.graph = self.graph, graph
         self.problems = tuple(map(_words, self._declared(graph.problems)))
         self.expected = _with_flows(with_graph(self._grown(known), graph), graph)
-        told = {
+        instructions = {
             node.full_name: planned_instructions(node)
             for node in self.expected.nodes
             if node.managed
         }
         for each in guests:
-            told[each.name] = _guest_instructions(each, graph, before)
-        self._told = told
-        return told
+            instructions[each.name] = _guest_instructions(each, graph, before)
+        self._instructions = instructions
+        return instructions
 
     def replan(self, plan: Plan, names: Collection[str]) -> None:
         """Negotiate again for nodes that are started again, and never the TCP ports they had.
@@ -227,7 +227,7 @@ class NegotiatedSource:
             self.graph,
             connections=tuple(each for each in self.graph.connections if each.node not in keys),
         )
-        self._heard = None
+        self._judged = None
         self._take(plan)
 
     def _take(self, plan: Plan) -> None:

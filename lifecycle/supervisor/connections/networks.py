@@ -84,14 +84,14 @@ class Keeper:
 
     Args:
         programmer: see Programs.
-        tell: takes what was done and what failed, as text for people; called from the loop.
+        report: takes what was done and what failed, as text for people; called from the loop.
         worker: the thread.
     """
 
-    def __init__(self, programmer: Programs, tell: Callable[[str], None], worker: Worker) -> None:
+    def __init__(self, programmer: Programs, report: Callable[[str], None], worker: Worker) -> None:
         self._worker = worker
         self._programmer = programmer
-        self._tell = tell
+        self._report = report
         self._flows: tuple[FlowReport, ...] | None = None
         self._changed = asyncio.Event()
         self._task: asyncio.Task[None] | None = None
@@ -130,7 +130,7 @@ class Keeper:
         try:
             await self._stop()
         finally:
-            await remove(self._programmer, self._tell, hurry, self._worker)
+            await remove(self._programmer, self._report, hurry, self._worker)
 
     async def _stop(self) -> None:
         """Follow no verdicts until `take`."""
@@ -158,7 +158,7 @@ class Keeper:
 
         def say(text: str) -> None:
             # At once: a task that is cancelled meanwhile has changed the networks all the same.
-            loop.call_soon_threadsafe(self._tell, text)
+            loop.call_soon_threadsafe(self._report, text)
 
         async with self._one_at_a_time:
             return await self._whole(self._worker.run(self._once, within_s, say))
@@ -189,12 +189,12 @@ class Keeper:
         try:
             yield
         except LifecycleError as error:
-            self._tell(str(error))
+            self._report(str(error))
 
 
 async def remove(
     removes: Removes,
-    tell: Callable[[str], None],
+    report: Callable[[str], None],
     hurry: asyncio.Event | None,
     worker: Worker,
 ) -> None:
@@ -202,7 +202,7 @@ async def remove(
 
     Args:
         removes: see Removes.
-        tell: takes what was done or failed, as text for people.
+        report: takes what was done or failed, as text for people.
         hurry: once set, no server is waited for any more.
         worker: the thread.
     """
@@ -221,11 +221,11 @@ async def remove(
     try:
         done = await removing
     except LifecycleError as error:
-        tell(f"{error}\n{_STILL_THERE}")
+        report(f"{error}\n{_STILL_THERE}")
         return
     for each in done:
         if each.changes:
-            tell(each.render(done=True))
+            report(each.render(done=True))
 
 
 class Networks:
@@ -249,7 +249,7 @@ class Networks:
         # Made here: in the end it may be too late to start a thread.
         self._worker = Worker("networks")
         if programmer is not None:
-            self._keeper = Keeper(programmer, self._tell, self._worker)
+            self._keeper = Keeper(programmer, self._report, self._worker)
             emit.listen(self._hear)
 
     async def begin(self, verdict: Verdict, timeout_s: float | None = None) -> None:
@@ -289,13 +289,13 @@ class Networks:
         elif (self._directory / LEDGER_NAME).is_file():
             from lifecycle.programming import Removal
 
-            await remove(Removal(self._directory), self._tell, hurry, self._worker)
+            await remove(Removal(self._directory), self._report, hurry, self._worker)
 
     def _hear(self, event: Event) -> None:
         if self._begun and self._keeper is not None and isinstance(event, VerdictChanged):
             self._keeper.take(event.verdict.flows)
 
-    def _tell(self, text: str) -> None:
+    def _report(self, text: str) -> None:
         self._emit(Notice(message=text))
 
 
@@ -308,14 +308,7 @@ def token_variables(program: Iterable[TargetOptions]) -> frozenset[str]:
     Raises:
         SettingsError: a settings file cannot be used.
     """
-    paths = {each.settings for each in program if each.settings}
-    if not paths:
-        return frozenset()
-    from lifecycle.programming import load_settings
-
-    found = [load_settings(each) for each in paths]
-    tokens = [each.token for file in found for each in (file.nef, file.camara) if each is not None]
-    return frozenset(each.env for each in tokens if each is not None and each.env)
+    return frozenset().union(*(each.token_variables() for each in program))
 
 
 def open_networks(

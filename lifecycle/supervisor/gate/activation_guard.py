@@ -88,8 +88,8 @@ class ActivationGuard:
     async def _ask(self, node: NodeRun) -> None:
         limit_s = node.planned.timeouts.deactivate_s
         try:
-            standing = await asyncio.wait_for(node.perform(Operation.DEACTIVATE), limit_s)
-            node.report(standing.state, connected=standing.connected)
+            condition = await asyncio.wait_for(node.perform(Operation.DEACTIVATE), limit_s)
+            node.report(condition.state, connected=condition.connected)
         except asyncio.TimeoutError:
             what = f"cannot deactivate {node.name!r} within {limit_s:g} s"
             self._system.emit(Notice(message=what))

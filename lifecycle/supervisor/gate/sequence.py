@@ -84,7 +84,7 @@ def undiscovered(
         tries: how often each was started again before.
     """
     violated = [each for each in verdict.findings if each.outcome is Outcome.VIOLATED]
-    if not all(rule(each.rule).if_unheard for each in violated):
+    if not all(rule(each.rule).if_undiscovered for each in violated):
         return None
     missing = [each for each in violated if each.rule == MISSING_NODE.id]
     # Who is not there yet, or not so far, keeps others waiting that nothing is wrong with.

@@ -61,7 +61,7 @@ class GracePeriod:
         self._demanded: dict[tuple[_Place, str], float] = {}
         self._unattributed: dict[_Key, float] = {}
 
-    def standing(
+    def after(
         self, last: Verdict | None, verdict: Verdict, expected: Plan, now_s: float
     ) -> tuple[Verdict, float | None]:
         """Return the verdict that holds, and after how many seconds it has to be judged again.
@@ -301,7 +301,7 @@ class VerificationLoop:
         """
         found = await self._look(stage)
         now_s = asyncio.get_running_loop().time()
-        verdict, again_s = self._grace_period.standing(
+        verdict, again_s = self._grace_period.after(
             self.latest, found, self._system.expected, now_s
         )
         self._stands(stage, verdict)
@@ -356,7 +356,7 @@ class VerificationLoop:
         """
         loop = asyncio.get_running_loop()
         deadline = loop.time() + timeout_s
-        standing: frozenset[tuple[str, str]] = frozenset()
+        stable: frozenset[tuple[str, str]] = frozenset()
         since = loop.time()
         again = ASK_AGAIN_S
         while True:
@@ -366,8 +366,8 @@ class VerificationLoop:
                 return verdict
             now = loop.time()
             found = frozenset((each.rule, each.subject) for each in verdict.findings)
-            if found != standing:
-                standing, since = found, now
+            if found != stable:
+                stable, since = found, now
             patience = _patience(verdict)
             if unchanged_s is not None:
                 patience = unchanged_s if patience is None else min(patience, unchanged_s)
@@ -382,11 +382,11 @@ class VerificationLoop:
 
     def _waits_for_match(self, verdict: Verdict) -> bool:
         """Whether a match is missing that no node would report: hosts report theirs."""
-        telling = {each.name for each in self._system.nodes.values() if each.tells}
+        reporting = {each.name for each in self._system.nodes.values() if each.reports_changes}
         return any(
             each.outcome is Outcome.VIOLATED
             and rule(each.rule).about is About.MATCH
-            and telling.isdisjoint(each.nodes)
+            and reporting.isdisjoint(each.nodes)
             for each in verdict.findings
         )
 

@@ -41,7 +41,7 @@ class Cause(enum.Enum):
     HUNG = "hung"
     UNSERVED = "unserved"
     LOST = "lost"
-    TOLD = "told"
+    REPORTED = "told"
 
 
 @dataclasses.dataclass(slots=True)

@@ -39,7 +39,7 @@ class AliveReceiver(Protocol):
 class AliveSender(Protocol):
     """One AlivePublisher of lifecycle.middleware."""
 
-    def tell(self, silent: Mapping[str, str]) -> None:
+    def notify(self, silent: Mapping[str, str]) -> None:
         """Say which of our nodes are silent."""
 
     def destroy(self) -> None:
@@ -73,14 +73,14 @@ class Listener:
     """What an AliveReceiver calls, from any thread.
 
     Attributes:
-        heard: with True when the peer is alive, with False when not any more.
+        alive: with True when the peer is alive, with False when not any more.
         left: it left properly.
-        told: what it reports of silent nodes.
+        silent: what it reports of silent nodes.
     """
 
-    heard: Callable[[bool], None]
+    alive: Callable[[bool], None]
     left: Callable[[], None]
-    told: Callable[[Mapping[str, str]], None]
+    silent: Callable[[Mapping[str, str]], None]
 
 
 @dataclasses.dataclass(slots=True)
@@ -96,7 +96,7 @@ class _PeerSupervisor:
     what: str
     machine: str
     nodes: tuple[str, ...]
-    heard: bool = False
+    alive: bool = False
     lost_at_s: float | None = None
 
 
@@ -153,7 +153,7 @@ class PeerSupervisors:
         self._missing.clear()
         for peer in self._known:
             # The return of one that is no longer planned is never reported.
-            for cause in (Cause.LOST, Cause.TOLD):
+            for cause in (Cause.LOST, Cause.REPORTED):
                 self._system.liveliness.came_back(peer.nodes, cause)
         self._known.clear()
         self.open()
@@ -168,7 +168,7 @@ class PeerSupervisors:
     @property
     def machines(self) -> frozenset[str]:
         """Machines whose supervisor is connected now."""
-        return frozenset(each.machine for each in self._machines if each.heard)
+        return frozenset(each.machine for each in self._machines if each.alive)
 
     async def close(self) -> None:
         """Leave, and stop watching."""
@@ -195,13 +195,13 @@ class PeerSupervisors:
 
             return call
 
-        return Listener(heard=soon(self._heard), left=soon(self._left), told=soon(self._told))
+        return Listener(alive=soon(self._alive), left=soon(self._left), silent=soon(self._silent))
 
-    def _heard(self, peer: _PeerSupervisor, heard: bool) -> None:
-        if self._closed or heard is peer.heard:
+    def _alive(self, peer: _PeerSupervisor, is_alive: bool) -> None:
+        if self._closed or is_alive is peer.alive:
             return
-        peer.heard = heard
-        if heard:
+        peer.alive = is_alive
+        if is_alive:
             self._found(peer)
         else:
             self._lost(peer)
@@ -235,21 +235,21 @@ class PeerSupervisors:
 
     def _left(self, peer: _PeerSupervisor) -> None:
         """It left properly, or DDS forgot it after it was lost."""
-        if self._closed or not peer.heard:
+        if self._closed or not peer.alive:
             return
-        peer.heard = False
+        peer.alive = False
         if peer.machine:
             self._system.emit(MachineConnection(machine=peer.machine, established=False, left=True))
-        self._system.liveliness.came_back(peer.nodes, Cause.TOLD)
+        self._system.liveliness.came_back(peer.nodes, Cause.REPORTED)
 
-    def _told(self, peer: _PeerSupervisor, silent: Mapping[str, str]) -> None:
+    def _silent(self, peer: _PeerSupervisor, silent: Mapping[str, str]) -> None:
         if self._closed:
             return
         for name in peer.nodes:
             if name in silent:
-                self._system.liveliness.fell_silent((name,), Cause.TOLD, silent[name])
+                self._system.liveliness.fell_silent((name,), Cause.REPORTED, silent[name])
             else:
-                self._system.liveliness.came_back((name,), Cause.TOLD)
+                self._system.liveliness.came_back((name,), Cause.REPORTED)
 
     def _tell(self) -> None:
         """Our own nodes fell silent or came back: say so."""
@@ -264,8 +264,8 @@ class PeerSupervisors:
         for pause_s in (*SAID_AGAIN_S, None):
             if silent is not self._said:
                 return
-            for voice in self._announcements:
-                voice.tell(silent)
+            for each in self._announcements:
+                each.notify(silent)
             if pause_s is not None:
                 await asyncio.sleep(pause_s)
 

@@ -180,15 +180,15 @@ class ServiceDriver:
         self._services = services
         self._node = node.full_name
         self._timeouts = node.timeouts
-        self._hand = ServiceHand(services, node.full_name, node.timeouts.connect_s)
+        self._interface = NodeInterfaceClient(services, node.full_name, node.timeouts.connect_s)
 
     async def start(self) -> NodeCondition:
         """Wait until the services answer."""
-        return await self._told(self._start())
+        return await self._reported(self._start())
 
     async def perform(self, operation: Operation, permit: Permit | None = None) -> NodeCondition:
         """Change the state unless the node is there already."""
-        return await self._told(self._perform(operation, permit))
+        return await self._reported(self._perform(operation, permit))
 
     async def configuration(self) -> NodeConfiguration | None:
         """Say None: observers read it from the graph where there is one."""
@@ -196,11 +196,11 @@ class ServiceDriver:
 
     async def interface(self) -> NodeConfiguration | None:
         """Ask `~/get_configuration`."""
-        return await self._hand.interface()
+        return await self._interface.interface()
 
     async def wire(self, step: Step) -> NodeConfiguration | None:
         """Call the node interface's service, and read what came of it."""
-        return await self._hand.wire(step)
+        return await self._interface.wire(step)
 
     async def _start(self) -> NodeCondition:
         return _standing(await self._state(self._timeouts.start_s))
@@ -246,7 +246,7 @@ class ServiceDriver:
     async def _state(self, limit_s: float) -> str:
         return await self._services.get_state(self._node, timeout_s=limit_s)
 
-    async def _told(self, doing: Awaitable[NodeCondition]) -> NodeCondition:
+    async def _reported(self, doing: Awaitable[NodeCondition]) -> NodeCondition:
         """Turn the middleware's errors into a failed step."""
         try:
             return await doing
@@ -264,7 +264,7 @@ class ServiceDriver:
         }.get(operation, limits.cleanup_s)
 
 
-class ServiceHand:
+class NodeInterfaceClient:
     """Wires a node through its node interface, in whichever process it is.
 
     Args:

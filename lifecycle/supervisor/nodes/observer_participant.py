@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from lifecycle.plan import ParticipantConnections, Plan, PlannedNode
 from lifecycle.supervisor.health.peer_supervisors import Listener
-from lifecycle.supervisor.nodes.driver import NodeDriver, ServiceDriver, ServiceHand
+from lifecycle.supervisor.nodes.driver import NodeDriver, NodeInterfaceClient, ServiceDriver
 from lifecycle.verify import NodeConfiguration, Observation
 
 if TYPE_CHECKING:
@@ -79,9 +79,9 @@ class ObserverParticipant:
         """Return the driver of a managed node that is not hosted by us."""
         return ServiceDriver(self._graph.clients, node)
 
-    def node_interface(self, node: str) -> ServiceHand:
+    def node_interface(self, node: str) -> NodeInterfaceClient:
         """Return what drives the node interface of any node that has one, by full name."""
-        return ServiceHand(self._graph.clients, node)
+        return NodeInterfaceClient(self._graph.clients, node)
 
     async def observe(self, plan: Plan) -> Observation:
         """Return what is there now."""
@@ -95,6 +95,10 @@ class ObserverParticipant:
     async def wait_change(self) -> None:
         """Wait until something changed."""
         await self._graph.wait_change()
+
+    def service_names(self) -> frozenset[str]:
+        """Return the names of all services that have a server or a client."""
+        return self._graph.discovery.service_names()
 
     def put_configuration(self, configuration: NodeConfiguration) -> None:
         """Give what a node reported over its control channel."""
@@ -160,7 +164,7 @@ class ObserverParticipant:
         from lifecycle.middleware import AliveSubscription
 
         return AliveSubscription(
-            self._node, topic, on_heard=to.heard, on_left=to.left, on_told=to.told
+            self._node, topic, on_liveliness=to.alive, on_left=to.left, on_notice=to.silent
         )
 
     def prepare_to_leave(self) -> None:

@@ -9,6 +9,7 @@ Must not import rclpy.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import dataclasses
 import functools
 from collections.abc import Collection, Iterable
@@ -17,12 +18,13 @@ from typing import Protocol
 
 from lifecycle.errors import BringUpError
 from lifecycle.manifest import Condition, RunKind
+from lifecycle.node import INTERFACE_ON_DEMAND, Operation
 from lifecycle.node import Event as HostEvent
-from lifecycle.node import Operation
 from lifecycle.plan import Plan, PlannedNode, PlannedProcess
 from lifecycle.supervisor.gate.gate import Permit
 from lifecycle.supervisor.health.liveliness import SilenceMonitor
 from lifecycle.supervisor.nodes.driver import ACTIVE, INACTIVE, NodeCondition, NodeDriver
+from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.supervisor.processes.logs import LogDirectory
 from lifecycle.supervisor.processes.patience import own_starved_s
 from lifecycle.supervisor.processes.process import ManagedProcess
@@ -118,6 +120,68 @@ class RemoteNodes:
             await self._changes.beyond(count, ASK_AGAIN_S if there else None)
 
 
+class ServiceNames(Protocol):
+    """What is asked for in the graph, see nodes/observer_participant.py."""
+
+    def service_names(self) -> frozenset[str]:
+        """Return the names of all services that have a server or a client."""
+
+
+class InterfaceOnDemand:
+    """Has nodes of ours offer the services of the node interface that a client waits for.
+
+    They are not there from the start, see node's INTERFACE_ON_DEMAND. Only hosts of ours leave them
+    out, and each has one supervisor.
+    """
+
+    def __init__(self, system: System, graph: ServiceNames, changes: ChangeSource) -> None:
+        self._system = system
+        self._graph = graph
+        self._changes = changes
+        self._offered: dict[str, ControlChannel] = {}
+
+    async def follow(self) -> None:
+        """Look after each change, at most every tenth of a second, until this is cancelled."""
+        while True:
+            count = self._changes.count
+            await self._look()
+            await asyncio.sleep(_DEMAND_S)
+            await self._changes.beyond(count, None)
+
+    async def _look(self) -> None:
+        quiet = {
+            node.name: channel
+            for node in self._system.nodes.values()
+            if (channel := _channel_of(node)) is not None
+            and self._offered.get(node.name) is not channel
+        }
+        if not quiet:
+            return
+        names = self._graph.service_names()
+        asked = [
+            name
+            for name in quiet
+            if any(f"{name}/{service}" in names for service in INTERFACE_ON_DEMAND)
+        ]
+        for name in asked:
+            self._offered[name] = quiet[name]
+        await asyncio.gather(*(_offer(quiet[name], name) for name in asked))
+
+
+def _channel_of(node: NodeRun) -> ControlChannel | None:
+    """Return the channel to a managed node's host, while that runs."""
+    process = node.process
+    if process is None or process.state is not ProcessState.RUNNING or not node.planned.managed:
+        return None
+    return process.channel
+
+
+async def _offer(channel: ControlChannel, node: str) -> None:
+    # A host that hangs or ends is noticed elsewhere.
+    with contextlib.suppress(BringUpError, asyncio.TimeoutError):
+        await asyncio.wait_for(channel.request(node, Operation.SERVE_INTERFACE), _OFFER_S)
+
+
 def _conditions(planned: PlannedNode, observation: Observation) -> Iterable[Condition]:
     name = planned.full_name
     observed = next((each for each in observation.nodes if each.full_name == name), None)
@@ -144,6 +208,9 @@ _CONDITIONS = {
     Condition.CONNECTED: Reach.CONNECTED,
     Condition.ACTIVE: Reach.ACTIVE,
 }
+
+_DEMAND_S = 0.1
+_OFFER_S = 5.0
 
 _REFRESH_S = 1.0
 """A host answers from its executor within a millisecond; this long it is busy or hung."""
@@ -177,7 +244,7 @@ class NodeRun:
         undo: what has to be undone, oldest first.
         stuck: an operation on it was given up: a polite request would wait behind it.
         connections: names of what the authority connected it to, oldest first.
-        tells: its host reports unasked when its configuration changes.
+        reports_changes: its host reports unasked when its configuration changes.
     """
 
     def __init__(self, planned: PlannedNode, emit: Emitter) -> None:
@@ -192,7 +259,7 @@ class NodeRun:
         self.undo: list[Operation] = []
         self.stuck = False
         self.connections: tuple[str, ...] = ()
-        self.tells = False
+        self.reports_changes = False
         self.changed = asyncio.Event()
         self._emit = emit
 
@@ -204,7 +271,7 @@ class NodeRun:
         self.undo = []
         self.stuck = False
         self.connections = ()
-        self.tells = False
+        self.reports_changes = False
         self.doing = ""
         self.connected = False
         self.state = ""
@@ -227,12 +294,12 @@ class NodeRun:
             return self.reach is not Reach.WAITING
         return _ORDER.index(self.reach) >= _ORDER.index(_CONDITIONS[condition])
 
-    def advance(self, reach: Reach, standing: NodeCondition | None = None) -> None:
+    def advance(self, reach: Reach, condition: NodeCondition | None = None) -> None:
         """Note that the node reached `reach`, and notify its listeners and waiters."""
         self.reach = reach
-        if standing is not None:
-            self._take(standing.state, connected=standing.connected)
-            self.learn(standing.configuration)
+        if condition is not None:
+            self._take(condition.state, connected=condition.connected)
+            self.learn(condition.configuration)
         self._tell()
 
     def learn(self, configuration: NodeConfiguration | None) -> None:
@@ -241,7 +308,7 @@ class NodeRun:
         Of a node whose host reports, every configuration has been taken in the order of its channel
         by now (System.on_host_event): what a reply carried may be older than what came since.
         """
-        if configuration is not None and not self.tells:
+        if configuration is not None and not self.reports_changes:
             self.configuration = configuration
 
     def report(self, state: str, *, connected: bool) -> None:
@@ -431,7 +498,7 @@ class System:
             return
         if event.configuration is not None:
             node.configuration = event.configuration
-            node.tells = node.tells or event.kind == "configuration"
+            node.reports_changes = node.reports_changes or event.kind == "configuration"
         if event.kind == "reply":
             return
         if event.state:
@@ -480,7 +547,7 @@ class System:
             and not node.stuck
             and node.name not in self.liveliness.silent
         ]
-        await asyncio.gather(*(self._refresh(node) for node in nodes if not node.tells))
+        await asyncio.gather(*(self._refresh(node) for node in nodes if not node.reports_changes))
         for node in nodes:
             if node.configuration is not None:
                 observer.put_configuration(node.configuration)

@@ -39,7 +39,7 @@ class ForkServerProcess:
     ) -> None:
         self._preload = preload
         self._environment = dict(environment)
-        self._interfaces: tuple[str, ...] = ()
+        self._names: tuple[str, ...] = ()
         self.socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         argv = [sys.executable, "-m", _MAIN, str(theirs.fileno())]
         argv += ["--preload"] * preload + ["--again"] * again
@@ -66,20 +66,20 @@ class ForkServerProcess:
         another = ForkServerProcess(
             preload=self._preload, environment=self._environment, again=True
         )
-        another.preload(self._interfaces)
+        another.preload(self._names)
         return another
 
-    def preload(self, interfaces: Collection[str]) -> None:
+    def preload(self, names: Collection[str]) -> None:
         """Have it import what the nodes of this manifest need besides, before it forks any.
 
         Args:
-            interfaces: `package/msg/Type`; what cannot be imported is left to whom it concerns.
+            names: see node's `needed_by`; what cannot be imported is left to whom it concerns.
         """
-        self._interfaces = tuple(interfaces)
-        if self._preload and self._interfaces:
+        self._names = tuple(names)
+        if self._preload and self._names:
             # One that has died is noticed by who asks it to fork.
             with contextlib.suppress(OSError):
-                self.socket.send("\n".join((PRELOAD, *self._interfaces)).encode())
+                self.socket.send("\n".join((PRELOAD, *self._names)).encode())
 
     def close(self, grace_s: float = CLOSE_S) -> None:
         """End the fork server; it ends by itself when its socket closes and no child is left."""

@@ -285,11 +285,11 @@ def _reseed() -> None:
         numpy_random.seed()
 
 
-def _preload(interfaces: Iterable[str]) -> None:
+def _preload(names: Iterable[str]) -> None:
     """Import what hosts need, and keep its pages shared: a first collection would touch them."""
     from lifecycle.node import preload
 
-    preload(interfaces)
+    preload(names)
     gc.collect()
     gc.freeze()
 

@@ -168,9 +168,9 @@ class LogDirectory:
         """Note that the log of a process can be written again."""
         self._failing.discard(process)
         if not self._failing:
-            self.tell_lost()
+            self.report_lost()
 
-    def tell_lost(self) -> None:
+    def report_lost(self) -> None:
         """Say what is missing, if that was not said."""
         lost, self._lost = self._lost, 0
         if lost:

@@ -252,6 +252,25 @@ class SystemReached:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class StageTimed:
+    """How long a stage of bring-up took; `up --timings` has one of each once bring-up is over.
+
+    Attributes:
+        stage: "supervisor", "processes", "configured", "connected", "observed", "verified",
+            "active" or "total".
+        took_s: since the stage before it was over; of the total, all of it.
+        elapsed_s: since the command was started.
+        last: name of the node that was the last to come so far, where it was a node's to do.
+    """
+
+    kind: ClassVar[str] = "stage"
+    stage: str
+    took_s: float
+    elapsed_s: float
+    last: str = ""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Failure:
     """A step that failed, or a process that ended unasked; the last verdict has it as a finding.
 
@@ -313,6 +332,7 @@ Event = Union[  # noqa: UP007 - a run-time alias on Python 3.10
     VerdictChanged,
     GateOpened,
     SystemReached,
+    StageTimed,
     Failure,
     Notice,
     Stopping,

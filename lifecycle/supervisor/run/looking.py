@@ -139,7 +139,7 @@ async def following(plan: Plan, on_look: Callable[[JudgedSystem], None]) -> None
     with _looking(plan) as observer_participant:
         while True:
             seen = await _see(plan, observer_participant)
-            now, again_s = grace_period.standing(last, seen.verdict, seen.plan, clock())
+            now, again_s = grace_period.after(last, seen.verdict, seen.plan, clock())
             if now != last or again_s is not None:
                 pause_s = _ASK_AGAIN_S
             last = now
@@ -180,12 +180,12 @@ def _looking(plan: Plan) -> ObserverParticipant:
     is_open = plan.policy.undeclared_nodes is EndpointPolicy.OPEN
     return ObserverParticipant.open(
         plan.domain_id,
-        onlooker_connections(plan, _heard(plan)),
+        onlooker_connections(plan, _reported_to_supervisors(plan)),
         guests=is_open and is_negotiated(plan),
     )
 
 
-def _heard(plan: Plan) -> tuple[NodeConfiguration, ...]:
+def _reported_to_supervisors(plan: Plan) -> tuple[NodeConfiguration, ...]:
     """Return what the supervisors of the system on this host know of its nodes."""
     root = runtime_root(os.environ)
     wanted = run_name(plan, "")

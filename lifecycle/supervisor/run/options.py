@@ -161,7 +161,7 @@ def _connected_to(url: str) -> ParticipantConnections:
 
 
 def onlooker_connections(
-    plan: Plan, heard: Iterable[NodeConfiguration] = ()
+    plan: Plan, reported: Iterable[NodeConfiguration] = ()
 ) -> ParticipantConnections:
     """Return how an observer beside the supervisor of this host is connected.
 
@@ -170,11 +170,11 @@ def onlooker_connections(
 
     Args:
         plan: of the system.
-        heard: what nodes report: one that was restarted listens elsewhere than planned.
+        reported: what nodes report: one that was restarted listens elsewhere than planned.
     """
     connections = observer_connections(plan)
     planned = [url for node in plan.nodes for url in urls_of(node)]
-    said = [url for each in heard for report in each.connections for url in report.urls]
+    said = [url for each in reported for report in each.connections for url in report.urls]
     listening = {*_tcp_listeners([*planned, *said])}
     urls = []
     for text in connections.urls:

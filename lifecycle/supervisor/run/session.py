@@ -39,7 +39,13 @@ from lifecycle.supervisor.health.process_monitor import (
 )
 from lifecycle.supervisor.nodes.bring_up import BringUp
 from lifecycle.supervisor.nodes.driver import NodeDriver
-from lifecycle.supervisor.nodes.system import ObservedGraph, RemoteNodes, System
+from lifecycle.supervisor.nodes.system import (
+    InterfaceOnDemand,
+    ObservedGraph,
+    RemoteNodes,
+    ServiceNames,
+    System,
+)
 from lifecycle.supervisor.processes.orphans import ProcessFamily, end_strays, reap_adopted
 from lifecycle.supervisor.processes.process import Spawner
 from lifecycle.supervisor.run.events import (
@@ -95,6 +101,7 @@ class SessionParticipant(
     agreement.PlanExchange,
     Reaching,
     ParticipantRegistry,
+    ServiceNames,
     Protocol,
 ):
     """What a session needs of its participant in the graph, see nodes/observer_participant.py.
@@ -199,6 +206,7 @@ class Session:
         self._remote_nodes = RemoteNodes(
             system.plan, system.awaited(), observer_participant, self._changes
         )
+        self._interfaces = InterfaceOnDemand(system, observer_participant, self._changes)
         self._gate_sequence = GateSequence(
             system,
             bring_up=self._bring_up,
@@ -277,6 +285,7 @@ class Session:
         self._agreement.open()
         self._emit.listen(lambda event: None if isinstance(event, LogLine) else server.changed())
         result = UpResult(exit_code=ExitCode.INTERNAL, verdict=NOT_JUDGED)
+        offering = asyncio.ensure_future(self._interfaces.follow())
         try:
             with self._signals():
                 try:
@@ -286,6 +295,7 @@ class Session:
                 if self._hurry.is_set() and result.exit_code == ExitCode.OK:
                     result = _hurried(result)
         finally:
+            await ended(offering)
             self._stale.close()
             await self._changes.close()
             self._emit(Stopped(exit_code=result.exit_code, elapsed_s=self._emit.elapsed_s))
@@ -472,7 +482,7 @@ class Session:
         left = await self._worker.run(end_strays, self._directory.run_id, self._fork_server)
         if left:
             self._emit(Notice(message=f"ended processes that were left behind: {_listed(left)}"))
-        self._system.logs.tell_lost()
+        self._system.logs.report_lost()
         if not self._stop.done():
             self._stop.cancel()
         elif not self._stop.cancelled():

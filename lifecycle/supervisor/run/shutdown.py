@@ -128,8 +128,8 @@ class TakeDown:
         }[operation]
 
         async def perform() -> None:
-            standing = await node.perform(operation)
-            node.report(standing.state, connected=standing.connected)
+            condition = await node.perform(operation)
+            node.report(condition.state, connected=condition.connected)
 
         await self._bounded(node, perform(), f"{operation.value} {node.name!r}", limit_s)
 

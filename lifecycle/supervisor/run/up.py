@@ -25,6 +25,7 @@ from lifecycle.middleware import (
     peers_environment,
     sweep,
 )
+from lifecycle.node import needed_by
 from lifecycle.plan import Plan, PlannedProcess, moved_observer, reached_hosts
 from lifecycle.run_directory import (
     RunDirectory,
@@ -266,14 +267,13 @@ def _preloading(
     options: UpOptions,
     processes: Iterable[PlannedProcess],
 ) -> Forerunner:
-    """Have a fork server load the types of what our Python nodes declare, once for all of them."""
+    """Have a fork server load what our Python nodes need, once for all of them."""
     python = [each for each in processes if each.run.kind is RunKind.PYTHON]
     if forerunner is None:
         without = token_variables(options.program)
         forerunner = Forerunner(preload=bool(python), without=without)
     nodes = (plan.node(key) for process in python for key in process.nodes)
-    types = dict.fromkeys(endpoint.type for node in nodes for endpoint in node.endpoints)
-    forerunner.process.preload(types)
+    forerunner.process.preload(needed_by(nodes))
     return forerunner
 
 

@@ -46,7 +46,7 @@ class Rule:
             manifest waived the requirement itself.
         heals: what takes its findings back.
         about: what it looks at that a node brings along; None for anything else.
-        if_unheard: it breaks where one participant does not discover another.
+        if_undiscovered: it breaks where one participant does not discover another.
         absence: for a rule whose violated findings say that something is not there (yet), how to
             call that, with `{kind}` of the endpoint and `{node}`; empty for others.
         awaits: for a rule whose findings say that something is not known (yet), the rule that is
@@ -63,7 +63,7 @@ class Rule:
     may_block: bool = True
     heals: Heals = Heals.WITH_CHANGE
     about: About | None = None
-    if_unheard: bool = False
+    if_undiscovered: bool = False
     absence: str = ""
     awaits: Rule | None = None
     names_expected: bool = False

@@ -7,7 +7,8 @@ end announces the hash of its definition (REP-2016), and rosidl installs the has
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Mapping
 
 from lifecycle.manifest import EndpointKind, EndpointPolicy, Position
 from lifecycle.verify.observation import ObservedEndpoint
@@ -86,12 +87,15 @@ RULES = (
 
 def check(view: View) -> Iterator[Finding]:
     """Judge the existence and the type of endpoints."""
+    known: Counter[tuple[str, EndpointKind | None]] = Counter()
+    if any(actual.unseen for actual in view.actual):
+        known.update((seen.name, seen.kind) for seen in (*view.seen, *view.seen_of_tools))
     for name, node in view.planned.items():
         absent = view.is_absent(node)
         for actual in view.actual_by_node[name]:
             yield from _declared(actual, absent=absent)
             if actual.unseen and not absent:
-                yield from _unseen(view, actual)
+                yield from _unseen(view, actual, known)
     yield from _undeclared(view)
     yield from _conflicts(view)
 
@@ -145,7 +149,9 @@ def _is_hidden(actual: Actual) -> bool:
     return actual.unseen and actual.report is None
 
 
-def _unseen(view: View, actual: Actual) -> Iterator[Finding]:
+def _unseen(
+    view: View, actual: Actual, known_ends: Mapping[tuple[str, EndpointKind | None], int]
+) -> Iterator[Finding]:
     """What discovery does not show is proven by its node's report and by matched counts."""
     node, planned, report = actual.node, actual.planned, actual.report
     word = planned.kind.noun
@@ -156,10 +162,7 @@ def _unseen(view: View, actual: Actual) -> Iterator[Finding]:
     elif report.matched is None:
         reason = "discovery does not show it here, and nobody counts whom it is matched with"
     else:
-        known = sum(
-            seen.name == planned.resolved and seen.kind is _OTHER[planned.kind]
-            for seen in (*view.seen, *view.seen_of_tools)
-        )
+        known = known_ends.get((planned.resolved, _OTHER.get(planned.kind)), 0)
         more = report.matched - known
         if more <= 0 or view.plan.policy.undeclared_nodes is EndpointPolicy.OPEN:
             return

@@ -32,9 +32,9 @@ from lifecycle.verify.rules.state import MISSING_REPORT
 from lifecycle.verify.transport import (
     NONE,
     UNKNOWN,
-    Uniqueness,
     effective_transport,
 )
+from lifecycle.verify.uniqueness import Uniqueness
 from lifecycle.verify.verdict import Finding, Outcome
 from lifecycle.verify.view import Actual, FlowView, View, connection_of
 
@@ -78,7 +78,7 @@ RULES = (NOT_UNIQUE, UNVERIFIABLE, BROKEN_ENDPOINT, NOT_MEASURED)
 
 def check(view: View) -> Iterator[Finding]:
     """Judge every strict endpoint, then every link's demand, then name what is not measured."""
-    uniqueness = Uniqueness(view.reported, view.addresses)
+    uniqueness = view.uniqueness
     for actual in view.actual:
         yield from _broken(actual)
         if actual.planned.unique is UniqueRequirement.STRICTLY_REQUIRED:
@@ -246,7 +246,7 @@ WRONG_MEDIUM = Rule(
     " given by its environment",
     concerns_flow=True,
     heals=Heals.WITH_TIME,
-    if_unheard=True,
+    if_undiscovered=True,
 )
 TRANSPORT_RULES = (WRONG_TRANSPORT, WRONG_MEDIUM)
 

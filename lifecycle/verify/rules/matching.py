@@ -33,7 +33,7 @@ UNMATCHED_LINK = Rule(
     concerns_flow=True,
     about=About.MATCH,
     heals=Heals.WITH_TIME,
-    if_unheard=True,
+    if_undiscovered=True,
     absence="match",
 )
 UNMATCHED_FLOW = Rule(
@@ -44,7 +44,7 @@ UNMATCHED_FLOW = Rule(
     concerns_flow=True,
     about=About.MATCH,
     heals=Heals.WITH_TIME,
-    if_unheard=True,
+    if_undiscovered=True,
     absence="match",
 )
 RULES = (UNMATCHED_LINK, UNMATCHED_FLOW)
@@ -258,7 +258,7 @@ UNMATCHED_CLIENT = Rule(
     fix="look at the QoS of both ends, and at the network between the two",
     about=About.MATCH,
     heals=Heals.WITH_TIME,
-    if_unheard=True,
+    if_undiscovered=True,
     absence="match",
 )
 CLIENT_RULES = (UNMATCHED_CLIENT,)

@@ -17,7 +17,7 @@ MISSING_NODE = Rule(
     concerns_flow=True,
     heals=Heals.WITH_TIME,
     about=About.PRESENCE,
-    if_unheard=True,
+    if_undiscovered=True,
     absence="node",
 )
 UNDECLARED_NODE = Rule(

@@ -23,7 +23,7 @@ UNATTRIBUTED_ENDPOINT = Rule(
     outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
     fix="wait for discovery; a plain DDS program never tells a node name: give it another domain",
     heals=Heals.WITH_TIME,
-    if_unheard=True,
+    if_undiscovered=True,
     awaits=MISSING_NODE,  # discovery shows an endpoint before its node
 )
 RULES = (UNATTRIBUTED_ENDPOINT,)

@@ -17,7 +17,7 @@ WRONG_STATE = Rule(
     fix="look at the node's log for the transition that failed, or at who else drives it",
     about=About.PROGRESS,
     heals=Heals.WITH_TIME,
-    if_unheard=True,
+    if_undiscovered=True,
 )
 STATE_UNVERIFIABLE = Rule(
     id="state.unverifiable",
@@ -26,7 +26,7 @@ STATE_UNVERIFIABLE = Rule(
     fix="see whether its ~/get_state answers; a plain node must be declared `managed: false`",
     about=About.PROGRESS,
     heals=Heals.WITH_TIME,
-    if_unheard=True,
+    if_undiscovered=True,
 )
 ACTIVATED_AT_CLOSED_GATE = Rule(
     id="state.activated-at-closed-gate",
@@ -35,7 +35,7 @@ ACTIVATED_AT_CLOSED_GATE = Rule(
     fix="find out who drives the node beside the supervisor, and let the gate activate it",
     about=About.PROGRESS,
     heals=Heals.WITH_TIME,
-    if_unheard=True,
+    if_undiscovered=True,
 )
 RULES = (WRONG_STATE, STATE_UNVERIFIABLE, ACTIVATED_AT_CLOSED_GATE)
 
@@ -82,7 +82,11 @@ def _judge(view: View, name: str, node: PlannedNode) -> Iterator[Finding]:
             observed=wrong[0],
             message=f"cannot accept node {name}: it is {wrong[0]} and must be {expected}",
         )
-    elif observed is not None and observed.managed is False and not _says_so(view, node, report):
+    elif (
+        observed is not None
+        and observed.managed is False
+        and not _reports_state(view, node, report)
+    ):
         yield WRONG_STATE.on_node(
             Outcome.VIOLATED,
             node,
@@ -101,7 +105,7 @@ def _judge(view: View, name: str, node: PlannedNode) -> Iterator[Finding]:
         )
 
 
-def _says_so(view: View, node: PlannedNode, report: NodeConfiguration | None) -> bool:
+def _reports_state(view: View, node: PlannedNode, report: NodeConfiguration | None) -> bool:
     """Return whether one of our nodes itself reports that it is managed, by its state.
 
     It is driven by its host and not by the services, which discovery may show late: the graph
@@ -117,7 +121,7 @@ MISSING_REPORT = Rule(
     fix="see whether its ~/get_configuration answers; look at its log",
     about=About.PROGRESS,
     heals=Heals.WITH_TIME,
-    if_unheard=True,
+    if_undiscovered=True,
     absence="report",
 )
 INCOMPLETE_REPORT = Rule(
@@ -127,7 +131,7 @@ INCOMPLETE_REPORT = Rule(
     fix="the node runs from another manifest, or has not connected: compare and restart it",
     about=About.PROGRESS,
     heals=Heals.WITH_TIME,
-    if_unheard=True,
+    if_undiscovered=True,
     absence="{kind} in the report of {node}",
 )
 REPORT_RULES = (MISSING_REPORT, INCOMPLETE_REPORT)

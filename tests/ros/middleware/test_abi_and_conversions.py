@@ -16,7 +16,6 @@ from std_srvs.srv import Trigger
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.qos import Durability, History, Liveliness, QosProfile, Reliability
 from lifecycle.middleware import (
-    NetworkFlowEndpointsUnsupported,
     UniqueFlowNotFeasible,
     UnknownInterfaceError,
     create_subscription,
@@ -25,6 +24,7 @@ from lifecycle.middleware import (
     import_interface,
     to_rclpy,
 )
+from lifecycle.middleware.fastdds.nfe import NetworkFlowEndpointsUnsupported
 from lifecycle.middleware.rcl import abi
 from lifecycle.network.nfe import UniqueRequirement
 

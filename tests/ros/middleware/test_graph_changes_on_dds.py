@@ -11,8 +11,8 @@ import rclpy
 from rclpy.node import Node
 from std_msgs.msg import String
 
-from lifecycle.middleware import on_graph_change
 from lifecycle.middleware.rcl import graph_changes
+from lifecycle.middleware.rcl.graph_changes import on_graph_change
 
 BOUND_S = 30.0
 

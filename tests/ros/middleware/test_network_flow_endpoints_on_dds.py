@@ -23,9 +23,9 @@ from lifecycle.middleware import (
     UniqueFlowNotFeasible,
     create_publisher,
     create_subscription,
-    get_dscp,
     get_network_flow_endpoints,
 )
+from lifecycle.middleware.fastdds.dscp import get_dscp
 from lifecycle.middleware.rcl import unique as creation
 from lifecycle.network.nfe import TransportProtocol, UniqueRequirement
 

@@ -268,3 +268,19 @@ os._exit(os.waitstatus_to_exitcode(os.wait()[1]))
         assert len(children) == 1
         ours.shutdown(socket.SHUT_RDWR)
     assert process.wait(30) == 0
+
+
+def test_what_hosts_are_forked_from_imports_only_what_every_node_needs() -> None:
+    code = (
+        "import sys; from lifecycle.node import preload; preload(); "
+        "print(*sys.modules); preload(['example_interfaces/msg/No', 'rclpy.action']); "
+        "print('rclpy.action' in sys.modules)"
+    )
+    modules, also = subprocess.check_output(
+        [sys.executable, "-c", code], text=True, timeout=30
+    ).splitlines()
+    unused = {"asyncio", "click", "jsonschema", "lifecycle.graph", "lifecycle.plan.build"}
+    assert unused.union({"lifecycle.verify.judge", "rclpy.action", "sensor_msgs"}).isdisjoint(
+        modules.split()
+    )
+    assert also == "True"

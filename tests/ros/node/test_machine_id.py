@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.node.reporting.machine_id import machine_id
+from lifecycle.middleware import machine_id
 
 
 @pytest.fixture(autouse=True)

@@ -11,15 +11,13 @@ from click.testing import CliRunner
 from lifecycle.cli.verbs import flows, up
 from lifecycle.cli.verbs.flows import NAMES, Export
 from lifecycle.errors import UsageError
-from lifecycle.programming.rules import EXPORTS
+from lifecycle.programming.rules.registry import EXPORTS
 from tests.unit.programming.apply.samples import nef_settings, settings_file
 from tests.unit.programming.rules.samples import plan, report
 
-NOTHING = {"device": "", "rate": "", "guarantees": (), "match": "flow", "config": ""}
-
 
 def export(name: str, *, mapping: str = "", **given: object) -> Export:
-    return Export(name, mapping=mapping, flow_labels=False, **{**NOTHING, **given})
+    return Export(name, mapping=mapping, flow_labels=False, **given)
 
 
 def test_every_export_can_be_asked_for() -> None:
@@ -118,3 +116,17 @@ def test_up_refuses_options_that_do_not_fit(options: list[str], message: str) ->
     result = CliRunner().invoke(up.command, [str(manifest), *options])
 
     assert str(result.exception) == message
+
+
+def test_what_networks_need_is_looked_up_only_for_an_option_that_is_no_verbs_own(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    given = up.command.make_context("up", ["m.yaml", "--match", "mark", "--queue=5ms"]).params
+    monkeypatch.setattr("lifecycle.cli.common._network_options", None)
+    light = up.command.make_context("up", ["m.yaml", "a:=b", "--program", "nft", "--strict"]).params
+
+    assert (given["match"], given["queue"]) == ("mark", "5ms")
+    assert not {"device", "rate", "config"} & given.keys()
+    assert given.keys() - light.keys() == {"match", "queue"}
+    with pytest.raises(TypeError):
+        up.command.make_context("up", ["m.yaml", "--rate", "1mbit"])

@@ -9,14 +9,13 @@ import click
 import pytest
 from click.testing import CliRunner
 
-from lifecycle.cli.verbs import flows_program
+from lifecycle.cli.verbs import flows as flows_verb
 from lifecycle.errors import ExitCode, UsageError
-from lifecycle.programming.apply import MissingFeatureError, TargetOptions
+from lifecycle.programming import TargetOptions, read_targets, read_treatment, target_kind
+from lifecycle.programming.apply.target import MissingFeatureError
 from tests.unit.programming.apply.samples import nef_settings, settings_file
 from tests.unit.programming.apply.servers import TOKEN, NefServer
 from tests.unit.programming.rules.samples import nfe, plan, report
-
-NOTHING = {"device": "", "rate": "", "guarantees": (), "match": "flow", "config": ""}
 
 
 @pytest.fixture
@@ -30,7 +29,7 @@ def options(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[TargetOpti
 
 def nef_options(tmp_path: Path, url: str) -> tuple[TargetOptions, ...]:
     settings = nef_settings(url, devices=["10.77.0.1"])
-    return (TargetOptions(kind="nef", settings=settings_file(tmp_path, nef=settings)),)
+    return (target_kind("nef").read({"config": settings_file(tmp_path, nef=settings)}),)
 
 
 @click.command("flows")
@@ -43,7 +42,7 @@ def show(manifest: str, watch: bool) -> int:
 
 
 def test_flows_of_a_manifest_are_shown_and_a_subcommand_is_a_subcommand() -> None:
-    flows = flows_program.with_subcommands(show)
+    flows = flows_verb.with_subcommands(show)
     run = CliRunner()
 
     assert run.invoke(flows, ["a.yaml", "--watch"], standalone_mode=False).return_value == 5
@@ -59,7 +58,7 @@ def test_flows_of_a_manifest_are_shown_and_a_subcommand_is_a_subcommand() -> Non
 
 
 def test_it_can_be_mounted_below_other_groups() -> None:
-    group = click.Group("lifecycle", commands=[flows_program.with_subcommands(show)])
+    group = click.Group("lifecycle", commands=[flows_verb.with_subcommands(show)])
 
     result = CliRunner().invoke(group, ["flows", "a.yaml"], standalone_mode=False)
 
@@ -67,12 +66,12 @@ def test_it_can_be_mounted_below_other_groups() -> None:
 
 
 def test_options_of_tc_are_read_with_their_units() -> None:
-    (options,) = flows_program.chosen(
-        ["tc"], **{**NOTHING, "device": "e0", "rate": "20mbit", "guarantees": ("ef=2mbit",)}
-    )
+    given = {"device": "e0", "rate": "20mbit", "guarantee": ("ef=2mbit",)}
+    (options,) = read_targets(["tc"], given)
 
-    assert (options.device, options.link_kbit) == ("e0", 20_000)
-    assert options.guaranteed_kbit == {"ef": 2_000}
+    settings = options.exported()["tc"]
+    assert (settings.device, settings.link_kbit) == ("e0", 20_000)
+    assert settings.guaranteed_kbit == {"ef": 2_000}
 
 
 @pytest.mark.parametrize(
@@ -89,7 +88,7 @@ def test_options_of_tc_are_read_with_their_units() -> None:
         (["tc"], {"device": "e0", "queue": "50ms"}, "cannot use --queue without --rate"),
         (
             ["tc"],
-            {"device": "e0", "guarantees": ("ef",)},
+            {"device": "e0", "guarantee": ("ef",)},
             "cannot read guarantee 'ef'; write CLASS=",
         ),
         (["tc"], {}, "cannot program tc without a device"),
@@ -99,7 +98,7 @@ def test_options_that_do_not_fit_are_refused(
     targets: list[str], given: dict[str, object], message: str
 ) -> None:
     with pytest.raises(UsageError) as caught:
-        flows_program.chosen(targets, **{**NOTHING, **given})
+        read_targets(targets, given)
 
     assert str(caught.value).startswith(message)
 
@@ -108,13 +107,13 @@ def test_a_5qi_mapping_is_one_of_ours_or_a_file(tmp_path: Path) -> None:
     file = tmp_path / "mapping.json"
     file.write_text('{"name": "own", "source": "us", "values": {"85": "EF"}}')
 
-    own = flows_program.treatment_of(mapping=str(file), flow_labels=True)
+    own = read_treatment(str(file), label_flows=True)
 
     assert own.label_flows
     assert own.mapping is not None
     assert own.mapping.dscp_for(85) == 46
     with pytest.raises(UsageError, match="cannot find 5QI to DSCP mapping 'nope'"):
-        flows_program.treatment_of(mapping="nope", flow_labels=False)
+        read_treatment("nope", label_flows=False)
 
 
 @pytest.mark.usefixtures("options")
@@ -125,7 +124,7 @@ def test_without_httpx_a_server_is_refused_by_the_name_of_the_extra(
     monkeypatch.setattr("lifecycle.programming.apply.http.httpx", None)
 
     with pytest.raises(MissingFeatureError) as caught:
-        flows_program.apply(plan(), [report()], options, dry_run=False)
+        flows_verb.apply(plan(), [report()], options, dry_run=False)
 
     assert str(caught.value) == (
         "cannot reach http://127.0.0.1:9/3gpp-as-session-with-qos/v1/robots: httpx is not installed"
@@ -142,16 +141,16 @@ def test_apply_diff_and_remove_go_together(
         flows = [report(), report("/robot/status", source=(nfe("0.0.0.0", 45009),))]
         name = f"nef at {server.url}/3gpp-as-session-with-qos/v1/robots"
 
-        assert flows_program.diff(plan(), flows, options) is ExitCode.VIOLATED
-        assert flows_program.apply(plan(), flows, options, dry_run=True) is ExitCode.OK
+        assert flows_verb.diff(plan(), flows, options) is ExitCode.VIOLATED
+        assert flows_verb.apply(plan(), flows, options, dry_run=True) is ExitCode.OK
         assert server.subscriptions == {}
-        assert flows_program.apply(plan(), flows, options, dry_run=False) is ExitCode.OK
+        assert flows_verb.apply(plan(), flows, options, dry_run=False) is ExitCode.OK
         capsys.readouterr()
-        assert flows_program.diff(plan(), flows, options) is ExitCode.OK
+        assert flows_verb.diff(plan(), flows, options) is ExitCode.OK
         out, err = capsys.readouterr()
-        assert flows_program.remove(plan()) is ExitCode.OK
+        assert flows_verb.remove(plan()) is ExitCode.OK
         removed = capsys.readouterr().out
-        assert flows_program.remove(plan()) is ExitCode.OK
+        assert flows_verb.remove(plan()) is ExitCode.OK
 
         assert out.partition("\n")[0] == f"{name}: 1 unchanged"
         assert err == (

@@ -58,6 +58,7 @@ domain 101, participant 53
 linux: ephemeral ports 32768–60999
   safe domains          0–101, 215–232
   fit in domain 101     54 participants per host, then the ephemeral ports 32768–60999
+  find each other       33 with 'range: localhost'
 """
     )
 
@@ -87,6 +88,7 @@ def test_json_holds_the_same_for_a_script(capsys: pytest.CaptureFixture[str]) ->
         "ephemeral": {"first": 49152, "last": 65535},
         "safe_domains": [[0, 166]],
         "capacity": {"participants": 120, "limit": "the ports of domain 167, from 49150"},
+        "localhost_participants": 33,
         "unique_subscription_ports": [7000, 7399],
         "needs": [],
     }
@@ -121,8 +123,9 @@ def test_each_host_of_a_manifest_lists_its_participants(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["ports", manifest(tmp_path), "--platform", "linux"]) == ExitCode.OK
-    assert capsys.readouterr().out.splitlines()[-8:] == [
+    assert capsys.readouterr().out.splitlines()[-9:] == [
         "  fit in domain 7       120 participants per host, then the ports of domain 8, from 9400",
+        "  find each other       33 with 'range: localhost'",
         "robot: 3 participants: fit",
         "  supervisor",
         "  talker",

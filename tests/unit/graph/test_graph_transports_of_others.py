@@ -51,7 +51,7 @@ class Master:
     def welcome(self, newcomer: MasterClient) -> None:
         for client in self.clients:
             if client is not newcomer:
-                self.scheduler.post(client.peer_came)
+                self.scheduler.post(client.peer_joined)
 
 
 class MasterClient:
@@ -81,7 +81,7 @@ class MasterClient:
         for callback in tuple(self._callbacks):
             callback(message)
 
-    def peer_came(self) -> None:
+    def peer_joined(self) -> None:
         for callback in tuple(self._peer_callbacks):
             callback()
 

@@ -60,6 +60,51 @@ def test_unique_subscriptions_share_four_hundred_ports_of_a_host(findings: Findi
     ]
 
 
+LOCALHOST = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+ELSEWHERE = f"environment: {{{LOCALHOST}: SUBNET}}"
+
+
+@pytest.mark.parametrize(
+    ("discovery", "first", "found"),
+    [
+        ("range: localhost", 'python: "demo:N"', "'range: localhost'"),
+        ("range: localhost, transport: udpv4", 'python: "demo:N"', "'range: localhost'"),
+        ("mode: dynamic", 'python: "demo:N"', f"{LOCALHOST}=LOCALHOST"),
+        ("range: localhost, transport: shm", 'python: "demo:N"', ""),
+        ("range: subnet", 'python: "demo:N"', ""),
+        ("mode: static", 'python: "demo:N"', ""),
+        ("range: localhost", "attach: true", ""),
+        ("range: localhost", f'python: "demo:N", {ELSEWHERE}', ""),
+        (
+            "range: localhost",
+            'python: "demo:N", environment: {RMW_IMPLEMENTATION: rmw_cyclonedds_cpp}',
+            "",
+        ),
+    ],
+)
+def test_two_participants_beyond_those_that_localhost_looks_for_never_find_each_other(
+    findings: Findings,
+    monkeypatch: pytest.MonkeyPatch,
+    discovery: str,
+    first: str,
+    found: str,
+) -> None:
+    monkeypatch.setenv(LOCALHOST, "LOCALHOST")
+    nodes = [f"  n0: {{run: {{{first}}}}}\n"]
+    nodes += [f'  n{index}: {{run: {{python: "demo:N"}}}}\n' for index in range(1, 33)]
+    text = f"discovery: {{{discovery}}}\nnodes:\n"
+    rule = "check.localhost"
+    assert [each for each in findings(text + "".join(nodes[:-1])) if rule in each] == []
+    message = (
+        f"check.localhost 3:1: discovery: cannot run 34 participants with {found} on machine "
+        "'local': at most 33 all find each other, because each looks for participants 0 to 31 of "
+        "its host only; use 'range: subnet', or give several nodes one 'process:'"
+    )
+    assert [each for each in findings(text + "".join(nodes)) if rule in each] == [message] * bool(
+        found
+    )
+
+
 def test_machines_of_one_address_are_one_host(findings: Findings) -> None:
     nodes = "".join(
         f'  n{index}: {{run: {{python: "demo:N"}}, machine: {"ab"[index % 2]}}}\n'

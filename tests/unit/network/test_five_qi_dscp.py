@@ -21,11 +21,6 @@ def test_the_azure_table_covers_the_26_values_of_release_16() -> None:
     assert mapping.dscp_for(90) is None
 
 
-def test_one_dscp_may_stand_for_several_5qis() -> None:
-    assert dscp_mapping("azure_private_5g_core").five_qis_for(46) == (1, 5, 65, 66)
-    assert dscp_mapping("gsma_ir34").five_qis_for(0) == ()
-
-
 def test_an_unknown_mapping_is_refused_with_what_there_is() -> None:
     with pytest.raises(ValueError) as caught:
         dscp_mapping("gsma")

@@ -50,15 +50,15 @@ def test_events_come_in_order_in_one_turn_and_to_sync_and_async_listeners() -> N
 
     events.listen(lambda event: heard.append(("sync", event)))
     remove = events.listen(listen)
-    events.tell(NET)
-    events.tell(LOST)
+    events.notify(NET)
+    events.notify(LOST)
     assert heard == []
     assert len(executor.tasks) == 1
     executor.turn()
     assert [event for kind, event in heard if kind == "sync"] == [NET, LOST]
     assert [event for kind, event in heard if kind == "async"] == [NET, LOST]
     remove()
-    events.tell(NET)
+    events.notify(NET)
     executor.turn()
     assert [kind for kind, _ in heard[4:]] == ["sync"]
 
@@ -68,9 +68,9 @@ def test_an_event_before_the_node_is_spun_is_told_with_the_first_one_after() -> 
     events = ConnectionEvents(executor.later)
     heard: list[ConnectionEvent] = []
     events.listen(heard.append)
-    events.tell(NET)
+    events.notify(NET)
     executor.is_spun = True
-    events.tell(LOST)
+    events.notify(LOST)
     executor.turn()
     assert heard == [NET, LOST]
 

@@ -254,7 +254,7 @@ class FakeProcess:
             self._spawner.came(self._name, *nodes)
         if command is not None:
             answer = dataclasses.replace(answer, configuration=self._carry_out(command, answer))
-        if self._spawner.tells and answer.configuration is not None:
+        if self._spawner.reports_changes and answer.configuration is not None:
             told = dataclasses.replace(answer, kind="configuration", id=0, ok=True, error="")
             writer.write(to_json(told) + b"\n")
         writer.write(to_json(answer) + b"\n")
@@ -290,7 +290,7 @@ class FakeSpawner:
         self.ends_at: dict[str, int] = {}
         self.processes: dict[str, FakeProcess] = {}
         self.interfaces: dict[str, NodeConfiguration] = {}
-        self.tells = False
+        self.reports_changes = False
         self.nodes: dict[str, tuple[str, ...]] = {}
         self.changed: Callable[[], None] = lambda: None
         self._pid = _FIRST_PID

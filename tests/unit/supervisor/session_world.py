@@ -22,7 +22,7 @@ from lifecycle.run_directory import RunDirectory, short_path
 from lifecycle.supervisor.connections.networks import Networks
 from lifecycle.supervisor.control.server import Answer, ControlRequest, Question
 from lifecycle.supervisor.health.peer_supervisors import Listener
-from lifecycle.supervisor.nodes.driver import NodeDriver, ServiceDriver, ServiceHand
+from lifecycle.supervisor.nodes.driver import NodeDriver, NodeInterfaceClient, ServiceDriver
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.orphans import end_strays
 from lifecycle.supervisor.processes.process import ProcessExit
@@ -69,7 +69,7 @@ class FakeForkServer(FakeSpawner):
 
     def __init__(self) -> None:
         super().__init__()
-        self.tells = True
+        self.reports_changes = True
         self.cannot_start = ""
         self.lingers_s = 0.0
 
@@ -118,6 +118,7 @@ class FakeParticipant:
         services: of the nodes in `others`.
         changes: so far.
         dropped: nodes whose reports were forgotten.
+        asked_for: services that have a client.
         while_looking: done once, when the next look has seen everything and is not over yet.
     """
 
@@ -128,6 +129,7 @@ class FakeParticipant:
         self.services = FakeServices(self, hosts.log)
         self.changes = 0
         self.dropped: list[str] = []
+        self.asked_for: set[str] = set()
         self.while_looking: Callable[[], None] | None = None
         self._hosts = hosts
         self._reports: dict[str, NodeConfiguration] = {}
@@ -169,8 +171,11 @@ class FakeParticipant:
     def driver(self, node: PlannedNode) -> NodeDriver:
         return ServiceDriver(self.services, node)
 
-    def node_interface(self, node: str) -> ServiceHand:
-        return ServiceHand(self.services, node)
+    def service_names(self) -> frozenset[str]:
+        return frozenset(self.asked_for)
+
+    def node_interface(self, node: str) -> NodeInterfaceClient:
+        return NodeInterfaceClient(self.services, node)
 
     def participants_of(
         self, pid: int, *, nodes: Iterable[str], reported: Iterable[str]

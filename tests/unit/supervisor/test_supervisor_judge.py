@@ -230,7 +230,7 @@ def test_a_node_that_tells_of_its_matches_is_not_asked_for_them(tmp_path: Path) 
     unmatched = dataclasses.replace(UNMATCHED, findings=(finding,))
 
     async def test(bench: _Bench) -> None:
-        bench.world.system.nodes["camera"].tells = True
+        bench.world.system.nodes["camera"].reports_changes = True
 
         def match() -> None:
             bench.verdicts = (OK,)
@@ -280,7 +280,7 @@ def test_of_a_server_that_is_matched_only_its_client_tells(
     )
 
     async def test(bench: _Bench) -> None:
-        bench.world.system.nodes["camera"].tells = True
+        bench.world.system.nodes["camera"].reports_changes = True
 
         def match() -> None:
             bench.verdicts = (OK,)
@@ -477,7 +477,7 @@ def test_the_configurations_of_nodes_are_read_before_each_look(tmp_path: Path) -
     async def test(bench: _Bench) -> None:
         node = bench.world.system.nodes["camera"]
         node.driver = object()  # type: ignore[assignment]
-        node.tells = True
+        node.reports_changes = True
         node.reach = Reach.CONNECTED
         node.configuration = interface_of("/camera")
         await bench.judge.once(Stage.CONNECTED)

@@ -81,12 +81,12 @@ def test_a_node_is_not_called_alive_that_has_not_started_or_is_not_in_the_graph(
         desk.system.liveliness.fell_silent(["/camera"], Cause.STOPPED, "it was stopped")
         desk.system.liveliness.came_back(["/camera"], Cause.STOPPED)
         # A supervisor that was started anew has not started its nodes yet.
-        desk.desk.heard(True)
+        desk.desk.alive(True)
         await settle()
-        desk.desk.heard(False)
+        desk.desk.alive(False)
         await settle()
         desk.system.present = frozenset({"/lamp"})
-        desk.desk.heard(True)
+        desk.desk.alive(True)
         await settle()
         alive = [each for each in desk.events if isinstance(each, NodeAlive)]
         assert {each.node: each.there for each in alive} == {
@@ -182,7 +182,7 @@ class FakeVoice:
     def __init__(self) -> None:
         self.told: list[Mapping[str, str]] = []
 
-    def tell(self, silent: Mapping[str, str]) -> None:
+    def notify(self, silent: Mapping[str, str]) -> None:
         self.told.append(dict(silent))
 
     def destroy(self) -> None:
@@ -266,11 +266,11 @@ async def settle() -> None:
 def test_with_a_machine_its_nodes_are_lost_and_found(tmp_path: Path) -> None:
     async def test() -> None:
         desk = Desk(tmp_path)
-        desk.desk.heard(True)
+        desk.desk.alive(True)
         await settle()
-        desk.desk.heard(False)
+        desk.desk.alive(False)
         await settle()
-        desk.desk.heard(True)
+        desk.desk.alive(True)
         await settle()
         assert desk.told() == [
             ("connection", "desk"),
@@ -291,7 +291,7 @@ def test_with_a_machine_its_nodes_are_lost_and_found(tmp_path: Path) -> None:
 def test_a_machine_that_was_never_heard_is_not_lost(tmp_path: Path) -> None:
     async def test() -> None:
         desk = Desk(tmp_path)
-        desk.desk.heard(False)
+        desk.desk.alive(False)
         await settle()
         assert desk.told() == []
         await desk.peer_supervisors.close()
@@ -302,7 +302,7 @@ def test_a_machine_that_was_never_heard_is_not_lost(tmp_path: Path) -> None:
 def test_a_supervisor_that_leaves_properly_loses_no_node(tmp_path: Path) -> None:
     async def test() -> None:
         desk = Desk(tmp_path)
-        desk.desk.heard(True)
+        desk.desk.alive(True)
         desk.desk.left()
         await settle()
         assert desk.told() == [("connection", "desk"), ("connection", "desk")]
@@ -314,8 +314,8 @@ def test_a_supervisor_that_leaves_properly_loses_no_node(tmp_path: Path) -> None
 def test_that_dds_forgets_a_lost_machine_changes_nothing(tmp_path: Path) -> None:
     async def test() -> None:
         desk = Desk(tmp_path)
-        desk.desk.heard(True)
-        desk.desk.heard(False)
+        desk.desk.alive(True)
+        desk.desk.alive(False)
         desk.desk.left()
         await settle()
         assert set(desk.system.liveliness.silent) == {"/viewer", "/lamp"}
@@ -327,13 +327,13 @@ def test_that_dds_forgets_a_lost_machine_changes_nothing(tmp_path: Path) -> None
 def test_calls_go_out_while_somebody_is_missing_and_only_then(tmp_path: Path) -> None:
     async def test() -> None:
         desk = Desk(tmp_path)
-        desk.desk.heard(True)
+        desk.desk.alive(True)
         await settle()
         assert desk.air.calls == []
-        desk.desk.heard(False)
+        desk.desk.alive(False)
         await asyncio.sleep(3.5 * CALL_EACH_S)
         assert desk.air.calls == [["10.0.0.2"]] * 4
-        desk.desk.heard(True)
+        desk.desk.alive(True)
         await asyncio.sleep(10 * CALL_EACH_S)
         assert len(desk.air.calls) == 4
         await desk.peer_supervisors.close()
@@ -344,10 +344,10 @@ def test_calls_go_out_while_somebody_is_missing_and_only_then(tmp_path: Path) ->
 def test_what_another_supervisor_says_of_its_nodes_is_taken_over(tmp_path: Path) -> None:
     async def test() -> None:
         desk = Desk(tmp_path)
-        desk.desk.told({"/viewer": "a callback hangs", "/camera": "not theirs to say"})
+        desk.desk.silent({"/viewer": "a callback hangs", "/camera": "not theirs to say"})
         await settle()
         assert dict(desk.system.liveliness.silent) == {"/viewer": "a callback hangs"}
-        desk.desk.told({})
+        desk.desk.silent({})
         await settle()
         assert desk.told() == [("silent", "/viewer"), ("alive", "/viewer")]
         await desk.peer_supervisors.close()
@@ -371,8 +371,8 @@ def test_our_own_silent_nodes_are_told_again_and_again_until_it_is_over(tmp_path
 def test_who_is_lost_to_us_is_not_told_to_others(tmp_path: Path) -> None:
     async def test() -> None:
         desk = Desk(tmp_path)
-        desk.desk.heard(True)
-        desk.desk.heard(False)
+        desk.desk.alive(True)
+        desk.desk.alive(False)
         await asyncio.sleep(1)
         assert desk.air.voices["robot/robot"].told == []
         await desk.peer_supervisors.close()
@@ -416,10 +416,10 @@ def test_a_reloaded_plan_has_its_own_attached_nodes_followed_and_no_others(tmp_p
         assert set(air.ears) == {"/lidar", "/radar"}
         old = dict(air.ears)
         for each in old.values():
-            each.listener.heard(True)
+            each.listener.alive(True)
         peer_supervisors.renew()
         assert air.destroyed == 0  # the same nodes: nobody is heard anew
-        old["/lidar"].listener.heard(False)
+        old["/lidar"].listener.alive(False)
         await settle()
         assert set(system.liveliness.silent) == {"/lidar"}
         await asyncio.sleep(1)
@@ -432,14 +432,14 @@ def test_a_reloaded_plan_has_its_own_attached_nodes_followed_and_no_others(tmp_p
         assert air.destroyed == 2
         assert set(air.ears) == {"/radar", "/sonar"}
         # Who is not planned any more is neither missed nor called, whatever was on the way.
-        old["/radar"].listener.heard(False)
+        old["/radar"].listener.alive(False)
         await settle()
         assert dict(system.liveliness.silent) == {}
         air.calls.clear()
         await asyncio.sleep(1)
         assert air.calls == []
-        air.ears["/sonar"].listener.heard(True)
-        air.ears["/sonar"].listener.heard(False)
+        air.ears["/sonar"].listener.alive(True)
+        air.ears["/sonar"].listener.alive(False)
         await settle()
         assert set(system.liveliness.silent) == {"/sonar"}
         await peer_supervisors.close()
@@ -460,15 +460,15 @@ def test_a_loss_has_us_and_our_hosts_prepare_and_after_it_tell_our_names_anew(
         peer_supervisors.open()
         await world.bring_up.connect(30)
         listener = air.ears["robot/desk"].listener
-        listener.heard(True)
+        listener.alive(True)
         await asyncio.sleep(1)
         assert air.done == []
-        listener.heard(False)
+        listener.alive(False)
         await asyncio.sleep(1)
         done = ["send_again_soon"]
         assert air.done == done
         if came_back:
-            listener.heard(True)
+            listener.alive(True)
             await asyncio.sleep(1)
             done.append("tell_names")
         assert air.done == done

@@ -12,13 +12,13 @@ from pathlib import Path
 import pytest
 
 from lifecycle.errors import ExitCode
-from lifecycle.programming.apply import (
+from lifecycle.programming.apply.target import (
     ChangeKind,
     FlowChange,
     PrivilegeError,
     TargetChanges,
-    TargetOptions,
 )
+from lifecycle.programming.apply.targets.registry import target_kind
 from lifecycle.run_directory import OWN_CHILD, RunDirectory, new_run_id
 from lifecycle.supervisor.connections.networks import Networks, open_networks, remove_programmed
 from lifecycle.supervisor.control.client import down
@@ -187,12 +187,12 @@ class Applied:
 
     def __init__(self, directory: Path, server: NefServer) -> None:
         settings = nef_settings(server.url, devices=["10.77.0.1"])
-        self.options = TargetOptions(kind="nef", settings=settings_file(directory, nef=settings))
+        self.options = target_kind("nef").read({"config": settings_file(directory, nef=settings)})
         self.root = directory / "lifecycle"
         self.environment = {"XDG_RUNTIME_DIR": str(directory)}
 
     def apply(self, *, owned: bool = False) -> Path:
-        from lifecycle.programming.apply import open_programmer
+        from lifecycle.programming.apply.programmer import open_programmer
         from lifecycle.run_directory import run_name
 
         programmer = open_programmer(

@@ -10,7 +10,8 @@ import json
 import pytest
 from rich.console import Console
 
-from lifecycle.cli.up_output import JsonLines, Live, PlainLines
+from lifecycle.cli.live_view import Live
+from lifecycle.cli.up_output import JsonLines, PlainLines, Timings
 from lifecycle.cli.verbs.control import status_text
 from lifecycle.cli.verbs.flows import render_flows
 from lifecycle.errors import ExitCode
@@ -33,6 +34,8 @@ from lifecycle.supervisor.run.events import (
     ProcessState,
     Reach,
     RequestSent,
+    RunStarted,
+    Stopping,
     SystemReached,
     VerdictChanged,
     WiringChanged,
@@ -115,6 +118,105 @@ def test_a_death_that_the_run_outlives_is_told_in_full_at_once() -> None:
         "failed: /camera (run.process-died): "
         "cannot keep '/camera' running: pid 7 died: killed by SIGSEGV\n"
     )
+
+
+def _timed(until: str, *events: tuple[float, Event]) -> list[str]:
+    """Return the lines about stages, of events that come at a time."""
+    stream = io.StringIO()
+    times = iter([at_s for at_s, _ in events])
+    output = Timings(PlainLines(_Into(stream)), until=until, clock=lambda: next(times))
+    for _, event in events:
+        output(event)
+    return [line for line in stream.getvalue().splitlines() if line.startswith(("stage", "system"))]
+
+
+def _came(node: str, reach: Reach) -> NodeChanged:
+    return NodeChanged(node=node, reach=reach)
+
+
+_RUN = RunStarted(
+    system="robot",
+    domain_id=30,
+    rmw="rmw_fastrtps_cpp",
+    discovery_range="localhost",
+    nodes=("/camera", "/arm"),
+    processes=("camera", "arm"),
+    log_directory="/log",
+)
+
+
+def test_a_stage_is_over_with_the_last_node_that_came_so_far() -> None:
+    judged = VerdictChanged(stage=Stage.CONNECTED, verdict=verdict_of(Outcome.VIOLATED))
+    lines = _timed(
+        "active",
+        (0.5, _RUN),
+        (1.0, _came("/camera", Reach.STARTED)),
+        (1.2, _came("/camera", Reach.CONNECTED)),
+        (1.5, _came("/arm", Reach.STARTED)),
+        (1.6, _came("/arm", Reach.CONFIGURED)),
+        (1.7, judged),
+        (2.0, _came("/arm", Reach.CONNECTED)),
+        (2.0, SystemReached(reached="connected", elapsed_s=1.5)),
+        (2.25, judged),
+        (2.5, VerdictChanged(stage=Stage.CONNECTED, verdict=verdict_of(Outcome.OK))),
+        (3.0, SystemReached(reached="verified", elapsed_s=2.5)),
+        (3.25, _came("/arm", Reach.ACTIVE)),
+        (3.5, _came("/camera", Reach.ACTIVE)),
+        (4.0, SystemReached(reached="active", elapsed_s=3.5)),
+    )
+    assert lines == [
+        "system connected after 1.50 s",
+        "system verified after 2.50 s",
+        "system active after 3.50 s",
+        "stage supervisor    0.500 s  at   0.500 s",
+        "stage processes     1.000 s  at   1.500 s  last /arm",
+        "stage configured    0.100 s  at   1.600 s  last /arm",
+        "stage connected     0.400 s  at   2.000 s  last /arm",
+        "stage observed      0.250 s  at   2.250 s",
+        "stage verified      0.750 s  at   3.000 s",
+        "stage active        1.000 s  at   4.000 s  last /camera",
+        "stage total         4.000 s  at   4.000 s",
+    ]
+
+
+def test_stages_that_were_not_reached_are_left_out_and_later_ones_are_not_timed_again() -> None:
+    again = (3.0, SystemReached(reached="connected", elapsed_s=3.0))
+    lines = _timed(
+        "active",
+        (0.5, _RUN),
+        (1.0, _came("/camera", Reach.STARTED)),
+        # A node that was not discovered is started again; the stage is over with the last try.
+        (1.5, _came("/camera", Reach.WAITING)),
+        (2.0, _came("/camera", Reach.STARTED)),
+        (2.5, Stopping(reason="the process of /arm died")),
+        (2.6, _came("/camera", Reach.STOPPED)),
+        again,
+    )
+    assert lines == [
+        "stage supervisor    0.500 s  at   0.500 s",
+        "stage processes     1.500 s  at   2.000 s  last /camera",
+        "stage total         2.500 s  at   2.500 s",
+        "system connected after 3.00 s",
+    ]
+
+
+def test_stages_are_events_of_their_own_in_json() -> None:
+    stream = io.StringIO()
+    times = iter((0.5, 1.0))
+    output = Timings(JsonLines(_Into(stream)), until="connected", clock=lambda: next(times))
+    output(_came("/camera", Reach.STARTED))
+    output(SystemReached(reached="connected", elapsed_s=0.75))
+    assert [json.loads(line) for line in stream.getvalue().splitlines()][2:] == [
+        {
+            "event": "stage",
+            "stage": "processes",
+            "took_s": 0.5,
+            "elapsed_s": 0.5,
+            "last": "/camera",
+        },
+        {"event": "stage", "stage": "connected", "took_s": 0.5, "elapsed_s": 1.0, "last": ""},
+        {"event": "stage", "stage": "total", "took_s": 1.0, "elapsed_s": 1.0, "last": ""},
+    ]
 
 
 class _Into:

@@ -368,7 +368,7 @@ def test_what_a_log_misses_is_said_once_counted_and_written_where_it_is_missing(
             "before\n2 log lines are missing here: No space left on device\nafter\n"
         )
     os.close(full)
-    directory.tell_lost()
+    directory.report_lost()
     assert said[1:] == [f"4 log lines are missing in {str(tmp_path)!r}: No space left on device"]
 
 

@@ -76,11 +76,11 @@ def test_what_has_only_just_become_expected_may_be_missing_for_a_moment(
     finding: tuple[str, str, str],
 ) -> None:
     grace_period = GracePeriod()
-    assert grace_period.standing(None, OK, BEFORE, 10.0) == (OK, None)
+    assert grace_period.after(None, OK, BEFORE, 10.0) == (OK, None)
     bad = found(finding)
-    assert grace_period.standing(OK, bad, AFTER, 20.0) == (OK, PASSING_S)
-    assert grace_period.standing(OK, bad, AFTER, 20.25) == (OK, PASSING_S - 0.25)
-    assert grace_period.standing(OK, bad, AFTER, 20.0 + PASSING_S) == (bad, None)
+    assert grace_period.after(OK, bad, AFTER, 20.0) == (OK, PASSING_S)
+    assert grace_period.after(OK, bad, AFTER, 20.25) == (OK, PASSING_S - 0.25)
+    assert grace_period.after(OK, bad, AFTER, 20.0 + PASSING_S) == (bad, None)
 
 
 @pytest.mark.parametrize(
@@ -95,16 +95,16 @@ def test_what_has_only_just_become_expected_may_be_missing_for_a_moment(
 )
 def test_what_was_expected_before_may_not(finding: tuple[str, str, str]) -> None:
     grace_period = GracePeriod()
-    grace_period.standing(None, OK, BEFORE, 10.0)
+    grace_period.after(None, OK, BEFORE, 10.0)
     bad = found(finding)
-    assert grace_period.standing(OK, bad, AFTER, 20.0) == (bad, None)
+    assert grace_period.after(OK, bad, AFTER, 20.0) == (bad, None)
 
 
 def test_what_was_expected_at_the_first_look_may_not_be_missing_for_a_moment_later() -> None:
     grace_period = GracePeriod()
-    grace_period.standing(None, OK, BEFORE, 10.0)
+    grace_period.after(None, OK, BEFORE, 10.0)
     bad = found(("graph.missing-endpoint", "/chatter", "/talker"))
-    assert grace_period.standing(OK, bad, BEFORE, 10.25) == (bad, None)
+    assert grace_period.after(OK, bad, BEFORE, 10.25) == (bad, None)
 
 
 def test_a_connection_that_was_only_just_negotiated_may_be_missing_for_a_moment() -> None:
@@ -112,46 +112,46 @@ def test_a_connection_that_was_only_just_negotiated_may_be_missing_for_a_moment(
     source = NegotiatedSource(plan)
     source.instructions(known(TALKER, LISTENER))
     grace_period = GracePeriod()
-    grace_period.standing(None, OK, plan, 10.0)
+    grace_period.after(None, OK, plan, 10.0)
     bad = found(("connection.missing", "/talker", "/talker"))
-    assert grace_period.standing(OK, bad, source.expected, 20.0) == (OK, PASSING_S)
+    assert grace_period.after(OK, bad, source.expected, 20.0) == (OK, PASSING_S)
 
 
 def test_whatever_else_is_wrong_is_told_at_once_with_all_of_it() -> None:
     grace_period = GracePeriod()
-    grace_period.standing(None, OK, BEFORE, 10.0)
+    grace_period.after(None, OK, BEFORE, 10.0)
     bad = found(YOUNG[0], ("graph.missing-node", "/talker", "/talker"))
-    assert grace_period.standing(OK, bad, AFTER, 20.0) == (bad, None)
+    assert grace_period.after(OK, bad, AFTER, 20.0) == (bad, None)
 
 
 def test_what_healed_is_told_at_once_too() -> None:
     grace_period = GracePeriod()
     bad = found(("graph.missing-node", "/talker", "/talker"))
-    grace_period.standing(None, bad, BEFORE, 10.0)
+    grace_period.after(None, bad, BEFORE, 10.0)
     other = found(YOUNG[0])
-    assert grace_period.standing(bad, other, AFTER, 20.0) == (other, None)
+    assert grace_period.after(bad, other, AFTER, 20.0) == (other, None)
 
 
 def test_each_newcomer_has_a_moment_of_its_own() -> None:
     grace_period = GracePeriod()
-    grace_period.standing(None, OK, BEFORE, 0.0)
+    grace_period.after(None, OK, BEFORE, 0.0)
     one = found((UNATTRIBUTED, "/rosout", ""))
     two = found((UNATTRIBUTED, "/rosout", ""), (UNATTRIBUTED, "/parameter_events", ""))
-    assert grace_period.standing(OK, one, BEFORE, 1.0) == (OK, PASSING_S)
-    assert grace_period.standing(OK, two, BEFORE, 1.5) == (OK, PASSING_S - 0.5)
-    assert grace_period.standing(OK, OK, BEFORE, 1.75) == (OK, None)
+    assert grace_period.after(OK, one, BEFORE, 1.0) == (OK, PASSING_S)
+    assert grace_period.after(OK, two, BEFORE, 1.5) == (OK, PASSING_S - 0.5)
+    assert grace_period.after(OK, OK, BEFORE, 1.75) == (OK, None)
     # Gone, and there again: that is another newcomer.
-    assert grace_period.standing(OK, one, BEFORE, 2.0) == (OK, PASSING_S)
+    assert grace_period.after(OK, one, BEFORE, 2.0) == (OK, PASSING_S)
 
 
 def test_the_first_verdict_of_all_is_told_whatever_it_is() -> None:
     bad = found((UNATTRIBUTED, "/rosout", ""))
-    assert GracePeriod().standing(None, bad, BEFORE, 0.0) == (bad, None)
+    assert GracePeriod().after(None, bad, BEFORE, 0.0) == (bad, None)
 
 
 def test_a_client_that_has_only_just_become_expected_may_be_unmatched_for_a_moment() -> None:
     grace_period = GracePeriod()
-    grace_period.standing(None, OK, BEFORE, 10.0)
+    grace_period.after(None, OK, BEFORE, 10.0)
     asks = dataclasses.replace(
         AFTER.nodes[0].endpoints[0], kind=EndpointKind.SERVICE_CLIENT, resolved="/ask"
     )
@@ -166,5 +166,5 @@ def test_a_client_that_has_only_just_become_expected_may_be_unmatched_for_a_mome
     )
     names = client.full_name, server.full_name
     bad = found(("graph.unmatched-client", f"/ask: {names[0]} → {names[1]}", names[0]))
-    assert grace_period.standing(OK, bad, plan, 20.0) == (OK, PASSING_S)
-    assert grace_period.standing(OK, bad, plan, 20.0 + PASSING_S) == (bad, None)
+    assert grace_period.after(OK, bad, plan, 20.0) == (OK, PASSING_S)
+    assert grace_period.after(OK, bad, plan, 20.0 + PASSING_S) == (bad, None)

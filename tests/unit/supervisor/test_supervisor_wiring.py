@@ -29,7 +29,7 @@ from lifecycle.plan.model import (
 from lifecycle.supervisor.connections.authority import (
     TRIES,
     ConnectionAuthority,
-    Hand,
+    NodeInterface,
     PlannedSource,
 )
 from lifecycle.supervisor.connections.desired_state import (
@@ -127,7 +127,7 @@ class Wiring:
         self.source = ChangingSource(plan)
         self.hands: dict[str, FakeHand] = {}
         self.authority = ConnectionAuthority(
-            self.world.system, self.source, self.world.emit, hand_of=self._hand
+            self.world.system, self.source, self.world.emit, interface_of=self._hand
         )
         self.world.bring_up = BringUp(
             self.world.system,
@@ -142,7 +142,7 @@ class Wiring:
                 node.full_name, "publishers/out", "subscriptions/in"
             )
 
-    def _hand(self, name: str) -> Hand:
+    def _hand(self, name: str) -> NodeInterface:
         return self.hands[name]
 
     def told(self, node: str) -> list[str]:

@@ -45,6 +45,7 @@ _STATES = {Stage.CONNECTED: "inactive", Stage.ACTIVE: "active"}
 
 def perfect(plan: Plan, stage: Stage = Stage.CONNECTED) -> Observation:
     """Everything that a system exactly as planned would show at this stage."""
+    places = _Places(plan)
     nodes: list[ObservedNode] = []
     endpoints: list[ObservedEndpoint] = []
     configurations: list[NodeConfiguration] = []
@@ -57,10 +58,25 @@ def perfect(plan: Plan, stage: Stage = Stage.CONNECTED) -> Observation:
         ]
         endpoints += [_observed(node, index) for index in range(len(node.endpoints))]
         if node.run.kind is RunKind.PYTHON:
-            configurations.append(_configuration(plan, node, stage))
+            configurations.append(_configuration(places, node, stage))
     return Observation(
         nodes=tuple(nodes), endpoints=tuple(endpoints), configurations=tuple(configurations)
     )
+
+
+class _Places:
+    """What a system's parts are numbered and found by, so that big ones can be made up as well."""
+
+    def __init__(self, plan: Plan) -> None:
+        self.addresses = {each.name: each.address for each in reversed(plan.machines)}
+        self.nodes = {each.key: index for index, each in enumerate(plan.nodes)}
+        self.processes = {each.name: index for index, each in enumerate(plan.processes)}
+        self.gids: dict[tuple[EndpointKind, str], list[str]] = {}
+        for node in plan.nodes:
+            for index, each in enumerate(node.endpoints):
+                self.gids.setdefault((each.kind, each.resolved), []).append(_gid(node, index))
+        for gids in self.gids.values():
+            gids.sort()
 
 
 def settled(qos: QosProfile, kind: EndpointKind) -> QosProfile:
@@ -119,13 +135,13 @@ def _observed(node: PlannedNode, index: int) -> ObservedEndpoint:
     )
 
 
-def _configuration(plan: Plan, node: PlannedNode, stage: Stage) -> NodeConfiguration:
-    number = [each.key for each in plan.nodes].index(node.key)
+def _configuration(places: _Places, node: PlannedNode, stage: Stage) -> NodeConfiguration:
+    number = places.nodes[node.key]
     machine = node.machine or "here"
     return NodeConfiguration(
         identity=Identity(
             machine_id=f"machine-{machine}",
-            process_id=1000 + [each.name for each in plan.processes].index(node.process),
+            process_id=1000 + places.processes[node.process],
             node_id=f"{node.full_name}@01030000{number:04x}",
         ),
         name=node.full_name,
@@ -135,7 +151,7 @@ def _configuration(plan: Plan, node: PlannedNode, stage: Stage) -> NodeConfigura
         transports=("udpv4", "shm"),
         serializations=("cdr",),
         paradigms=("publish/subscribe", "request/response"),
-        endpoints=tuple(_report(plan, node, index) for index in range(len(node.endpoints))),
+        endpoints=tuple(_report(places, node, index) for index in range(len(node.endpoints))),
         connections=tuple(_connection(node, each) for each in node.participants if each.connection),
         checksum=f"{number:016x}",
         parameters=tuple(
@@ -161,7 +177,7 @@ def _connection(node: PlannedNode, participant: PlannedParticipant) -> Connectio
     )
 
 
-def _report(plan: Plan, node: PlannedNode, index: int) -> EndpointReport:
+def _report(places: _Places, node: PlannedNode, index: int) -> EndpointReport:
     planned = node.endpoints[index]
     is_topic = planned.kind in _TOPIC_KINDS
     return EndpointReport(
@@ -172,18 +188,18 @@ def _report(plan: Plan, node: PlannedNode, index: int) -> EndpointReport:
         qos=settled(planned.qos, planned.kind) if planned.qos else None,
         gid=_gid(node, index) if is_topic else "",
         unique=planned.unique,
-        nfes=_nfes(plan, node, index) if is_topic else None,
+        nfes=_nfes(places, node, index) if is_topic else None,
         participant=planned.participant,
         connection=connection_of(node, planned),
         mapped=True,
-        matched=len(_peers(plan, planned)) if is_topic else None,
-        peers=_peers(plan, planned) if is_topic else None,
-        server_matched=_server_matched(plan, planned),
+        matched=len(_peers(places, planned)) if is_topic else None,
+        peers=_peers(places, planned) if is_topic else None,
+        server_matched=_server_matched(places, planned),
         dscp=planned.dscp,
     )
 
 
-def _server_matched(plan: Plan, planned: PlannedEndpoint) -> bool | None:
+def _server_matched(places: _Places, planned: PlannedEndpoint) -> bool | None:
     """What a client says of the declared servers of its service or action."""
     kind = {
         EndpointKind.SERVICE_CLIENT: EndpointKind.SERVICE_SERVER,
@@ -191,43 +207,31 @@ def _server_matched(plan: Plan, planned: PlannedEndpoint) -> bool | None:
     }.get(planned.kind)
     if kind is None:
         return None
-    return any(
-        (each.kind, each.resolved) == (kind, planned.resolved)
-        for node in plan.nodes
-        for each in node.endpoints
-    )
+    return (kind, planned.resolved) in places.gids
 
 
-def _peers(plan: Plan, planned: PlannedEndpoint) -> tuple[str, ...]:
+def _peers(places: _Places, planned: PlannedEndpoint) -> tuple[str, ...]:
     """GIDs of the declared endpoints on the other side of the topic."""
     other = _TOPIC_KINDS[planned.kind is EndpointKind.PUBLISHER]
-    return tuple(
-        sorted(
-            _gid(node, index)
-            for node in plan.nodes
-            for index, each in enumerate(node.endpoints)
-            if each.kind is other and each.resolved == planned.resolved
-        )
-    )
+    return tuple(places.gids.get((other, planned.resolved), ()))
 
 
-def _nfes(plan: Plan, node: PlannedNode, index: int) -> tuple[NetworkFlowEndpoint, ...]:
+def _nfes(places: _Places, node: PlannedNode, index: int) -> tuple[NetworkFlowEndpoint, ...]:
     """Shared memory, unless its participant must not, and one UDP socket.
 
     The socket is the participant's, unless the endpoint has its own.
     """
     planned = node.endpoints[index]
-    process = [each.name for each in plan.processes].index(node.process)
-    number = [each.key for each in plan.nodes].index(node.key)
+    process, number = places.processes[node.process], places.nodes[node.key]
     if planned.kind is EndpointKind.PUBLISHER:
         names = [each.name for each in node.participants]
         extra = names.index(planned.participant) + 1 if planned.participant else 0
         address = "0.0.0.0"
         port = 40000 + 100 * (number if extra else process) + extra
     elif planned.unique in _OWN_FLOW:
-        address, port = _address(plan, node), 7000 + 20 * number + index
+        address, port = _address(places, node), 7000 + 20 * number + index
     else:
-        address, port = _address(plan, node), 7411 + 2 * process
+        address, port = _address(places, node), 7411 + 2 * process
     shared_memory = NetworkFlowEndpoint(
         transport_protocol=TransportProtocol.UNKNOWN,
         internet_protocol=InternetProtocol.UNKNOWN,
@@ -249,5 +253,5 @@ def _transports(node: PlannedNode, planned: PlannedEndpoint) -> tuple[str, ...]:
     return node.transports
 
 
-def _address(plan: Plan, node: PlannedNode) -> str:
-    return next((each.address for each in plan.machines if each.name == node.machine), "127.0.0.1")
+def _address(places: _Places, node: PlannedNode) -> str:
+    return places.addresses.get(node.machine, "127.0.0.1")

@@ -9,14 +9,18 @@ import pytest
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.verify import (
     ObservedEndpoint,
-    action_part,
     fold_actions,
     is_noise_endpoint,
     is_noise_node,
-    our_nodes,
     without_noise,
 )
-from lifecycle.verify.tool_filter import DeclaredNames, known_node, tolerating_pattern
+from lifecycle.verify.tool_filter import (
+    DeclaredNames,
+    action_part,
+    known_node,
+    our_nodes,
+    tolerating_pattern,
+)
 from tests.builders import endpoint, node, planned, publisher, subscription
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION

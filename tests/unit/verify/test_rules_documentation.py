@@ -56,7 +56,7 @@ def test_a_rule_cannot_be_given_an_outcome_that_it_does_not_document():
 
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.id)
 def test_what_is_only_not_there_yet_may_come(rule: Rule):
-    passing = rule.absence or rule.awaits or rule.about or rule.if_unheard
+    passing = rule.absence or rule.awaits or rule.about or rule.if_undiscovered
     assert not passing or rule.heals is Heals.WITH_TIME
     assert (rule.about is not About.MATCH) or rule.absence
 

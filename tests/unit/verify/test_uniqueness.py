@@ -2,16 +2,34 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.network.nfe import InternetProtocol, NetworkFlowEndpoint, TransportProtocol
+from lifecycle.network.nfe import (
+    InternetProtocol,
+    NetworkFlowEndpoint,
+    TransportProtocol,
+    is_unique_endpoint,
+    located,
+)
 from lifecycle.plan import Plan
 from lifecycle.verify import Identity, Stage
 from lifecycle.verify.matcher import lay_out
-from lifecycle.verify.transport import Uniqueness
+from lifecycle.verify.uniqueness import Uniqueness
 from lifecycle.verify.view import Actual
-from tests.builders import endpoint, node, planned, publisher, subscription
+from tests.builders import (
+    configuration,
+    endpoint,
+    node,
+    planned,
+    publisher,
+    reported,
+    subscription,
+)
 from tests.unit.verify.edits import (
     Edit,
     both,
@@ -277,3 +295,43 @@ def test_what_does_not_count_is_named_all_the_same():
     edit = both(on_machines("m", "n"), lists(SUB, a=(nfe(1), BRIDGE), b=(BRIDGE,)))
     uniqueness, ends = laid_out(plan_of(SUB), edit, DECLARED)
     assert uniqueness.nfes((ends["/a"],)) == (nfe(1), BRIDGE)
+
+
+NFES = st.one_of(
+    st.just(SHM),
+    st.builds(
+        nfe,
+        st.sampled_from((1, 2)),
+        st.sampled_from(("10.0.0.1", "0.0.0.0", "127.0.0.1", "239.1.1.1", "::", "fe80::1%a")),
+        st.sampled_from((TransportProtocol.UDP, TCP)),
+    ),
+)
+ENDS = st.tuples(
+    st.sampled_from((PUB, SUB)),
+    st.sampled_from((("m", 1), ("m", 2), ("n", 1))),
+    st.none() | st.lists(NFES, max_size=3).map(tuple),
+)
+
+ALONE = planned(node("one", publisher("a")))
+(END,) = lay_out(ALONE, perfect(ALONE), Stage.CONNECTED).actual
+
+
+@given(st.lists(ENDS, max_size=8))
+def test_answers_are_those_of_comparing_every_endpoint_with_every_other(ends):
+    reports = [reported(kind, f"e{i}", nfes=nfes) for i, (kind, _, nfes) in enumerate(ends)]
+    uniqueness = Uniqueness(
+        configuration(
+            f"/n{index}", each, identity=Identity(machine_id=host, process_id=pid, node_id="")
+        )
+        for index, (each, (_, (host, pid), _)) in enumerate(zip(reports, ends, strict=True))
+    )
+    for index, (kind, process, nfes) in enumerate(ends):
+        others = [
+            located(each, place[0])
+            for other, (side, place, each) in enumerate(ends)
+            # What is not known hides no equal one but in its own process.
+            if other != index and side is kind and (each is not None or place == process)
+        ]
+        end = dataclasses.replace(END, report=reports[index])
+        expected = is_unique_endpoint(located(nfes, process[0]), others)
+        assert uniqueness.is_unique(end) is expected

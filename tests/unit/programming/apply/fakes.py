@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from lifecycle.programming.apply.changes import ChangeKind, FlowChange, TargetChanges
-from lifecycle.programming.apply.errors import ProgrammingError
+from lifecycle.programming.apply.target import (
+    ChangeKind,
+    FlowChange,
+    ProgrammingError,
+    TargetChanges,
+)
 from lifecycle.programming.apply.tool import ToolOutput
 from lifecycle.programming.rules.rules import FlowRule
 

@@ -16,12 +16,11 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.programming.apply.changes import Target
-from lifecycle.programming.apply.errors import HttpError, PartlyError, SettingsError
 from lifecycle.programming.apply.http import Api, Patience
 from lifecycle.programming.apply.ledger import EntryState
 from lifecycle.programming.apply.programmer import Programmer
-from lifecycle.programming.apply.targets import TargetOptions, Targets
+from lifecycle.programming.apply.target import HttpError, PartlyError, SettingsError, Target
+from lifecycle.programming.apply.targets.registry import Targets, target_kind
 from lifecycle.supervisor.connections.networks import Networks
 from lifecycle.supervisor.run.events import Emitter, Notice
 from lifecycle.supervisor.run.failure import StepFailedError
@@ -309,7 +308,7 @@ def target_at(
     )
     file = settings_file(path, **{kind: settings})
     try:
-        yield targets.make(TargetOptions(kind=kind, settings=file)), targets
+        yield target_kind(kind).read({"config": file}).open(targets), targets
     finally:
         targets.close()
 
@@ -399,7 +398,7 @@ def _programmer(path: Path, server: HostileServer, patience: Patience) -> Progra
     targets = Targets(ledger, patience=patience)
     settings = nef_settings(server.url, devices=["10.77.0.1"], timeout_s=60)
     file = settings_file(path, nef=settings)
-    target = targets.make(TargetOptions(kind="nef", settings=file))
+    target = target_kind("nef").read({"config": file}).open(targets)
     return Programmer(plan(), [target], ledger, made_by=targets)
 
 
@@ -505,7 +504,7 @@ class TestProxies:
             targets = Targets(ledger, patience=Patience(attempts=1))
             file = settings_file(tmp_path, nef=nef_settings("https://nef.invalid", timeout_s=5))
             with pytest.raises(PartlyError):
-                targets.make(TargetOptions(kind="nef", settings=file)).apply([rule()])
+                target_kind("nef").read({"config": file}).open(targets).apply([rule()])
             targets.close()
 
         assert proxy.asked[0].startswith("CONNECT nef.invalid:443 ")

@@ -12,8 +12,6 @@ import pytest
 
 from lifecycle.errors import UsageError
 from lifecycle.programming.apply import ledger as ledger_module
-from lifecycle.programming.apply.changes import ChangeKind, FlowChange, TargetChanges
-from lifecycle.programming.apply.errors import PartlyError, ProgrammingError
 from lifecycle.programming.apply.ledger import (
     Entry,
     Ledger,
@@ -24,11 +22,19 @@ from lifecycle.programming.apply.ledger import (
 from lifecycle.programming.apply.programmer import (
     Programmer,
     RouteSources,
+    Targets,
     remove_run,
     route_source,
     sweep_orphans,
 )
-from lifecycle.programming.apply.targets import TargetOptions, Targets
+from lifecycle.programming.apply.target import (
+    ChangeKind,
+    FlowChange,
+    PartlyError,
+    ProgrammingError,
+    TargetChanges,
+)
+from lifecycle.programming.apply.targets.registry import target_kind
 from lifecycle.programming.rules.rules import flow_rules
 from lifecycle.supervisor.connections import networks as keeper_module
 from lifecycle.supervisor.connections.networks import Keeper
@@ -231,7 +237,7 @@ def orphan(tmp_path: Path, server: NefServer, *, dead: bool) -> Path:
     directory = tmp_path / "run" / "robot@7"
     owned = Ledger(directory, "robot", owned=dead)
     targets = Targets(owned)
-    targets.make(TargetOptions(kind="nef", settings=file)).apply([rule()])
+    target_kind("nef").read({"config": file}).open(targets).apply([rule()])
     targets.close()
     if dead:
         written = ledger.read()

@@ -8,10 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.programming.apply.changes import FlowChange, Target, TargetChanges
-from lifecycle.programming.apply.errors import PartlyError
 from lifecycle.programming.apply.ledger import EntryState, Ledger
-from lifecycle.programming.apply.targets import TargetOptions, Targets
+from lifecycle.programming.apply.target import FlowChange, PartlyError, Target, TargetChanges
+from lifecycle.programming.apply.targets.registry import Targets, target_kind
 from tests.unit.programming.apply.samples import (
     camara_settings,
     ledger_in,
@@ -46,7 +45,7 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
 
         def make(**settings: object) -> Target:
             file = settings_file(tmp_path, camara=camara_settings(server.url, **settings))
-            return targets.make(TargetOptions(kind="camara", settings=file))
+            return target_kind("camara").read({"config": file}).open(targets)
 
         yield Bench(make, server, ledger, clock)
         targets.close()

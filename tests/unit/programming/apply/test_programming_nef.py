@@ -10,10 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.programming.apply.changes import ChangeKind, Target, TargetChanges
-from lifecycle.programming.apply.errors import PartlyError
 from lifecycle.programming.apply.ledger import EntryState, Ledger
-from lifecycle.programming.apply.targets import TargetOptions, Targets
+from lifecycle.programming.apply.target import ChangeKind, PartlyError, Target, TargetChanges
+from lifecycle.programming.apply.targets.registry import Targets, target_kind
 from tests.unit.programming.apply.samples import (
     ledger_in,
     nef_settings,
@@ -51,7 +50,7 @@ def _bench(tmp_path: Path, server: NefServer, **settings: object) -> Iterator[Be
     targets = Targets(ledger, clock=clock)
 
     def make() -> Target:
-        return targets.make(TargetOptions(kind="nef", settings=file))
+        return target_kind("nef").read({"config": file}).open(targets)
 
     yield Bench(make(), server, ledger, clock, make)
     targets.close()

@@ -8,10 +8,16 @@ from pathlib import Path
 import pytest
 
 from lifecycle.errors import UsageError
-from lifecycle.programming.apply.errors import SettingsError
 from lifecycle.programming.apply.ledger import TargetRecord
 from lifecycle.programming.apply.settings import Token, load_settings
-from lifecycle.programming.apply.targets import TargetOptions, Targets
+from lifecycle.programming.apply.target import SettingsError
+from lifecycle.programming.apply.targets.nef import NefTargetSettings
+from lifecycle.programming.apply.targets.registry import (
+    Targets,
+    read_targets,
+    settings_types,
+    target_kind,
+)
 from tests.unit.programming.apply.samples import (
     camara_settings,
     ledger_in,
@@ -33,12 +39,12 @@ nef:
 def test_yaml_and_json_are_read_alike(tmp_path: Path) -> None:
     file = tmp_path / "targets.yaml"
     file.write_text(NEF_YAML)
-    of_yaml = load_settings(file).nef
+    of_yaml = load_settings(file, settings_types()).servers["nef"]
     same = nef_settings("https://nef.example.net", token={"file": "token.txt"})
-    of_json = load_settings(settings_file(tmp_path, nef=same)).nef
+    of_json = load_settings(settings_file(tmp_path, nef=same), settings_types()).servers["nef"]
 
     assert of_yaml == of_json
-    assert of_yaml is not None
+    assert isinstance(of_yaml, NefTargetSettings)
     assert of_yaml.qos_references == {85: "robot-control"}
     assert of_yaml.token == Token(file=str(tmp_path / "token.txt"))
 
@@ -75,7 +81,7 @@ def test_what_is_not_allowed_is_refused_where_it_stands(
     file = settings_file(tmp_path, nef={**nef_settings("https://nef.example.net"), **changed})
 
     with pytest.raises(SettingsError) as caught:
-        load_settings(file)
+        load_settings(file, settings_types())
 
     where = "nef.token" if "token" in changed else "nef"
     assert str(caught.value) == f"cannot use settings {file!r}: {where}: {message}"
@@ -86,7 +92,7 @@ def test_a_key_that_is_no_5qi_is_refused_where_it_stands(tmp_path: Path) -> None
     references = {"qos_references": {"EF": "robot-control"}}
     file = settings_file(tmp_path, nef={**nef_settings("https://nef.example.net"), **references})
     with pytest.raises(SettingsError) as caught:
-        load_settings(file)
+        load_settings(file, settings_types())
     assert str(caught.value) == (
         f"cannot use settings {file!r}: a key of nef.qos_references: Expected `int`, got `str`"
     )
@@ -96,7 +102,7 @@ def test_a_sink_must_be_https(tmp_path: Path) -> None:
     settings = camara_settings("https://api.example.net/qod", sink="http://x.example/s")
 
     with pytest.raises(SettingsError, match=r"cannot use sink 'http://x\.example/s'"):
-        load_settings(settings_file(tmp_path, camara=settings))
+        load_settings(settings_file(tmp_path, camara=settings), settings_types())
 
 
 def test_text_that_is_no_yaml_is_not_quoted_for_it_may_hold_a_token(tmp_path: Path) -> None:
@@ -104,7 +110,7 @@ def test_text_that_is_no_yaml_is_not_quoted_for_it_may_hold_a_token(tmp_path: Pa
     file.write_text("nef: {token: hunter2\n  x: [")
 
     with pytest.raises(SettingsError) as caught:
-        load_settings(file)
+        load_settings(file, settings_types())
 
     assert str(caught.value).startswith(f"cannot read settings {str(file)!r}: no YAML at line 2")
     assert "hunter2" not in str(caught.value)
@@ -112,7 +118,7 @@ def test_text_that_is_no_yaml_is_not_quoted_for_it_may_hold_a_token(tmp_path: Pa
 
 def test_a_file_that_is_not_there_is_one_clear_error() -> None:
     with pytest.raises(SettingsError) as caught:
-        load_settings("/nowhere/targets.yaml")
+        load_settings("/nowhere/targets.yaml", settings_types())
 
     assert str(caught.value) == (
         "cannot read settings '/nowhere/targets.yaml': No such file or directory"
@@ -166,7 +172,7 @@ def test_options_that_do_not_name_a_network_are_refused(
     options: dict[str, str], message: str
 ) -> None:
     with pytest.raises(UsageError) as caught:
-        TargetOptions(**options)
+        read_targets([options["kind"]], {})
 
     assert str(caught.value) == message
 
@@ -175,7 +181,7 @@ def test_settings_of_another_kind_are_refused(tmp_path: Path) -> None:
     file = settings_file(tmp_path, camara=camara_settings("https://x.example/qod"))
 
     with pytest.raises(SettingsError) as caught:
-        Targets(ledger_in(tmp_path)).make(TargetOptions(kind="nef", settings=file))
+        target_kind("nef").read({"config": file}).open(Targets(ledger_in(tmp_path)))
 
     assert str(caught.value) == f"cannot program nef: settings {file!r} have no key 'nef'"
 
@@ -185,10 +191,11 @@ def test_what_a_ledger_lists_is_not_looked_for_at_another_server(tmp_path: Path)
     targets = Targets(ledger_in(tmp_path))
 
     there = "https://one.example/3gpp-as-session-with-qos/v1/robots"
-    targets.restore(TargetRecord(target="nef", scope=there, settings=file))
+    record = TargetRecord(target="nef", scope=there, settings=file)
+    target_kind("nef").restore(record, targets)
     Path(file).write_text(json.dumps({"nef": nef_settings("https://two.example")}))
     with pytest.raises(SettingsError) as caught:
-        targets.restore(TargetRecord(target="nef", scope=there, settings=file))
+        target_kind("nef").restore(record, targets)
     targets.close()
 
     assert str(caught.value) == (
@@ -202,8 +209,7 @@ def test_the_settings_in_the_documentation_can_be_used(tmp_path: Path) -> None:
     file = tmp_path / "targets.yaml"
     file.write_text(page.read_text(encoding="utf-8").split("```yaml\n")[1].split("```")[0])
 
-    settings = load_settings(file)
+    settings = load_settings(file, settings_types())
 
-    assert settings.nef is not None
-    assert settings.camara is not None
-    assert settings.camara.token == Token(file=str(tmp_path / "camara.token"))
+    assert set(settings.servers) == {"nef", "camara"}
+    assert settings.servers["camara"].token == Token(file=str(tmp_path / "camara.token"))

@@ -8,14 +8,16 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.programming.apply.changes import ChangeKind, FlowChange, TargetChanges
-from lifecycle.programming.apply.errors import (
+from lifecycle.programming.apply.target import (
+    ChangeKind,
+    FlowChange,
     MissingFeatureError,
     PrivilegeError,
     ProgrammingError,
+    TargetChanges,
 )
-from lifecycle.programming.apply.nft import NftTarget
-from lifecycle.programming.apply.tc import parse_queue, parse_rate, probe_features
+from lifecycle.programming.apply.targets.nft import NftTarget
+from lifecycle.programming.apply.targets.tc import parse_queue, parse_rate, probe_features
 from lifecycle.programming.apply.tool import HostTool, ToolOutput, demand
 from tests.unit.programming.apply.fakes import FakeTool, failed
 from tests.unit.programming.apply.samples import ledger_in, rule

@@ -9,10 +9,10 @@ import xml.etree.ElementTree as ET
 
 import pytest
 
-from lifecycle.programming.rules import EXPORTS, ExportSettings, export_input, flows_to_csv
 from lifecycle.programming.rules.camara import CamaraSettings
 from lifecycle.programming.rules.fastdds_pro import render_fastdds_pro
 from lifecycle.programming.rules.nef import NefSettings
+from lifecycle.programming.rules.registry import EXPORTS, ExportSettings, export_input, flows_to_csv
 from lifecycle.programming.rules.tc import TcSettings
 from lifecycle.programming.rules.zenoh import render_zenoh, zenoh_endpoint
 from tests.unit.programming.rules.samples import EXPECTED, LEFT_OUT, RULES, VIDEO, plan, report

@@ -6,21 +6,22 @@ Owns: when the table is written, and whose it is. Its contents are `rules.nftabl
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
-from lifecycle.programming.apply.changes import (
+from lifecycle.errors import UsageError
+from lifecycle.programming.apply.ledger import Entry, Ledger, TargetRecord, digest_of
+from lifecycle.programming.apply.target import (
     ChangeKind,
     FlowChange,
+    NotOursError,
+    PrivilegeError,
+    ProgrammingError,
     TargetChanges,
     deletions,
     describe_rule,
 )
-from lifecycle.programming.apply.errors import (
-    NotOursError,
-    PrivilegeError,
-    ProgrammingError,
-)
-from lifecycle.programming.apply.ledger import Entry, Ledger, TargetRecord, digest_of
+from lifecycle.programming.apply.targets.registry import TargetOptions, Targets
 from lifecycle.programming.apply.tool import HostTool, Tool, demand, failure, qdiscs_of
 from lifecycle.programming.rules.nftables import (
     FAMILY,
@@ -263,3 +264,29 @@ def _marking(rules: Sequence[FlowRule]) -> tuple[tuple[FlowRule, ...], tuple[str
 def _steady(listing: str) -> str:
     """A listing without what changes by itself: counters."""
     return _COUNTS.sub("counter", listing)
+
+
+class NftOptions(TargetOptions):
+    """It needs none."""
+
+    kind = KIND
+
+    @classmethod
+    def read(cls, given: Mapping[str, Any]) -> NftOptions:  # noqa: ARG003 - TargetOptions
+        """Take none."""
+        return cls()
+
+    @classmethod
+    def restore(cls, record: TargetRecord, means: Targets) -> NftTarget:  # noqa: ARG003 - likewise
+        """Return the table of the ledger's system."""
+        return cls().open(means)
+
+    def open(self, means: Targets) -> NftTarget:
+        """Return the table of the ledger's system."""
+        try:
+            return NftTarget(means.ledger.system, means.ledger, means.tool)
+        except ValueError as error:
+            raise UsageError(str(error)) from error
+
+
+TARGET = NftOptions

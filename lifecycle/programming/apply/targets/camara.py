@@ -9,12 +9,14 @@ from __future__ import annotations
 import datetime as dt
 from collections.abc import Sequence
 
-from lifecycle.programming.apply.errors import HttpError
+import msgspec
+
 from lifecycle.programming.apply.http import Api, Fields, as_segment, show, text_of
 from lifecycle.programming.apply.ledger import Entry
-from lifecycle.programming.apply.remote import Body, Made, RemoteRequest, asks_of
-from lifecycle.programming.apply.settings import CamaraTargetSettings
-from lifecycle.programming.rules.camara import camara_sessions
+from lifecycle.programming.apply.remote import Body, Made, RemoteRequest, ServerOptions, asks_of
+from lifecycle.programming.apply.settings import ServerSettings
+from lifecycle.programming.apply.target import HttpError
+from lifecycle.programming.rules.camara import CamaraSettings, camara_sessions
 from lifecycle.programming.rules.rules import FlowRule
 
 KIND = "camara"
@@ -34,6 +36,35 @@ _STATUSES = ("REQUESTED", "AVAILABLE", "UNAVAILABLE")
 
 _LONGEST_S = 2**31 - 1
 """Largest `duration`, an int32."""
+
+
+class CamaraTargetSettings(ServerSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How to reach a CAMARA QualityOnDemand 1.1.0 interface and what to ask it for.
+
+    Attributes:
+        url: everything before `/sessions`.
+        devices, qos_profiles, default_qos_profile, duration_s, sink, public_addresses,
+            device_by_token: see rules.camara.CamaraSettings.
+        wait_s: how long a session may take to become available; 0 does not wait.
+    """
+
+    devices: tuple[str, ...]
+    qos_profiles: dict[int, str] = msgspec.field(default_factory=dict)
+    default_qos_profile: str = ""
+    duration_s: int = 3600
+    sink: str = ""
+    public_addresses: dict[str, str] = msgspec.field(default_factory=dict)
+    device_by_token: bool = False
+    wait_s: float = 10.0
+
+    def asked(self) -> CamaraSettings:
+        """Return what goes into bodies.
+
+        Raises:
+            ValueError: a value is not allowed.
+        """
+        asked: CamaraSettings = self.part(CamaraSettings)
+        return asked
 
 
 class CamaraService:
@@ -217,3 +248,23 @@ def _plain_fraction(text: str) -> str:
     head, dot, rest = text.partition(".")
     digits = len(rest) - len(rest.lstrip("0123456789"))
     return f"{head}.{rest[:digits][:6]:0<6}{rest[digits:]}" if dot else text
+
+
+class CamaraOptions(ServerOptions[CamaraTargetSettings]):
+    """A QualityOnDemand interface."""
+
+    kind = KIND
+    settings_type = CamaraTargetSettings
+
+    @classmethod
+    def url(cls, settings: CamaraTargetSettings) -> str:
+        """Return what precedes `/sessions`."""
+        return settings.url.rstrip("/")
+
+    @classmethod
+    def service(cls, settings: CamaraTargetSettings, api: Api) -> CamaraService:
+        """Return what asks it."""
+        return CamaraService(settings, api)
+
+
+TARGET = CamaraOptions

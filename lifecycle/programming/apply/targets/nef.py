@@ -6,10 +6,12 @@ server's view of a subscription is compared with ours. Bodies are `rules.nef`.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from lifecycle.programming.apply.errors import HttpError
+import msgspec
+
 from lifecycle.programming.apply.http import (
     MERGE_PATCH,
     Api,
@@ -19,9 +21,10 @@ from lifecycle.programming.apply.http import (
     text_of,
 )
 from lifecycle.programming.apply.ledger import Entry
-from lifecycle.programming.apply.remote import Body, Made, RemoteRequest, asks_of
-from lifecycle.programming.apply.settings import NefTargetSettings
-from lifecycle.programming.rules.nef import nef_subscriptions
+from lifecycle.programming.apply.remote import Body, Made, RemoteRequest, ServerOptions, asks_of
+from lifecycle.programming.apply.settings import ServerSettings
+from lifecycle.programming.apply.target import HttpError
+from lifecycle.programming.rules.nef import NefSettings, UplinkFilter, nef_subscriptions
 from lifecycle.programming.rules.packet_filter import parse_filter
 from lifecycle.programming.rules.rules import FlowRule
 
@@ -34,6 +37,42 @@ _COMPARED = ("ueIpv4Addr", "ueIpv6Addr", "qosReference", "notificationDestinatio
 
 _NO_PATCH = (404, 405, 415, 501)
 """Statuses of servers without PATCH."""
+
+
+class NefTargetSettings(ServerSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How to reach a 3GPP NEF and what to ask it for (TS 29.122, release 17).
+
+    Attributes:
+        url: API root, before `/3gpp-as-session-with-qos/v1`.
+        scs_as_id: who we are to the operator.
+        notification_destination, devices, qos_references, default_qos_reference,
+            supported_features, protocol_by_name, uplink: see rules.nef.NefSettings.
+    """
+
+    scs_as_id: str
+    notification_destination: str
+    devices: tuple[str, ...]
+    qos_references: dict[int, str] = msgspec.field(default_factory=dict)
+    default_qos_reference: str = ""
+    supported_features: str = "0"
+    protocol_by_name: bool = False
+    uplink: UplinkFilter = UplinkFilter.IN
+
+    def check(self) -> None:
+        """Refuse an id that is no segment of a path."""
+        if not re.fullmatch(r"[A-Za-z0-9._~-]+", self.scs_as_id):
+            raise ValueError(
+                f"cannot use scs_as_id {self.scs_as_id!r}; use letters, digits and . _ ~ -"
+            )
+
+    def asked(self) -> NefSettings:
+        """Return what goes into bodies.
+
+        Raises:
+            ValueError: a value is not allowed.
+        """
+        asked: NefSettings = self.part(NefSettings)
+        return asked
 
 
 def nef_scope(settings: NefTargetSettings) -> str:
@@ -191,3 +230,23 @@ def _spelled(text: str) -> str:
         return parse_filter(" ".join(text.split())).text()
     except ValueError:
         return text
+
+
+class NefOptions(ServerOptions[NefTargetSettings]):
+    """A NEF."""
+
+    kind = KIND
+    settings_type = NefTargetSettings
+
+    @classmethod
+    def url(cls, settings: NefTargetSettings) -> str:
+        """Return the URL of our collection of subscriptions."""
+        return nef_scope(settings)
+
+    @classmethod
+    def service(cls, settings: NefTargetSettings, api: Api) -> NefService:
+        """Return what asks it."""
+        return NefService(settings, api)
+
+
+TARGET = NefOptions

@@ -9,21 +9,22 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
-from lifecycle.programming.apply.changes import (
+from lifecycle.errors import UsageError
+from lifecycle.programming.apply.ledger import Entry, Ledger, TargetRecord, digest_of
+from lifecycle.programming.apply.target import (
     ChangeKind,
     FlowChange,
+    MissingFeatureError,
+    NotOursError,
+    ProgrammingError,
     TargetChanges,
     deletions,
     describe_rule,
 )
-from lifecycle.programming.apply.errors import (
-    MissingFeatureError,
-    NotOursError,
-    ProgrammingError,
-)
-from lifecycle.programming.apply.ledger import Entry, Ledger, TargetRecord, digest_of
+from lifecycle.programming.apply.targets.registry import TargetOption, TargetOptions, Targets
 from lifecycle.programming.apply.tool import (
     HostTool,
     Tool,
@@ -35,6 +36,7 @@ from lifecycle.programming.apply.tool import (
 from lifecycle.programming.rules.rules import FlowRule, rules_digest
 from lifecycle.programming.rules.tc import (
     CLASSIFIERS,
+    DEFAULT_QUEUE_MS,
     OWNED_HANDLE,
     QDISCS,
     TcFeatures,
@@ -465,3 +467,89 @@ def _without(stale: Iterable[Entry], entries: Iterable[Entry]) -> tuple[Entry, .
     """The entries whose key no new entry has."""
     keys = {each.key for each in entries}
     return tuple(each for each in stale if each.key not in keys)
+
+
+class TcOptions(TargetOptions):
+    """The options of one device.
+
+    Args:
+        settings: read from them.
+    """
+
+    kind = KIND
+    hint = "give --device eth0"
+    takes = (
+        TargetOption(flag="--device", metavar="DEV", help="tc: the device, eth0."),
+        TargetOption(flag="--rate", metavar="RATE", help="tc: rate of the link behind it, 20mbit."),
+        TargetOption(
+            flag="--guarantee",
+            metavar="CLASS=RATE",
+            multiple=True,
+            help="tc: rate of a class, ef=2mbit; above its burst peak.",
+        ),
+        TargetOption(
+            flag="--queue",
+            metavar="TIME",
+            needs="rate",
+            why="how long it is follows from both",
+            help="tc: how long the queue of a class may become at that rate; else 50ms.",
+        ),
+        TargetOption(
+            flag="--match",
+            choices=("flow", "mark"),
+            default="flow",
+            help="tc: look at 5-tuples, or at what is marked.",
+        ),
+    )
+
+    def __init__(self, settings: TcSettings) -> None:
+        self.settings = settings
+
+    @classmethod
+    def read(cls, given: Mapping[str, Any]) -> TcOptions:
+        """Read rates, times and classes."""
+        rate, queue = given.get("rate"), given.get("queue")
+        try:
+            link_kbit = parse_rate(rate) if rate else None
+            queue_ms = parse_queue(queue) if queue else DEFAULT_QUEUE_MS
+            guaranteed = map(_guarantee, given.get("guarantee", ()))
+            guaranteed_kbit = {name: parse_rate(text) for name, text in guaranteed}
+            device = given.get("device")
+            if not device:
+                raise UsageError(
+                    "cannot program tc without a device; only devices that are named are touched",
+                    hint=cls.hint,
+                )
+            settings = TcSettings(
+                device=device,
+                link_kbit=link_kbit,
+                guaranteed_kbit=guaranteed_kbit,
+                match=TcMatch(given.get("match", TcMatch.FLOW.value)),
+                queue_ms=queue_ms,
+            )
+        except ValueError as error:
+            raise UsageError(str(error)) from error
+        return cls(settings)
+
+    @classmethod
+    def restore(cls, record: TargetRecord, means: Targets) -> TcTarget:
+        """Return the device of a record."""
+        return cls(TcSettings(device=record.scope)).open(means)
+
+    def open(self, means: Targets) -> TcTarget:
+        """Return the device."""
+        return TcTarget(means.ledger.system, self.settings, means.ledger, means.tool)
+
+    def exported(self) -> Mapping[str, Any]:
+        """Return the settings of the device."""
+        return {self.kind: self.settings}
+
+
+def _guarantee(text: str) -> tuple[str, str]:
+    name, equals, rate = text.partition("=")
+    if not (name and equals and rate):
+        raise ValueError(f"cannot read guarantee {text!r}; write CLASS=RATE, ef=2mbit")
+    return name, rate
+
+
+TARGET = TcOptions

@@ -1,0 +1,1 @@
+"""Networks that can be programmed, one module each; registry.py lists them."""

@@ -1,0 +1,171 @@
+"""Which endpoints have unique network flow endpoints, by what nodes report. Pure.
+
+For uniqueness the endpoints that nodes report are compared. An endpoint that no node reports lives
+in another process, and it cannot share one of these NFEs: a UDP or TCP port belongs to one process
+of a host (bind(2), EADDRINUSE), and another host has other addresses. So unknown NFEs make an
+answer unknown only inside one process. Where the manifest declares the address of a machine, the
+NFEs on that address are judged: it is by this one that flows between machines go.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
+from typing import Protocol
+
+from lifecycle.manifest import EndpointKind
+from lifecycle.network import (
+    InternetProtocol,
+    LocatedNfe,
+    NetworkFlowEndpoint,
+    TransportProtocol,
+    canonical,
+    dissimilar,
+    is_ip,
+    is_multicast,
+    is_wildcard,
+    located,
+)
+from lifecycle.verify.observation import EndpointReport, NodeConfiguration
+
+_SIDES = (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION)
+_SEVERAL = -1
+"""Instead of the one endpoint that has an NFE."""
+
+_Bucket = tuple[EndpointKind, InternetProtocol, TransportProtocol, int]
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class _Entry:
+    """One endpoint.
+
+    Attributes:
+        nfes: all that it reports; None if they are not known.
+        judged: those of them that count.
+    """
+
+    report: EndpointReport
+    process: tuple[str, int]
+    nfes: tuple[LocatedNfe, ...] | None
+    judged: tuple[LocatedNfe, ...] | None
+
+
+class ReportedEnd(Protocol):
+    """An endpoint with what its node reports of it."""
+
+    @property
+    def report(self) -> EndpointReport | None:
+        """The report; None if there is none."""
+
+
+class Uniqueness:
+    """Answers for every reported endpoint whether it is unique; built once per judgement."""
+
+    def __init__(
+        self,
+        configurations: Iterable[NodeConfiguration],
+        addresses: Mapping[str, str] = MappingProxyType({}),
+    ) -> None:
+        """Collect what nodes report.
+
+        Args:
+            configurations: of every node.
+            addresses: declared address of each node's machine, by full node name.
+        """
+        self._entries: dict[int, _Entry] = {}
+        # NFEs with another port or protocol are dissimilar whatever else they hold, so only those
+        # of one bucket are ever compared: judging grows with the endpoints, not with their square.
+        # Endpoints of one participant have the same NFEs, so each is kept once, with whose it is.
+        self._buckets: dict[_Bucket, dict[LocatedNfe, int]] = {}
+        self._unknown: set[tuple[EndpointKind, tuple[str, int]]] = set()
+        self._answers: dict[int, bool | None] = {}
+        for configuration in configurations:
+            for report in configuration.endpoints:
+                if report.kind in _SIDES and not report.error:
+                    self._add(configuration, report, addresses.get(configuration.name, ""))
+
+    def _add(self, configuration: NodeConfiguration, report: EndpointReport, address: str) -> None:
+        identity = configuration.identity
+        nfes = located(
+            report.nfes,
+            identity.machine_id,
+            dscp=report.dscp if report.kind is EndpointKind.PUBLISHER else None,
+        )
+        entry = _Entry(
+            report=report,
+            process=(identity.machine_id, identity.process_id),
+            nfes=nfes,
+            judged=None if nfes is None else _that_count(nfes, address),
+        )
+        self._entries[id(report)] = entry
+        if entry.judged is None:
+            self._unknown.add((report.kind, entry.process))
+            return
+        for each in entry.judged:
+            if is_ip(each):
+                owners = self._buckets.setdefault(_bucket(report.kind, each), {})
+                if owners.setdefault(each, id(entry)) != id(entry):
+                    owners[each] = _SEVERAL
+
+    def nfes(self, ends: Sequence[ReportedEnd]) -> tuple[NetworkFlowEndpoint, ...]:
+        """Return the NFEs of endpoints, each once, with the DSCP that was read back."""
+        entries = (self._entries.get(id(end.report)) for end in ends)
+        found = (each.nfe for entry in entries if entry for each in entry.nfes or ())
+        return tuple(dict.fromkeys(found))
+
+    def is_unique(self, end: ReportedEnd) -> bool | None:
+        """Return whether an endpoint is unique; None when its NFEs are not known."""
+        key = id(end.report)
+        entry = self._entries.get(key)
+        if entry is None:
+            return None
+        if key not in self._answers:
+            self._answers[key] = self._judge(entry)
+        return self._answers[key]
+
+    def all_unique(self, ends: Sequence[ReportedEnd]) -> bool | None:
+        """Return whether each of several endpoints is unique; False if one is certainly not."""
+        answers = [self.is_unique(end) for end in ends]
+        if False in answers:
+            return False
+        return None if None in answers or not answers else True
+
+    def _judge(self, entry: _Entry) -> bool | None:
+        if entry.judged is None:
+            return None
+        kind, me = entry.report.kind, id(entry)
+        own = [each for each in entry.judged if is_ip(each)]
+        for each in own:
+            owners = self._buckets[_bucket(kind, each)]
+            if owners[each] == _SEVERAL or not all(
+                owner == me or dissimilar(each, other) for other, owner in owners.items()
+            ):
+                return False
+        if not own:
+            return False  # as in `is_unique_endpoint`
+        return None if (kind, entry.process) in self._unknown else True
+
+
+def _that_count(nfes: tuple[LocatedNfe, ...], address: str) -> tuple[LocatedNfe, ...]:
+    """Return the NFEs on the address that the machine is declared to have; all if none is.
+
+    A host has addresses that lead nowhere outside, and many hosts have the same: each container
+    bridge is 172.17.0.1. Two endpoints on two of them do not share a flow. Wildcards and groups
+    count as the declared address too.
+    """
+    wanted = canonical(address)
+    found = tuple(
+        each
+        for each in nfes
+        if is_wildcard(each.nfe.internet_address)
+        or is_multicast(each.nfe.internet_address)
+        or canonical(each.nfe.internet_address) == wanted
+    )
+    unicast = any(not is_multicast(each.nfe.internet_address) for each in found)
+    return found if address and unicast else nfes
+
+
+def _bucket(kind: EndpointKind, located_nfe: LocatedNfe) -> _Bucket:
+    nfe = located_nfe.nfe
+    return (kind, nfe.internet_protocol, nfe.transport_protocol, nfe.transport_port)
