@@ -248,7 +248,6 @@ def parts() -> dict[str, tuple[float, int]]:
     from std_msgs.msg import String
     from std_srvs.srv import Trigger
 
-    from lifecycle.graph import DdsTransport
     from lifecycle.middleware import AlivePublisher
 
     rclpy.init()
@@ -258,7 +257,6 @@ def parts() -> dict[str, tuple[float, int]]:
         "publisher": lambda i: node.create_publisher(String, f"out_{i}", 10),
         "subscription": lambda i: node.create_subscription(String, f"in_{i}", print, 10),
         "timer": lambda _: node.create_timer(1.0, print),
-        "graph member (data_layer.events)": lambda _: DdsTransport(node),
         "liveliness (runs alone)": lambda i: AlivePublisher(node, f"/alive_{i}"),
     }
     kept, found = [], {}

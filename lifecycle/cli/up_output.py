@@ -1,13 +1,11 @@
 """Output of `lifecycle up`: JSON lines, plain lines, or a live table on a terminal.
 
-Owns: the choice between them, the two line formats, and the live table: log lines and notices
-scroll above it; it shows each node's process, state, matched endpoints and flows, and is drawn
-again at every event. Everything comes from the supervisor's events.
+Owns: the choice between them and the two line formats. Everything comes from the supervisor's
+events.
 """
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import functools
 import json
@@ -19,11 +17,6 @@ from pathlib import Path
 from typing import Protocol
 
 import click
-from rich import box
-from rich.console import Console, Group, RenderableType
-from rich.live import Live as RichLive
-from rich.table import Table
-from rich.text import Text
 
 from lifecycle.cli.standard_streams import Writer
 from lifecycle.node import Operation
@@ -37,7 +30,6 @@ from lifecycle.supervisor import (
     NodeAlive,
     NodeChanged,
     NodeSilent,
-    NodeStatus,
     Notice,
     ProcessChanged,
     ProcessState,
@@ -102,6 +94,8 @@ def output(format_: str, timings_until: str = "") -> Iterator[RunOutput]:
             if format_ == "json":
                 shown = JsonLines(writer)
             elif sys.stdout.isatty():
+                from lifecycle.cli.live_view import Live  # rich, which nothing else needs
+
                 shown = stack.enter_context(Live(writer=writer))
             else:
                 shown = PlainLines(writer)
@@ -452,167 +446,3 @@ def verdict_line(verdict: Verdict) -> str:
 def _count(number: int, noun: str) -> str:
     ending = "" if number == 1 else "es" if noun.endswith("s") else "s"
     return f"{number} {noun}{ending}"
-
-
-_REDRAW_S = 0.04
-"""At most 25 times a second, however many events there are."""
-
-_PHASES = ("connecting", "verifying", "activating", "active")
-_OUTCOMES = {Outcome.OK: "green", Outcome.VIOLATED: "red", Outcome.UNVERIFIABLE: "yellow"}
-_STATES = {"active": "bold green", "inactive": "cyan", "finalized": "dim", "": "dim"}
-_PROCESS = {"running": "green", "starting": "yellow", "stopping": "yellow", "exited": "dim"}
-_PROCESS_COLOURS = ("cyan", "magenta", "blue", "green", "yellow", "bright_black")
-
-
-class Live:
-    """A listener that draws; use it in a `with`.
-
-    Nothing is drawn while the terminal is stopped (Ctrl-S): log lines are counted then, and the
-    table is drawn as it is once there is room again.
-
-    Args:
-        console: None for one on `writer`.
-        writer: of the terminal; None where nothing stops.
-    """
-
-    def __init__(self, console: Console | None = None, *, writer: Writer | None = None) -> None:
-        self._writer = writer
-        file = None if writer is None else writer.stream()
-        self._console = console or Console(file=file, highlight=False)
-        self._missed = 0
-        self._skipped = False
-        self._live = RichLive(console=self._console, auto_refresh=False, transient=False)
-        self._status: Callable[[], SystemStatus] | None = None
-        self._verdict = ""
-        self._drawn_s = 0.0
-        self._processes: list[str] = []
-        self._rollback = Rollback()
-
-    def __enter__(self) -> Live:  # noqa: PYI034 - typing.Self is not in Python 3.10
-        self._live.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._live.stop()
-
-    def watch(self, status: Callable[[], SystemStatus]) -> None:
-        """Take the way to ask for what the table shows."""
-        self._status = status
-        if self._writer is not None:
-            loop = asyncio.get_running_loop()
-            self._writer.on_room = lambda: _soon(loop, self._catch_up)
-        self._draw()
-
-    def __call__(self, event: Event) -> None:
-        """Show one event."""
-        hidden = self._rollback.hides(event)
-        if isinstance(event, VerdictChanged):
-            self._verdict = verdict_line(event.verdict)
-        elif isinstance(event, LogLine):
-            if self._is_behind:
-                self._missed += 1
-            elif not hidden:
-                self._console.print(self._log_line(event))
-        elif not isinstance(event, NodeChanged | ProcessChanged) and (line := describe(event)):
-            style = "red" if isinstance(event, Failure) else "dim"
-            self._console.print(Text(line, style=style))
-        now_s = time.monotonic()
-        urgent = isinstance(event, SystemReached | Stopping | Stopped | Failure)
-        if urgent or now_s - self._drawn_s >= _REDRAW_S:
-            self._drawn_s = now_s
-            self._draw()
-
-    def finish(self, result: UpResult) -> None:
-        """Show the verdict below the last table."""
-        self._draw()
-        self._live.stop()
-        flows = result.verdict.verdict is not Outcome.VIOLATED
-        text = render_text(result.verdict, flows=flows, width=self._console.width)
-        style = _OUTCOMES[result.verdict.verdict]
-        head, _, rest = text.partition("\n")
-        self._console.print(Text(head, style=f"bold {style}"))
-        if rest.strip():
-            self._console.print(Text(rest.rstrip("\n")))
-        if self._writer is not None:
-            self._writer.close()
-
-    @property
-    def _is_behind(self) -> bool:
-        return self._writer is not None and self._writer.is_behind
-
-    def _catch_up(self) -> None:
-        """Draw what was not drawn while the terminal was behind."""
-        if self._skipped or self._missed:
-            self._draw()
-
-    def _draw(self) -> None:
-        self._skipped = self._is_behind
-        if self._skipped:
-            return
-        missed, self._missed = self._missed, 0
-        if missed:
-            text = f"{missed} log lines are missing here: the terminal was stopped"
-            self._console.print(Text(text, style="dim"))
-        if self._status is not None:
-            self._live.update(self._picture(self._status()), refresh=True)
-
-    def _picture(self, status: SystemStatus) -> RenderableType:
-        table = Table(box=box.SIMPLE_HEAD, pad_edge=False, header_style="bold")
-        for column in ("node", "process", "state", "matched", "unique flows", ""):
-            table.add_column(column, no_wrap=column != "")
-        for node in status.nodes:
-            table.add_row(*_row(node))
-        style = "white" if status.verdict is None else _OUTCOMES[status.verdict]
-        return Group(_head(status), table, Text(self._verdict, style=style))
-
-    def _log_line(self, event: LogLine) -> Text:
-        if event.process not in self._processes:
-            self._processes.append(event.process)
-        index = self._processes.index(event.process) % len(_PROCESS_COLOURS)
-        return Text.assemble((f"[{event.process}] ", _PROCESS_COLOURS[index]), log_line(event.line))
-
-
-def _soon(loop: asyncio.AbstractEventLoop, call: Callable[[], None]) -> None:
-    with contextlib.suppress(RuntimeError):  # closed: the last is drawn without it
-        loop.call_soon_threadsafe(call)
-
-
-def _head(status: SystemStatus) -> Text:
-    """The pipeline, with the phase that the system is in."""
-    head = Text.assemble(
-        (one_line(status.system), "bold"),
-        (f"  domain {status.domain_id}  {status.elapsed_s:.1f} s   ", "dim"),
-    )
-    reached = status.phase in _PHASES
-    for index, phase in enumerate(_PHASES):
-        done = reached and index < _PHASES.index(status.phase)
-        now = phase == status.phase
-        style = "bold green" if now and phase == "active" else "bold yellow" if now else "dim"
-        head.append(" ▸ " if index else "", "dim")
-        head.append(phase, "green" if done else style)
-    if not reached:
-        head.append(f"   {one_line(status.phase)}", "bold yellow")
-    return head
-
-
-def _row(node: NodeStatus) -> tuple[RenderableType, ...]:
-    if node.process_state is None:
-        process = Text("not ours", style="dim")
-    else:
-        word = node.process_state.value
-        process = Text(f"{word} {node.pid or ''}".strip(), style=_PROCESS.get(word, ""))
-    nested = " · connected" if node.state == "inactive" and node.matched else ""
-    state = node.state if node.managed else node.reach.value
-    state = "dead" if node.died else state
-    complete = "green" if node.matched >= node.endpoints else "yellow"
-    return (
-        Text(one_line(node.node), style="red" if node.findings else "bold"),
-        process,
-        Text(
-            f"{one_line(state) or '–'}{nested}",
-            style="red" if node.died else _STATES.get(node.state, "yellow"),
-        ),
-        Text(f"{node.matched}/{node.endpoints}", style=complete if node.endpoints else "dim"),
-        Text(f"{node.unique_flows}/{node.flows}" if node.flows else "–", style="dim"),
-        Text(one_line(node.died or node.doing), style="red" if node.died else "yellow"),
-    )

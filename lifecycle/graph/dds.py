@@ -11,7 +11,7 @@ import logging
 import threading
 import typing
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rclpy.callback_groups import CallbackGroup, MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
@@ -23,8 +23,10 @@ from rclpy.subscription import Subscription
 from std_msgs.msg import String
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.graph.scheduler import Remove
 from lifecycle.verify import GRAPH_TOPIC
+
+if TYPE_CHECKING:  # it imports asyncio, which a node that only reports has no use for
+    from lifecycle.graph.scheduler import Remove
 
 _logger = logging.getLogger(__name__)
 

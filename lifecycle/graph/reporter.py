@@ -10,7 +10,7 @@ import logging
 import threading
 import typing
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from lifecycle.errors import LifecycleError
 from lifecycle.graph.messages import (
@@ -30,8 +30,10 @@ from lifecycle.graph.messages import (
     encode,
     new_incarnation,
 )
-from lifecycle.graph.scheduler import Remove
 from lifecycle.graph.transport import GraphTransport
+
+if TYPE_CHECKING:  # it imports asyncio, which a node that only reports has no use for
+    from lifecycle.graph.scheduler import Remove
 
 _logger = logging.getLogger(__name__)
 

@@ -11,9 +11,10 @@ from __future__ import annotations
 import random
 import typing
 from collections.abc import Callable, Iterable
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
-from lifecycle.graph.scheduler import Remove, Scheduler
+if TYPE_CHECKING:  # it imports asyncio, which a node that only reports has no use for
+    from lifecycle.graph.scheduler import Remove, Scheduler
 
 
 class GraphTransport(Protocol):

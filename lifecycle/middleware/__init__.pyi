@@ -17,6 +17,7 @@ from .fastdds.nfe import has_shared_memory as has_shared_memory
 from .fastdds.participant import FlowParticipant as FlowParticipant
 from .fastdds.participant_profile import ParticipantSettings as ParticipantSettings
 from .fastdds.profiles import discovery_environment as discovery_environment
+from .fastdds.settings import once_participant_is_made as once_participant_is_made
 from .fastdds.settings import participant_settings as participant_settings
 from .process.busy_timer import BusySign as BusySign
 from .process.busy_timer import Overdue as Overdue

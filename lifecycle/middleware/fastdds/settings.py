@@ -25,9 +25,10 @@ import functools
 import hashlib
 import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
+import rclpy.node
 from rclpy.context import Context
 from rclpy.utilities import get_rmw_implementation_identifier
 
@@ -342,6 +343,31 @@ def _discovery(context: Context) -> Any:
 
 _RMW = "rmw_fastrtps_cpp"
 _SERVER_VARIABLE = "ROS_DISCOVERY_SERVER"
+
+
+@contextlib.contextmanager
+def once_participant_is_made(call: Callable[[], None]) -> Iterator[None]:
+    """Call this when the next node's participant is there, and nothing of the node but its name.
+
+    rclpy makes services, publishers and subscriptions of a node after rcl has made the node.
+
+    Args:
+        call: blocks the constructor of the first node that is made in the block, in its thread.
+    """
+    library = rclpy.node._rclpy  # noqa: SLF001 - there is no other moment
+    made = library.Node
+
+    def make(*args: Any, **kwargs: Any) -> Any:
+        library.Node = made
+        node = made(*args, **kwargs)
+        call()
+        return node
+
+    library.Node = make
+    try:
+        yield
+    finally:
+        library.Node = made
 
 
 @contextlib.contextmanager

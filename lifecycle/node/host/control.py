@@ -56,6 +56,8 @@ class Operation(enum.Enum):
     # announce to the graph anew which nodes are here.
     SEND_AGAIN_SOON = "send_again_soon"
     TELL_NAMES = "tell_names"
+    # The one that is not answered: the participants of all are there, make endpoints.
+    PROCEED = "proceed"
 
 
 INTERFACE_ON_DEMAND = ("alias", "connect_to", "disconnect", "remap")
@@ -66,13 +68,18 @@ another way to do the same. `map_to` is always there: with it a node is known to
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class HostSpec:
-    """First line from the supervisor: what this process hosts."""
+    """First line from the supervisor: what this process hosts.
+
+    Attributes:
+        gathers: make the participant, report it, and make no endpoint before `PROCEED`.
+    """
 
     system: str
     process: str
     domain_id: int
     discovery_range: DiscoveryRange
     nodes: tuple[PlannedNode, ...]
+    gathers: bool = False
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -99,10 +106,11 @@ class Event:
     """Host → supervisor; exactly one of the groups below is set.
 
     Attributes:
-        kind: "ready" (all nodes constructed, executor spinning), "failed" (construction failed;
-            `error` says why, the process exits), "state" (a node's state changed), "reply",
-            "beat" (the executor has returned from a callback that took too long),
-            "configuration" (it changed: endpoints, connections, mappings or matches).
+        kind: "participant" (it is made, and waits for PROCEED), "ready" (all nodes constructed,
+            executor spinning), "failed" (construction failed; `error` says why, the process exits),
+            "state" (a node's state changed), "reply", "beat" (the executor has returned from a
+            callback that took too long), "configuration" (it changed: endpoints, connections,
+            mappings or matches).
         id: the Command's id, for "reply".
         ok: the operation succeeded, for "reply".
         state: lifecycle_msgs/State label after it.

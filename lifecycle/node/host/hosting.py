@@ -29,6 +29,7 @@ from lifecycle.middleware import (
     BusySign,
     ParticipantSettings,
     leave_and_exit,
+    once_participant_is_made,
     participant_settings,
     send_again_soon,
 )
@@ -243,6 +244,9 @@ _NODE_INTERFACE = {
 }
 
 
+_GATHER_S = 15.0
+"""The supervisor says far sooner that all participants are there, or waits no more."""
+
 _LEAVE_S = 0.5
 """For the participants of nodes that were constructed while another's module is imported."""
 
@@ -262,6 +266,7 @@ class Host:
         self._lock = threading.Lock()
         self._imports = False
         self._ended = False
+        self._proceed = threading.Event()
         self._nodes: dict[str, LifecycleNode] = {}
         self._commands = HostCommands(
             self._nodes,
@@ -280,9 +285,12 @@ class Host:
             participants = Participants(self._context)
             for index, planned in enumerate(self._spec.nodes):
                 failure: Exception | None = None
+                first = self._spec.gathers and index == 0
                 try:
                     node_class = self._import(planned)
-                    with participants.carrying(planned) as context:
+                    with participants.carrying(planned) as context, contextlib.ExitStack() as stack:
+                        if first:
+                            stack.enter_context(once_participant_is_made(self._gather))
                         node = construct(planned, node_class, context, self._spec.system)
                         self._add(planned, node)
                 except Exception as error:  # noqa: BLE001 - reported to the supervisor
@@ -293,6 +301,17 @@ class Host:
             self._loop.call_soon(self._ready)
             self._loop.spin_and_exit()
         raise AssertionError("spin_and_exit returned")
+
+    def _gather(self) -> None:
+        """Wait until the participants of the other processes are there, bounded.
+
+        Participants that find each other before they have endpoints cost discovery a tenth: what
+        is made afterwards is sent once to each peer. To those found later all of it is sent again,
+        and each such message has a heartbeat sent to all others (Fast DDS 2.14; 20 nodes: 33,000
+        of 80,000 datagrams).
+        """
+        self._channel.write(Event(kind="participant"))
+        self._proceed.wait(_GATHER_S)
 
     def _import(self, planned: PlannedNode) -> type[Node]:
         """Import a node's class; ending the process meanwhile need not wait for it."""
@@ -328,6 +347,7 @@ class Host:
 
     def _end(self, reason: str) -> None:
         """Shut down and leave; from any thread but the main one."""
+        self._proceed.set()
         with self._lock:
             self._ended = True
             if self._imports:
@@ -393,7 +413,10 @@ class Host:
                 # Both ends are ours: this is a bug, and the log is where it can be found.
                 logging.getLogger(__name__).exception("cannot read command %r", line)
                 continue
-            self._loop.call_soon(self._execute, command)
+            if command.operation is Operation.PROCEED:
+                self._proceed.set()
+            else:
+                self._loop.call_soon(self._execute, command)
 
     async def _execute(self, command: Command) -> None:
         self._channel.write(await self._commands.execute(command))

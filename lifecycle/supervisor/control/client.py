@@ -9,10 +9,8 @@ import time
 from pathlib import Path
 
 from lifecycle.errors import ExitCode, UsageError
-from lifecycle.middleware import sweep
 from lifecycle.plan import Plan
 from lifecycle.run_directory import RunDirectory, is_held, new_run_id, read_record
-from lifecycle.supervisor.connections.networks import remove_programmed
 from lifecycle.supervisor.control.server import (
     Answer,
     ControlRequest,
@@ -22,7 +20,6 @@ from lifecycle.supervisor.control.server import (
     strange,
 )
 from lifecycle.supervisor.control.status import SystemStatus
-from lifecycle.supervisor.processes.orphans import end_run
 
 STATUS_S = 5.0
 _SOCKET = "control"
@@ -164,6 +161,10 @@ def down(path: Path, timeout_s: float) -> ExitCode:
         raise strange(path / _SOCKET, "it has no exit code")
     if answer is not None and _released(path, deadline):
         return ExitCode.OK
+    from lifecycle.middleware import sweep
+    from lifecycle.supervisor.connections.networks import remove_programmed
+    from lifecycle.supervisor.processes.orphans import end_run
+
     directory = RunDirectory.acquire(path.parent, path.name, new_run_id())
     try:
         if directory.previous is not None:

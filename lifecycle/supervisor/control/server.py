@@ -13,14 +13,17 @@ import socket
 import time
 from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import UsageError
 from lifecycle.plan import Plan
 from lifecycle.run_directory import connect, short_path
-from lifecycle.supervisor.control.orders import Done, Order, OrderKind
 from lifecycle.supervisor.control.status import SystemStatus
 from lifecycle.verify import Observation, Verdict
+
+if TYPE_CHECKING:
+    from lifecycle.supervisor.control.orders import Done, Order
 
 _BURST_S = 0.05
 _CLOSE_S = 1.0
@@ -32,7 +35,6 @@ _LARGEST_ANSWER = 64 * 2**20
 _ANSWER_S = 10.0
 """For the rest of an answer that has begun."""
 _READ = 2**18
-_ORDERS = {each.value: each for each in OrderKind}
 
 
 class ControlRequest(enum.Enum):
@@ -179,9 +181,11 @@ class ControlServer:
     async def _answer(self, question: Question) -> Answer:
         if question.ask is ControlRequest.LOOK and self._look is not None:
             return Answer(look=self._look())
-        if self._order is not None and question.ask.value in _ORDERS:
+        from lifecycle.supervisor.control.orders import Order, OrderKind  # clients need neither
+
+        if self._order is not None and question.ask.value in {each.value for each in OrderKind}:
             order = Order(
-                kind=_ORDERS[question.ask.value],
+                kind=OrderKind(question.ask.value),
                 node=question.node,
                 plan=question.plan,
                 reload=question.reload,

@@ -7,11 +7,14 @@ import rclpy.
 from __future__ import annotations
 
 import dataclasses
+from typing import TYPE_CHECKING
 
 from lifecycle.manifest import RunKind, UniqueHow
-from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.run.events import ProcessState, Reach
-from lifecycle.verify import ConnectionReport, Outcome, Verdict, not_ok
+from lifecycle.verify import ConnectionReport, Outcome, Verdict
+
+if TYPE_CHECKING:
+    from lifecycle.supervisor.nodes.system import NodeRun, System
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -125,6 +128,8 @@ def system_status(
     system: System, verdict: Verdict | None, *, phase: str, supervisor: int, elapsed_s: float
 ) -> SystemStatus:
     """Return what is known of the whole system."""
+    from lifecycle.verify import not_ok  # imports every rule, and clients need none
+
     silent = system.liveliness.silent
     return SystemStatus(
         system=system.plan.system,

@@ -76,6 +76,60 @@ class Wirer(Protocol):
         """Make all that a configured node must have before it connects; raises BringUpError."""
 
 
+_GATHERED_S = 0.5
+"""For so long no further participant has come: whoever is still missing imports something big."""
+
+
+class Gathering:
+    """Has hosts make their endpoints when the participants of all of them are there.
+
+    Args:
+        limit_s: seconds, > 0, that any of them waits for the others at most.
+    """
+
+    def __init__(self, limit_s: float) -> None:
+        self._limit_s = limit_s
+        self._missing: set[ControlChannel] = set()
+        self._waiting: list[ControlChannel] = []
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._late: list[asyncio.TimerHandle] = []
+
+    def expect(self, channel: ControlChannel) -> None:
+        """Wait for the participant of one more host, which is started now."""
+        self._missing.add(channel)
+        task = asyncio.ensure_future(self._await(channel))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _await(self, channel: ControlChannel) -> None:
+        came = await channel.gathered()
+        self._missing.discard(channel)
+        if came:
+            self._waiting.append(channel)
+        if not self._missing:
+            self._proceed()
+            return
+        loop = asyncio.get_running_loop()
+        if came and len(self._waiting) == 1:
+            self._late = [loop.call_later(self._limit_s, self._proceed)]
+        for quiet in self._late[1:]:
+            quiet.cancel()
+        self._late[1:] = [loop.call_later(_GATHERED_S, self._proceed)]
+
+    def _proceed(self) -> None:
+        for timer in self._late:
+            timer.cancel()
+        self._late = []
+        for channel in self._waiting:
+            channel.proceed()
+        self._waiting = []
+
+    async def close(self) -> None:
+        """Hold nobody any more."""
+        self._proceed()
+        await ended(*self._tasks)
+
+
 class BringUp:
     """Brings one system up.
 
@@ -105,6 +159,7 @@ class BringUp:
         self._recorded = recorded
         self._wirer = wirer
         self._starts: dict[str, asyncio.Task[None]] = {}
+        self._gathering: Gathering | None = None
         self._appearing: list[asyncio.Task[None]] = []
         self._failures: list[StepFailedError] = []
         self._in_progress = 0
@@ -170,9 +225,15 @@ class BringUp:
         await asyncio.gather(*self._appearing, return_exceptions=True)
 
     async def _connect_all(self, nodes: Iterable[NodeRun]) -> None:
+        nodes = tuple(nodes)
+        hosts = {node.planned.process for node in nodes if node.planned.run.kind is RunKind.PYTHON}
+        limit_s = min((node.planned.timeouts.start_s for node in nodes), default=0.0) / 2
+        self._gathering = Gathering(limit_s) if len(hosts) > 1 else None
         try:
             await self._side_by_side(self._walk(node) for node in nodes)
         finally:
+            if self._gathering is not None:
+                await self._gathering.close()
             for start in self._starts.values():
                 start.cancel()
             await asyncio.gather(*self._starts.values(), return_exceptions=True)
@@ -368,10 +429,13 @@ class BringUp:
                     domain_id=self._system.plan.domain_id,
                     discovery_range=self._system.plan.discovery_range,
                     nodes=tuple(node.planned for node in nodes),
+                    gathers=self._gathering is not None,
                 ),
                 self._system.on_host_event,
                 hung,
             )
+            if self._gathering is not None:
+                self._gathering.expect(channel)
         try:
             await process.spawn(self._spawner_of(process), channel)
         except (BringUpError, OSError) as error:

@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import socket
 from collections.abc import Callable
+from typing import Any
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import BringUpError
@@ -74,6 +75,7 @@ class ControlChannel:
         self._ready: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         # The host may end before a caller waits for "ready".
         self._ready.add_done_callback(lambda done: done.cancelled() or done.exception())
+        self._participant = asyncio.Event()
         self._writer: asyncio.StreamWriter | None = None
         self._task: asyncio.Task[None] | None = None
 
@@ -106,6 +108,21 @@ class ControlChannel:
             ChannelClosedError: the host ended without a reason.
         """
         await asyncio.shield(self._ready)
+
+    async def gathered(self) -> bool:
+        """Wait until the host waits for `proceed`; False once it will not do so any more."""
+        there: asyncio.Future[Any] = asyncio.ensure_future(self._participant.wait())
+        try:
+            await asyncio.wait({there, self._ready}, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            there.cancel()
+        return not self._ready.done()
+
+    def proceed(self) -> None:
+        """Have the host make its endpoints."""
+        if self._writer is not None:
+            command = Command(id=0, node="", operation=Operation.PROCEED)
+            self._writer.write(to_json(command) + b"\n")
 
     async def request(
         self,
@@ -179,6 +196,8 @@ class ControlChannel:
             reply = self._replies.get(event.id)
             if reply is not None and not reply.done():
                 reply.set_result(event)
+        elif event.kind == "participant":
+            self._participant.set()
         elif event.kind == "ready":
             if not self._ready.done():
                 self._ready.set_result(None)

@@ -14,7 +14,7 @@ from typing import ClassVar, Union
 
 from lifecycle.codec import to_plain
 from lifecycle.node import Operation
-from lifecycle.verify import Stage, Verdict, plain_findings
+from lifecycle.verify import Stage, Verdict
 
 
 class ProcessState(enum.Enum):
@@ -373,5 +373,7 @@ def to_record(event: Event) -> dict[str, object]:
     plain = to_plain(event)
     assert isinstance(plain, dict)
     if isinstance(event, VerdictChanged):
+        from lifecycle.verify import plain_findings  # imports every rule
+
         plain["verdict"]["findings"] = plain_findings(event.verdict)
     return {"event": event.kind, **plain}

@@ -332,7 +332,7 @@ def test_an_idle_connection_costs_no_thread_of_ours_and_no_time(
 
         def idle() -> bool:
             start_s = sum(me.cpu_times()[:2])
-            time.sleep(0.5)  # the idle time itself; the 40 announcements take four of them
+            time.sleep(0.5)  # the idle time itself; the first announcements take four of them
             return sum(me.cpu_times()[:2]) - start_s <= 0.03
 
         wait_until(idle)

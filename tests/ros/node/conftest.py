@@ -31,8 +31,9 @@ def start(fresh_domain: int, tmp_path: Path) -> Iterator[Callable[..., HostProce
     """Start hosts in a domain of their own."""
     hosts: list[HostProcess] = []
 
-    def start(*nodes: PlannedNode) -> HostProcess:
-        hosts.append(HostProcess(fresh_domain, nodes, tmp_path / f"host{len(hosts)}.log"))
+    def start(*nodes: PlannedNode, gathers: bool = False) -> HostProcess:
+        log = tmp_path / f"host{len(hosts)}.log"
+        hosts.append(HostProcess(fresh_domain, nodes, log, gathers=gathers))
         return hosts[-1]
 
     yield start

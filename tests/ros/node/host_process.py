@@ -30,7 +30,14 @@ def hosted(name: str, class_: str, *endpoints: Any, **changes: Any) -> PlannedNo
 class HostProcess:
     """A host and our end of its socket."""
 
-    def __init__(self, domain_id: int, nodes: tuple[PlannedNode, ...], log: Path) -> None:
+    def __init__(
+        self,
+        domain_id: int,
+        nodes: tuple[PlannedNode, ...],
+        log: Path,
+        *,
+        gathers: bool = False,
+    ) -> None:
         ours, theirs = socket.socketpair()
         ours.settimeout(30)
         self.log = log
@@ -55,6 +62,7 @@ class HostProcess:
             domain_id=domain_id,
             discovery_range=DiscoveryRange.LOCALHOST,
             nodes=nodes,
+            gathers=gathers,
         )
         self.send(spec)
 

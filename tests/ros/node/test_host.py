@@ -19,7 +19,7 @@ from std_msgs.msg import String
 
 from lifecycle import codec
 from lifecycle.manifest.model import DiscoveryRange, Timeouts
-from lifecycle.node.host.control import Event, HostSpec, Operation
+from lifecycle.node.host.control import Command, Event, HostSpec, Operation
 
 HERE = Path(__file__).parent
 CONFIGURE, CONNECT, ACTIVATE = Operation.CONFIGURE, Operation.CONNECT, Operation.ACTIVATE
@@ -47,6 +47,26 @@ def test_two_nodes_in_one_process_are_brought_up_and_end_with_the_channel(start:
     assert (told.name, told.identity.process_id) == ("/one", host.process.pid)
     host.hang_up()
     assert host.wait() == 0
+
+
+def test_a_host_that_gathers_makes_no_endpoint_before_it_may(
+    start: Start, fresh_domain: int, wait_until: Callable[..., None]
+) -> None:
+    host = start(hosted("one", "Good"), gathers=True)
+    assert host.read() == Event(kind="participant")
+    with driver_in(fresh_domain) as driver:
+        wait_until(lambda: "one" in driver.node.get_node_names())
+        assert driver.node.get_service_names_and_types_by_node("one", "/") == []
+        host.send(Command(id=0, node="", operation=Operation.PROCEED))
+        host.until("ready")
+    assert host.do("/one", CONFIGURE).ok
+
+
+def test_a_host_that_is_ended_while_it_gathers_ends(start: Start) -> None:
+    host = start(hosted("one", "Good"), gathers=True)
+    assert host.read() == Event(kind="participant")
+    host.hang_up()
+    assert host.wait(5.0) == 0
 
 
 def test_every_change_of_state_is_told_before_the_reply(start: Start) -> None:

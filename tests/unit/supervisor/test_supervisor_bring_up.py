@@ -14,7 +14,7 @@ from lifecycle.node.host.control import Operation
 from lifecycle.supervisor.gate.gate import Gate, Permit, VerificationError
 from lifecycle.supervisor.gate.verification_loop import ChangeCounter, VerificationLoop
 from lifecycle.supervisor.health.process_monitor import ProcessMonitor
-from lifecycle.supervisor.nodes.bring_up import ALSO_S
+from lifecycle.supervisor.nodes.bring_up import ALSO_S, Gathering
 from lifecycle.supervisor.processes.process import ProcessExit
 from lifecycle.supervisor.run.events import Notice, ProcessChanged, ProcessState, Reach, RequestSent
 from lifecycle.supervisor.run.failure import StepFailedError, with_failure
@@ -540,3 +540,52 @@ def test_a_failure_is_one_finding_with_the_log_that_says_more() -> None:
     assert finding.hint.endswith("the last lines of its log: /log/a.log")
     assert with_failure(verdict, failure).findings == verdict.findings
     assert not verdict.judged
+
+
+class _Host:
+    """A host's control channel, as Gathering sees it."""
+
+    def __init__(self, participant_s: float, *, fails: bool = False) -> None:
+        self._participant_s = participant_s
+        self._fails = fails
+        self.proceeded_at: float | None = None
+
+    async def gathered(self) -> bool:
+        await asyncio.sleep(self._participant_s)
+        return not self._fails
+
+    def proceed(self) -> None:
+        self.proceeded_at = asyncio.get_running_loop().time()
+
+
+def _proceeding(*hosts: _Host, limit_s: float = 5.0) -> list[float | None]:
+    async def main() -> list[float | None]:
+        gathering = Gathering(limit_s)
+        began = asyncio.get_running_loop().time()
+        for host in hosts:
+            gathering.expect(host)  # type: ignore[arg-type]
+        await asyncio.sleep(60.0)
+        await gathering.close()
+        return [
+            None if host.proceeded_at is None else round(host.proceeded_at - began, 2)
+            for host in hosts
+        ]
+
+    return run(main())
+
+
+def test_hosts_make_their_endpoints_once_the_last_participant_is_there() -> None:
+    assert _proceeding(_Host(0.1), _Host(0.4), _Host(0.3)) == [0.4, 0.4, 0.4]
+
+
+def test_a_host_that_cannot_be_made_holds_no_other() -> None:
+    assert _proceeding(_Host(0.1), _Host(0.2, fails=True)) == [0.2, None]
+
+
+def test_hosts_wait_for_one_that_imports_for_long_no_longer_than_half_a_second() -> None:
+    assert _proceeding(_Host(0.1), _Host(0.3), _Host(9.0)) == [0.8, 0.8, 9.0]
+
+
+def test_hosts_that_come_one_after_the_other_hold_none_beyond_the_limit() -> None:
+    hosts = [_Host(0.4 * (index + 1)) for index in range(10)]
+    assert _proceeding(*hosts, limit_s=1.0)[:5] == [1.4, 1.4, 1.4, 2.6, 2.6]

@@ -10,7 +10,8 @@ import json
 import pytest
 from rich.console import Console
 
-from lifecycle.cli.up_output import JsonLines, Live, PlainLines, Timings
+from lifecycle.cli.live_view import Live
+from lifecycle.cli.up_output import JsonLines, PlainLines, Timings
 from lifecycle.cli.verbs.control import status_text
 from lifecycle.cli.verbs.flows import render_flows
 from lifecycle.errors import ExitCode

@@ -132,6 +132,27 @@ def test_a_killed_process_is_noticed_within_a_tenth_of_a_second(tmp_path: Path) 
     _run(test())
 
 
+def test_how_a_process_ended_may_be_reported_later_than_it_is_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("lifecycle.supervisor.processes.fork_server._STATUS_WAIT_S", 0.01)
+
+    async def test() -> None:
+        wrong: list[object] = []
+        asyncio.get_running_loop().set_exception_handler(lambda _, context: wrong.append(context))
+        async with _bench(tmp_path) as bench:
+            process = await bench.start("sleep", "60")
+            os.kill(bench.fork_server.pid, signal.SIGSTOP)  # it has no processor
+            os.kill(process.pid, signal.SIGKILL)
+            assert await process.ended == ProcessExit()
+            os.kill(bench.fork_server.pid, signal.SIGCONT)
+            another = await bench.start("true")
+            await another.ended
+        assert wrong == []
+
+    _run(test())
+
+
 def test_a_program_that_does_not_exist_says_so_in_its_output(tmp_path: Path) -> None:
     async def test() -> None:
         async with _bench(tmp_path) as bench:
