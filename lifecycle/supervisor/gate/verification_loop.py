@@ -38,6 +38,7 @@ from lifecycle.verify import (
     Verdict,
     Verifier,
     rule,
+    verify,
 )
 
 PASSING_S = 1.0
@@ -255,7 +256,8 @@ class VerificationLoop:
         self._changes = changes
         self._emit = emit
         self._strict = strict
-        self._verify = verify_ or Verifier().verify
+        self._verify = verify_ or verify
+        self._watch = verify_ or Verifier().verify
         self._looker = looker
         self._agreement = agreement
         self._guard = guard
@@ -324,7 +326,9 @@ class VerificationLoop:
             self._looker.look(observation)
         if self._guard is not None:
             self._guard.look(observation)
-        verdict = self._verify(
+        # What opens the gate is judged from scratch; what is watched, where it has changed.
+        judge = self._watch if stage is Stage.ACTIVE else self._verify
+        verdict = judge(
             self._system.expected,
             observation,
             stage=stage,
