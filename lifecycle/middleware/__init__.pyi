@@ -28,6 +28,7 @@ from .process.control import machine_id as machine_id
 from .process.control import no_room_for_threads as no_room_for_threads
 from .process.shared_memory import Creations as Creations
 from .process.shared_memory import check_room as check_room
+from .process.shared_memory import holds_shared_memory as holds_shared_memory
 from .process.shared_memory import leftovers as leftovers
 from .process.shared_memory import segments_of as segments_of
 from .process.shared_memory import sweep as sweep

@@ -140,3 +140,25 @@ def test_the_sweep_spares_a_living_process_and_clears_up_after_a_killed_one(
     observer.destroy()
     assert domains_own(sweep(ours)) <= domains_own(ours) - segment
     assert not any(Path("/dev/shm", name).exists() for name in domains_own(ours))
+
+
+def test_a_process_knows_whether_it_still_has_shared_memory_that_has_a_name(
+    fresh_domain: int,
+) -> None:
+    code = (
+        "import gc, sys, rclpy\n"
+        "from lifecycle.middleware import holds_shared_memory\n"
+        "print(holds_shared_memory())\n"
+        "rclpy.init(domain_id=int(sys.argv[1]))\n"
+        "node = rclpy.create_node('some')\n"
+        "print(holds_shared_memory())\n"
+        "node.destroy_node()\n"
+        "rclpy.shutdown()\n"
+        "del node\n"
+        "gc.collect()\n"
+        "print(holds_shared_memory())\n"
+    )
+    said = subprocess.check_output(
+        [sys.executable, "-c", code, str(fresh_domain)], text=True, timeout=30
+    )
+    assert said.split() == ["False", "True", "False"]
