@@ -83,7 +83,7 @@ def _unattributed(view: View) -> Iterator[Finding]:
     for endpoint in view.unattributed:
         word = endpoint.kind.noun
         feeds = view.names.fed_by(endpoint.kind, endpoint.name)
-        violated = feeds or view.frame.stage is Stage.CONNECTED
+        violated = feeds or view.stage is Stage.CONNECTED
         yield UNATTRIBUTED_ENDPOINT.finding(
             Outcome.VIOLATED if violated else Outcome.UNVERIFIABLE,
             subject=endpoint.name,

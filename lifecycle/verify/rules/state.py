@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from lifecycle.plan import PlannedNode
+from lifecycle.verify.observation import NodeConfiguration
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.verdict import Finding, Outcome, Stage
-from lifecycle.verify.view import NodeFacts, View, once
+from lifecycle.verify.view import View
 
 WRONG_STATE = Rule(
     id="state.wrong-state",
@@ -42,22 +44,21 @@ _STATES = {Stage.CONNECTED: "inactive", Stage.ACTIVE: "active"}
 
 def check(view: View) -> Iterator[Finding]:
     """Judge the state of every managed node that is there."""
-    for facts in view.nodes.values():
-        yield from once(facts, _judge)
+    for name, node in view.planned.items():
+        if node.managed and not view.is_absent(node):
+            yield from _judge(view, name, node)
 
 
-def _judge(facts: NodeFacts) -> Iterator[Finding]:
-    frame, node, name = facts.frame, facts.node, facts.name
-    if not node.managed or facts.absent:
-        return
-    wanted = _STATES[frame.stage]
+def _judge(view: View, name: str, node: PlannedNode) -> Iterator[Finding]:
+    wanted = _STATES[view.stage]
     allowed = {wanted}
-    ahead = frame.stage is Stage.CONNECTED and name in frame.ahead
-    if ahead or (frame.stage is Stage.CONNECTED and not frame.brings_up(node)):
+    ahead = view.stage is Stage.CONNECTED and name in view.ahead
+    if ahead or (view.stage is Stage.CONNECTED and not view.brings_up(node)):
         # Another supervisor brings it up, and its gate opens on the same proof, maybe before ours;
         # or an earlier gate let it through, and only others have to pass again.
         allowed.add("active")
-    observed, report = facts.observed, facts.configuration
+    observed = view.observed.get(name)
+    report = view.configurations.get(name)
     # Both sources count: if they disagree one of them is late, and nothing is proven yet.
     states = dict.fromkeys(
         state
@@ -68,7 +69,7 @@ def _judge(facts: NodeFacts) -> Iterator[Finding]:
     passing = {"activating"} if ahead else set()
     wrong = [state for state in states if state not in allowed | passing]
     expected = wanted
-    if frame.stage is Stage.CONNECTED and frame.ours(node):
+    if view.stage is Stage.CONNECTED and view.ours(node):
         expected = "inactive, connected"
         if not wrong and report is not None and not report.connected:
             wrong = ["inactive, disconnected"]
@@ -81,7 +82,11 @@ def _judge(facts: NodeFacts) -> Iterator[Finding]:
             observed=wrong[0],
             message=f"cannot accept node {name}: it is {wrong[0]} and must be {expected}",
         )
-    elif observed is not None and observed.managed is False and not _reports_state(facts):
+    elif (
+        observed is not None
+        and observed.managed is False
+        and not _reports_state(view, node, report)
+    ):
         yield WRONG_STATE.on_node(
             Outcome.VIOLATED,
             node,
@@ -100,14 +105,13 @@ def _judge(facts: NodeFacts) -> Iterator[Finding]:
         )
 
 
-def _reports_state(facts: NodeFacts) -> bool:
+def _reports_state(view: View, node: PlannedNode, report: NodeConfiguration | None) -> bool:
     """Return whether one of our nodes itself reports that it is managed, by its state.
 
     It is driven by its host and not by the services, which discovery may show late: the graph
     shows a node before all of its endpoints.
     """
-    report = facts.configuration
-    return facts.frame.ours(facts.node) and report is not None and bool(report.state)
+    return view.ours(node) and report is not None and bool(report.state)
 
 
 MISSING_REPORT = Rule(
@@ -135,32 +139,27 @@ REPORT_RULES = (MISSING_REPORT, INCOMPLETE_REPORT)
 
 def check_reports(view: View) -> Iterator[Finding]:
     """Judge that our own nodes report all that only they can report."""
-    for facts in view.nodes.values():
-        yield from once(facts, _judge_report)
-
-
-def _judge_report(facts: NodeFacts) -> Iterator[Finding]:
-    name = facts.name
-    if not facts.frame.ours(facts.node) or facts.absent:
-        return
-    if facts.configuration is None:
-        yield MISSING_REPORT.on_node(
-            Outcome.VIOLATED,
-            facts.node,
-            expected="node configuration",
-            observed="no report",
-            message=f"cannot judge node {name}: it did not report its configuration",
-        )
-        return
-    for actual in facts.actual:
-        if actual.report is not None:
+    for name, node in view.planned.items():
+        if not view.ours(node) or view.is_absent(node):
             continue
-        planned = actual.planned
-        word = planned.kind.noun
-        yield INCOMPLETE_REPORT.on_endpoint(
-            Outcome.VIOLATED,
-            actual,
-            expected=f"{word} in the report of {name}",
-            observed="not mentioned",
-            message=f"cannot judge the {word} of {planned.resolved}: {name} does not report it",
-        )
+        if name not in view.configurations:
+            yield MISSING_REPORT.on_node(
+                Outcome.VIOLATED,
+                node,
+                expected="node configuration",
+                observed="no report",
+                message=f"cannot judge node {name}: it did not report its configuration",
+            )
+            continue
+        for actual in view.actual_by_node[name]:
+            if actual.report is not None:
+                continue
+            planned = actual.planned
+            word = planned.kind.noun
+            yield INCOMPLETE_REPORT.on_endpoint(
+                Outcome.VIOLATED,
+                actual,
+                expected=f"{word} in the report of {name}",
+                observed="not mentioned",
+                message=f"cannot judge the {word} of {planned.resolved}: {name} does not report it",
+            )
