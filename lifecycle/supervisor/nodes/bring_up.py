@@ -15,7 +15,7 @@ from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterable
 from typing import Any, Protocol, TypeVar
 
 from lifecycle.errors import BringUpError
-from lifecycle.manifest import Condition, RunKind
+from lifecycle.manifest import Condition, RunKind, TargetState
 from lifecycle.node import HostSpec, Operation
 from lifecycle.plan import PlannedNode
 from lifecycle.supervisor.gate.gate import Permit
@@ -186,7 +186,7 @@ class BringUp:
             VerificationError: something changed after the verdict, and what it is now keeps the
                 gate closed for all that were not asked yet.
         """
-        managed = [node for node in self._some(nodes) if node.planned.managed]
+        managed = [node for node in self._some(nodes) if node.is_to_be_active]
         try:
             await asyncio.wait_for(
                 self._side_by_side(self._activate(node, permit) for node in managed), timeout_s
@@ -331,7 +331,16 @@ class BringUp:
             self._appearing.append(asyncio.ensure_future(self._appear(node)))
 
     async def _appear(self, node: NodeRun) -> None:
-        await self._appears(node.name)
+        appears = asyncio.ensure_future(self._appears(node.name))
+        waits: set[asyncio.Future[Any]] = {appears}
+        if node.process is not None:
+            waits.add(node.process.ended)
+        try:
+            await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            await ended(appears)
+        if appears.done() and not appears.cancelled():
+            appears.result()
         self._started(node)
 
     def _started(self, node: NodeRun, standing: NodeCondition | None = None) -> None:
@@ -346,6 +355,8 @@ class BringUp:
         limit_s = node.planned.timeouts.start_s
         standing = await self._step(node, node.driver.start(), limit_s, rule=START_FAILED)
         self._started(node, standing)
+        if node.planned.state is TargetState.UNCONFIGURED:
+            return
         await self._system.reached(node, Condition.CONFIGURED, "configure")
         await self._operate(node, Operation.CONFIGURE, Reach.CONFIGURED)
         await self._system.reached(node, Condition.CONNECTED, "connect")
@@ -536,7 +547,7 @@ def died(process: ManagedProcess, node: NodeRun | None = None) -> StepFailedErro
         rule=PROCESS_DIED,
         subject=subject,
         process=process.name,
-        log=str(process.log.path),
+        log=process.log.shown,
     )
 
 
@@ -576,4 +587,4 @@ def _is(doing: str) -> str:
 def _process_of(node: NodeRun) -> dict[str, str]:
     """Return what a failure reports of the process of its node."""
     process = node.process
-    return {} if process is None else {"process": process.name, "log": str(process.log.path)}
+    return {} if process is None else {"process": process.name, "log": process.log.shown}
