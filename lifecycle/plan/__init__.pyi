@@ -23,6 +23,7 @@ from .connections.static_endpoints import GRAPH_TYPE as GRAPH_TYPE
 from .connections.static_endpoints import MAX_USER_ID as MAX_USER_ID
 from .connections.wiring import with_graph as with_graph
 from .model import ExpectedParameter as ExpectedParameter
+from .model import HeldBy as HeldBy
 from .model import ParticipantConnections as ParticipantConnections
 from .model import Plan as Plan
 from .model import PlanError as PlanError

@@ -9,6 +9,7 @@ that authors have every other attribute name to themselves.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Collection
 from typing import TYPE_CHECKING, Any
 
@@ -169,6 +170,22 @@ class Undeclared:
 _WITHOUT_DATA_LAYER = (NodeState.INACTIVE_DISCONNECTED, NodeState.UNCONFIGURED, NodeState.FINALIZED)
 """A node that enters one of these is not the one that was verified any more."""
 
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class HostedState:
+    """The state of a hosted node.
+
+    Attributes:
+        label: lifecycle_msgs/State label; empty for a node that is not managed.
+        connected: its data layer is made.
+        steady: no transition is running.
+    """
+
+    label: str
+    connected: bool
+    steady: bool
+
+
 BRING_UP = (TransitionRequest.CONFIGURE, TransitionRequest.CONNECT, TransitionRequest.ACTIVATE)
 
 
@@ -207,7 +224,7 @@ class Managed:
         self._infrastructure = ReentrantCallbackGroup()
         self._turns = Turns(node, self._infrastructure)
         self.call_soon = self._turns.call_soon
-        self._listeners: list[Callable[[Node], None]] = []
+        self._listeners: list[Callable[[Managed], None]] = []
         self._method_timers: list[Timer] = []
         self._member: GraphMember | None = None
         self.connection_events = ConnectionEvents(self.call_soon)
@@ -262,8 +279,19 @@ class Managed:
         """The state, nested ones distinguished; `state.seen` is what other tools see."""
         return self._controller.machine.state
 
-    def add_listener(self, listener: Callable[[Node], None]) -> None:
-        """Call `listener(node)` after every change of state, whatever caused it."""
+    @property
+    def node(self) -> Node:
+        """The rclpy node."""
+        return self._node
+
+    @property
+    def reported(self) -> HostedState:
+        """The state, as a supervisor is told of it."""
+        state = self.state
+        return HostedState(label=state.seen.label, connected=state.connected, steady=state.steady)
+
+    def add_listener(self, listener: Callable[[Managed], None]) -> None:
+        """Call `listener(self)` after every change of state, whatever caused it."""
         self._listeners.append(listener)
 
     async def change(self, request: TransitionRequest | str) -> Result:
@@ -445,7 +473,7 @@ class Managed:
         if self._member is not None:
             self._member.state_changed(change.goal)
         for listener in self._listeners:
-            listener(self._node)
+            listener(self)
 
 
 def _known(request: TransitionRequest | str) -> TransitionRequest:

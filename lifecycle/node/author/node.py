@@ -390,9 +390,9 @@ class LifecycleNode(Declarations, LocalInterface, GatedFactories):
         **options: Any,
     ) -> None:
         mode = parse_mode(lifecycle)
-        construction = take_construction()
-        planned = construction.spec if construction is not None else None
         name = node_name or default_name(type(self))
+        construction = take_construction(name, namespace)
+        planned = construction.spec if construction is not None else None
         if planned is not None:
             name, namespace = planned.name, planned.namespace
             options["cli_args"] = [*ros_arguments(planned), *(options.get("cli_args") or ())]
