@@ -26,8 +26,7 @@ from lifecycle.supervisor.processes.control_channel import (
     ControlChannel,
     HostFailedError,
 )
-from lifecycle.supervisor.processes.patience import patient
-from lifecycle.supervisor.processes.process import ManagedProcess, Spawner
+from lifecycle.supervisor.processes.process import ManagedProcess, Spawner, patient
 from lifecycle.supervisor.run.events import ProcessState, Reach
 from lifecycle.supervisor.run.failure import StepFailedError, ended
 from lifecycle.verify import (
