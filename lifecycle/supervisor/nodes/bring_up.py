@@ -27,8 +27,7 @@ from lifecycle.supervisor.processes.control_channel import (
     ControlChannel,
     HostFailedError,
 )
-from lifecycle.supervisor.processes.patience import patient
-from lifecycle.supervisor.processes.process import ManagedProcess, Spawner
+from lifecycle.supervisor.processes.process import ManagedProcess, Spawner, patient
 from lifecycle.supervisor.run.events import ProcessState, Reach
 from lifecycle.supervisor.run.failure import StepFailedError, ended
 from lifecycle.verify import (
@@ -295,10 +294,9 @@ class BringUp:
             return None
         first, *others = self._failures
         reported = [
-            _not_hosted(self._system.nodes[process.planned.nodes[0]], each)
+            each
             for process in self._system.processes.values()
-            if process.channel is not None
-            for each in process.channel.failures
+            for each in _not_hosted(process, self._system.nodes[process.planned.nodes[0]])
         ]
         return first.joined([*others, *reported])
 
@@ -485,7 +483,7 @@ class BringUp:
             raise
         except BringUpError as error:
             if isinstance(error, HostFailedError):
-                raise _not_hosted(node, error) from error
+                raise _start_failed(error, node.name, **_process_of(node)) from error
             if isinstance(error, ChannelClosedError):
                 await self._death(node)
                 if node.process is not None and node.process.ended.done():
@@ -532,7 +530,13 @@ def manifest_folders(nodes: Iterable[PlannedNode]) -> tuple[str, ...]:
 
 
 def died(process: ManagedProcess, node: NodeRun | None = None) -> StepFailedError:
-    """The failure that an unexpected end of `process` is."""
+    """The failure that an unexpected end of `process` is: what it said that it fails of, if it did.
+
+    That can be known before any step on its nodes has begun, while others are still being started.
+    """
+    reasons = _not_hosted(process, node)
+    if reasons:
+        return reasons[0].joined(reasons[1:])
     names = process.planned.nodes
     doing = f" while {node.doing}" if node is not None and node.doing else ""
     subject = node.name if node is not None else process.name
@@ -556,15 +560,28 @@ def _not_run(process: ManagedProcess) -> str:
     return f", as of a program that {why}: {process.planned.argv[0]!r}"
 
 
-def _not_hosted(node: NodeRun, error: HostFailedError) -> StepFailedError:
-    """The failure of a process to host one of its nodes, which need not be `node`."""
-    name = error.node or node.name
+def _not_hosted(process: ManagedProcess, node: NodeRun | None) -> list[StepFailedError]:
+    """Return why a process cannot host its nodes, as far as it has said so.
+
+    Args:
+        process: one that we started.
+        node: the subject where the process names none.
+    """
+    name = process.name if node is None else node.name
+    log = str(process.log.path)
+    failures = () if process.channel is None else process.channel.failures
+    return [_start_failed(each, name, process=process.name, log=log) for each in failures]
+
+
+def _start_failed(error: HostFailedError, name: str, **process: str) -> StepFailedError:
+    """The failure of a process to host one of its nodes, by default `name`."""
+    name = error.node or name
     message = error.message
     return StepFailedError(
         message if message.startswith("cannot") else f"cannot start {name!r}: {message}",
         rule=START_FAILED,
         subject=name,
-        **_process_of(node),
+        **process,
     )
 
 

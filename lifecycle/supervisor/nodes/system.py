@@ -26,8 +26,7 @@ from lifecycle.supervisor.health.liveliness import SilenceMonitor
 from lifecycle.supervisor.nodes.driver import ACTIVE, INACTIVE, NodeCondition, NodeDriver
 from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.supervisor.processes.logs import LogDirectory
-from lifecycle.supervisor.processes.patience import own_starved_s
-from lifecycle.supervisor.processes.process import ManagedProcess
+from lifecycle.supervisor.processes.process import ManagedProcess, own_starved_s
 from lifecycle.supervisor.run.events import (
     Emitter,
     NodeChanged,
