@@ -44,6 +44,7 @@ from lifecycle.node.lifecycle.machine import (
     NodeState,
     RefusedError,
     StateChange,
+    Transition,
     TransitionRequest,
 )
 from lifecycle.node.lifecycle.services import LifecycleServices, Turns
@@ -52,6 +53,7 @@ from lifecycle.verify import NodeConfiguration
 
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup
+    from rclpy.service import Service
 
 
 class GraphMember:
@@ -212,6 +214,8 @@ class Managed:
         mode: Mode,
         gate: NodeGate,
         supervisor: str = "",
+        *,
+        served: bool = True,
     ) -> None:
         self._node = node
         self._supervisor = supervisor
@@ -248,19 +252,22 @@ class Managed:
         )
         self._controller = Controller(self, spec.timeouts, self._changed)
         self.interface = NodeInterface(self.full_name, self.data_layer, lambda: self.state)
-        self._services = LifecycleServices(
-            node,
-            state_machine=self._controller.machine,
-            change=self._change_by_service,
-            refuse=node.get_logger().warning,
-            configuration=lambda: configuration.to_json(self.get_configuration()),
-            group=self._infrastructure,
-        )
+        self._services: LifecycleServices | None = None
+        if served:
+            self._services = LifecycleServices(
+                node,
+                state_machine=self._controller.machine,
+                change=self._change_by_service,
+                refuse=node.get_logger().warning,
+                configuration=lambda: configuration.to_json(self.get_configuration()),
+                group=self._infrastructure,
+            )
         self._remote = RemoteInterface(
             node, self.interface, log=node.get_logger().error, group=self._infrastructure
         )
-        # A supervisor sees who asks for the others, and has them made.
-        self._remote.serve(but=INTERFACE_ON_DEMAND if supervisor else ())
+        if served:
+            # A supervisor sees who asks for the others, and has them made.
+            self._remote.serve(but=INTERFACE_ON_DEMAND if supervisor else ())
         if spec.events or spec.membership:
             self._join()
 
@@ -289,6 +296,14 @@ class Managed:
         """The state, as a supervisor is told of it."""
         state = self.state
         return HostedState(label=state.seen.label, connected=state.connected, steady=state.steady)
+
+    def available_transitions(self) -> tuple[Transition, ...]:
+        """Return the edges that may be taken from this state, as other tools see them."""
+        return self._controller.machine.available_transitions()
+
+    def service(self, name: str) -> Service | None:
+        """Return the lifecycle service `~/name`; None if the node has no such interface."""
+        return None if self._services is None else self._services.made[name]
 
     def add_listener(self, listener: Callable[[Managed], None]) -> None:
         """Call `listener(self)` after every change of state, whatever caused it."""
@@ -464,11 +479,13 @@ class Managed:
         """Follow a change of the machine: the gate first, then notify the others."""
         if change.goal is NodeState.ACTIVE:
             self.gate.open()
-        elif change.start is NodeState.ACTIVE:
+        elif change.goal is NodeState.ACTIVATING_CONNECTED:
+            self.gate.open_early()
+        elif change.start in (NodeState.ACTIVE, NodeState.ACTIVATING_CONNECTED):
             self.gate.close()
         if self._supervisor and change.goal in _WITHOUT_DATA_LAYER:
             self._let_through = False
-        if change.event is not None:
+        if change.event is not None and self._services is not None:
             self._services.publish(change.event)
         if self._member is not None:
             self._member.state_changed(change.goal)
