@@ -45,6 +45,9 @@ NOISE_TOPICS = frozenset(
 )
 """Topics of the client libraries themselves, and ours."""
 
+_SERVICE_EVENT = "/_service_event"
+"""What a service or client says of its calls once its introspection is configured (REP-2012)."""
+
 NODE_SERVICES: Mapping[str, str] = {
     "describe_parameters": "rcl_interfaces/srv/DescribeParameters",
     "get_parameter_types": "rcl_interfaces/srv/GetParameterTypes",
@@ -239,6 +242,8 @@ def is_noise_endpoint(kind: EndpointKind, node: str, name: str, type_: str, *, o
     of_observers = name.startswith(_OUR_TOPICS) and bool(tolerating_pattern(node, ()))
     if of_observers or (kind, name) in NOISE_TOPICS:
         return True
+    if name.endswith(_SERVICE_EVENT) and kind is EndpointKind.PUBLISHER:
+        return "/srv/" in type_ and type_.endswith("_Event")
     owner, _, base = name.rpartition("/")
     offers = kind in (EndpointKind.SERVICE_SERVER, EndpointKind.PUBLISHER)
     if offers and owner != node:

@@ -461,6 +461,21 @@ class LifecycleNode(Declarations, LocalInterface, RclpyLifecycle, GatedFactories
         )
         return client
 
+    def subscription(self, name: str) -> Subscription:
+        """Return rclpy's object of the declared subscription `name`, from on_connect on.
+
+        For `get_publisher_count()` and the like; it is another one after a handover.
+
+        Raises:
+            UnknownEndpointError: nothing of that name is declared; a KeyError too.
+            LifecycleError: the node is not connected.
+        """
+        return self.lifecycle.data_layer.endpoints.client(EndpointKind.SUBSCRIPTION, name)
+
+    def service(self, name: str) -> Service:
+        """Return rclpy's object of the declared service server `name`; as `subscription`."""
+        return self.lifecycle.data_layer.endpoints.client(EndpointKind.SERVICE_SERVER, name)
+
     def action_client(self, name: str) -> ActionClient:
         """Return the declared action client `name`, from on_connect on; raises as `client`.
 
