@@ -426,6 +426,10 @@ class ConfigurationChanges:
         """Call `listener` with the configuration, in the executor, after each change."""
         self._listeners.append(listener)
 
+    def close(self) -> None:
+        """Notify of nothing any more: the node's process leaves DDS."""
+        self._listeners.clear()
+
     def touch(self) -> None:
         """Something of the configuration has changed, match counts included."""
         if self._listeners and not self._scheduled:
@@ -433,6 +437,8 @@ class ConfigurationChanges:
 
     def _notify(self) -> None:
         self._scheduled = False
+        if not self._listeners:
+            return
         configuration = self.collect()
         if configuration is None:
             return

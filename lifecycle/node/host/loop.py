@@ -47,6 +47,7 @@ from lifecycle.node.lifecycle.execution import hint
 
 if TYPE_CHECKING:
     from lifecycle.node.author.managed import HostedState
+    from lifecycle.node.configuration import ConfigurationChanges
     from lifecycle.plan import PlannedNode
 
 
@@ -64,6 +65,10 @@ class Hosted(Protocol):
     @property
     def reported(self) -> HostedState:
         """Its state now."""
+
+    @property
+    def configuration_changes(self) -> ConfigurationChanges:
+        """Notifies of each change of its configuration."""
 
     def add_listener(self, listener: Callable[[Any], None]) -> None:
         """Call `listener(self)` after every change of state."""
@@ -292,6 +297,8 @@ class NodeLoop:
                 await hosted.shut_down(reason)
             except Exception:  # noqa: BLE001, PERF203 - the other nodes must still be shut down
                 traceback.print_exc()
+        for hosted in self._hosted:
+            hosted.configuration_changes.close()
         self._done = True
         if self._own is not self._executor:
             self.call_beside(_nothing)  # what waits there looks again

@@ -161,14 +161,16 @@ def test_a_node_of_rclpy_lifecycle_is_driven_by_its_own_state_machine(
 def test_a_function_may_return_several_nodes_of_one_process(
     fresh_domain: int, tmp_path: Path, wait_until: Any
 ) -> None:
+    # Beside the manifest, and not where `up` was started.
+    (tmp_path / "beside.py").write_text(f"from {_NODES} import pair")
     shared = {"process": "both", "managed": False, "arguments": {"word": "pair"}}
     manifest = write(
         tmp_path,
         fresh_domain,
         {
             # By the names that the code gives them.
-            "talker": node("pair", interface=TALKS, **shared),
-            "ears": node("pair", interface=HEARS, **shared),
+            "talker": node("beside:pair", interface=TALKS, **shared),
+            "ears": node("beside:pair", interface=HEARS, **shared),
         },
     )
     with running.up(manifest, runtime=tmp_path) as up:
@@ -196,7 +198,7 @@ def test_callbacks_run_in_several_threads_where_the_executor_has_them(
         policy={"unverifiable": "block"},
     )
     with running.up(manifest, "--stop-after", "30", runtime=tmp_path) as up:
-        up.until("system", reached="active")
+        up.until("gate")
         assert is_proven(up)
         # Its callback raises with the answer: the process ends.
         up.until("process", process="caller", state="exited")
