@@ -50,6 +50,12 @@ from .rcl.qos import UnknownInterfaceError as UnknownInterfaceError
 from .rcl.qos import from_rclpy as from_rclpy
 from .rcl.qos import import_interface as import_interface
 from .rcl.qos import to_rclpy as to_rclpy
+from .rcl.rclpy_nodes import RCLError as RCLError
+from .rcl.rclpy_nodes import RclpyStateMachine as RclpyStateMachine
+from .rcl.rclpy_nodes import Watching as Watching
+from .rcl.rclpy_nodes import follow_nodes as follow_nodes
+from .rcl.rclpy_nodes import interface_of as interface_of
+from .rcl.rclpy_nodes import is_rclpy_managed as is_rclpy_managed
 from .rcl.rmw_choice import check_rmw as check_rmw
 from .services.actions import GoalClient as GoalClient
 from .services.actions import GoalServer as GoalServer

@@ -23,6 +23,7 @@ from .model import GRAPH_TOPIC as GRAPH_TOPIC
 from .model import GRAPH_TYPE as GRAPH_TYPE
 from .model import MAX_USER_ID as MAX_USER_ID
 from .model import ExpectedParameter as ExpectedParameter
+from .model import HeldBy as HeldBy
 from .model import ParticipantConnections as ParticipantConnections
 from .model import Plan as Plan
 from .model import PlanError as PlanError

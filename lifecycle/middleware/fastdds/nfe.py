@@ -191,6 +191,7 @@ def create_subscription(
     callback_group: CallbackGroup | None = None,
     event_callbacks: SubscriptionEventCallbacks | None = None,
     raw: bool = False,
+    content_filter: tuple[str, tuple[str, ...]] | None = None,
 ) -> Subscription:
     """Create a subscription on `node`, with network flow endpoints of its own where asked.
 
@@ -212,6 +213,8 @@ def create_subscription(
         callback_group: None for the node's default one.
         event_callbacks: as in rclpy.
         raw: give the callback serialized bytes.
+        content_filter: expression, and the values of its parameters (DDS 1.4, annex B); rclpy 7 has
+            no way to give one.
 
     Raises:
         UniqueFlowNotFeasible: not possible here; no endpoint is left.
@@ -219,7 +222,7 @@ def create_subscription(
     """
     profile = to_rclpy(qos)
     if unique is UniqueRequirement.NOT_REQUIRED:
-        return node.create_subscription(
+        plain = node.create_subscription(
             type_,
             topic,
             callback,
@@ -228,6 +231,7 @@ def create_subscription(
             event_callbacks=event_callbacks,
             raw=raw,
         )
+        return _filtered(node, plain, content_filter)
     group = callback_group or node.default_callback_group
     handle = _create_handle(
         node, "subscription", type_=type_, topic=topic, profile=profile, unique=unique
@@ -249,6 +253,53 @@ def create_subscription(
     group.add_entity(subscription)
     node._subscriptions.append(subscription)  # noqa: SLF001 - what Node.create_subscription does
     _register(node, subscription)
+    return _filtered(node, subscription, content_filter)
+
+
+class _ContentFilter(ctypes.Structure):
+    """rcl_subscription_content_filter_options_t."""
+
+    _fields_ = (
+        ("expression", ctypes.c_void_p),
+        ("count", ctypes.c_size_t),
+        ("parameters", ctypes.c_void_p),
+        ("allocator", abi.Allocator),
+    )
+
+
+def _filtered(
+    node: Node, subscription: Subscription, content_filter: tuple[str, tuple[str, ...]] | None
+) -> Subscription:
+    """Have the middleware take those messages alone that a filter lets through."""
+    if content_filter is None:
+        return subscription
+    rcl = abi.load()
+    expression, parameters = content_filter
+    values = (ctypes.c_char_p * len(parameters))(*(each.encode() for each in parameters))
+    options = _ContentFilter()
+    pointer, code = ctypes.c_void_p, ctypes.c_int
+    init = abi.bind(
+        "rcl",
+        "rcl_subscription_content_filter_options_init",
+        code,
+        (pointer, ctypes.c_char_p, ctypes.c_size_t, pointer, pointer),
+    )
+    apply = abi.bind("rcl", "rcl_subscription_set_content_filter", code, (pointer, pointer))
+    end = abi.bind("rcl", "rcl_subscription_content_filter_options_fini", code, (pointer, pointer))
+    with subscription.handle:
+        made = subscription.handle.pointer
+        failed = init(
+            made, expression.encode(), len(parameters), values, ctypes.byref(options)
+        ) or apply(made, ctypes.byref(options))
+        reason = rcl.take_error() if failed else ""
+        end(made, ctypes.byref(options))
+    if failed:
+        topic = subscription.topic_name
+        node.destroy_subscription(subscription)
+        raise MiddlewareError(
+            f"cannot filter subscription {topic!r} by {expression!r}: {reason}",
+            hint="write it as the WHERE part of SQL, with %0, %1, … for its parameters",
+        )
     return subscription
 
 

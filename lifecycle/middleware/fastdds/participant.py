@@ -236,6 +236,8 @@ class FlowParticipant:
         unique: UniqueRequirement = UniqueRequirement.NOT_REQUIRED,
         callback_group: CallbackGroup | None = None,
         event_callbacks: SubscriptionEventCallbacks | None = None,
+        raw: bool = False,
+        content_filter: tuple[str, tuple[str, ...]] | None = None,
     ) -> Subscription:
         """Create a subscription on this participant; `topic` should be fully qualified.
 
@@ -253,6 +255,8 @@ class FlowParticipant:
                 unique=unique,
                 callback_group=self._group(callback_group),
                 event_callbacks=event_callbacks,
+                raw=raw,
+                content_filter=content_filter,
             )
         try:
             self.ensure_dscp()

@@ -12,6 +12,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterable, Iterator
+from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from lifecycle.errors import BringUpError
@@ -178,17 +179,17 @@ class BringUp:
     async def activate(
         self, permit: Permit, timeout_s: float, nodes: Iterable[NodeRun] | None = None
     ) -> None:
-        """Activate every managed node, or some, as `permit` allows.
+        """Activate every node that is held, or some, as `permit` allows.
 
         Raises:
             StepFailedError: as for `connect`.
             VerificationError: something changed after the verdict, and what it is now keeps the
                 gate closed for all that were not asked yet.
         """
-        managed = [node for node in self._some(nodes) if node.planned.managed]
+        held = [node for node in self._some(nodes) if node.planned.holds]
         try:
             await asyncio.wait_for(
-                self._side_by_side(self._activate(node, permit) for node in managed), timeout_s
+                self._side_by_side(self._activate(node, permit) for node in held), timeout_s
             )
         except asyncio.TimeoutError:
             raise self._failure() or self._late(timeout_s) from None
@@ -205,7 +206,7 @@ class BringUp:
         active = tuple(
             node
             for node in self._some(nodes)
-            if node.planned.managed and (nodes is not None or node.reach is Reach.ACTIVE)
+            if node.planned.holds and (nodes is not None or node.reach is Reach.ACTIVE)
         )
         await self._side_by_side(self._deactivate(node, active) for node in active)
 
@@ -404,7 +405,7 @@ class BringUp:
         limit_s = node.planned.timeouts.start_s
         node.doing = "starting"
         if process is not None and process.channel is not None:
-            if node.planned.managed:
+            if node.planned.holds:
                 node.driver = ControlDriver(process.channel, node.name)
         elif node.planned.managed:
             node.doing = "waiting to appear in the graph"
@@ -428,6 +429,7 @@ class BringUp:
                     discovery_range=self._system.plan.discovery_range,
                     nodes=tuple(node.planned for node in nodes),
                     gathers=self._gathering is not None,
+                    folders=manifest_folders(node.planned for node in nodes),
                 ),
                 self._system.on_host_event,
                 hung,
@@ -519,6 +521,12 @@ class BringUp:
             subject=culprit.name if culprit else self._system.plan.system,
             **(_process_of(culprit) if culprit else {}),
         )
+
+
+def manifest_folders(nodes: Iterable[PlannedNode]) -> tuple[str, ...]:
+    """Return the absolute folders of the manifests that declare some nodes."""
+    folders = (str(Path(node.at.file).absolute().parent) for node in nodes if node.at.file)
+    return tuple(dict.fromkeys(folders))
 
 
 def died(process: ManagedProcess, node: NodeRun | None = None) -> StepFailedError:
