@@ -23,6 +23,7 @@ from lifecycle.manifest.model import (
     Discovery,
     Endpoint,
     EndpointKind,
+    Executor,
     FlowNeed,
     Interface,
     Node,
@@ -422,10 +423,15 @@ def _run(node: Cursor, base: Path, found: Findings) -> Run:
     elif "attach" in cursor:
         kind = RunKind.ATTACH
         _refuse(cursor, _OF_A_PROCESS, "a node that somebody else starts", found)
+    _check_python_keys(cursor, kind, found)
     folder = cursor.text("working_directory")
+    arguments = (
+        (name, _parameter(name, each, found)) for name, each in cursor.entries("arguments")
+    )
     return cursor.build(
         Run,
         kind=kind,
+        arguments=tuple((name, value) for name, value in arguments if value is not None),
         environment=tuple((name, each.value.text) for name, each in cursor.entries("environment")),
         working_directory=absolute(base, folder) if folder else "",
         prefix=_words(cursor, "prefix", found),
@@ -458,6 +464,23 @@ def _words(run: Cursor, key: str, found: Findings) -> tuple[str, ...]:
         hint = "close the quotation, or write a list of words"
         found.append(error("manifest.words", cursor.at, message, hint))
         return ()
+
+
+_OF_PYTHON = ("arguments", "executor", "threads")
+
+
+def _check_python_keys(cursor: Cursor, kind: RunKind, found: Findings) -> None:
+    for name in _OF_PYTHON:
+        if name not in cursor:
+            continue
+        at = cursor.document.key_at((*cursor.place, name))
+        if kind is not RunKind.PYTHON:
+            message = f"cannot set {name} of what is not 'run: {{python: …}}'"
+            found.append(error("manifest.python-only", at, message, "remove it"))
+        elif name == "threads" and cursor.text("executor") != Executor.MULTI.value:
+            message = "cannot give threads to an executor that has one"
+            hint = "write 'executor: multi', or remove it"
+            found.append(error("manifest.threads", at, message, hint))
 
 
 def _parameters(node: Cursor, found: Findings) -> dict[str, tuple[ParameterValue, Position]]:

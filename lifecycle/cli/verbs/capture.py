@@ -69,7 +69,7 @@ def command(
 
     Nodes of this host are written with the command line, folder and environment of their process,
     so that `lifecycle up` starts them again; all with the interfaces and QoS that discovery shows,
-    and with the values of their parameters. What cannot be seen stands beside a comment: `# gap: …`.
+    and with the values of their parameters. What cannot be seen stands beside a comment: `# gap: …`
     The result passes `lifecycle check`, and `lifecycle verify` of the same system is ok. Exits with
     4 if no node is there.
     """

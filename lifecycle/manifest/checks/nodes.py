@@ -22,6 +22,7 @@ from lifecycle.manifest.model import (
     DiscoveryMode,
     DiscoveryRange,
     EndpointKind,
+    Executor,
     FlowTransport,
     Machine,
     Node,
@@ -88,6 +89,10 @@ def check_processes(system: DeclaredSystem) -> Iterator[Diagnostic]:
             yield from _apart(node, other, at)
 
 
+def _executor(run: Run) -> tuple[Executor, int]:
+    return run.executor, run.threads
+
+
 def _apart(node: Node, other: Node, at: Position) -> Iterator[Diagnostic]:
     """Judge two nodes that share a process."""
     together = f"cannot share process {node.process!r} with {other.key!r} ({spell(other.at)})"
@@ -110,6 +115,7 @@ def _apart(node: Node, other: Node, at: Position) -> Iterator[Diagnostic]:
             ("prefix", one.prefix, two.prefix),
             ("output", one.output, two.output),
             ("ros_args", one.ros_args, two.ros_args),
+            ("executor", _executor(one), _executor(two)),
         )
         if mine != its
     ]

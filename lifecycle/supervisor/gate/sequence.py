@@ -437,7 +437,7 @@ class GateSequence:
         return frozenset(
             each.name
             for each in self._system.nodes.values()
-            if each.planned.managed and each.reach is Reach.ACTIVE
+            if each.planned.holds and each.reach is Reach.ACTIVE
         )
 
     def _reached(self, phase: str) -> None:
