@@ -15,8 +15,8 @@ from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterable
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
-from lifecycle.errors import BringUpError
-from lifecycle.manifest import Condition, RunKind, TargetState
+from lifecycle.errors import BringUpError, MiddlewareError
+from lifecycle.manifest import Condition, RosArguments, RunKind, TargetState
 from lifecycle.node import HostSpec, Operation
 from lifecycle.plan import PlannedNode
 from lifecycle.supervisor.gate.gate import Permit
@@ -28,7 +28,7 @@ from lifecycle.supervisor.processes.control_channel import (
     HostFailedError,
 )
 from lifecycle.supervisor.processes.process import ManagedProcess, Spawner, patient
-from lifecycle.supervisor.run.events import ProcessState, Reach
+from lifecycle.supervisor.run.events import Notice, ProcessState, Reach
 from lifecycle.supervisor.run.failure import StepFailedError, ended
 from lifecycle.verify import (
     DEADLINE,
@@ -139,6 +139,7 @@ class BringUp:
         services: makes the driver of a managed node that is not ours.
         appears: waits until a node of this name is in the graph.
         recorded: called after each spawn, to keep the record of children true.
+        gives: sets the parameters of a running node that its command line does not give it.
         wirer: wires each node between its configure and its connect; None leaves it to the nodes.
     """
 
@@ -151,7 +152,9 @@ class BringUp:
         appears: Callable[[str], Awaitable[None]],
         recorded: Callable[[], None],
         wirer: Wirer | None = None,
+        gives: Callable[[PlannedNode], Awaitable[None]] | None = None,
     ) -> None:
+        self._gives = gives
         self._system = system
         self._spawner_of = spawner_of
         self._services = services
@@ -340,7 +343,19 @@ class BringUp:
             await ended(appears)
         if appears.done() and not appears.cancelled():
             appears.result()
+            await self._give(node)
         self._started(node)
+
+    async def _give(self, node: NodeRun) -> None:
+        """Set its parameters where no command line can; what it has not yet, it may have later."""
+        if self._gives is None or node.planned.run.ros_args is not RosArguments.NONE:
+            return
+        try:
+            await self._gives(node.planned)
+        except MiddlewareError as error:
+            # Judged by what it has then, which names the parameter.
+            self._system.emit(Notice(message=error.message))
+        self._system.touched.set()
 
     def _started(self, node: NodeRun, standing: NodeCondition | None = None) -> None:
         node.doing = ""
@@ -354,10 +369,12 @@ class BringUp:
         limit_s = node.planned.timeouts.start_s
         standing = await self._step(node, node.driver.start(), limit_s, rule=START_FAILED)
         self._started(node, standing)
+        await self._give(node)
         if node.planned.state is TargetState.UNCONFIGURED:
             return
         await self._system.reached(node, Condition.CONFIGURED, "configure")
         await self._operate(node, Operation.CONFIGURE, Reach.CONFIGURED)
+        await self._give(node)
         await self._system.reached(node, Condition.CONNECTED, "connect")
         if self._wirer is not None:
             await self._wirer.ready(node)

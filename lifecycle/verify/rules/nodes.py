@@ -47,7 +47,7 @@ ENDED_NODE = Rule(
     outcomes=(Outcome.UNVERIFIABLE,),
     fix="nothing, if its work was to be done once; without `may_end` its end is a failure",
     concerns_flow=True,
-    about=About.PRESENCE,
+    heals=Heals.NEVER,
 )
 RULES = (MISSING_NODE, ENDED_NODE, UNDECLARED_NODE, DUPLICATE_NODE)
 

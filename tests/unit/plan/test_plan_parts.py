@@ -200,7 +200,7 @@ def test_a_process_is_told_its_domain_its_range_and_its_nodes_variables():
 # --- command lines
 
 
-def test_a_command_gets_its_name_remaps_parameters_and_log_level_as_ros_spells_them():
+def test_a_command_gets_its_namespace_remaps_parameters_and_log_level_as_ros_spells_them():
     one = node(
         "talker",
         run=Run(kind=RunKind.COMMAND, command=("/opt/talker", "--fast")),
@@ -210,8 +210,8 @@ def test_a_command_gets_its_name_remaps_parameters_and_log_level_as_ros_spells_t
         parameter_files=("/etc/talker.yaml",),
         log_level="debug",
     )
-    assert shlex.join(command_line(one, {})) == (
-        "/opt/talker --fast --ros-args -r __node:=talker -r __ns:=/robot -r chatter:=/talk"
+    assert shlex.join(command_line([one], {})) == (
+        "/opt/talker --fast --ros-args -r __ns:=/robot -r chatter:=/talk"
         " --params-file /etc/talker.yaml -p rate:=2.0 -p 'name:=\"1\"' --log-level debug"
     )
 
@@ -264,14 +264,14 @@ def test_an_executable_is_found_under_the_first_prefix_that_has_it(tmp_path: Pat
     executable(tmp_path / "three", "demo", "talker")
     found = executable(tmp_path / "two", "demo", "talker")
     prefixes = ":".join(str(tmp_path / each) for each in ("one", "two", "three"))
-    assert command_line(packaged(), {"AMENT_PREFIX_PATH": prefixes})[0] == str(found)
+    assert command_line([packaged()], {"AMENT_PREFIX_PATH": prefixes})[0] == str(found)
 
 
 def test_a_file_that_may_not_be_executed_is_not_found(tmp_path: Path):
     executable(tmp_path, "demo", "talker").chmod(0o644)
     executable(tmp_path, "demo", "listener")
     with pytest.raises(PlanError) as error:
-        command_line(packaged(), {"AMENT_PREFIX_PATH": str(tmp_path)})
+        command_line([packaged()], {"AMENT_PREFIX_PATH": str(tmp_path)})
     assert error.value.message == (
         "cannot find executable 'talker' of package 'demo': the package has listener"
     )
@@ -279,7 +279,7 @@ def test_a_file_that_may_not_be_executed_is_not_found(tmp_path: Path):
 
 def test_a_missing_package_says_where_it_was_looked_for():
     with pytest.raises(PlanError) as error:
-        command_line(packaged(), {"AMENT_PREFIX_PATH": "/nowhere:/elsewhere"})
+        command_line([packaged()], {"AMENT_PREFIX_PATH": "/nowhere:/elsewhere"})
     assert str(error.value) == (
         "robot.lifecycle.yaml:3:3: cannot find executable 'talker' of package 'demo':"
         " no lib/demo with executables under /nowhere, /elsewhere;"
@@ -289,7 +289,7 @@ def test_a_missing_package_says_where_it_was_looked_for():
 
 def test_no_ament_environment_says_so():
     with pytest.raises(PlanError) as error:
-        command_line(packaged(), {})
+        command_line([packaged()], {})
     assert error.value.message == (
         "cannot find executable 'talker' of package 'demo': AMENT_PREFIX_PATH is empty"
     )
