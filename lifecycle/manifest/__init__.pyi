@@ -30,6 +30,7 @@ from .model import DiscoveryRange as DiscoveryRange
 from .model import Endpoint as Endpoint
 from .model import EndpointKind as EndpointKind
 from .model import EndpointPolicy as EndpointPolicy
+from .model import Executor as Executor
 from .model import FlowIdentification as FlowIdentification
 from .model import FlowNeed as FlowNeed
 from .model import FlowTerms as FlowTerms

@@ -22,6 +22,7 @@ from lifecycle.manifest.model import (
     Discovery,
     Endpoint,
     EndpointKind,
+    Executor,
     FlowNeed,
     Interface,
     Node,
@@ -418,13 +419,35 @@ def _run(node: Cursor, base: Path, found: Findings) -> Run:
                 at = cursor.document.key_at((*cursor.place, name))
                 message = f"cannot set {name} of a node that somebody else starts"
                 found.append(error("manifest.attach", at, message, "remove it"))
+    _check_python_keys(cursor, kind, found)
     folder = cursor.text("working_directory")
+    arguments = (
+        (name, _parameter(name, each, found)) for name, each in cursor.entries("arguments")
+    )
     return cursor.build(
         Run,
         kind=kind,
+        arguments=tuple((name, value) for name, value in arguments if value is not None),
         environment=tuple((name, each.value.text) for name, each in cursor.entries("environment")),
         working_directory=absolute(base, folder) if folder else "",
     )
+
+
+_OF_PYTHON = ("arguments", "executor", "threads")
+
+
+def _check_python_keys(cursor: Cursor, kind: RunKind, found: Findings) -> None:
+    for name in _OF_PYTHON:
+        if name not in cursor:
+            continue
+        at = cursor.document.key_at((*cursor.place, name))
+        if kind is not RunKind.PYTHON:
+            message = f"cannot set {name} of what is not 'run: {{python: …}}'"
+            found.append(error("manifest.python-only", at, message, "remove it"))
+        elif name == "threads" and cursor.text("executor") != Executor.MULTI.value:
+            message = "cannot give threads to an executor that has one"
+            hint = "write 'executor: multi', or remove it"
+            found.append(error("manifest.threads", at, message, hint))
 
 
 def build_parameters(node: Cursor, found: Findings) -> dict[str, tuple[ParameterValue, Position]]:

@@ -58,6 +58,14 @@ class RunKind(enum.Enum):
     ATTACH = "attach"  # started outside the supervisor
 
 
+class Executor(enum.Enum):
+    """Which of rclpy's executors runs the callbacks of a Python process."""
+
+    SINGLE = "single"  # one callback at a time
+    MULTI = "multi"  # in several threads, as callback groups allow
+    EVENTS = "events"  # rclpy.experimental's EventsExecutor, one at a time
+
+
 class Condition(enum.Enum):
     """What a node's own step waits for in another node; ordered.
 
@@ -136,7 +144,10 @@ class Run:
     """How to start a node. Exactly one of the forms is set, as `kind` says.
 
     Attributes:
-        python: `module:Class` for PYTHON.
+        python: `module:Class`, or `module:function` that returns nodes, for PYTHON.
+        arguments: (keyword, value) that the class or function is called with.
+        executor: of the process, which all nodes in it share.
+        threads: of a MULTI executor; 0 is one for each processor, at least two.
         command: argv for COMMAND; empty when `package`/`executable` name it instead.
         package: ament package, resolved through AMENT_PREFIX_PATH at plan time.
         environment: extra variables, (name, value).
@@ -144,6 +155,9 @@ class Run:
 
     kind: RunKind
     python: str = ""
+    arguments: tuple[tuple[str, ParameterValue], ...] = ()
+    executor: Executor = Executor.SINGLE
+    threads: int = 0
     command: tuple[str, ...] = ()
     package: str = ""
     executable: str = ""
@@ -324,8 +338,7 @@ class NodeDeclaration:
         key: its key under `nodes:`, unique in the system (prefixed by includes as `prefix/key`).
         name: ROS base name; the key's last part unless `name:` is set.
         namespace: absolute, `/` for the root.
-        managed: True for a ROS 2 managed node; False for a plain node, which nothing can hold
-            back from sending.
+        managed: True for a ROS 2 managed node; False for a plain node.
         parameters: (name, value) given on top of parameter files.
         remap: (from, to) as written.
     """
@@ -343,6 +356,11 @@ class NodeDeclaration:
     timeouts: Timeouts = Timeouts()
     log_level: str = ""
     at: Position
+
+    @property
+    def holds(self) -> bool:
+        """It waits for the gate: a managed node, or a plain one in a process of ours."""
+        return self.managed or self.run.kind is RunKind.PYTHON
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -397,6 +415,7 @@ __all__ = [
     "Endpoint",
     "EndpointKind",
     "EndpointPolicy",
+    "Executor",
     "FlowIdentification",
     "FlowNeed",
     "FlowTransport",
