@@ -123,6 +123,7 @@ def build_manifest(
     environment: Mapping[str, str],
     unsound: Collection[Place],
     found: Findings,
+    machine: str = THIS_HOST,
 ) -> Manifest:
     """Build what one document declares, its includes not yet joined.
 
@@ -134,9 +135,10 @@ def build_manifest(
         environment: for AMENT_PREFIX_PATH, where interfaces by reference are searched.
         unsound: links to leave out, which keep their place in the list.
         found: findings are appended here; with an error among them, what is wrong is left out.
+        machine: of nodes that name none.
     """
     nodes = tuple(
-        build_node(key, cursor, base=base, machine=THIS_HOST, environment=environment, found=found)
+        build_node(key, cursor, base=base, machine=machine, environment=environment, found=found)
         for key, cursor in root.entries("nodes")
     )
     return Manifest(
@@ -266,6 +268,44 @@ def load(
     if any(each.severity is Severity.ERROR for each in found):
         raise ManifestError(every())
     return Loaded(manifest=manifest, warnings=every())
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class ArgumentDeclaration:
+    """An argument that a manifest takes: `rate:=5.0` on the command line.
+
+    Attributes:
+        default: as it is written, substitutions unresolved; None for one that is required.
+        choices: the only values allowed; empty if any is.
+    """
+
+    name: str
+    default: str | None
+    choices: tuple[str, ...]
+    description: str
+    at: Position
+
+
+def declared_arguments(path: str | Path) -> tuple[ArgumentDeclaration, ...]:
+    """Return the arguments that one manifest declares, in their order, whatever else is in it.
+
+    Raises:
+        ManifestError: it cannot be read, or its `arguments:` are none.
+    """
+    document = read_document(path, shown=os.fspath(path))
+    wrong = [each for place, each in validate(document) if place[:1] == ("arguments",)]
+    if wrong:
+        raise ManifestError(_sorted(wrong, [document.file]))
+    return tuple(
+        ArgumentDeclaration(
+            name=name,
+            default=cursor.text("default") if "default" in cursor else None,
+            choices=tuple(each.value.text for each in cursor.items("choices")),
+            description=cursor.text("description"),
+            at=cursor.key_at,
+        )
+        for name, cursor in Cursor.root(document).entries("arguments")
+    )
 
 
 def _without_left_out(manifest: Manifest) -> Manifest:
@@ -442,7 +482,7 @@ class _Reading:
         return any(not keys or not found or found[0] in keys for found in inside)
 
 
-NOTHING = Shared()
+NOTHING = Shared(machine=THIS_HOST)
 
 
 class _Loading:
@@ -520,6 +560,7 @@ class _Loading:
             environment=self._environment,
             unsound=links(unsound),
             found=self.found,
+            machine=shared.machine,
         )
         self.machines = _union(self.machines, entries(document, "machines"))
         self._check_outermost(root, manifest)
@@ -611,7 +652,7 @@ class _Loading:
                 key,
                 cursor,
                 base=reading.origin.path.parent,
-                machine=root.text("machine", THIS_HOST),
+                machine=root.text("machine", shared.machine),
                 environment=self._environment,
                 found=self.found,
             )

@@ -1,4 +1,4 @@
-"""What nodes share: `parameters:`, `remap:`, `use_sim_time:` of documents and groups, by nearness.
+"""What nodes share: `parameters:`, `remap:`, `machine:` … of documents and groups, by nearness.
 
 Owns: how values that are written for many nodes reach each of them; what is nearer to a node wins:
 the node itself, its parameter files, its group, the groups around it, its document, the documents
@@ -28,8 +28,10 @@ class Shared:
     Attributes:
         parameters: value and place, by name.
         remap: new name and place, by the name in the node's code.
+        machine: where a node runs that names no machine.
     """
 
+    machine: str
     parameters: Mapping[str, tuple[ParameterValue, Position]] = dataclasses.field(
         default_factory=dict
     )
@@ -52,7 +54,11 @@ class Shared:
         elif sim_time is not None and isinstance(sim_time.scalar, bool):
             parameters[SIM_TIME] = (sim_time.scalar, sim_time.key_at)
         remap = {name: (each.value.text, each.key_at) for name, each in cursor.entries("remap")}
-        return Shared(parameters={**self.parameters, **parameters}, remap={**self.remap, **remap})
+        return Shared(
+            machine=cursor.text("machine", self.machine),
+            parameters={**self.parameters, **parameters},
+            remap={**self.remap, **remap},
+        )
 
     def given_to(self, node: Node) -> Node:
         """Return a node with what it does not set itself."""
