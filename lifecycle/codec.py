@@ -3,7 +3,9 @@
 Owns: the one way a dataclass becomes JSON (control channel, reports, files) and becomes typed
 again. Enums travel as their values, tuples as arrays, None as null. Owns also the ranges in the
 schemas of results (`make schemas`); reading enforces none of them, because each reader reports what
-is out of range in its own message. Imports nothing of the package.
+is out of range in its own message; and reading the tables that ship inside the package:
+`lifecycle/network/data/` holds transcribed facts with their sources, nothing is computed into them.
+Imports nothing of the package.
 """
 
 from __future__ import annotations
@@ -61,3 +63,16 @@ def from_json(data: bytes | str, type_: type[T], *, longest: int | None = None) 
 def to_plain(value: object) -> object:
     """Return `value` as dicts, lists and scalars, as JSON would hold it."""
     return msgspec.to_builtins(value)
+
+
+def read_table(name: str, type_: type[T]) -> T:
+    """Read `lifecycle/network/data/<name>.json` as `type_`.
+
+    Raises:
+        FileNotFoundError: no such table.
+        ValueError: the file does not fit `type_`.
+    """
+    from importlib import resources  # late: a fork server reads no table
+
+    file = resources.files("lifecycle.network").joinpath("data").joinpath(f"{name}.json")
+    return from_json(file.read_bytes(), type_)

@@ -1,6 +1,3 @@
-from .dds import GRAPH_QOS as GRAPH_QOS
-from .dds import DdsTransport as DdsTransport
-from .dds import steady_timer as steady_timer
 from .events import FORGET_AFTER_S as FORGET_AFTER_S
 from .events import SILENT_AFTER_S as SILENT_AFTER_S
 from .events import GraphEvents as GraphEvents
@@ -45,6 +42,9 @@ from .scheduler import set_within as set_within
 from .state import Fetch as Fetch
 from .state import GraphState as GraphState
 from .state import Look as Look
+from .transport import GRAPH_QOS as GRAPH_QOS
+from .transport import DdsTransport as DdsTransport
 from .transport import GraphTransport as GraphTransport
 from .transport import InMemoryNetwork as InMemoryNetwork
 from .transport import InMemoryTransport as InMemoryTransport
+from .transport import steady_timer as steady_timer

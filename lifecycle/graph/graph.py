@@ -15,12 +15,11 @@ from collections.abc import Callable
 
 from rclpy.node import Node
 
-from lifecycle.graph.dds import DdsTransport
 from lifecycle.graph.events import SILENT_AFTER_S, GraphEvents
 from lifecycle.graph.observer import BURST_S, QUIET_S, Observer
 from lifecycle.graph.scheduler import LoopScheduler, ThreadScheduler
 from lifecycle.graph.state import GraphState
-from lifecycle.graph.transport import GraphTransport
+from lifecycle.graph.transport import DdsTransport, GraphTransport
 from lifecycle.middleware import GraphObserver, NodeClients
 from lifecycle.plan import ParticipantConnections, Plan
 from lifecycle.verify import Observation, Stage, Verdict, verify

@@ -22,6 +22,7 @@ from lifecycle.manifest.model import (
     Discovery,
     Endpoint,
     EndpointKind,
+    Executor,
     FlowNeed,
     Interface,
     Node,
@@ -340,7 +341,7 @@ def _known(value: Scalar) -> bool | int | float | str:
     return value
 
 
-__all__ = ["Findings", "build_node", "quantities"]
+__all__ = ["Findings", "build_node", "build_parameters", "quantities"]
 
 _PROGRAMS = ("python", "command", "package", "executable")
 _POSITIONED = ("machine", "namespace", "name", "process", "run", "interface", "log_level")
@@ -366,7 +367,7 @@ def build_node(
         found: findings are appended here.
     """
     namespace = cursor.text("namespace").strip("/")
-    parameters = _parameters(cursor, found)
+    parameters = build_parameters(cursor, found)
     interface = build_interface(cursor, base=base, environment=environment, found=found)
     return cursor.build(
         Node,
@@ -418,17 +419,39 @@ def _run(node: Cursor, base: Path, found: Findings) -> Run:
                 at = cursor.document.key_at((*cursor.place, name))
                 message = f"cannot set {name} of a node that somebody else starts"
                 found.append(error("manifest.attach", at, message, "remove it"))
+    _check_python_keys(cursor, kind, found)
     folder = cursor.text("working_directory")
+    arguments = (
+        (name, _parameter(name, each, found)) for name, each in cursor.entries("arguments")
+    )
     return cursor.build(
         Run,
         kind=kind,
+        arguments=tuple((name, value) for name, value in arguments if value is not None),
         environment=tuple((name, each.value.text) for name, each in cursor.entries("environment")),
         working_directory=absolute(base, folder) if folder else "",
     )
 
 
-def _parameters(node: Cursor, found: Findings) -> dict[str, tuple[ParameterValue, Position]]:
-    """Flatten parameter mappings into dotted names, as rcl's parameter files do."""
+_OF_PYTHON = ("arguments", "executor", "threads")
+
+
+def _check_python_keys(cursor: Cursor, kind: RunKind, found: Findings) -> None:
+    for name in _OF_PYTHON:
+        if name not in cursor:
+            continue
+        at = cursor.document.key_at((*cursor.place, name))
+        if kind is not RunKind.PYTHON:
+            message = f"cannot set {name} of what is not 'run: {{python: …}}'"
+            found.append(error("manifest.python-only", at, message, "remove it"))
+        elif name == "threads" and cursor.text("executor") != Executor.MULTI.value:
+            message = "cannot give threads to an executor that has one"
+            hint = "write 'executor: multi', or remove it"
+            found.append(error("manifest.threads", at, message, hint))
+
+
+def build_parameters(node: Cursor, found: Findings) -> dict[str, tuple[ParameterValue, Position]]:
+    """Flatten `parameters:` of a node, group or document into dotted names, as rcl's files do."""
     flat: dict[str, tuple[ParameterValue, Position]] = {}
     pending = list(reversed(list(node.entries("parameters"))))
     while pending:

@@ -58,6 +58,14 @@ class RunKind(enum.Enum):
     ATTACH = "attach"  # started outside the supervisor
 
 
+class Executor(enum.Enum):
+    """Which of rclpy's executors runs the callbacks of a Python process."""
+
+    SINGLE = "single"  # one callback at a time
+    MULTI = "multi"  # in several threads, as callback groups allow
+    EVENTS = "events"  # rclpy.experimental's EventsExecutor, one at a time
+
+
 class Condition(enum.Enum):
     """What a node's own step waits for in another node; ordered.
 
@@ -136,7 +144,10 @@ class Run:
     """How to start a node. Exactly one of the forms is set, as `kind` says.
 
     Attributes:
-        python: `module:Class` for PYTHON.
+        python: `module:Class`, or `module:function` that returns nodes, for PYTHON.
+        arguments: (keyword, value) that the class or function is called with.
+        executor: of the process, which all nodes in it share.
+        threads: of a MULTI executor; 0 is one for each processor, at least two.
         command: argv for COMMAND; empty when `package`/`executable` name it instead.
         package: ament package, resolved through AMENT_PREFIX_PATH at plan time.
         environment: extra variables, (name, value).
@@ -144,6 +155,9 @@ class Run:
 
     kind: RunKind
     python: str = ""
+    arguments: tuple[tuple[str, ParameterValue], ...] = ()
+    executor: Executor = Executor.SINGLE
+    threads: int = 0
     command: tuple[str, ...] = ()
     package: str = ""
     executable: str = ""
@@ -324,8 +338,7 @@ class NodeDeclaration:
         key: its key under `nodes:`, unique in the system (prefixed by includes as `prefix/key`).
         name: ROS base name; the key's last part unless `name:` is set.
         namespace: absolute, `/` for the root.
-        managed: True for a ROS 2 managed node; False for a plain node, which nothing can hold
-            back from sending.
+        managed: True for a ROS 2 managed node; False for a plain node.
         parameters: (name, value) given on top of parameter files.
         remap: (from, to) as written.
     """
@@ -344,6 +357,11 @@ class NodeDeclaration:
     log_level: str = ""
     at: Position
 
+    @property
+    def holds(self) -> bool:
+        """It waits for the gate: a managed node, or a plain one in a process of ours."""
+        return self.managed or self.run.kind is RunKind.PYTHON
+
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Node(NodeDeclaration):
@@ -356,6 +374,7 @@ class Node(NodeDeclaration):
             `where`.
         written_paths: paths as the manifest writes them, by place: `parameter_files.0`,
             `run.working_directory`; what other fields have of them is absolute.
+        shared: parts that are written for several nodes, by path as in `positions`.
     """
 
     process: str = ""
@@ -365,6 +384,7 @@ class Node(NodeDeclaration):
     connections: tuple[ConnectionDeclaration, ...] = ()
     positions: tuple[tuple[str, Position], ...] = ()
     written_paths: tuple[tuple[str, str], ...] = ()
+    shared: frozenset[str] = frozenset()
 
     def where(self, part: str) -> Position:
         """Return the position of a part of this node; the node's own if that is not known."""
@@ -395,6 +415,7 @@ __all__ = [
     "Endpoint",
     "EndpointKind",
     "EndpointPolicy",
+    "Executor",
     "FlowIdentification",
     "FlowNeed",
     "FlowTransport",
@@ -561,6 +582,8 @@ class Manifest(SystemDeclaration):
         path: the file it was read from, as the user wrote it.
         arguments: resolved values by name.
         positions: where values of `discovery:` and `data_layer:` are, by path, `discovery.mode`.
+        left_out: keys of the nodes that `if:` or `unless:` leaves out, as far as they are known;
+            one that ends in `/` is the prefix of a group or include.
     """
 
     path: str
@@ -569,6 +592,7 @@ class Manifest(SystemDeclaration):
     nodes: tuple[Node, ...] = ()
     links: tuple[Link, ...] = ()
     positions: tuple[tuple[str, Position], ...] = ()
+    left_out: tuple[str, ...] = ()
 
     def where(self, path: str, section: Position) -> Position:
         """Return the position of a value; that of its section where it is not written."""

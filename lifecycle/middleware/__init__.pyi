@@ -12,6 +12,9 @@ from .discovery.rediscovery import call_out as call_out
 from .discovery.rediscovery import send_again_soon as send_again_soon
 from .discovery.rediscovery import tell_names as tell_names
 from .fastdds.nfe import SHARED_MEMORY as SHARED_MEMORY
+from .fastdds.nfe import UniqueFlowNotFeasible as UniqueFlowNotFeasible
+from .fastdds.nfe import create_publisher as create_publisher
+from .fastdds.nfe import create_subscription as create_subscription
 from .fastdds.nfe import get_network_flow_endpoints as get_network_flow_endpoints
 from .fastdds.nfe import has_shared_memory as has_shared_memory
 from .fastdds.participant import FlowParticipant as FlowParticipant
@@ -47,10 +50,13 @@ from .rcl.qos import UnknownInterfaceError as UnknownInterfaceError
 from .rcl.qos import from_rclpy as from_rclpy
 from .rcl.qos import import_interface as import_interface
 from .rcl.qos import to_rclpy as to_rclpy
+from .rcl.rclpy_nodes import RCLError as RCLError
+from .rcl.rclpy_nodes import RclpyStateMachine as RclpyStateMachine
+from .rcl.rclpy_nodes import Watching as Watching
+from .rcl.rclpy_nodes import follow_nodes as follow_nodes
+from .rcl.rclpy_nodes import interface_of as interface_of
+from .rcl.rclpy_nodes import is_rclpy_managed as is_rclpy_managed
 from .rcl.rmw_choice import check_rmw as check_rmw
-from .rcl.unique import UniqueFlowNotFeasible as UniqueFlowNotFeasible
-from .rcl.unique import create_publisher as create_publisher
-from .rcl.unique import create_subscription as create_subscription
 from .services.actions import GoalClient as GoalClient
 from .services.actions import GoalServer as GoalServer
 from .services.clients import NodeClients as NodeClients

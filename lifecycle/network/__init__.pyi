@@ -2,11 +2,6 @@ from .connection_url import ConnectionUrl as ConnectionUrl
 from .connection_url import ConnectionUrlError as ConnectionUrlError
 from .connection_url import Peer as Peer
 from .connection_url import parse as parse
-from .datagram import RTPS_OVERHEAD_BYTES as RTPS_OVERHEAD_BYTES
-from .datagram import SAFE_DATAGRAM_BYTES as SAFE_DATAGRAM_BYTES
-from .datagram import datagram_bytes as datagram_bytes
-from .datagram import is_fragmented as is_fragmented
-from .datagram import max_unfragmented as max_unfragmented
 from .dscp import ECN_MASK as ECN_MASK
 from .dscp import MAX_DSCP as MAX_DSCP
 from .dscp import CodePoint as CodePoint
@@ -32,9 +27,14 @@ from .medium import BUILTIN_TRANSPORTS as BUILTIN_TRANSPORTS
 from .medium import CONNECTABLE as CONNECTABLE
 from .medium import NETWORK_MEDIA as NETWORK_MEDIA
 from .medium import RMW_DEFAULT as RMW_DEFAULT
+from .medium import RTPS_OVERHEAD_BYTES as RTPS_OVERHEAD_BYTES
+from .medium import SAFE_DATAGRAM_BYTES as SAFE_DATAGRAM_BYTES
 from .medium import TRANSPORTS_VARIABLE as TRANSPORTS_VARIABLE
 from .medium import FlowTransport as FlowTransport
 from .medium import Medium as Medium
+from .medium import datagram_bytes as datagram_bytes
+from .medium import is_fragmented as is_fragmented
+from .medium import max_unfragmented as max_unfragmented
 from .nfe import FlowIdentifier as FlowIdentifier
 from .nfe import FlowTuple as FlowTuple
 from .nfe import FlowUniqueness as FlowUniqueness

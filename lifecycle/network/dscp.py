@@ -17,8 +17,7 @@ import functools
 import re
 from typing import Annotated
 
-from lifecycle.codec import Octet, says
-from lifecycle.network.tables import read_table
+from lifecycle.codec import Octet, read_table, says
 
 MAX_DSCP = 63
 """Six bits."""

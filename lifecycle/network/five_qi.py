@@ -12,9 +12,8 @@ import dataclasses
 import enum
 import functools
 
-from lifecycle.codec import from_json
+from lifecycle.codec import from_json, read_table
 from lifecycle.network.dscp import parse_dscp
-from lifecycle.network.tables import read_table
 
 
 class ResourceType(enum.Enum):

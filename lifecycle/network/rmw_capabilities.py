@@ -10,8 +10,8 @@ import dataclasses
 import enum
 import functools
 
+from lifecycle.codec import read_table
 from lifecycle.network.nfe import UniqueRequirement
-from lifecycle.network.tables import read_table
 
 DEFAULT_RMW = "rmw_fastrtps_cpp"
 """What ROS 2 Jazzy takes when RMW_IMPLEMENTATION is not set (REP 2000)."""

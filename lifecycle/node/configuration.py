@@ -22,6 +22,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rclpy.exceptions import InvalidHandle
 from rclpy.utilities import get_rmw_implementation_identifier
 
 from lifecycle import codec
@@ -34,6 +35,7 @@ from lifecycle.middleware import (
     from_rclpy,
     get_network_flow_endpoints,
     guid_of,
+    interface_of,
     is_server_matched,
     machine_id,
     matched_with,
@@ -135,6 +137,76 @@ def collect(
         *(_report(node, mapping) for mapping in data_layer.mappings),
         *(_undeclared_report(node, kind, entity) for kind, entity in undeclared),
     )
+    return _document(
+        node,
+        state.seen.label,
+        connected=state.connected,
+        endpoints=endpoints,
+        connections=connection_reports(spec, data_layer),
+    )
+
+
+def collect_foreign(
+    node: Node,
+    state: str,
+    *,
+    connected: bool,
+    spec: PlannedNode,
+    own: Connection,
+    endpoints: Iterable[tuple[EndpointKind, Any]],
+) -> NodeConfiguration:
+    """Return the configuration of a node of which the class is not ours, as it is now.
+
+    Args:
+        node: the node itself.
+        state: lifecycle_msgs/State label; empty for a plain node.
+        connected: its data layer is made.
+        spec: what it was planned to be.
+        own: its participant.
+        endpoints: kind and rclpy object of what it has made.
+    """
+    declared = {(each.kind, each.resolved): each for each in spec.endpoints}
+    reports: list[EndpointReport] = []
+    for kind, entity in endpoints:
+        try:
+            report = _undeclared_report(node, kind, entity, own)
+        except InvalidHandle:
+            continue  # destroyed meanwhile
+        planned = declared.pop((kind, report.resolved), None)
+        reports.append(
+            report if planned is None else dataclasses.replace(report, name=planned.name)
+        )
+    reports += [
+        EndpointReport(
+            kind=each.kind,
+            name=each.name,
+            resolved=each.resolved,
+            type=each.type,
+            qos=each.qos,
+            mapped=False,
+        )
+        for each in declared.values()
+    ]
+    topics = [each for each in reports if each.mapped and each.kind.is_topic]
+    connection = ConnectionReport(
+        name="",
+        urls=spec.connections.urls,
+        established=all(each.matched for each in topics),
+        mappings=tuple(each.kind.spell(each.name) for each in reports if each.mapped and each.name),
+    )
+    return _document(
+        node, state, connected=connected, endpoints=tuple(reports), connections=(connection,)
+    )
+
+
+def _document(
+    node: Node,
+    state: str,
+    *,
+    connected: bool,
+    endpoints: tuple[EndpointReport, ...],
+    connections: tuple[ConnectionReport, ...],
+) -> NodeConfiguration:
     name = node.get_fully_qualified_name()
     configuration = NodeConfiguration(
         identity=Identity(
@@ -143,14 +215,14 @@ def collect(
             node_id=f"{name}@{_gid_prefix(node)}",
         ),
         name=name,
-        state=state.seen.label,
-        connected=state.connected,
+        state=state,
+        connected=connected,
         rmw=get_rmw_implementation_identifier(),
         transports=transports() or _transports(endpoints),
         serializations=SERIALIZATIONS,
         paradigms=PARADIGMS,
         endpoints=endpoints,
-        connections=connection_reports(spec, data_layer),
+        connections=connections,
         parameters=parameters.reports(node),
     )
     return dataclasses.replace(configuration, checksum=checksum(configuration))
@@ -217,16 +289,20 @@ def _report(node: Node, mapping: Mapping) -> EndpointReport:
     )
 
 
-def _undeclared_report(node: Node, kind: EndpointKind, entity: Any) -> EndpointReport:
+def _undeclared_report(
+    node: Node, kind: EndpointKind, entity: Any, own: Connection | None = None
+) -> EndpointReport:
     """Report an endpoint that no interface declares; it has no name but the one on the wire."""
     resolved = wire_name(entity)
-    interface = entity.msg_type if kind.is_topic else entity.srv_type
+    interface = interface_of(entity)
     report = EndpointReport(
         kind=kind, name="", resolved=resolved, type=interface_name(interface), mapped=True
     )
+    if own is not None and kind in CLIENTS:
+        return dataclasses.replace(report, server_matched=is_server_matched(entity))
     if not kind.is_topic:
         return report
-    return dataclasses.replace(_with_matches(report, node, entity), nfes=_nfes(kind, entity, None))
+    return dataclasses.replace(_with_matches(report, node, entity), nfes=_nfes(kind, entity, own))
 
 
 def _with_matches(report: EndpointReport, witness: Node, entity: Any) -> EndpointReport:
@@ -266,9 +342,12 @@ def _own_endpoint(node: Node, topic: str, kind: EndpointKind, gid: str = "") -> 
 
 def _gid_prefix(node: Node) -> str:
     """Return the participant's part of the node's GIDs in hex; empty if unknown."""
-    topic = node.resolve_topic_name("~/transition_event")
-    info = _own_endpoint(node, topic, EndpointKind.PUBLISHER)
-    return info.gid[:_GID_PREFIX_DIGITS] if info is not None else ""
+    for name in ("~/transition_event", "/parameter_events"):
+        topic = node.resolve_topic_name(name)
+        info = _own_endpoint(node, topic, EndpointKind.PUBLISHER)
+        if info is not None:
+            return info.gid[:_GID_PREFIX_DIGITS]
+    return ""
 
 
 def _nfes(
@@ -347,6 +426,10 @@ class ConfigurationChanges:
         """Call `listener` with the configuration, in the executor, after each change."""
         self._listeners.append(listener)
 
+    def close(self) -> None:
+        """Notify of nothing any more: the node's process leaves DDS."""
+        self._listeners.clear()
+
     def touch(self) -> None:
         """Something of the configuration has changed, match counts included."""
         if self._listeners and not self._scheduled:
@@ -354,6 +437,8 @@ class ConfigurationChanges:
 
     def _notify(self) -> None:
         self._scheduled = False
+        if not self._listeners:
+            return
         configuration = self.collect()
         if configuration is None:
             return

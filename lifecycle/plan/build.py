@@ -48,6 +48,7 @@ from lifecycle.manifest import (
 from lifecycle.network import DEFAULT_RMW, MAX_DOMAIN_ID, domain_of
 from lifecycle.plan.connections.wiring import WiredSystem, place_declared, variables_of, wire
 from lifecycle.plan.model import (
+    HeldBy,
     Plan,
     PlanError,
     PlannedEndpoint,
@@ -451,6 +452,7 @@ def _planned_node(
     return PlannedNode(
         **declared(NodeDeclaration, node),
         process=process_name(node),
+        held_by=_held_by(node),
         endpoints=endpoints,
         declared_parameters=node.interface.parameters,
         expected_parameters=files.expected(node),
@@ -462,6 +464,12 @@ def _planned_node(
             _planned_file(node.parameter_files, place, text) for place, text in node.written_paths
         ),
     )
+
+
+def _held_by(node: Node) -> HeldBy:
+    if node.run.kind is RunKind.PYTHON:
+        return HeldBy.STATE_MACHINE if node.managed else HeldBy.EXECUTOR
+    return HeldBy.SERVICES if node.managed else HeldBy.NOTHING
 
 
 def _planned_file(files: tuple[str, ...], place: str, written: str) -> PlannedFile:

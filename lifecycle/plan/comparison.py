@@ -22,7 +22,7 @@ import zlib
 from collections.abc import Iterator, Mapping
 
 from lifecycle.codec import from_json, to_json, to_plain
-from lifecycle.manifest import Position
+from lifecycle.manifest import Position, RunKind
 from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedNode
 
 _VALUE_CHARACTERS = 80
@@ -40,7 +40,7 @@ _NODE_DERIVED = (
     # What the planner, the authority or a restart makes of the rest, and what `_node` adds itself.
     *("key", "at", "run", "endpoints", "declared_parameters", "parameters", "parameter_files"),
     *("remap", "participants", "after", "transports", "max_datagram_bytes", "connections"),
-    *("authority", "events", "membership", "files"),
+    *("authority", "events", "membership", "files", "held_by"),
     *("expected_parameters", "unread_parameter_files"),
 )
 _ENDPOINT_DERIVED = (
@@ -138,8 +138,11 @@ def _document(plan: Plan) -> _Tree:
 
 
 def _node(node: PlannedNode) -> _Tree:
-    run = _fields(node.run, "kind", "environment", "working_directory")
+    run = _fields(node.run, "kind", "environment", "working_directory", "arguments", "executor")
     run = {name: value for name, value in run.items() if value} or {node.run.kind.value: True}
+    if node.run.kind is RunKind.PYTHON:
+        run["arguments"] = {name: to_plain(value) for name, value in node.run.arguments}
+        run["executor"] = node.run.executor.value
     written = {each.place: each for each in node.files}
     folder = written.get("run.working_directory")
     run["working_directory"] = folder.written if folder else node.run.working_directory or None

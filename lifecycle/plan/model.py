@@ -8,6 +8,7 @@ Owns: the types that cross from here into verify/, middleware/, node/ and superv
 from __future__ import annotations
 
 import dataclasses
+import enum
 from typing import Annotated, Any
 
 from lifecycle.codec import DomainId, DscpValue, Port, Positive, says
@@ -47,6 +48,15 @@ def declared(as_: type, by: object) -> dict[str, Any]:
         by: a value of it, or of a type that extends it.
     """
     return {each.name: getattr(by, each.name) for each in dataclasses.fields(as_)}
+
+
+MAX_USER_ID = 32767
+"""Fast DDS 2.14 reads ids of endpoints as int16_t."""
+
+GRAPH_TOPIC = "ros_discovery_info"
+"""By which rmw maps endpoints to nodes; every participant has a writer and a reader of it."""
+
+GRAPH_TYPE = "rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_"
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -202,12 +212,22 @@ class ExpectedParameter:
     at: Position
 
 
+class HeldBy(enum.Enum):
+    """What keeps a node from working before the gate opens."""
+
+    STATE_MACHINE = "state machine"  # in a process of ours, which refuses other clients
+    SERVICES = "lifecycle services"  # elsewhere; what others activate is deactivated again
+    EXECUTOR = "executor"  # no callback runs, and what it publishes is dropped or kept
+    NOTHING = "nothing"  # it works as soon as it is started
+
+
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class PlannedNode(NodeDeclaration):
     """One node as it must exist at run time.
 
     Attributes:
         process: name of its PlannedProcess.
+        held_by: what holds it until the system is verified.
         expected_parameters: what its parameters must be once it is configured: those declared and
             those given, see lifecycle.plan.parameters.
         unread_parameter_files: those whose values are not known here and so not expected.
@@ -238,6 +258,7 @@ class PlannedNode(NodeDeclaration):
     files: tuple[PlannedFile, ...] = ()
     expected_parameters: tuple[ExpectedParameter, ...] = ()
     unread_parameter_files: tuple[str, ...] = ()
+    held_by: HeldBy = HeldBy.STATE_MACHINE
 
     @property
     def full_name(self) -> str:

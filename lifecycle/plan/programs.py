@@ -101,13 +101,17 @@ def resolve_programs(
     return Resolution(diagnostics=tuple(looking.found), unresolved=tuple(looking.unresolved))
 
 
+_Key = tuple[tuple[str, ...], str]
+"""Where modules are looked for, and `module:Class`."""
+
+
 class _Looking:
     def __init__(self, environment: Mapping[str, str]) -> None:
         self.found: list[Diagnostic] = []
         self.unresolved: list[UnresolvedProgram] = []
         self._environment = environment
-        self._sources: dict[str, Sources] = {}
-        self._classes: dict[tuple[str, str], NodeClass | NotThereError | UnknownError] = {}
+        self._sources: dict[tuple[str, ...], Sources] = {}
+        self._classes: dict[_Key, NodeClass | NotThereError | UnknownError] = {}
 
     def look(self, node: Node, *, is_ours: bool) -> None:
         if node.run.kind is RunKind.PYTHON:
@@ -151,15 +155,14 @@ class _Looking:
             hint = "derive it from lifecycle.LifecycleNode, or from rclpy.node.Node"
             self.found.append(error(RULE, at, message, hint))
         else:
+            self.found += _called(node, found, at)
             self._interface(node, found, subject)
 
     def _class(self, node: Node) -> NodeClass | NotThereError | UnknownError:
-        folder = node.run.working_directory or str(Path.cwd())
-        key = (folder, node.run.python)
+        folders = _folders(node)
+        key = (folders, node.run.python)
         if key not in self._classes:
-            sources = self._sources.setdefault(
-                folder, Sources(list(dict.fromkeys((folder, str(Path.cwd())))))
-            )
+            sources = self._sources.setdefault(folders, Sources(folders))
             module, _, name = node.run.python.partition(":")
             try:
                 self._classes[key] = sources.read_class(module, name)
@@ -215,6 +218,54 @@ class _Looking:
         except PlanError as problem:
             missing = NotThereError(problem.message, hint=problem.hint)
             self._missing(node, "run.executable", subject, missing, is_ours=is_ours)
+
+
+def _folders(node: Node) -> tuple[str, ...]:
+    """Return where modules are looked for first, as a host does."""
+    given = dict(node.run.environment).get("PYTHONPATH", "").split(os.pathsep)
+    beside = [str(Path(node.at.file).absolute().parent)] if node.at.file else []
+    first = node.run.working_directory or str(Path.cwd())
+    return tuple(dict.fromkeys((first, *beside, *filter(None, given), str(Path.cwd()))))
+
+
+def _called(node: Node, found: NodeClass, at: Position) -> Iterator[Diagnostic]:
+    """Yield what keeps a class or function from being called and hosted as the manifest says."""
+    if found.spins:
+        yield error(
+            RULE,
+            at,
+            f"cannot host the nodes of {found.name!r}: it calls {found.spins}, which their host "
+            "does",
+            "name the node's class, or a function that returns nodes without spinning them",
+        )
+    if node.managed and found.is_managed is False and found.is_node:
+        yield error(
+            RULE,
+            at,
+            f"cannot manage {node.key!r}: {found.name} ({found.file or 'rclpy'}) is a plain node",
+            "write 'managed: false'; it is held by its executor until the system is verified",
+        )
+    arguments = dict(node.run.arguments)
+    where = _at(node, "run")
+    if found.takes is not None:
+        for name in arguments:
+            if name not in found.takes:
+                yield error(
+                    RULE,
+                    where,
+                    f"cannot give {found.name} ({found.file}) an argument {name!r}",
+                    did_you_mean(name, found.takes)
+                    or f"it takes {', '.join(found.takes) or 'none'}",
+                )
+    # rclpy's own name for what the manifest says anyway.
+    missing = [each for each in found.needs if each not in (*arguments, "node_name")]
+    if missing:
+        yield error(
+            RULE,
+            where,
+            f"cannot call {found.name} ({found.file}) without {', '.join(missing)}",
+            "give it under 'run: {arguments: …}'",
+        )
 
 
 def _find_program(word: str, folder: Path, variables: Mapping[str, str]) -> None:

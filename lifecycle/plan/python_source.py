@@ -43,6 +43,14 @@ _DECLARES = {
 }
 
 _Function = (ast.FunctionDef, ast.AsyncFunctionDef)
+_MANAGED = {
+    "lifecycle.LifecycleNode",
+    "rclpy.lifecycle.LifecycleNode",
+    "rclpy.lifecycle.LifecycleNodeMixin",
+    "rclpy.lifecycle.Node",
+}
+_OF_HOST = {"rclpy.init", "rclpy.spin", "rclpy.shutdown", "init", "spin", "shutdown"}
+"""What a script's `main` calls, and a host does itself."""
 
 
 class NotThereError(LifecycleError):
@@ -87,8 +95,14 @@ class NodeClass:
     """What the source of a class shows.
 
     Attributes:
-        is_node: it is a node class; None if one of its bases cannot be found.
-        is_ours: it is a LifecycleNode.
+        is_node: it is a node class, or a function; None if one of its bases cannot be found.
+        is_ours: it is a LifecycleNode of this package.
+        is_managed: it is that or one of rclpy.lifecycle; None of a function, whose nodes are known
+            once it has returned.
+        takes: keyword arguments of its constructor, or of the function; None where any is taken,
+            or nothing is known.
+        needs: those of them without a default.
+        spins: where a function calls what its host has done or does, `rclpy.spin (nodes.py:7)`.
         unknown: why more may belong to it than is known; empty if nothing does.
         declares: its code declares endpoints itself.
     """
@@ -97,6 +111,10 @@ class NodeClass:
     file: str
     is_node: bool | None
     is_ours: bool
+    is_managed: bool | None = None
+    takes: tuple[str, ...] | None = None
+    needs: tuple[str, ...] = ()
+    spins: str = ""
     handlers: tuple[Handler, ...] = ()
     accesses: tuple[Access, ...] = ()
     unknown: str = ""
@@ -120,6 +138,14 @@ class _Class:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
+class _Makes:
+    """A function."""
+
+    module: _Module
+    node: ast.FunctionDef | ast.AsyncFunctionDef
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
 class _Known:
     """A class, function or module that is known by its name alone."""
 
@@ -131,7 +157,7 @@ class _Imported:
     name: str
 
 
-_Value = _Class | _Known | _Imported
+_Value = _Class | _Makes | _Known | _Imported
 
 
 class Sources:
@@ -146,7 +172,7 @@ class Sources:
         self._modules: dict[str, _Module] = {}
 
     def read_class(self, module: str, name: str) -> NodeClass:
-        """Return what the class `module:name` is.
+        """Return what the class, or function, `module:name` is.
 
         Raises:
             NotThereError: there is no such module, or no such class in it.
@@ -170,7 +196,22 @@ class Sources:
         if isinstance(value, _Known):
             node = value.name.rpartition(".")[2] in {"LifecycleNode", "Node"}
             return NodeClass(
-                name=name, file="", is_node=node or None, is_ours="LifecycleNode" in value.name
+                name=name,
+                file="",
+                is_node=node or None,
+                is_ours=value.name == "lifecycle.LifecycleNode",
+                is_managed=value.name in _MANAGED if node else None,
+            )
+        if isinstance(value, _Makes):
+            takes, needs = _arguments(value.node, of_method=False)
+            return NodeClass(
+                name=name,
+                file=_shown(value.module.file),
+                is_node=True,
+                is_ours=False,
+                takes=takes,
+                needs=needs,
+                spins=_spins(value),
             )
         return self._described(value)
 
@@ -178,6 +219,16 @@ class Sources:
         line, known, unknown = self._line([value], 0)
         is_ours = "lifecycle.LifecycleNode" in known
         is_node = is_ours or any(each.startswith("rclpy.") for each in known)
+        takes: tuple[str, ...] | None = None
+        needs: tuple[str, ...] = ()
+        constructors = [
+            function
+            for each in line
+            for name, function in _methods(each.node)
+            if name == "__init__" and isinstance(function, _Function)
+        ]
+        if constructors and not unknown:
+            takes, needs = _arguments(constructors[0], of_method=True)
         found: dict[str, list[Handler]] = {}
         accesses: list[Access] = []
         declares = False
@@ -200,6 +251,9 @@ class Sources:
             file=_shown(value.module.file),
             is_node=True if is_node else None if unknown else False,
             is_ours=is_ours,
+            is_managed=True if known & _MANAGED else None if unknown else False,
+            takes=takes,
+            needs=needs,
             handlers=tuple(each for marks in found.values() for each in marks),
             accesses=tuple(accesses),
             unknown=unknown,
@@ -309,10 +363,7 @@ class Sources:
         if isinstance(node, (ast.Name, ast.Attribute)):
             return self._value(module, node, depth + 1)
         if isinstance(node, _Function) and not node.decorator_list:
-            raise NotThereError(
-                f"cannot use {name!r} of {module.name} ({_shown(module.file)}:{node.lineno}) as a "
-                "class: it is a function"
-            )
+            return _Makes(module, node)
         if isinstance(node, (ast.Constant, ast.List, ast.Dict, ast.Tuple, ast.Set)):
             raise NotThereError(
                 f"cannot use {name!r} of {module.name} ({_shown(module.file)}:{node.lineno}) as a "
@@ -519,8 +570,11 @@ def _known(module: str, name: str) -> _Known | None:
         if name == "LifecycleNode" or name in _HANDLERS or name == "on_timer":
             return _Known(f"lifecycle.{name}")
         return None
-    if module.partition(".")[0] == "rclpy" and name in {"Node", "LifecycleNode"}:
-        return _Known("rclpy.node.Node")
+    if module.partition(".")[0] == "rclpy":
+        if name in {"LifecycleNode", "LifecycleNodeMixin"} or "lifecycle" in module:
+            return _Known(f"rclpy.lifecycle.{name}")
+        if name == "Node":
+            return _Known("rclpy.node.Node")
     if module in {"typing", "abc", "enum", "typing_extensions"}:
         return _Known(f"{module}.{name}")
     return None
@@ -530,6 +584,35 @@ def _methods(node: ast.ClassDef) -> Iterator[tuple[str, ast.AST]]:
     for each in node.body:
         if isinstance(each, _Function):
             yield each.name, each
+
+
+def _arguments(
+    function: ast.FunctionDef | ast.AsyncFunctionDef, *, of_method: bool
+) -> tuple[tuple[str, ...] | None, tuple[str, ...]]:
+    """Return the keywords that a function takes, None for any, and those that it needs."""
+    given = function.args
+    positional = given.posonlyargs + given.args
+    defaults = len(given.defaults)
+    required = positional[: len(positional) - defaults] if defaults else positional
+    takes = [each.arg for each in (*given.args, *given.kwonlyargs)]
+    needs = [each.arg for each in required]
+    needs += [
+        each.arg
+        for each, default in zip(given.kwonlyargs, given.kw_defaults, strict=True)
+        if default is None
+    ]
+    if of_method and positional:
+        own = positional[0].arg
+        takes = [each for each in takes if each != own]
+        needs = needs[1:] if needs[:1] == [own] else needs
+    return None if given.kwarg else tuple(takes), tuple(needs)
+
+
+def _spins(function: _Makes) -> str:
+    for node in ast.walk(function.node):
+        if isinstance(node, ast.Call) and ast.unparse(node.func) in _OF_HOST:
+            return f"{ast.unparse(node.func)} ({_shown(function.module.file)}:{node.lineno})"
+    return ""
 
 
 def _made_in_body(of: _Class) -> str:

@@ -35,6 +35,7 @@ from lifecycle.network import (
 )
 from lifecycle.plan.connections.hosts import demand
 from lifecycle.plan.model import (
+    HeldBy,
     ParticipantConnections,
     Plan,
     PlannedEndpoint,
@@ -395,8 +396,17 @@ def _nodes(plan: Plan, width: int) -> list[str]:
             f"endpoints {node.endpoint_policy.value}",
         ]
         lines.append(f"  {node.full_name} ({', '.join(facts)})")
+        lines.append(f"    {_HELD[node.held_by]}")
         lines += _endpoints(node, width)
     return lines
+
+
+_HELD = {
+    HeldBy.STATE_MACHINE: "held by its state machine until verified",
+    HeldBy.SERVICES: "held by its lifecycle services until verified",
+    HeldBy.EXECUTOR: "held by its executor and its publishers until verified",
+    HeldBy.NOTHING: "not held: works as soon as it is started",
+}
 
 
 def _endpoints(node: PlannedNode, width: int) -> list[str]:

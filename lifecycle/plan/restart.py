@@ -16,8 +16,7 @@ from collections.abc import Collection, Iterator, Mapping
 from types import MappingProxyType
 
 from lifecycle.network import ConnectionUrl, Medium, Peer, parse
-from lifecycle.plan.connections.contacts import contacts_of
-from lifecycle.plan.connections.hosts import PortPool
+from lifecycle.plan.connections.hosts import PortPool, contacts_of
 from lifecycle.plan.model import ParticipantConnections, Plan, PlanError, PlannedNode
 from lifecycle.plan.negotiation.parties import hosts_of, terms_of
 

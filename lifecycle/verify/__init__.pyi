@@ -29,7 +29,7 @@ from .rules.matching import MatchEnd as MatchEnd
 from .rules.matching import match as match
 from .rules.matching import obstacle as obstacle
 from .rules.nodes import MISSING_NODE as MISSING_NODE
-from .rules.outsiders import UNATTRIBUTED_ENDPOINT as UNATTRIBUTED_ENDPOINT
+from .rules.nodes import UNATTRIBUTED_ENDPOINT as UNATTRIBUTED_ENDPOINT
 from .rules.run import DEADLINE as DEADLINE
 from .rules.run import NOT_PROGRAMMED as NOT_PROGRAMMED
 from .rules.run import NOT_WIRED as NOT_WIRED

@@ -45,6 +45,9 @@ NOISE_TOPICS = frozenset(
 )
 """Topics of the client libraries themselves, and ours."""
 
+_SERVICE_EVENT = "/_service_event"
+"""What a service or client says of its calls once its introspection is configured (REP-2012)."""
+
 NODE_SERVICES: Mapping[str, str] = {
     "describe_parameters": "rcl_interfaces/srv/DescribeParameters",
     "get_parameter_types": "rcl_interfaces/srv/GetParameterTypes",
@@ -218,6 +221,11 @@ NO_NAMES = DeclaredNames()
 """Nothing is looked for."""
 
 
+def _is_service_event(kind: EndpointKind, name: str, type_: str) -> bool:
+    publishes = kind is EndpointKind.PUBLISHER and name.endswith(_SERVICE_EVENT)
+    return publishes and "/srv/" in type_ and type_.endswith("_Event")
+
+
 def is_noise_endpoint(kind: EndpointKind, node: str, name: str, type_: str, *, ours: bool) -> bool:
     """Return whether an endpoint is one that client libraries make without being asked.
 
@@ -237,7 +245,7 @@ def is_noise_endpoint(kind: EndpointKind, node: str, name: str, type_: str, *, o
     if not node:
         return False
     of_observers = name.startswith(_OUR_TOPICS) and bool(tolerating_pattern(node, ()))
-    if of_observers or (kind, name) in NOISE_TOPICS:
+    if of_observers or (kind, name) in NOISE_TOPICS or _is_service_event(kind, name, type_):
         return True
     owner, _, base = name.rpartition("/")
     offers = kind in (EndpointKind.SERVICE_SERVER, EndpointKind.PUBLISHER)

@@ -90,7 +90,7 @@ def main() -> None:
 
 
 def _say(nodes: list[Node], topic: str, index: int) -> None:
-    from lifecycle.graph.dds import GRAPH_QOS
+    from lifecycle.graph.transport import GRAPH_QOS
     from lifecycle.middleware.discovery.liveliness import _qos
     from tests.hostile.answers import MESSAGES
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from lifecycle.export.picture.build import Supervised, build_picture, planned_picture
-from lifecycle.export.picture.graph import picture_to_dot, picture_to_mermaid
 from lifecycle.export.picture.html import picture_to_html
 from lifecycle.export.picture.model import Picture, PicturedNodeState, Presence
 from lifecycle.export.picture.svg import picture_to_svg
-from lifecycle.export.picture.text import picture_to_text
+from lifecycle.export.picture.text import picture_to_dot, picture_to_mermaid, picture_to_text
 
 WRITERS: Mapping[str, Callable[[Picture], str]] = {
     "text": picture_to_text,

@@ -1,12 +1,24 @@
-"""A picture as plain text. Owns its lines. Pure."""
+"""A picture as text: plain, Graphviz DOT, and Mermaid for Markdown. Pure.
+
+Owns: the lines of the plain one; nodes, frames and edge labels that the two graphs share, which lay
+themselves out, and the syntax and escapes of each. One graph shows what rows and columns show in
+two.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import dataclasses
+import json
+import re
+from collections.abc import Callable, Iterable, Iterator
 
+from lifecycle.export.picture.lines import OWN
 from lifecycle.export.picture.model import (
+    DASHES,
+    LINES,
     OUTCOMES,
     STATES,
+    LineKind,
     Picture,
     PicturedArrow,
     PicturedFlow,
@@ -16,7 +28,7 @@ from lifecycle.export.picture.model import (
     numbers,
     remark,
 )
-from lifecycle.export.picture.views import edge_label, end_words
+from lifecycle.export.picture.views import edge_label, end_words, is_unique, wrapped
 from lifecycle.printable import one_line
 from lifecycle.verify import Outcome
 
@@ -136,3 +148,224 @@ def _columns(rows: Iterable[tuple[str, ...]], *, indent: str) -> Iterator[str]:
     for row in table:
         cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True) if width)
         yield indent + "  ".join(cells)
+
+
+_LABEL_CHARACTERS = 60
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Edge:
+    """What goes from one node to another, or nowhere.
+
+    Attributes:
+        source: node id; empty if there is none.
+        target: likewise.
+        words: one line each.
+        unique: its flow is, or in the picture of a plan is to be.
+    """
+
+    source: str
+    target: str
+    kind: LineKind
+    presence: Presence
+    words: tuple[str, ...]
+    unique: bool = False
+
+
+def framed(
+    picture: Picture,
+    opening: Callable[[str, str], str],
+    closing: str,
+    node: Callable[[PicturedNode], str],
+) -> Iterator[str]:
+    """Yield the nodes in the frames of their machines and processes, indented.
+
+    Args:
+        picture: whose nodes.
+        opening: from the id and the title of a frame to what opens it.
+        closing: what closes it.
+        node: what a node is.
+    """
+    for m, machine in enumerate(picture.machines):
+        yield f"  {opening(f'm{m}', machine.title)}"
+        for p, process in enumerate(machine.processes):
+            inner = [f"    {node(each)}" for each in process.nodes]
+            if process.title:
+                yield f"    {opening(f'm{m}p{p}', process.title)}"
+                yield from (f"  {each}" for each in inner)
+                yield f"    {closing}"
+            else:
+                yield from inner
+        yield f"  {closing}"
+
+
+def node_words(node: PicturedNode) -> tuple[str, ...]:
+    """Return the text in a node: name, state, participants that are not ordinary, findings."""
+    words = [f"{STATES[node.state].symbol} {node.state.value}"]
+    words += remark(node.presence) if node.presence is Presence.MISSING else ()
+    words += node.notes
+    for each in node.participants:
+        said = [*(remark(each.presence) if each.presence is not node.presence else ()), *each.notes]
+        if said or each.name != OWN:
+            words.append(f"{each.name}: {', '.join(said)}" if said else each.name)
+    words += filter(None, [numbers(node.findings)])
+    return (node.name, *wrapped(words, _LABEL_CHARACTERS))
+
+
+def edges(picture: Picture) -> Iterator[Edge]:
+    """Yield every arrow, and an edge to nowhere for each end without one."""
+    flows = {(flow.topic, *flow.names): flow for flow in picture.flows}
+    names = {node.id: node.name for node in picture.nodes()}
+    carriers = {each.id: each.name for node in picture.nodes() for each in node.participants}
+    for line in picture.lines:
+        for arrow in line.arrows:
+            flow = flows.get((line.name, names[arrow.source], names[arrow.target]))
+            yield Edge(
+                source=arrow.source,
+                target=arrow.target,
+                kind=line.kind,
+                presence=arrow.presence,
+                words=_arrow_words(line, arrow, flow, carriers),
+                unique=flow is not None and is_unique(flow),
+            )
+        for end in line.alone:
+            leaves = end in line.sources
+            yield Edge(
+                source=end.node if leaves else "",
+                target="" if leaves else end.node,
+                kind=line.kind,
+                presence=end.presence,
+                words=(line.name, *remark(end.presence), *end.notes),
+            )
+
+
+def _arrow_words(
+    line: PicturedLine, arrow: PicturedArrow, flow: PicturedFlow | None, carriers: dict[str, str]
+) -> tuple[str, ...]:
+    words = [line.name, *remark(arrow.presence)]
+    if flow is not None:
+        if arrow.presence.as_declared:
+            words += [edge_label(flow), *flow.demands]
+            carried = dict.fromkeys(carriers[end] for end in (flow.publisher, flow.subscription))
+            words += [f"by {each}" for each in carried if each != OWN]
+        if flow.outcome not in (Outcome.OK, None):
+            words.append(flow.outcome.value)
+    return tuple(filter(None, dict.fromkeys([*words, *arrow.notes])))
+
+
+_STYLES = {
+    Presence.PRESENT: "solid",
+    Presence.MISSING: "dashed",
+    Presence.UNDECLARED: "dotted",
+    Presence.PLANNED: "solid",
+}
+
+
+def picture_to_dot(picture: Picture) -> str:
+    """Return one digraph: nodes by machine and process, edges with their flows.
+
+    States are colours and labels; missing is dashed and red, undeclared is dotted and orange; edges
+    of unique flows are bold.
+    """
+    lines = [
+        f"digraph {'planned' if picture.verdict is None else 'running'} {{",
+        f"  label={_dot_quoted(picture.title)};",
+        "  rankdir=LR; labelloc=t; compound=true;",
+        '  graph [fontname="sans-serif", style=rounded];',
+        '  node [fontname="sans-serif", shape=box];',
+        '  edge [fontname="sans-serif", fontsize=10];',
+        *framed(picture, _dot_opening, "}", _dot_node),
+    ]
+    for number, edge in enumerate(edges(picture)):
+        lines += [f"  {each}" for each in _dot_edge(edge, f"stub{number}")]
+    return "\n".join([*lines, "}"]) + "\n"
+
+
+def _dot_opening(id_: str, title: str) -> str:
+    return f"subgraph cluster_{id_} {{ label={_dot_quoted(title)};"
+
+
+def _dot_node(node: PicturedNode) -> str:
+    look = STATES[node.state]
+    return (
+        f"{node.id} [label={_dot_quoted(*node_words(node))}, "
+        f'style="rounded,filled,{_STYLES[node.presence]}", fillcolor="{look.fill}", '
+        f'fontcolor="{look.ink}", color="{LINES[node.presence]}", penwidth=2];'
+    )
+
+
+def _dot_edge(edge: Edge, stub: str) -> Iterator[str]:
+    """An end without an opposite is drawn towards an empty circle."""
+    if not (edge.source and edge.target):
+        yield f'{stub} [shape=circle, width=0.15, label=""];'
+    head = "normal" if edge.kind is LineKind.TOPIC else "empty"
+    yield (
+        f"{edge.source or stub} -> {edge.target or stub} [label={_dot_quoted(*edge.words)}, "
+        f'arrowhead={head}, style={_STYLES[edge.presence]}, color="{LINES[edge.presence]}"'
+        f"{', penwidth=3' if edge.unique else ''}];"
+    )
+
+
+def _dot_quoted(*words: str) -> str:
+    r"""A quoted label of several lines: `\n` ends one, and a backslash would escape something."""
+    return '"' + r"\n".join(map(_dot_escape, words)) + '"'
+
+
+def _dot_escape(word: str) -> str:
+    return one_line(" ".join(word.replace("\\", "\\\\").replace('"', '\\"').split()))
+
+
+def picture_to_mermaid(picture: Picture) -> str:
+    """Return one flowchart: nodes by machine and process, edges with their flows.
+
+    States are colours and labels; missing is dashed and red, undeclared is dotted and orange; edges
+    of unique flows are thick.
+    """
+    lines = ["---", f"title: {json.dumps(picture.title)}", "---", "flowchart LR"]
+    lines += framed(picture, _mermaid_opening, "end", _mermaid_node)
+    styles: list[str] = []
+    for number, edge in enumerate(edges(picture)):
+        lines.append(f"  {_mermaid_edge(edge, f's{number}(( ))')}")
+        if dash := DASHES[edge.presence]:
+            styles.append(
+                f"  linkStyle {number} stroke:{LINES[edge.presence]},stroke-dasharray:{dash}"
+            )
+    return "\n".join([*lines, *styles, *_classes(picture)]) + "\n"
+
+
+def _mermaid_opening(id_: str, title: str) -> str:
+    return f"subgraph {id_}[{_mermaid_quoted(title)}]"
+
+
+def _mermaid_node(node: PicturedNode) -> str:
+    return f"{node.id}[{_mermaid_quoted(*node_words(node))}]:::{_class(node)}"
+
+
+def _mermaid_edge(edge: Edge, stub: str) -> str:
+    """An end without an opposite is drawn towards an empty circle."""
+    arrow = "==>" if edge.unique else "-->" if edge.kind is LineKind.TOPIC else "-.->"
+    return f"{edge.source or stub} {arrow}|{_mermaid_quoted(*edge.words)}| {edge.target or stub}"
+
+
+def _class(node: PicturedNode) -> str:
+    state = node.state.name.lower()
+    return state if node.presence.as_declared else f"{node.presence.value}_{state}"
+
+
+def _classes(picture: Picture) -> Iterator[str]:
+    """The classes that the picture uses."""
+    for name, node in {_class(node): node for node in picture.nodes()}.items():
+        look = STATES[node.state]
+        dash = DASHES[node.presence]
+        dashed = f",stroke-width:2px,stroke-dasharray:{dash}" if dash else ""
+        colour = LINES[node.presence]
+        yield f"  classDef {name} fill:{look.fill},color:{look.ink},stroke:{colour}{dashed}"
+
+
+def _mermaid_quoted(*words: str) -> str:
+    """A quoted label of several lines; what Mermaid could read as syntax becomes an entity."""
+    return '"' + "<br/>".join(map(_mermaid_escape, words)) + '"'
+
+
+def _mermaid_escape(word: str) -> str:
+    return re.sub(r"[^\w /.,:=()~+→-]", lambda match: f"#{ord(match[0])};", word)

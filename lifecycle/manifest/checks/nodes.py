@@ -20,9 +20,11 @@ from lifecycle.manifest.model import (
     DiscoveryMode,
     DiscoveryRange,
     EndpointKind,
+    Executor,
     FlowTransport,
     Machine,
     Node,
+    Run,
     RunKind,
 )
 from lifecycle.manifest.schema import did_you_mean
@@ -81,6 +83,10 @@ def check_processes(system: DeclaredSystem) -> Iterator[Diagnostic]:
             yield from _apart(node, other, at)
 
 
+def _executor(run: Run) -> tuple[Executor, int]:
+    return run.executor, run.threads
+
+
 def _apart(node: Node, other: Node, at: Position) -> Iterator[Diagnostic]:
     """Judge two nodes that share a process."""
     together = f"cannot share process {node.process!r} with {other.key!r} ({spell(other.at)})"
@@ -94,6 +100,7 @@ def _apart(node: Node, other: Node, at: Position) -> Iterator[Diagnostic]:
         for name, one, two in (
             ("environment", dict(node.run.environment), dict(other.run.environment)),
             ("working_directory", node.run.working_directory, other.run.working_directory),
+            ("executor", _executor(node.run), _executor(other.run)),
         )
         if one != two
     ]

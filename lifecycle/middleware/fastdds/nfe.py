@@ -1,27 +1,47 @@
-"""Network flow endpoints of rclpy publishers and subscriptions.
+"""Network flow endpoints of rclpy publishers and subscriptions; making endpoints with unique ones.
 
-Owns: the call into rmw that rclpy lacks. An NFE list says which network resources an endpoint may
+Owns: the call into rmw that rclpy lacks, and the creation option that it cannot set, rcl's
+`require_unique_network_flow_endpoints`: the endpoint is made by rclpy, re-initialised in place with
+the option, and only then given event handlers and shown to the node, so that neither an executor
+nor an event ever sees the handle while it changes. See *Unique Network Flows*
+(rmw_unique_network_flow_endpoints_requirement_t).
+An NFE list says which network resources an endpoint may
 use, not which transport carried a message; `dscp` and `flow_label` in it are always 0 with
 Fast DDS (see `lifecycle.middleware.fastdds.dscp` for the value the kernel really uses).
 """
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import dataclasses
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from rcl_interfaces.msg import ParameterEvent
-from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.callback_groups import CallbackGroup
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import qos_profile_parameter_events
+from rclpy.qos import QoSProfile, qos_profile_parameter_events
 from rclpy.subscription import Subscription
+from rclpy.type_support import check_is_valid_msg_type
+from rclpy.validate_topic_name import validate_topic_name
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.fastdds.shared_executor import is_guest
+from lifecycle.manifest import QosProfile
 from lifecycle.middleware.rcl import abi
-from lifecycle.network import InternetProtocol, NetworkFlowEndpoint, TransportProtocol
+from lifecycle.middleware.rcl.hidden_node import is_guest
+from lifecycle.middleware.rcl.qos import to_rclpy
+from lifecycle.network import (
+    InternetProtocol,
+    NetworkFlowEndpoint,
+    TransportProtocol,
+    UniqueRequirement,
+    is_ip,
+)
 
 _TRANSPORTS = (TransportProtocol.UNKNOWN, TransportProtocol.UDP, TransportProtocol.TCP)
 _INTERNETS = (InternetProtocol.UNKNOWN, InternetProtocol.IPV4, InternetProtocol.IPV6)
@@ -138,3 +158,307 @@ def _failure(result: int, kind: str, reason: str) -> MiddlewareError:
             message, reason=reason, hint="set RMW_IMPLEMENTATION=rmw_fastrtps_cpp"
         )
     return MiddlewareError(message)
+
+
+_PUBLISHER_HINT = "give the publisher its own participant, or ask for optionally_required"
+_SUBSCRIPTION_HINT = "ask for optionally_required, or set RMW_IMPLEMENTATION=rmw_fastrtps_cpp"
+_UNIQUE_PORTS = range(7000, 7400)
+"""Fast DDS looks for a unique port in [portBase − 400, portBase), in every domain."""
+
+
+class UniqueFlowNotFeasible(MiddlewareError):  # noqa: N818 - states a fact, not a fault
+    """The RMW cannot give this endpoint network flow endpoints of its own; none was made.
+
+    Attributes:
+        topic: fully qualified.
+        reason: the RMW's own message.
+    """
+
+    def __init__(self, message: str, *, topic: str, reason: str, hint: str = "") -> None:
+        super().__init__(message, hint=hint)
+        self.topic = topic
+        self.reason = reason
+
+
+def create_subscription(
+    node: Node,
+    type_: type[Any],
+    topic: str,
+    callback: Callable[..., Any],
+    qos: QosProfile | QoSProfile,
+    *,
+    unique: UniqueRequirement = UniqueRequirement.NOT_REQUIRED,
+    callback_group: CallbackGroup | None = None,
+    event_callbacks: SubscriptionEventCallbacks | None = None,
+    raw: bool = False,
+    content_filter: tuple[str, tuple[str, ...]] | None = None,
+) -> Subscription:
+    """Create a subscription on `node`, with network flow endpoints of its own where asked.
+
+    NOT_REQUIRED is plain rclpy. The others pass the option to the RMW; STRICTLY_REQUIRED then also
+    demands proof, because some RMWs accept the option and ignore it. Fast DDS takes the first free
+    UDP port of 7000–7399. Destroy it as any other, with `node.destroy_subscription`.
+
+    Fast DDS 2.14 gives the port (with its socket, two threads and about 170 kB) back only when the
+    participant ends, not with the subscription: whatever re-creates unique subscriptions again and
+    again does better with `FlowParticipant.create_subscription`.
+
+    Args:
+        node: created by rclpy; spun by any executor.
+        type_: message class.
+        topic: relative, absolute or private; remapped as rclpy does.
+        callback: takes the message, or the message and its info.
+        qos: the manifest's profile or rclpy's.
+        unique: the requirement.
+        callback_group: None for the node's default one.
+        event_callbacks: as in rclpy.
+        raw: give the callback serialized bytes.
+        content_filter: expression, and the values of its parameters (DDS 1.4, annex B); rclpy 7 has
+            no way to give one.
+
+    Raises:
+        UniqueFlowNotFeasible: not possible here; no endpoint is left.
+        MiddlewareError: the endpoint could not be made at all.
+    """
+    profile = to_rclpy(qos)
+    if unique is UniqueRequirement.NOT_REQUIRED:
+        plain = node.create_subscription(
+            type_,
+            topic,
+            callback,
+            profile,
+            callback_group=callback_group,
+            event_callbacks=event_callbacks,
+            raw=raw,
+        )
+        return _filtered(node, plain, content_filter)
+    group = callback_group or node.default_callback_group
+    handle = _create_handle(
+        node, "subscription", type_=type_, topic=topic, profile=profile, unique=unique
+    )
+    try:
+        subscription = Subscription(
+            handle,
+            type_,
+            topic,
+            callback,
+            group,
+            profile,
+            raw,
+            event_callbacks=event_callbacks or SubscriptionEventCallbacks(),
+        )
+    except BaseException:
+        handle.destroy_when_not_in_use()
+        raise
+    group.add_entity(subscription)
+    node._subscriptions.append(subscription)  # noqa: SLF001 - what Node.create_subscription does
+    _register(node, subscription)
+    return _filtered(node, subscription, content_filter)
+
+
+class _ContentFilter(ctypes.Structure):
+    """rcl_subscription_content_filter_options_t."""
+
+    _fields_ = (
+        ("expression", ctypes.c_void_p),
+        ("count", ctypes.c_size_t),
+        ("parameters", ctypes.c_void_p),
+        ("allocator", abi.Allocator),
+    )
+
+
+def _filtered(
+    node: Node, subscription: Subscription, content_filter: tuple[str, tuple[str, ...]] | None
+) -> Subscription:
+    """Have the middleware take those messages alone that a filter lets through."""
+    if content_filter is None:
+        return subscription
+    rcl = abi.load()
+    expression, parameters = content_filter
+    values = (ctypes.c_char_p * len(parameters))(*(each.encode() for each in parameters))
+    options = _ContentFilter()
+    pointer, code = ctypes.c_void_p, ctypes.c_int
+    init = abi.bind(
+        "rcl",
+        "rcl_subscription_content_filter_options_init",
+        code,
+        (pointer, ctypes.c_char_p, ctypes.c_size_t, pointer, pointer),
+    )
+    apply = abi.bind("rcl", "rcl_subscription_set_content_filter", code, (pointer, pointer))
+    end = abi.bind("rcl", "rcl_subscription_content_filter_options_fini", code, (pointer, pointer))
+    with subscription.handle:
+        made = subscription.handle.pointer
+        failed = init(
+            made, expression.encode(), len(parameters), values, ctypes.byref(options)
+        ) or apply(made, ctypes.byref(options))
+        reason = rcl.take_error() if failed else ""
+        end(made, ctypes.byref(options))
+    if failed:
+        topic = subscription.topic_name
+        node.destroy_subscription(subscription)
+        raise MiddlewareError(
+            f"cannot filter subscription {topic!r} by {expression!r}: {reason}",
+            hint="write it as the WHERE part of SQL, with %0, %1, … for its parameters",
+        )
+    return subscription
+
+
+def create_publisher(
+    node: Node,
+    type_: type[Any],
+    topic: str,
+    qos: QosProfile | QoSProfile,
+    *,
+    unique: UniqueRequirement = UniqueRequirement.NOT_REQUIRED,
+    callback_group: CallbackGroup | None = None,
+    event_callbacks: PublisherEventCallbacks | None = None,
+    publisher_class: type[Publisher] = Publisher,
+) -> Publisher:
+    """Create a publisher on `node`, on the node's own participant.
+
+    Fast DDS refuses STRICTLY_REQUIRED on publishers and silently ignores OPTIONALLY_REQUIRED: a
+    publisher becomes unique on a `FlowParticipant`. Arguments as `create_subscription`;
+    `publisher_class` as in rclpy.
+
+    Raises:
+        UniqueFlowNotFeasible: STRICTLY_REQUIRED on an RMW that cannot; no endpoint is left.
+        MiddlewareError: the endpoint could not be made at all.
+    """
+    profile = to_rclpy(qos)
+    if unique is UniqueRequirement.NOT_REQUIRED:
+        return node.create_publisher(
+            type_,
+            topic,
+            profile,
+            callback_group=callback_group,
+            event_callbacks=event_callbacks,
+            publisher_class=publisher_class,
+        )
+    handle = _create_handle(
+        node, "publisher", type_=type_, topic=topic, profile=profile, unique=unique
+    )
+    try:
+        publisher = publisher_class(
+            handle,
+            type_,
+            topic,
+            profile,
+            event_callbacks=event_callbacks or PublisherEventCallbacks(),
+            callback_group=callback_group or node.default_callback_group,
+        )
+    except BaseException:
+        handle.destroy_when_not_in_use()
+        raise
+    node._publishers.append(publisher)  # noqa: SLF001 - what Node.create_publisher does
+    _register(node, publisher)
+    return publisher
+
+
+class _RefusedError(Exception):
+    """The RMW said no; the text is its reason."""
+
+
+def _create_handle(
+    node: Node,
+    kind: str,
+    *,
+    type_: type[Any],
+    topic: str,
+    profile: QoSProfile,
+    unique: UniqueRequirement,
+) -> Any:
+    """Make rclpy's C++ handle and re-initialise the rcl struct inside it with the option."""
+    rcl = abi.load()
+    check_is_valid_msg_type(type_)  # also loads the type support
+    validate_topic_name(topic)  # names the character at fault, which resolving does not
+    resolved = node.resolve_topic_name(topic)  # for messages; unreadable while re-initialising
+    make = rclpy_implementation.Publisher
+    if kind == "subscription":
+        make = rclpy_implementation.Subscription
+    with node.handle:
+        handle = make(node.handle, type_, topic, profile.get_c_qos_profile())
+    try:
+        with handle, node.handle:
+            _reinitialise(
+                rcl,
+                kind,
+                entity=handle.pointer,
+                node=node.handle.pointer,
+                type_support=abi.type_support(type_),
+                topic=topic,
+                unique=unique,
+            )
+        if unique is UniqueRequirement.STRICTLY_REQUIRED:
+            _prove(handle, kind)
+    except _RefusedError as refused:
+        handle.destroy_when_not_in_use()
+        raise UniqueFlowNotFeasible(
+            f"cannot create {kind} {resolved!r} with network flow endpoints {unique.value}: "
+            f"{refused}",
+            topic=resolved,
+            reason=str(refused),
+            hint=_PUBLISHER_HINT if kind == "publisher" else _subscription_hint(),
+        ) from refused
+    except BaseException:
+        # A handle whose init failed is zero inside; rcl's fini accepts that.
+        handle.destroy_when_not_in_use()
+        raise
+    return handle
+
+
+def _reinitialise(
+    rcl: abi.Rcl,
+    kind: str,
+    *,
+    entity: int,
+    node: int,
+    type_support: int,
+    topic: str,
+    unique: UniqueRequirement,
+) -> None:
+    functions = rcl.by_kind[kind]
+    held = functions["options"](entity).contents
+    options = type(held).from_buffer_copy(held)  # fini frees the original
+    options.rmw.unique = unique.rmw_value
+    if functions["fini"](entity, node) != abi.RCL_RET_OK:
+        raise MiddlewareError(f"cannot re-create {kind} {topic!r}: {rcl.take_error()}")
+    # The unresolved name, as rclpy gave it: rcl must apply remap rules exactly once.
+    result = functions["init"](entity, node, type_support, topic.encode(), ctypes.byref(options))
+    if result != abi.RCL_RET_OK:
+        raise _RefusedError(rcl.take_error())
+
+
+def _prove(handle: Any, kind: str) -> None:
+    """Refuse an endpoint whose RMW accepted STRICTLY_REQUIRED but shows nothing for it."""
+    try:
+        nfes = read_handle(handle, kind)
+    except NetworkFlowEndpointsUnsupported as error:
+        raise _RefusedError(error.reason) from error
+    if not nfes:
+        raise _RefusedError("the RMW lists no network flow endpoint for it")
+    if not any(is_ip(each) for each in nfes):
+        # The article defines network flows for UDP and TCP over IP only.
+        raise _RefusedError("the RMW lists only shared memory for it, which is no network flow")
+
+
+def _subscription_hint() -> str:
+    """Say so when the host's unique ports are used up: rcl's own reason does not."""
+    taken = set()
+    for table in ("/proc/net/udp", "/proc/net/udp6"):
+        with contextlib.suppress(FileNotFoundError):
+            for line in Path(table).read_text(encoding="ascii").splitlines()[1:]:
+                taken.add(int(line.split()[1].rpartition(":")[2], 16))
+    if not taken.issuperset(_UNIQUE_PORTS):
+        return _SUBSCRIPTION_HINT
+    return (
+        f"all {len(_UNIQUE_PORTS)} ports {_UNIQUE_PORTS[0]}–{_UNIQUE_PORTS[-1]} of this host are "
+        "taken; Fast DDS frees one only when the participant that used it ends: restart the "
+        "processes whose nodes were disconnected and connected again"
+    )
+
+
+def _register(node: Node, entity: Publisher | Subscription) -> None:
+    """Show the finished entity to executors, as Node.create_… does at its end."""
+    for handler in entity.event_handlers:
+        node.add_waitable(handler)
+    node._wake_executor()  # noqa: SLF001

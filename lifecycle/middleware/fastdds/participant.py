@@ -31,7 +31,7 @@ from rclpy.subscription import Subscription
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest import QosProfile
 from lifecycle.middleware.fastdds import dscp as marks
-from lifecycle.middleware.fastdds import shared_executor
+from lifecycle.middleware.fastdds import nfe
 from lifecycle.middleware.fastdds.dscp import never_wait
 from lifecycle.middleware.fastdds.nfe import get_network_flow_endpoints, has_shared_memory
 from lifecycle.middleware.fastdds.participant_profile import (
@@ -42,7 +42,7 @@ from lifecycle.middleware.fastdds.participant_profile import (
 from lifecycle.middleware.fastdds.settings import with_endpoint_profiles
 from lifecycle.middleware.fastdds.url_check import open_sockets
 from lifecycle.middleware.fastdds.url_profile import LOOPBACK, transport_of
-from lifecycle.middleware.rcl import unique as flows
+from lifecycle.middleware.rcl import hidden_node
 from lifecycle.middleware.rcl.hidden_node import forget_hidden, hidden_nodes, quiet_node
 from lifecycle.middleware.rcl.qos import to_rclpy
 from lifecycle.network import ConnectionUrl, Medium, NetworkFlowEndpoint, UniqueRequirement
@@ -163,7 +163,7 @@ class FlowParticipant:
         self.name = name
         self.settings = settings
         self._served = served
-        self._guests: list[shared_executor.Guest] = []
+        self._guests: list[hidden_node.Guest] = []
         self._dscp = dscp
         self._context: rclpy.Context | None
         self._nfes: tuple[NetworkFlowEndpoint, ...] = ()
@@ -236,6 +236,8 @@ class FlowParticipant:
         unique: UniqueRequirement = UniqueRequirement.NOT_REQUIRED,
         callback_group: CallbackGroup | None = None,
         event_callbacks: SubscriptionEventCallbacks | None = None,
+        raw: bool = False,
+        content_filter: tuple[str, tuple[str, ...]] | None = None,
     ) -> Subscription:
         """Create a subscription on this participant; `topic` should be fully qualified.
 
@@ -244,7 +246,7 @@ class FlowParticipant:
         subscription on a node that stays (see `create_subscription` of this room).
         """
         with self._announced(type_, topic, writer=False):
-            subscription = flows.create_subscription(
+            subscription = nfe.create_subscription(
                 self.node,
                 type_,
                 topic,
@@ -253,6 +255,8 @@ class FlowParticipant:
                 unique=unique,
                 callback_group=self._group(callback_group),
                 event_callbacks=event_callbacks,
+                raw=raw,
+                content_filter=content_filter,
             )
         try:
             self.ensure_dscp()
@@ -311,7 +315,7 @@ class FlowParticipant:
         return client
 
     def create_action(
-        self, make: Callable[[Node], shared_executor.Action], what: str, name: str
+        self, make: Callable[[Node], hidden_node.Action], what: str, name: str
     ) -> Any:
         """Create an action server or client on this participant; spun as a subscription is.
 
@@ -328,13 +332,13 @@ class FlowParticipant:
         self._receive(action)
         return action
 
-    def destroy_endpoint(self, entity: Publisher | shared_executor.Guest) -> None:
+    def destroy_endpoint(self, entity: Publisher | hidden_node.Guest) -> None:
         """Destroy an endpoint that was made here; again is harmless."""
         if isinstance(entity, Publisher):
             self.node.destroy_publisher(entity)
             return
         host = self._served or self.node
-        shared_executor.dismiss(entity, host)
+        hidden_node.dismiss(entity, host)
         if entity in self._guests:
             self._guests.remove(entity)
 
@@ -413,9 +417,9 @@ class FlowParticipant:
             return self._served.default_callback_group
         return group
 
-    def _receive(self, entity: shared_executor.Guest) -> None:
+    def _receive(self, entity: hidden_node.Guest) -> None:
         if self._served is not None:
-            shared_executor.move(entity, self.node, self._served)
+            hidden_node.move(entity, self.node, self._served)
             self._guests.append(entity)
 
     def _announced(

@@ -1,17 +1,27 @@
 """Hidden nodes: a DDS participant with nothing on it but what was requested.
 
-Owns: how such a node and its context are made, and which of them this process has.
+Owns: how such a node and its context are made, and which of them this process has; showing an
+endpoint that was made there to the node that it serves. An executor asks its nodes for their
+entities each time it waits, and rcl waits for entities of any context together; so a moved endpoint
+is spun by whatever spins the node that it serves, now and later, is gated by that node's callback
+groups, and costs no thread and nothing while idle.
 """
 
 from __future__ import annotations
 
 import os
+import typing
 import weakref
 from collections.abc import Sequence
+from typing import Any
 
 import rclpy
+from rclpy.client import Client
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.service import Service
+from rclpy.subscription import Subscription
+from rclpy.waitable import Waitable
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
@@ -85,3 +95,51 @@ def hidden_nodes() -> tuple[Node, ...]:
 def forget_hidden(node: Node) -> None:
     """No longer list a node that is about to be destroyed; again is harmless."""
     _hidden.discard(node)
+
+
+Action: typing.TypeAlias = Waitable
+"""An action server or client; importing their classes takes 100 ms."""
+
+Guest: typing.TypeAlias = Subscription | Service | Client | Action
+
+_LISTS = {Subscription: "_subscriptions", Service: "_services", Client: "_clients"}
+_guests: weakref.WeakSet[Any] = weakref.WeakSet()
+
+
+def move(entity: Guest, maker: Node, host: Node) -> None:
+    """Have `host`'s executor run the callbacks of an endpoint that `maker` has just made.
+
+    Its callback group must be one of `host`'s. `host.destroy_…` takes it away again.
+    """
+    if isinstance(entity, Waitable):
+        maker.remove_waitable(entity)
+        entity._node = host  # noqa: SLF001 - whose executor works on goals, and which removes it
+        host.add_waitable(entity)
+        return
+    name = _LISTS[type(entity)]
+    getattr(maker, name).remove(entity)
+    getattr(host, name).append(entity)
+    for handler in entity.event_handlers if isinstance(entity, Subscription) else ():
+        maker.remove_waitable(handler)
+        host.add_waitable(handler)
+    _guests.add(entity)
+    host._wake_executor()  # noqa: SLF001 - as Node.create_… does
+
+
+def is_guest(entity: object) -> bool:
+    """Whether an endpoint is on a node whose participant is not its own."""
+    return entity in _guests
+
+
+def dismiss(entity: Guest, host: Node) -> None:
+    """Destroy a guest; harmless if `host` did, or was destroyed itself."""
+    if isinstance(entity, Waitable):
+        entity.destroy()
+        return
+    for kind, destroy in (
+        (Subscription, host.destroy_subscription),
+        (Service, host.destroy_service),
+        (Client, host.destroy_client),
+    ):
+        if isinstance(entity, kind):
+            destroy(entity)

@@ -7,8 +7,8 @@ up to declaring.py.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
 
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
@@ -20,6 +20,12 @@ from lifecycle.node.author import declaring
 from lifecycle.node.author.handlers import ActionHandler
 from lifecycle.node.author.managed import Managed
 from lifecycle.node.author.spec import calling_position
+from lifecycle.node.endpoints.making import EndpointOptions
+
+if TYPE_CHECKING:
+    from rclpy.callback_groups import CallbackGroup
+    from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+    from rclpy.service_introspection import ServiceIntrospectionState
 
 
 class Declarations(Node):  # type: ignore[misc]  # rclpy is not typed
@@ -129,6 +135,47 @@ class Declarations(Node):  # type: ignore[misc]  # rclpy is not typed
             UnknownEndpointError: nothing, or more than one thing, is declared so.
         """
         self.lifecycle.declared.hint(endpoint, lossy=lossy, size_bytes=size_bytes)
+
+    def set_options(
+        self,
+        endpoint: str,
+        *,
+        callback_group: CallbackGroup | None = None,
+        event_callbacks: PublisherEventCallbacks | SubscriptionEventCallbacks | None = None,
+        raw: bool = False,
+        content_filter: str | tuple[str, Sequence[str]] | None = None,
+        introspection: ServiceIntrospectionState | None = None,
+    ) -> None:
+        """Say how a declared endpoint is made, as the arguments of rclpy's factories do.
+
+        In `__init__` or on_configure; it holds each time that the endpoint is made.
+
+        Args:
+            endpoint: `video`, or `publishers/video` where another kind has the name too.
+            callback_group: of its callback and its events.
+            event_callbacks: of a publisher or subscription: deadline, liveliness, incompatible QoS,
+                matched, …
+            raw: a subscription's handler is given serialized bytes instead of a message.
+            content_filter: of a subscription: `"data > 5"`, or an expression with parameters,
+                `("frame_id = %0", ["'map'"])` (DDS 1.4, annex B).
+            introspection: of a service server or client: what it publishes of each call.
+
+        Raises:
+            UnknownEndpointError: nothing, or more than one thing, is declared so.
+            LifecycleError: its kind cannot have one of them, or it exists already.
+        """
+        if isinstance(content_filter, str):
+            content_filter = (content_filter, ())
+        self.lifecycle.declared.set_options(
+            endpoint,
+            EndpointOptions(
+                callback_group=callback_group,
+                event_callbacks=event_callbacks,
+                raw=raw,
+                content_filter=content_filter and (content_filter[0], tuple(content_filter[1])),
+                introspection=introspection,
+            ),
+        )
 
     def _declare(
         self,

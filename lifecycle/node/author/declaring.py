@@ -19,6 +19,7 @@ from lifecycle.manifest import EndpointKind, EndpointPolicy, Position, QosProfil
 from lifecycle.middleware import from_rclpy
 from lifecycle.node.author.handlers import Handlers, match, needs_handler
 from lifecycle.node.connections.data_layer import CONFIGURED, NodeDataLayer
+from lifecycle.node.endpoints.making import EndpointOptions
 from lifecycle.node.endpoints.mapping import Key, find_endpoint
 from lifecycle.node.lifecycle.machine import NodeState
 from lifecycle.plan import PlannedEndpoint, PlannedNode
@@ -114,6 +115,7 @@ class DeclaredInCode:
         self._state = state
         self._callbacks: dict[Key, Callable[..., Any]] = {}
         self._hints: dict[Key, tuple[bool | None, int | None]] = {}
+        self._options: dict[Key, EndpointOptions] = {}
 
     def refuse(self, kind: EndpointKind, name: str) -> None:
         """Raise unless one more endpoint may be declared now.
@@ -185,6 +187,28 @@ class DeclaredInCode:
                 self._data_layer.endpoints.find(spelling).key, lossy, size_bytes
             )
 
+    def set_options(self, spelling: str, options: EndpointOptions) -> None:
+        """Keep how an endpoint is to be made.
+
+        Raises:
+            UnknownEndpointError: nothing, or more than one thing, is declared so.
+            LifecycleError: it exists already, or its kind cannot have them.
+        """
+        if self._state() is NodeState.UNCONFIGURED:
+            declared = [(each.kind, each.name) for each in self.spec.endpoints]
+            key = find_endpoint(spelling, declared, node=self._node)
+            options.refuse_unfit(key[0])
+            self._options[key] = options
+            return
+        mapping = self._data_layer.endpoints.find(spelling)
+        options.refuse_unfit(mapping.endpoint.kind)
+        if mapping.placement is not None:
+            raise LifecycleError(
+                f"cannot set options of {mapping.spelling} of {self._node}: it exists already",
+                hint="call set_options in __init__ or in on_configure",
+            )
+        mapping.options = options
+
     @property
     def now(self) -> PlannedNode:
         """The plan with those endpoints that were declared since configure."""
@@ -207,6 +231,8 @@ class DeclaredInCode:
         self._data_layer.declare(self.spec, lambda each: self._handler(node, each, matched))
         for key, hints in self._hints.items():
             self._data_layer.endpoints.hint(key, *hints)
+        for key, options in self._options.items():
+            self._data_layer.endpoints.mappings[key].options = options
 
     def _handler(
         self, node: Node, endpoint: PlannedEndpoint, matched: Handlers

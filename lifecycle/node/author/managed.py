@@ -9,6 +9,7 @@ that authors have every other attribute name to themselves.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Collection
 from typing import TYPE_CHECKING, Any
 
@@ -43,6 +44,7 @@ from lifecycle.node.lifecycle.machine import (
     NodeState,
     RefusedError,
     StateChange,
+    Transition,
     TransitionRequest,
 )
 from lifecycle.node.lifecycle.services import LifecycleServices, Turns
@@ -51,6 +53,7 @@ from lifecycle.verify import NodeConfiguration
 
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup
+    from rclpy.service import Service
 
 
 class GraphMember:
@@ -169,6 +172,22 @@ class Undeclared:
 _WITHOUT_DATA_LAYER = (NodeState.INACTIVE_DISCONNECTED, NodeState.UNCONFIGURED, NodeState.FINALIZED)
 """A node that enters one of these is not the one that was verified any more."""
 
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class HostedState:
+    """The state of a hosted node.
+
+    Attributes:
+        label: lifecycle_msgs/State label; empty for a node that is not managed.
+        connected: its data layer is made.
+        steady: no transition is running.
+    """
+
+    label: str
+    connected: bool
+    steady: bool
+
+
 BRING_UP = (TransitionRequest.CONFIGURE, TransitionRequest.CONNECT, TransitionRequest.ACTIVATE)
 
 
@@ -195,6 +214,8 @@ class Managed:
         mode: Mode,
         gate: NodeGate,
         supervisor: str = "",
+        *,
+        served: bool = True,
     ) -> None:
         self._node = node
         self._supervisor = supervisor
@@ -207,7 +228,7 @@ class Managed:
         self._infrastructure = ReentrantCallbackGroup()
         self._turns = Turns(node, self._infrastructure)
         self.call_soon = self._turns.call_soon
-        self._listeners: list[Callable[[Node], None]] = []
+        self._listeners: list[Callable[[Managed], None]] = []
         self._method_timers: list[Timer] = []
         self._member: GraphMember | None = None
         self.connection_events = ConnectionEvents(self.call_soon)
@@ -231,19 +252,22 @@ class Managed:
         )
         self._controller = Controller(self, spec.timeouts, self._changed)
         self.interface = NodeInterface(self.full_name, self.data_layer, lambda: self.state)
-        self._services = LifecycleServices(
-            node,
-            state_machine=self._controller.machine,
-            change=self._change_by_service,
-            refuse=node.get_logger().warning,
-            configuration=lambda: configuration.to_json(self.get_configuration()),
-            group=self._infrastructure,
-        )
+        self._services: LifecycleServices | None = None
+        if served:
+            self._services = LifecycleServices(
+                node,
+                state_machine=self._controller.machine,
+                change=self._change_by_service,
+                refuse=node.get_logger().warning,
+                configuration=lambda: configuration.to_json(self.get_configuration()),
+                group=self._infrastructure,
+            )
         self._remote = RemoteInterface(
             node, self.interface, log=node.get_logger().error, group=self._infrastructure
         )
-        # A supervisor sees who asks for the others, and has them made.
-        self._remote.serve(but=INTERFACE_ON_DEMAND if supervisor else ())
+        if served:
+            # A supervisor sees who asks for the others, and has them made.
+            self._remote.serve(but=INTERFACE_ON_DEMAND if supervisor else ())
         if spec.events or spec.membership:
             self._join()
 
@@ -262,8 +286,27 @@ class Managed:
         """The state, nested ones distinguished; `state.seen` is what other tools see."""
         return self._controller.machine.state
 
-    def add_listener(self, listener: Callable[[Node], None]) -> None:
-        """Call `listener(node)` after every change of state, whatever caused it."""
+    @property
+    def node(self) -> Node:
+        """The rclpy node."""
+        return self._node
+
+    @property
+    def reported(self) -> HostedState:
+        """The state, as a supervisor is told of it."""
+        state = self.state
+        return HostedState(label=state.seen.label, connected=state.connected, steady=state.steady)
+
+    def available_transitions(self) -> tuple[Transition, ...]:
+        """Return the edges that may be taken from this state, as other tools see them."""
+        return self._controller.machine.available_transitions()
+
+    def service(self, name: str) -> Service | None:
+        """Return the lifecycle service `~/name`; None if the node has no such interface."""
+        return None if self._services is None else self._services.made[name]
+
+    def add_listener(self, listener: Callable[[Managed], None]) -> None:
+        """Call `listener(self)` after every change of state, whatever caused it."""
         self._listeners.append(listener)
 
     async def change(self, request: TransitionRequest | str) -> Result:
@@ -436,16 +479,18 @@ class Managed:
         """Follow a change of the machine: the gate first, then notify the others."""
         if change.goal is NodeState.ACTIVE:
             self.gate.open()
-        elif change.start is NodeState.ACTIVE:
+        elif change.goal is NodeState.ACTIVATING_CONNECTED:
+            self.gate.open_early()
+        elif change.start in (NodeState.ACTIVE, NodeState.ACTIVATING_CONNECTED):
             self.gate.close()
         if self._supervisor and change.goal in _WITHOUT_DATA_LAYER:
             self._let_through = False
-        if change.event is not None:
+        if change.event is not None and self._services is not None:
             self._services.publish(change.event)
         if self._member is not None:
             self._member.state_changed(change.goal)
         for listener in self._listeners:
-            listener(self._node)
+            listener(self)
 
 
 def _known(request: TransitionRequest | str) -> TransitionRequest:

@@ -24,7 +24,7 @@ from rclpy.callback_groups import CallbackGroup
 from rclpy.client import Client
 from rclpy.clock import Clock
 from rclpy.context import Context
-from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
+from rclpy.lifecycle import LifecyclePublisher, LifecycleState, TransitionCallbackReturn
 from rclpy.logging import LoggingSeverity
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -42,6 +42,7 @@ from lifecycle.node import configuration
 from lifecycle.node.author import parameters
 from lifecycle.node.author.declarations import Declarations
 from lifecycle.node.author.managed import Managed
+from lifecycle.node.author.rclpy_lifecycle import RclpyLifecycle
 from lifecycle.node.author.spec import (
     Mode,
     default_name,
@@ -90,7 +91,7 @@ def refuse_to_block(what: str, instead: str) -> None:
         what: that an answer is awaited of.
         instead: what can be awaited.
     """
-    if _in_executor():
+    if in_executor():
         raise DeadlockError(
             f"cannot wait for {what} in a callback: the answer comes by the executor that waits "
             "for this callback",
@@ -98,7 +99,7 @@ def refuse_to_block(what: str, instead: str) -> None:
         )
 
 
-def _in_executor() -> bool:
+def in_executor() -> bool:
     """Return whether this thread is inside a single-threaded executor's turn.
 
     A multi-threaded one runs callbacks in other threads than the one that spins.
@@ -125,7 +126,8 @@ class GatedFactories(Node):  # type: ignore[misc]  # rclpy is not typed
         publisher = super().create_publisher(msg_type, topic, qos_profile, **options)
         if self._gate is not None:
             self.lifecycle.undeclared.add(EndpointKind.PUBLISHER, publisher)
-            self._gate.add(publisher, GatedPublisher(publisher, self.get_logger().warning))
+            gated = GatedPublisher(publisher, self.get_logger().warning)
+            self._gate.add(publisher, gated, early=isinstance(publisher, LifecyclePublisher))
         return publisher
 
     def create_subscription(
@@ -324,7 +326,7 @@ def _any_signature(callback: Callable[..., CallbackReturn]) -> Callable[..., Cal
     return callback
 
 
-class LifecycleNode(Declarations, LocalInterface, GatedFactories):
+class LifecycleNode(Declarations, LocalInterface, RclpyLifecycle, GatedFactories):
     """A ROS 2 managed node whose endpoints are declared, not scattered through its code.
 
     From outside it is exactly a managed node (`ros2 lifecycle`, launch_ros and nav2 drive it),
@@ -378,6 +380,8 @@ class LifecycleNode(Declarations, LocalInterface, GatedFactories):
             itself as soon as it is spun. Under a supervisor or `lifecycle run` theirs wins.
         namespace: as in rclpy; a manifest's wins.
         context: as in rclpy.
+        enable_communication_interface: serve and announce its states; without, no other process
+            can drive it or read its configuration.
         options: further keywords of rclpy.node.Node.
 
     Attributes:
@@ -392,12 +396,19 @@ class LifecycleNode(Declarations, LocalInterface, GatedFactories):
         lifecycle: str = "manual",
         namespace: str | None = None,
         context: Context | None = None,
+        enable_communication_interface: bool = True,
         **options: Any,
     ) -> None:
         mode = parse_mode(lifecycle)
-        construction = take_construction()
-        planned = construction.spec if construction is not None else None
+        if not isinstance(enable_communication_interface, bool):
+            raise TypeError(
+                f"cannot use enable_communication_interface={enable_communication_interface!r}; "
+                "allowed: True, False"
+            )
+        self._managed_entities = {}
         name = node_name or default_name(type(self))
+        construction = take_construction(name, namespace)
+        planned = construction.spec if construction is not None else None
         if planned is not None:
             name, namespace = planned.name, planned.namespace
             options["cli_args"] = [*ros_arguments(planned), *(options.get("cli_args") or ())]
@@ -415,7 +426,15 @@ class LifecycleNode(Declarations, LocalInterface, GatedFactories):
         if spec.log_level:
             self.get_logger().set_level(LoggingSeverity[spec.log_level.upper()])
         supervisor = construction.supervisor if construction is not None else ""
-        self.lifecycle: Managed = Managed(self, spec, mode, self._gate, supervisor)
+        self.lifecycle: Managed = Managed(
+            self,
+            spec,
+            mode,
+            self._gate,
+            supervisor,
+            served=enable_communication_interface,
+        )
+        self._take_rclpy_names()
         if construction is None and mode is Mode.AUTO:
             self.lifecycle.bring_up_when_spun()
 
@@ -446,6 +465,21 @@ class LifecycleNode(Declarations, LocalInterface, GatedFactories):
             EndpointKind.SERVICE_CLIENT, name
         )
         return client
+
+    def subscription(self, name: str) -> Subscription:
+        """Return rclpy's object of the declared subscription `name`, from on_connect on.
+
+        For `get_publisher_count()` and the like; it is another one after a handover.
+
+        Raises:
+            UnknownEndpointError: nothing of that name is declared; a KeyError too.
+            LifecycleError: the node is not connected.
+        """
+        return self.lifecycle.data_layer.endpoints.client(EndpointKind.SUBSCRIPTION, name)
+
+    def service(self, name: str) -> Service:
+        """Return rclpy's object of the declared service server `name`; as `subscription`."""
+        return self.lifecycle.data_layer.endpoints.client(EndpointKind.SERVICE_SERVER, name)
 
     def action_client(self, name: str) -> ActionClient:
         """Return the declared action client `name`, from on_connect on; raises as `client`.
@@ -481,6 +515,7 @@ class LifecycleNode(Declarations, LocalInterface, GatedFactories):
     @_any_signature
     def on_configure(self, state: LifecycleState) -> CallbackReturn:
         """Read parameters, take resources. Endpoints are declared but do not exist yet."""
+        return self._call_managed("on_configure", state)
 
     @_any_signature
     def on_connect(self, state: LifecycleState) -> CallbackReturn:
@@ -489,10 +524,12 @@ class LifecycleNode(Declarations, LocalInterface, GatedFactories):
     @_any_signature
     def on_activate(self, state: LifecycleState) -> CallbackReturn:
         """Start working; data flows once this has succeeded."""
+        return self._call_managed("on_activate", state)
 
     @_any_signature
     def on_deactivate(self, state: LifecycleState) -> CallbackReturn:
         """Stop working; data has stopped flowing already."""
+        return self._call_managed("on_deactivate", state)
 
     @_any_signature
     def on_disconnect(self, state: LifecycleState) -> CallbackReturn:
@@ -501,11 +538,14 @@ class LifecycleNode(Declarations, LocalInterface, GatedFactories):
     @_any_signature
     def on_cleanup(self, state: LifecycleState) -> CallbackReturn:
         """Give back what on_configure took."""
+        return self._call_managed("on_cleanup", state)
 
     @_any_signature
     def on_shutdown(self, state: LifecycleState) -> CallbackReturn:
         """The last call, from any state; endpoints are removed after it."""
+        return self._call_managed("on_shutdown", state)
 
     @_any_signature
     def on_error(self, state: LifecycleState) -> CallbackReturn:
         """A callback ended in ERROR: SUCCESS says the node is as new, FAILURE finalizes it."""
+        return self._call_managed("on_error", state)

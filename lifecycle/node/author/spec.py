@@ -15,11 +15,12 @@ import enum
 import importlib
 import importlib.util
 import inspect
+import os
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Protocol
 
 from lifecycle.errors import BringUpError, LifecycleError
 from lifecycle.manifest import EndpointPolicy, Position, Run, RunKind
@@ -59,14 +60,21 @@ class Construction:
     supervisor: str = ""
 
 
-_CURRENT: contextvars.ContextVar[Construction | None] = contextvars.ContextVar(
+class Constructions(Protocol):
+    """What a host says to each of several nodes, see host/foreign.py."""
+
+    def take(self, name: str, namespace: str | None) -> Construction | None:
+        """Return what is said to a node that its code calls so; None for nothing."""
+
+
+_CURRENT: contextvars.ContextVar[Construction | Constructions | None] = contextvars.ContextVar(
     "lifecycle_construction", default=None
 )
 
 
 @contextlib.contextmanager
-def constructing(construction: Construction) -> Iterator[None]:
-    """Make the next LifecycleNode that is constructed inside the block this one."""
+def constructing(construction: Construction | Constructions) -> Iterator[None]:
+    """Make the next LifecycleNode that is constructed inside the block this one, or these."""
     token = _CURRENT.set(construction)
     try:
         yield
@@ -74,11 +82,12 @@ def constructing(construction: Construction) -> Iterator[None]:
         _CURRENT.reset(token)
 
 
-def take_construction() -> Construction | None:
+def take_construction(name: str, namespace: str | None) -> Construction | None:
     """Return the pending construction once; a second node made by the first gets None."""
     construction = _CURRENT.get()
-    if construction is not None:
-        _CURRENT.set(None)
+    if construction is None or not isinstance(construction, Construction):
+        return None if construction is None else construction.take(name, namespace)
+    _CURRENT.set(None)
     return construction
 
 
@@ -139,21 +148,26 @@ def ros_arguments(spec: PlannedNode) -> list[str]:
     return ["--ros-args", *words] if words else []
 
 
-def load_class(reference: str) -> type[Node]:
-    """Import `package.module:Class`; the working directory is looked in, as `python -m` does.
+def load_nodes(reference: str, folders: Iterable[str] = ()) -> Callable[..., Any]:
+    """Import `package.module:Class` or `package.module:function`.
+
+    It is looked for in the working directory, as `python -m` does, in `folders`, on PYTHONPATH, and
+    in what is installed.
+
+    Args:
+        reference: as the manifest has it.
+        folders: absolute; where the manifest is.
 
     Raises:
-        BringUpError: malformed, no such module, no such class, or not an rclpy node. What the
-            module itself raises while it is imported passes through.
+        BringUpError: malformed, no such module, no such name, or a class that is no rclpy node.
+            What the module itself raises while it is imported passes through.
     """
     from rclpy.node import Node
 
-    module_name, separator, class_name = reference.partition(":")
-    if not separator or not module_name or not class_name.isidentifier():
+    module_name, separator, name = reference.partition(":")
+    if not separator or not module_name or not name.isidentifier():
         raise BringUpError(f"cannot read {reference!r}; write package.module:Class")
-    here = str(Path.cwd())
-    if here not in sys.path and "" not in sys.path:
-        sys.path.insert(0, here)
+    looked = _look_in(folders)
     try:
         module = importlib.import_module(module_name)
     except ModuleNotFoundError as error:
@@ -162,19 +176,45 @@ def load_class(reference: str) -> type[Node]:
             raise
         raise BringUpError(
             f"cannot import {reference!r}: no module {error.name!r}",
-            hint=f"it is looked for in {here} and in what is installed",
+            hint=f"it is looked for in {', '.join(looked)} and in what is installed",
         ) from error
-    found = getattr(module, class_name, None)
-    if not isinstance(found, type) or not issubclass(found, Node):
-        nodes = [
-            name
-            for name, value in vars(module).items()
-            if isinstance(value, type) and issubclass(value, Node)
-        ]
-        near = nearest(class_name, nodes)
-        what = "has no" if found is None else "has, but not as a node class,"
-        raise BringUpError(
-            f"cannot use {reference!r}: {module_name} {what} {class_name!r}",
-            hint=f"did you mean {near!r}?" if near else f"node classes there: {nodes or 'none'}",
-        )
-    return found
+    found = getattr(module, name, None)
+    if isinstance(found, type) and issubclass(found, Node):
+        return found
+    if callable(found) and not isinstance(found, type):
+        function: Callable[..., Any] = found
+        return function
+    nodes = [
+        each
+        for each, value in vars(module).items()
+        if isinstance(value, type) and issubclass(value, Node)
+    ]
+    near = nearest(name, nodes)
+    what = "has no" if found is None else "has, but not as a node class or a function,"
+    raise BringUpError(
+        f"cannot use {reference!r}: {module_name} {what} {name!r}",
+        hint=f"did you mean {near!r}?" if near else f"node classes there: {nodes or 'none'}",
+    )
+
+
+def _look_in(folders: Iterable[str]) -> tuple[str, ...]:
+    """Have modules looked for in more places, and return these."""
+    # PYTHONPATH of the manifest's own `environment:` came after this interpreter started.
+    given = [each for each in os.environ.get("PYTHONPATH", "").split(os.pathsep) if each]
+    here = [] if "" in sys.path else [str(Path.cwd())]
+    for each in reversed([*here, *folders, *given]):
+        if each not in sys.path:
+            sys.path.insert(0, each)
+    return tuple(dict.fromkeys([str(Path.cwd()), *folders, *given]))
+
+
+def load_class(reference: str, folders: Iterable[str] = ()) -> type[Node]:
+    """Import `package.module:Class`, as `load_nodes`.
+
+    Raises:
+        BringUpError: likewise, or it is a function.
+    """
+    found = load_nodes(reference, folders)
+    if isinstance(found, type):
+        return found
+    raise BringUpError(f"cannot use {reference!r}: a class is needed, and it is a function")

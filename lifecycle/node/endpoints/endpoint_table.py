@@ -109,7 +109,7 @@ class EndpointTable:
         return self.handles[name]
 
     def client(self, kind: EndpointKind, name: str) -> Any:
-        """Return a declared service or action client.
+        """Return the rclpy object of a declared endpoint that has no handle, as clients have none.
 
         Raises:
             UnknownEndpointError: no such declaration.

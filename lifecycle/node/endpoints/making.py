@@ -6,12 +6,14 @@ what exists where is data_layer.py's.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
+from rclpy.qos import qos_profile_system_default
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest import EndpointKind, QosProfile
@@ -22,12 +24,54 @@ from lifecycle.plan import PlannedEndpoint
 
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup
+    from rclpy.service_introspection import ServiceIntrospectionState
 
     from lifecycle.node.connections.connections import Connection
     from lifecycle.node.lifecycle.gate import Later, NodeGate
 
 CLIENTS = frozenset({EndpointKind.SERVICE_CLIENT, EndpointKind.ACTION_CLIENT})
 _ACTIONS = frozenset({EndpointKind.ACTION_SERVER, EndpointKind.ACTION_CLIENT})
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class EndpointOptions:
+    """What only code can say of how an endpoint is made; as in rclpy's factories.
+
+    Attributes:
+        callback_group: of its callback and its events; None for the node's own choice.
+        event_callbacks: rclpy's PublisherEventCallbacks or SubscriptionEventCallbacks.
+        raw: a subscription's handler is given serialized bytes.
+        content_filter: expression of a subscription, and the values of its parameters.
+        introspection: of a service server or client (REP-2012).
+    """
+
+    callback_group: CallbackGroup | None = None
+    event_callbacks: Any = None
+    raw: bool = False
+    content_filter: tuple[str, tuple[str, ...]] | None = None
+    introspection: ServiceIntrospectionState | None = None
+
+    def refuse_unfit(self, kind: EndpointKind) -> None:
+        """Raise LifecycleError for what endpoints of a kind cannot have."""
+        given = {
+            "raw": self.raw,
+            "content_filter": self.content_filter is not None,
+            "event_callbacks": self.event_callbacks is not None,
+            "introspection": self.introspection is not None,
+        }
+        for name, is_given in given.items():
+            if is_given and kind not in _FITTING[name]:
+                fitting = ", ".join(f"{each.noun}s" for each in _FITTING[name])
+                raise LifecycleError(f"cannot set {name} of a {kind.noun}; only of {fitting}")
+
+
+_FITTING = {
+    "raw": (EndpointKind.SUBSCRIPTION,),
+    "content_filter": (EndpointKind.SUBSCRIPTION,),
+    "event_callbacks": (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION),
+    "introspection": (EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT),
+}
+NO_OPTIONS = EndpointOptions()
 
 
 class Maker:
@@ -62,6 +106,7 @@ class Maker:
         *,
         handler: Callable[..., Any] | None,
         name: str = "",
+        options: EndpointOptions = NO_OPTIONS,
     ) -> Any:
         """Return a new rclpy entity for `endpoint` on `connection`.
 
@@ -71,19 +116,29 @@ class Maker:
             connection: that carries it.
             handler: takes messages, requests or goals; None where the kind has no handler.
             name: fully qualified name instead of the declared one.
+            options: what code says of it.
 
         Raises:
             LifecycleError: the RMW refused, with its reason; nothing is left.
         """
-        make = {
+        makes: dict[EndpointKind, Callable[..., Any]] = {
             EndpointKind.PUBLISHER: self._publisher,
             EndpointKind.SUBSCRIPTION: self._subscription,
             EndpointKind.SERVICE_SERVER: self._service,
             EndpointKind.SERVICE_CLIENT: self._client,
             EndpointKind.ACTION_SERVER: self._action_server,
             EndpointKind.ACTION_CLIENT: self._action_client,
-        }[endpoint.kind]
-        entity = make(endpoint, interface, connection, handler, name)
+        }
+        make = makes[endpoint.kind]
+        entity = make(endpoint, interface, connection, handler, name=name, options=options)
+        if connection.participant is not None:
+            # The hidden node is not spun: its events are handled where the node's own are.
+            for event in getattr(entity, "event_handlers", ()):
+                self._node.add_waitable(event)
+        if options.introspection is not None:
+            entity.configure_introspection(
+                self._node.get_clock(), qos_profile_system_default, options.introspection
+            )
         made = wire_name(entity)
         if name and made and made != name:
             self.unmake(endpoint, entity, connection)
@@ -103,6 +158,8 @@ class Maker:
             self._gate.remove(entity)
         if participant is not None:
             self._gate.remove(entity)
+            for event in getattr(entity, "event_handlers", ()):
+                self._node.remove_waitable(event)
             participant.destroy_endpoint(entity)
         elif endpoint.kind in _ACTIONS:
             entity.destroy()
@@ -152,14 +209,28 @@ class Maker:
         interface: type[Any],
         connection: Connection,
         handler: Callable[..., Any] | None,  # noqa: ARG002 - it has none
+        *,
         name: str,
+        options: EndpointOptions,
     ) -> Any:
         qos = endpoint.qos or QosProfile()
         if connection.participant is not None:
             topic = name or self.resolve(endpoint)
-            return connection.participant.create_publisher(interface, topic, qos)
+            return connection.participant.create_publisher(
+                interface,
+                topic,
+                qos,
+                callback_group=options.callback_group,
+                event_callbacks=options.event_callbacks,
+            )
         entity = create_publisher(
-            self._node, interface, name or endpoint.name, qos, unique=endpoint.unique
+            self._node,
+            interface,
+            name or endpoint.name,
+            qos,
+            unique=endpoint.unique,
+            callback_group=options.callback_group,
+            event_callbacks=options.event_callbacks,
         )
         self._gate.release(entity)  # the handle is the gate
         return entity
@@ -170,13 +241,22 @@ class Maker:
         interface: type[Any],
         connection: Connection,
         handler: Callable[..., Any] | None,
+        *,
         name: str,
+        options: EndpointOptions,
     ) -> Any:
         assert handler is not None
         qos = endpoint.qos or QosProfile()
+        further: dict[str, Any] = {
+            "unique": endpoint.unique,
+            "callback_group": options.callback_group,
+            "event_callbacks": options.event_callbacks,
+            "raw": options.raw,
+            "content_filter": options.content_filter,
+        }
         if connection.participant is not None:
             entity = connection.participant.create_subscription(
-                interface, name or self.resolve(endpoint), handler, qos, unique=endpoint.unique
+                interface, name or self.resolve(endpoint), handler, qos, **further
             )
         else:
             entity = create_subscription(
@@ -185,7 +265,7 @@ class Maker:
                 name or endpoint.name,
                 handler,
                 qos,
-                unique=endpoint.unique,
+                **further,
             )
         self._gate.add_subscription(entity, self._later)
         return entity
@@ -196,16 +276,26 @@ class Maker:
         interface: type[Any],
         connection: Connection,
         handler: Callable[..., Any] | None,
+        *,
         name: str,
+        options: EndpointOptions,
     ) -> Any:
         assert handler is not None
         if connection.participant is not None:
             entity = connection.participant.create_service(
-                interface, name or self.resolve(endpoint), _answering(handler), **_qos(endpoint)
+                interface,
+                name or self.resolve(endpoint),
+                _answering(handler),
+                callback_group=options.callback_group,
+                **_qos(endpoint),
             )
         else:
             entity = self._node.create_service(
-                interface, name or endpoint.name, _answering(handler), **_qos_profile(endpoint)
+                interface,
+                name or endpoint.name,
+                _answering(handler),
+                callback_group=options.callback_group,
+                **_qos_profile(endpoint),
             )
         self._survive_late_answers(entity, endpoint)
         return entity
@@ -216,18 +306,21 @@ class Maker:
         interface: type[Any],
         connection: Connection,
         handler: Callable[..., Any] | None,  # noqa: ARG002 - it has none
+        *,
         name: str,
+        options: EndpointOptions,
     ) -> Any:
+        group = options.callback_group or self._client_group
         if connection.participant is None:
             return self._node.create_client(
-                interface, name or endpoint.name, **_qos_profile(endpoint)
+                interface, name or endpoint.name, callback_group=group, **_qos_profile(endpoint)
             )
         from lifecycle.node.author.node import refuse_to_deadlock
 
         client = connection.participant.create_client(
             interface,
             name or self.resolve(endpoint),
-            callback_group=self._client_group,
+            callback_group=group,
             **_qos(endpoint),
         )
         refuse_to_deadlock(client)
@@ -239,7 +332,9 @@ class Maker:
         interface: type[Any],
         connection: Connection,
         handler: Callable[..., Any] | None,
+        *,
         name: str,
+        options: EndpointOptions,
     ) -> Any:
         from lifecycle.middleware import GoalServer  # late: numpy, 100 ms
 
@@ -263,7 +358,7 @@ class Maker:
                 called,
                 goals.execute,
                 accept=goals.accept,
-                group=self._node.default_callback_group,
+                group=options.callback_group or self._node.default_callback_group,
             ),
         )
         self._goals[id(server)] = goals
@@ -276,7 +371,9 @@ class Maker:
         interface: type[Any],
         connection: Connection,
         handler: Callable[..., Any] | None,  # noqa: ARG002 - it has none
+        *,
         name: str,
+        options: EndpointOptions,
     ) -> Any:
         from lifecycle.middleware import GoalClient
         from lifecycle.node.author.node import refuse_to_block
@@ -289,7 +386,7 @@ class Maker:
                 node,
                 interface,
                 called,
-                group=self._client_group,
+                group=options.callback_group or self._client_group,
                 refuse_to_block=refuse_to_block,
             ),
         )

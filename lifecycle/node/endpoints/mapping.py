@@ -25,7 +25,7 @@ from lifecycle.errors import LifecycleError
 from lifecycle.manifest import EndpointKind
 from lifecycle.node.author.handlers import nearest
 from lifecycle.node.connections.connections import Connection
-from lifecycle.node.endpoints.making import wire_name
+from lifecycle.node.endpoints.making import NO_OPTIONS, EndpointOptions, wire_name
 from lifecycle.plan import PlannedEndpoint
 
 if TYPE_CHECKING:
@@ -189,6 +189,7 @@ class Mapping:
         peers: matched remote endpoints; None while mapped nowhere, and for services and actions.
         lossy: the author's hint: the data bear an unreliable transport; None without one.
         size_bytes: the author's hint: its largest serialized message; None without one.
+        options: how its entities are made, as far as code says it.
     """
 
     endpoint: PlannedEndpoint
@@ -201,6 +202,7 @@ class Mapping:
     peers: int | None = None
     lossy: bool | None = None
     size_bytes: int | None = None
+    options: EndpointOptions = NO_OPTIONS
 
     @property
     def key(self) -> Key:

@@ -310,7 +310,12 @@ class Placer:
         matched: Callable[[Mapping], None],
     ) -> Part:
         entity = self._maker.make(
-            mapping.endpoint, mapping.interface, connection, handler=mapping.handler, name=name
+            mapping.endpoint,
+            mapping.interface,
+            connection,
+            handler=mapping.handler,
+            name=name,
+            options=mapping.options,
         )
         return Part(
             name=name, entity=entity, watch=self._watch(mapping, connection, entity, matched)

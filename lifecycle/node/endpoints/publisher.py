@@ -16,6 +16,7 @@ import weakref
 from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
+from rclpy.duration import Duration
 from rclpy.serialization import serialize_message
 
 from lifecycle.errors import LifecycleError
@@ -142,6 +143,32 @@ class DeclaredPublisher:
     def get_subscription_count(self) -> int:
         """Return how many subscriptions are matched; 0 while not connected."""
         return self._entity.get_subscription_count() if self._entity is not None else 0
+
+    @property
+    def topic_name(self) -> str:
+        """Fully qualified; empty while not connected."""
+        return str(self._entity.topic_name) if self._entity is not None else ""
+
+    @property
+    def is_activated(self) -> bool:
+        """What is published goes out, as rclpy's lifecycle publishers say it."""
+        return self._is_open and self._entity is not None
+
+    def assert_liveliness(self) -> None:
+        """Say that the author is alive, where its QoS has MANUAL_BY_TOPIC; nothing else."""
+        if self._entity is not None:
+            for each in (self._entity, *self._further):
+                each.assert_liveliness()
+
+    def wait_for_all_acked(self, timeout: Duration | None = None) -> bool:
+        """Return whether all that was published is acknowledged, at the latest after `timeout`.
+
+        It blocks; None waits for ever. Nothing is awaited while not connected.
+        """
+        if self._entity is None:
+            return True
+        limit = Duration(seconds=-1) if timeout is None else timeout
+        return all(each.wait_for_all_acked(limit) for each in (self._entity, *self._further))
 
     def prepare(self, entities: Sequence[Publisher]) -> None:
         """Give entities that this will publish by what was sent, before any peer is matched.

@@ -72,6 +72,7 @@ class HostSpec:
 
     Attributes:
         gathers: make the participant, report it, and make no endpoint before `PROCEED`.
+        folders: absolute, of the manifest and what it includes: modules are looked for there.
     """
 
     system: str
@@ -80,6 +81,7 @@ class HostSpec:
     discovery_range: DiscoveryRange
     nodes: tuple[PlannedNode, ...]
     gathers: bool = False
+    folders: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -113,7 +115,7 @@ class Event:
             mappings or matches).
         id: the Command's id, for "reply".
         ok: the operation succeeded, for "reply".
-        state: lifecycle_msgs/State label after it.
+        state: lifecycle_msgs/State label after it; empty of a plain node.
         connected: the data layer is made.
         error: the reason, with the exception's last line; the traceback is in the log.
         configuration: for "configuration", and replies that carry it (all but ACTIVATE,

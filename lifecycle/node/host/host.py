@@ -113,7 +113,7 @@ def needed_by(nodes: Iterable[PlannedNode]) -> tuple[str, ...]:
     names: dict[str, None] = {}
     for node in nodes:
         if node.events or node.membership:
-            names["lifecycle.graph.dds"] = names["lifecycle.graph.reporter"] = None
+            names["lifecycle.graph.transport"] = names["lifecycle.graph.reporter"] = None
         for endpoint in node.endpoints:
             if "/action/" in endpoint.type:
                 names["rclpy.action"] = None

@@ -16,7 +16,7 @@ import signal
 import threading
 import traceback
 from collections.abc import Callable, Iterator, Mapping
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import rclpy
 from rclpy.context import Context
@@ -28,13 +28,13 @@ from lifecycle.errors import LifecycleError
 from lifecycle.middleware import (
     BusySign,
     ParticipantSettings,
+    follow_nodes,
     leave_and_exit,
     once_participant_is_made,
     participant_settings,
     send_again_soon,
 )
-from lifecycle.node.author.node import LifecycleNode
-from lifecycle.node.author.spec import Construction, Mode, constructing, load_class, ros_arguments
+from lifecycle.node.author.spec import load_nodes
 from lifecycle.node.connections.data_layer import NodeInterface
 from lifecycle.node.host.control import (
     Command,
@@ -44,24 +44,17 @@ from lifecycle.node.host.control import (
     Operation,
     report_failure,
 )
+from lifecycle.node.host.foreign import Adoption, ForeignNode, Hosted, refuse_unmanaged
 from lifecycle.node.host.loop import NodeLoop, Watchdog, on_signal
 from lifecycle.node.lifecycle.machine import CallbackOutcome
-from lifecycle.plan import PlannedNode, parameter_text
+from lifecycle.plan import PlannedNode
 from lifecycle.verify import NodeConfiguration
 
 
 def process_context(spec: HostSpec) -> Context:
     """Initialise rclpy for a process and return its default context."""
-    arguments: list[str] = []
-    if len(spec.nodes) == 1 and not spec.nodes[0].managed:
-        # A plain node names itself; only process-wide arguments can give it name and parameters.
-        node = spec.nodes[0]
-        words = ros_arguments(node) or ["--ros-args"]
-        arguments = [*words, "-r", f"__node:={node.name}", "-r", f"__ns:={node.namespace}"]
-        for name, value in node.parameters:
-            arguments += ["-p", f"{name}:={parameter_text(value)}"]
     rclpy.init(
-        args=arguments,
+        args=[],
         domain_id=spec.domain_id,
         signal_handler_options=SignalHandlerOptions.NO,
     )
@@ -105,41 +98,16 @@ class Participants:
         self._made[settings] = context
 
 
-def class_of(planned: PlannedNode, *, alone: bool) -> type[Node]:
-    """Import the class of one planned node.
-
-    Args:
-        planned: names it.
-        alone: it is the only node of its process.
+def maker_of(planned: PlannedNode, folders: tuple[str, ...]) -> Callable[..., Any]:
+    """Import the class or function of one planned node.
 
     Raises:
-        LifecycleError: the class cannot be used as planned. What its module raises passes.
+        LifecycleError: it cannot be used as planned. What its module raises passes.
     """
-    node_class = load_class(planned.run.python)
-    managed = issubclass(node_class, LifecycleNode)
-    if planned.managed and not managed:
-        raise LifecycleError(
-            f"cannot manage {planned.full_name}: {planned.run.python!r} is not a LifecycleNode",
-            hint="subclass lifecycle.LifecycleNode, or say `managed: false`",
-        )
-    if not managed and not alone:
-        raise LifecycleError(
-            f"cannot host {planned.full_name} beside other nodes: a plain node takes its name "
-            "and remaps from its process",
-            hint="give it a process of its own",
-        )
-    return node_class
-
-
-def construct(planned: PlannedNode, node_class: type[Node], context: Context, system: str) -> Node:
-    """Construct one planned node of a supervised system; what its constructor raises passes."""
-    # Of a plain node the supervisor drives no states.
-    supervisor = system if planned.managed else ""
-    construction = Construction(
-        spec=planned, mode=Mode.MANUAL, context=context, supervisor=supervisor
-    )
-    with constructing(construction):
-        return node_class()
+    found = load_nodes(planned.run.python, folders)
+    if isinstance(found, type):
+        refuse_unmanaged(planned, found)
+    return found
 
 
 _ANSWERED_WITHOUT_CONFIGURATION = frozenset(
@@ -157,13 +125,13 @@ class HostCommands:
     """Carries out the commands to the nodes of one process.
 
     Args:
-        nodes: the managed ones by full name, as they are at any time.
+        nodes: by full name, as they are at any time.
         of_process: what the operations of the whole process do.
     """
 
     def __init__(
         self,
-        nodes: Mapping[str, LifecycleNode],
+        nodes: Mapping[str, Hosted],
         of_process: Mapping[Operation, Callable[[], object]],
     ) -> None:
         self._nodes = nodes
@@ -183,7 +151,7 @@ class HostCommands:
     async def _carry_out(self, command: Command) -> Event:
         node = self._nodes.get(command.node)
         if node is None:
-            known = ", ".join(self._nodes) or "no managed node"
+            known = ", ".join(self._nodes) or "no node"
             raise LifecycleError(f"cannot find node {command.node!r}; this process hosts {known}")
         if command.operation is Operation.GET_CONFIGURATION:
             return self._reply(command, ok=True)
@@ -191,12 +159,12 @@ class HostCommands:
             self._of_process[command.operation]()
             return self._reply(command, ok=True)
         if command.operation is Operation.SERVE_INTERFACE:
-            node.lifecycle.serve_interface()
+            node.serve_interface()
             return self._reply(command, ok=True)
         if command.operation in _NODE_INTERFACE:
-            await _NODE_INTERFACE[command.operation](node.lifecycle.interface, command)
+            await _NODE_INTERFACE[command.operation](node.interface, command)
             return self._reply(command, ok=True)
-        result = await node.lifecycle.change_for_supervisor(command.operation.value)
+        result = await node.change_for_supervisor(command.operation.value)
         return self._reply(
             command, ok=result.outcome is CallbackOutcome.SUCCESS, error=result.error
         )
@@ -207,21 +175,21 @@ class HostCommands:
         node = self._nodes.get(command.node)
         if node is None:
             return Event(kind="reply", node=command.node, id=command.id, ok=ok, error=error)
-        state = node.lifecycle.state
+        state = node.reported
         carries = describe and (
             command.operation not in _ANSWERED_WITHOUT_CONFIGURATION
             # No event reports its sockets: what its callback did to them is read when it has ended.
-            or (command.operation is Operation.ACTIVATE and node.lifecycle.is_marked)
+            or (command.operation is Operation.ACTIVATE and node.is_marked)
         )
         return Event(
             kind="reply",
             node=command.node,
             id=command.id,
             ok=ok,
-            state=state.seen.label,
+            state=state.label,
             connected=state.connected,
             error=error,
-            configuration=node.lifecycle.get_configuration() if carries else None,
+            configuration=node.get_configuration() if carries else None,
         )
 
 
@@ -262,12 +230,16 @@ class Host:
         if channel.descriptors:
             sign = BusySign(*channel.descriptors)
             watchdog = Watchdog(sign, lambda _: channel.write(Event(kind="beat")))
-        self._loop = NodeLoop(context, watchdog)
+        run = spec.nodes[0].run
+        self._loop = NodeLoop(context, watchdog, executor=run.executor, threads=run.threads)
         self._lock = threading.Lock()
         self._imports = False
         self._ended = False
         self._proceed = threading.Event()
-        self._nodes: dict[str, LifecycleNode] = {}
+        self._nodes: dict[str, Hosted] = {}
+        self._adoption = Adoption(
+            Participants(context).carrying, self._adopt, supervisor=spec.system
+        )
         self._commands = HostCommands(
             self._nodes,
             {
@@ -282,17 +254,18 @@ class Host:
         self._obey()
         beside = (self._channel.fileno(), self._receive)
         with on_signal(lambda number: self._end(number.name), beside=beside):
-            participants = Participants(self._context)
+            follow_nodes(self._adoption)
             for index, planned in enumerate(self._spec.nodes):
                 failure: Exception | None = None
                 first = self._spec.gathers and index == 0
                 try:
-                    node_class = self._import(planned)
-                    with participants.carrying(planned) as context, contextlib.ExitStack() as stack:
+                    if planned.key in self._adoption.made:
+                        continue  # by the same call as one before it
+                    maker = self._import(planned)
+                    with contextlib.ExitStack() as stack:
                         if first:
                             stack.enter_context(once_participant_is_made(self._gather))
-                        node = construct(planned, node_class, context, self._spec.system)
-                        self._add(planned, node)
+                        self._construct(planned, maker)
                 except Exception as error:  # noqa: BLE001 - reported to the supervisor
                     failure = error
                 if failure is not None:
@@ -313,10 +286,10 @@ class Host:
         self._channel.write(Event(kind="participant"))
         self._proceed.wait(_GATHER_S)
 
-    def _import(self, planned: PlannedNode) -> type[Node]:
+    def _import(self, planned: PlannedNode) -> Callable[..., Any]:
         """Import a node's class; ending the process meanwhile need not wait for it."""
         with self._importing():
-            return class_of(planned, alone=len(self._spec.nodes) == 1)
+            return maker_of(planned, self._spec.folders)
 
     @contextlib.contextmanager
     def _importing(self) -> Iterator[None]:
@@ -364,23 +337,41 @@ class Host:
             deadline_s=_LEAVE_S,
         )
 
-    def _add(self, planned: PlannedNode, node: Node) -> None:
-        if isinstance(node, LifecycleNode):
-            self._nodes[planned.full_name] = node
-            node.lifecycle.add_listener(self._report_state)
-            node.lifecycle.configuration_changes.listen(self._report_configuration)
-        self._loop.add(node)
+    def _construct(self, planned: PlannedNode, maker: Callable[..., Any]) -> None:
+        group = [each for each in self._spec.nodes if each.run == planned.run]
+        by_key = {each.key: each for each in group}
+        for key in self._adoption.make(planned, group, maker):
+            node, foreign = self._adoption.made[key]
+            hosted: Hosted = foreign or node.lifecycle
+            self._nodes[by_key[key].full_name] = hosted
+            if by_key[key].managed:
+                hosted.add_listener(self._report_state)
+            hosted.configuration_changes.listen(self._report_configuration)
+            self._loop.add(node, hosted)
+
+    def _adopt(self, node: Node, planned: PlannedNode) -> ForeignNode:
+        return ForeignNode(
+            node,
+            planned,
+            supervisor=self._spec.system,
+            spinner=self._loop,
+            later=self._loop.call_beside,
+            watching=self._loop.watching,
+        )
 
     async def _ready(self) -> None:
+        for hosted in self._nodes.values():
+            if isinstance(hosted, ForeignNode):
+                hosted.configuration_changes.touch()
         self._channel.write(Event(kind="ready"))
 
-    def _report_state(self, node: LifecycleNode) -> None:
-        state = node.lifecycle.state
+    def _report_state(self, hosted: Hosted) -> None:
+        state = hosted.reported
         self._channel.write(
             Event(
                 kind="state",
-                node=node.lifecycle.full_name,
-                state=state.seen.label,
+                node=hosted.full_name,
+                state=state.label,
                 connected=state.connected,
             )
         )

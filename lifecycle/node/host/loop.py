@@ -23,15 +23,58 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable, Coroutine, Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from rclpy.context import Context
-from rclpy.executors import ShutdownException
+from rclpy.executors import (
+    ExternalShutdownException,
+    MultiThreadedExecutor,
+    ShutdownException,
+)
 from rclpy.node import Node
 
-from lifecycle.middleware import BusySign, NodeExecutor, hidden_nodes, leave_and_exit, tell_names
+from lifecycle.manifest import Executor
+from lifecycle.middleware import (
+    BusySign,
+    NodeExecutor,
+    Watching,
+    hidden_nodes,
+    leave_and_exit,
+    tell_names,
+)
 from lifecycle.node.author.node import LifecycleNode
 from lifecycle.node.lifecycle.execution import hint
+
+if TYPE_CHECKING:
+    from lifecycle.node.author.managed import HostedState
+    from lifecycle.node.configuration import ConfigurationChanges
+    from lifecycle.plan import PlannedNode
+
+
+class Hosted(Protocol):
+    """What a loop knows of a node beside its callbacks; `node.lifecycle` of ours."""
+
+    @property
+    def full_name(self) -> str:
+        """Fully qualified node name."""
+
+    @property
+    def spec(self) -> PlannedNode:
+        """What it was planned to be."""
+
+    @property
+    def reported(self) -> HostedState:
+        """Its state now."""
+
+    @property
+    def configuration_changes(self) -> ConfigurationChanges:
+        """Notifies of each change of its configuration."""
+
+    def add_listener(self, listener: Callable[[Any], None]) -> None:
+        """Call `listener(self)` after every change of state."""
+
+    async def shut_down(self, reason: str) -> object:
+        """Bring it to finalized, if it has states."""
 
 
 class Watchdog:
@@ -48,9 +91,9 @@ class Watchdog:
         self._running = False
         self._changing: set[str] = set()
 
-    def add(self, node: LifecycleNode) -> None:
-        """Leave the transitions of `node` to their own deadlines."""
-        node.lifecycle.add_listener(self._follow)
+    def add(self, hosted: Hosted) -> None:
+        """Leave the transitions of a node to their own deadlines."""
+        hosted.add_listener(self._follow)
 
     def begin(self) -> None:
         """Note that a callback begins."""
@@ -63,10 +106,10 @@ class Watchdog:
         self._running = False
         self._idle()
 
-    def _follow(self, node: LifecycleNode) -> None:
+    def _follow(self, hosted: Hosted) -> None:
         """A transition begins or ends, inside a callback as everything does."""
-        name = node.lifecycle.full_name
-        if not node.lifecycle.state.steady:
+        name = hosted.full_name
+        if not hosted.reported.steady:
             self._changing.add(name)
             self._idle()
             return
@@ -82,6 +125,9 @@ class Watchdog:
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _LEAVE_S = 2.0
+_SPIN_S = 60.0
+"""rclpy 7.1.6's EventsExecutor has its `spin()` wait until the end of time, which overflows: it
+then looks at the clock without a pause, and other threads cannot wake it."""
 
 
 class NodeLoop:
@@ -90,22 +136,40 @@ class NodeLoop:
     Args:
         context: of the executor; nodes may have others.
         watchdog: notified when a callback begins and ends.
+        executor: what runs the callbacks of nodes. One that is not `single` has a thread of its
+            own, or several, and no watchdog: while one callback hangs others may run.
+        threads: of a `multi` one; 0 is one for each processor, at least two.
 
     Example:
         >>> loop = NodeLoop(context)
-        >>> loop.add(Camera())
+        >>> camera = Camera()
+        >>> loop.add(camera, camera.lifecycle)
         >>> with on_signal(lambda number: loop.stop(f"signal {number}", code=0)):
         ...     loop.spin_and_exit()
     """
 
-    def __init__(self, context: Context, watchdog: Watchdog | None = None) -> None:
+    def __init__(
+        self,
+        context: Context,
+        watchdog: Watchdog | None = None,
+        *,
+        executor: Executor = Executor.SINGLE,
+        threads: int = 0,
+    ) -> None:
         self._context = context
         self._watchdog = watchdog
         self._executor = NodeExecutor(context=context)
+        self._own: Any = self._executor
+        if executor is not Executor.SINGLE:
+            self._watchdog = None
+            self._own = _executor(executor, threads, context)
+        self._watching: Watching | None = None
         self._nodes: list[Node] = []
+        self._hosted: list[Hosted] = []
         self._lock = threading.Lock()
         self._stopping = False
         self._done = False
+        self._left = False
         self._code = 0
 
     @property
@@ -113,12 +177,32 @@ class NodeLoop:
         """Those that were added."""
         return tuple(self._nodes)
 
-    def add(self, node: Node) -> None:
-        """Spin a node from now on; shut down in reverse order of addition."""
+    @property
+    def watching(self) -> Watching:
+        """Events that this loop waits for, whatever runs the callbacks of nodes."""
+        if self._watching is None:
+            self._watching = Watching()
+            self._executor.add_node(self._watching)
+        return self._watching
+
+    def add(self, node: Node, hosted: Hosted) -> None:
+        """Shut a node down in the end, in reverse order of addition; a managed one is spun now."""
         self._nodes.append(node)
-        if self._watchdog is not None and isinstance(node, LifecycleNode):
-            self._watchdog.add(node)
-        self._executor.add_node(node)
+        self._hosted.append(hosted)
+        if self._watchdog is not None:
+            self._watchdog.add(hosted)
+        if isinstance(node, LifecycleNode) and hosted is node.lifecycle:
+            self.spin(node)
+
+    def spin(self, node: Node) -> None:
+        """Run a node's callbacks from now on, unless its own code has somebody else do it."""
+        if node.executor is None or node.executor is self._own:
+            self._own.add_node(node)
+
+    def rest(self, node: Node) -> None:
+        """Run no callback of a node that begins from now on."""
+        if node.executor is self._own:
+            self._own.remove_node(node)
 
     def tell_names(self) -> None:
         """Make every participant of this process publish anew which nodes and endpoints it has."""
@@ -126,8 +210,12 @@ class NodeLoop:
         tell_names((*by_context.values(), *hidden_nodes()))
 
     def call_soon(self, task: Callable[..., Coroutine[Any, Any, None]], *arguments: object) -> None:
-        """Run an `async def` in the executor's thread; from any thread. It must not raise."""
-        self._executor.create_task(task, *arguments)
+        """Run an `async def` where callbacks of nodes run; from any thread. It must not raise."""
+        self._own.create_task(task, *arguments)
+
+    def call_beside(self, task: Callable[[], Any]) -> object:
+        """Run a function, sync or async, in the main thread's executor; false after its end."""
+        return False if self._left else self._executor.create_task(task)
 
     def stop(self, reason: str, *, code: int) -> None:
         """Shut every node down and leave with `code`; from any thread, the first call counts.
@@ -140,8 +228,10 @@ class NodeLoop:
                 return
             self._stopping = True
             self._code = code
-        managed = [node for node in self._nodes if isinstance(node, LifecycleNode)]
-        bound_s = sum(node.lifecycle.spec.timeouts.shutdown_s for node in managed) + _LEAVE_S
+        bound_s = (
+            sum(each.spec.timeouts.shutdown_s for each in self._hosted if each.spec.managed)
+            + _LEAVE_S
+        )
         guard = threading.Thread(
             target=self._give_up, args=(bound_s, reason), name="give-up", daemon=True
         )
@@ -156,14 +246,16 @@ class NodeLoop:
         An exception in a message, service or timer callback ends the process, as in rclpy: its
         traceback is printed, then all nodes are shut down.
         """
+        if self._own is not self._executor:
+            threading.Thread(target=self._spin_own, name="executor", daemon=True).start()
         while not self._done:
             try:
                 self._turn()
             except Exception as error:  # noqa: BLE001, PERF203 - the user's code: reported
-                traceback.print_exc()
-                if todo := hint(error):
-                    sys.stderr.write(f"{todo}\n")
-                self.stop("a callback raised an exception", code=1)
+                self._failed(error)
+        if self._own is not self._executor:
+            self._own.shutdown(_LEAVE_S)
+        self._left = True
         self._executor.shutdown()
         contexts = dict.fromkeys([self._context, *(node.context for node in self._nodes)])
         leave_and_exit(self._code, nodes=self._nodes, contexts=contexts)
@@ -183,14 +275,33 @@ class NodeLoop:
         finally:
             self._watchdog.end()
 
+    def _spin_own(self) -> None:
+        """Run the executor of nodes in this thread until it is shut down."""
+        while not self._done:
+            try:
+                self._own.spin_once(_SPIN_S)
+            except (ShutdownException, ExternalShutdownException):  # noqa: PERF203
+                return
+            except Exception as error:  # noqa: BLE001 - the user's code: reported
+                self._failed(error)
+
+    def _failed(self, error: Exception) -> None:
+        traceback.print_exception(error)
+        if todo := hint(error):
+            sys.stderr.write(f"{todo}\n")
+        self.stop("a callback raised an exception", code=1)
+
     async def _shut_down(self, reason: str) -> None:
-        for node in reversed(self._nodes):
-            if isinstance(node, LifecycleNode):
-                try:
-                    await node.lifecycle.shut_down(reason)
-                except Exception:  # noqa: BLE001 - the other nodes must still be shut down
-                    traceback.print_exc()
+        for hosted in reversed(self._hosted):
+            try:
+                await hosted.shut_down(reason)
+            except Exception:  # noqa: BLE001, PERF203 - the other nodes must still be shut down
+                traceback.print_exc()
+        for hosted in self._hosted:
+            hosted.configuration_changes.close()
         self._done = True
+        if self._own is not self._executor:
+            self.call_beside(_nothing)  # what waits there looks again
 
     def _give_up(self, bound_s: float, reason: str) -> None:
         """End the process when a blocking callback keeps the executor from doing so."""
@@ -202,6 +313,19 @@ class NodeLoop:
         )
         sys.stderr.flush()
         os._exit(self._code or 1)
+
+
+def _nothing() -> None:
+    """Being called is the point."""
+
+
+def _executor(kind: Executor, threads: int, context: Context) -> Any:
+    """Return rclpy's executor of a kind that has threads of its own."""
+    if kind is Executor.EVENTS:
+        from rclpy.experimental.events_executor import EventsExecutor
+
+        return EventsExecutor(context=context)
+    return MultiThreadedExecutor(threads or max(2, os.cpu_count() or 0), context=context)
 
 
 @contextlib.contextmanager

@@ -152,9 +152,9 @@ def run(
         )
         with constructing(construction), participant_settings(context, _settings(spec)):
             node = node_class()
-        loop.add(node)
+        loop.add(node, node.lifecycle)
         liveliness.open(node, loop.tell_names)
-        node.lifecycle.add_listener(lambda each: report(f"{_name(each)}: {_state(each)}"))
+        node.lifecycle.add_listener(lambda _: report(f"{_name(node)}: {_state(node)}"))
         report(f"{_name(node)}: {_state(node)}")
         if node.lifecycle.mode is Mode.AUTO:
             loop.call_soon(_bring_up, node, loop, report)

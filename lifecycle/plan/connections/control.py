@@ -16,8 +16,15 @@ from collections.abc import Mapping, Sequence
 
 from lifecycle.manifest import Discovery, DiscoveryMode, FlowTransport, RunKind
 from lifecycle.network import ConnectionUrl, Medium, Peer, parse
-from lifecycle.plan.connections.contacts import Contact, contacts_of, fixed_url, peers_by
-from lifecycle.plan.connections.hosts import LOOPBACK, Hosts, PortPool
+from lifecycle.plan.connections.hosts import (
+    LOOPBACK,
+    Contact,
+    Hosts,
+    PortPool,
+    contacts_of,
+    fixed_url,
+    peers_by,
+)
 from lifecycle.plan.model import (
     ParticipantConnections,
     PlannedNode,

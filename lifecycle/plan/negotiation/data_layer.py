@@ -10,7 +10,7 @@ import dataclasses
 
 from lifecycle.manifest import EndpointKind, FlowTransport, QosProfile
 from lifecycle.network import CONNECTABLE, RMW_DEFAULT, Medium, Peer
-from lifecycle.plan.connections.contacts import Contact
+from lifecycle.plan.connections.hosts import Contact
 
 PARADIGMS = ("publish-subscribe", "request-response")
 """Topics; services, and actions, which consist of both."""

@@ -16,8 +16,15 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from lifecycle.manifest import EndpointKind, FlowTransport
 from lifecycle.network import ConnectionUrl, Medium, parse
-from lifecycle.plan.connections.contacts import Contact, contacts_of, peers_by, ports_of
-from lifecycle.plan.connections.hosts import LOOPBACK, LOOPBACK6, PortPool
+from lifecycle.plan.connections.hosts import (
+    LOOPBACK,
+    LOOPBACK6,
+    Contact,
+    PortPool,
+    contacts_of,
+    peers_by,
+    ports_of,
+)
 from lifecycle.plan.model import PlanError
 from lifecycle.plan.negotiation.data_layer import (
     DataLayerGraph,

@@ -33,9 +33,8 @@ from lifecycle.network import (
     domain_base,
     parse,
 )
-from lifecycle.plan.connections.contacts import contacts_of, ports_of
 from lifecycle.plan.connections.control import is_fixed, participant_name
-from lifecycle.plan.connections.hosts import Hosts
+from lifecycle.plan.connections.hosts import Hosts, contacts_of, ports_of
 from lifecycle.plan.model import (
     ParticipantConnections,
     Plan,

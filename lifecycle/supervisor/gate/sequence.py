@@ -430,14 +430,14 @@ class GateSequence:
         return tuple(
             each
             for each in self._system.nodes.values()
-            if each.planned.managed and each.reach is not Reach.ACTIVE
+            if each.planned.holds and each.reach is not Reach.ACTIVE
         )
 
     def _active(self) -> frozenset[str]:
         return frozenset(
             each.name
             for each in self._system.nodes.values()
-            if each.planned.managed and each.reach is Reach.ACTIVE
+            if each.planned.holds and each.reach is Reach.ACTIVE
         )
 
     def _reached(self, phase: str) -> None:

@@ -68,7 +68,7 @@ class ProcessMonitor:
             StepFailedError: a process ended.
         """
         running = asyncio.ensure_future(phase)
-        death = asyncio.ensure_future(self.next_death())
+        death = asyncio.ensure_future(first_death(self._system, self.dead))
         try:
             waits: set[asyncio.Future[Any]] = {running, death}
             await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
@@ -77,7 +77,7 @@ class ProcessMonitor:
             if running.done():
                 running.result()
             if death.done():
-                raise death.result()
+                raise self._failure(death.result())
         except StepFailedError as failure:
             failure.joined(self.deaths())
             raise

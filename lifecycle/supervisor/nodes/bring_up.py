@@ -12,6 +12,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterable, Iterator
+from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from lifecycle.errors import BringUpError
@@ -26,8 +27,7 @@ from lifecycle.supervisor.processes.control_channel import (
     ControlChannel,
     HostFailedError,
 )
-from lifecycle.supervisor.processes.patience import patient
-from lifecycle.supervisor.processes.process import ManagedProcess, Spawner
+from lifecycle.supervisor.processes.process import ManagedProcess, Spawner, patient
 from lifecycle.supervisor.run.events import ProcessState, Reach
 from lifecycle.supervisor.run.failure import StepFailedError, ended
 from lifecycle.verify import (
@@ -179,17 +179,17 @@ class BringUp:
     async def activate(
         self, permit: Permit, timeout_s: float, nodes: Iterable[NodeRun] | None = None
     ) -> None:
-        """Activate every managed node, or some, as `permit` allows.
+        """Activate every node that is held, or some, as `permit` allows.
 
         Raises:
             StepFailedError: as for `connect`.
             VerificationError: something changed after the verdict, and what it is now keeps the
                 gate closed for all that were not asked yet.
         """
-        managed = [node for node in self._some(nodes) if node.planned.managed]
+        held = [node for node in self._some(nodes) if node.planned.holds]
         try:
             await asyncio.wait_for(
-                self._side_by_side(self._activate(node, permit) for node in managed), timeout_s
+                self._side_by_side(self._activate(node, permit) for node in held), timeout_s
             )
         except asyncio.TimeoutError:
             raise self._failure() or self._late(timeout_s) from None
@@ -206,7 +206,7 @@ class BringUp:
         active = tuple(
             node
             for node in self._some(nodes)
-            if node.planned.managed and (nodes is not None or node.reach is Reach.ACTIVE)
+            if node.planned.holds and (nodes is not None or node.reach is Reach.ACTIVE)
         )
         await self._side_by_side(self._deactivate(node, active) for node in active)
 
@@ -294,10 +294,9 @@ class BringUp:
             return None
         first, *others = self._failures
         reported = [
-            _not_hosted(self._system.nodes[process.planned.nodes[0]], each)
+            each
             for process in self._system.processes.values()
-            if process.channel is not None
-            for each in process.channel.failures
+            for each in _not_hosted(process, self._system.nodes[process.planned.nodes[0]])
         ]
         return first.joined([*others, *reported])
 
@@ -406,7 +405,7 @@ class BringUp:
         limit_s = node.planned.timeouts.start_s
         node.doing = "starting"
         if process is not None and process.channel is not None:
-            if node.planned.managed:
+            if node.planned.holds:
                 node.driver = ControlDriver(process.channel, node.name)
         elif node.planned.managed:
             node.doing = "waiting to appear in the graph"
@@ -430,6 +429,7 @@ class BringUp:
                     discovery_range=self._system.plan.discovery_range,
                     nodes=tuple(node.planned for node in nodes),
                     gathers=self._gathering is not None,
+                    folders=manifest_folders(node.planned for node in nodes),
                 ),
                 self._system.on_host_event,
                 hung,
@@ -483,7 +483,7 @@ class BringUp:
             raise
         except BringUpError as error:
             if isinstance(error, HostFailedError):
-                raise _not_hosted(node, error) from error
+                raise _start_failed(error, node.name, **_process_of(node)) from error
             if isinstance(error, ChannelClosedError):
                 await self._death(node)
                 if node.process is not None and node.process.ended.done():
@@ -523,8 +523,20 @@ class BringUp:
         )
 
 
+def manifest_folders(nodes: Iterable[PlannedNode]) -> tuple[str, ...]:
+    """Return the absolute folders of the manifests that declare some nodes."""
+    folders = (str(Path(node.at.file).absolute().parent) for node in nodes if node.at.file)
+    return tuple(dict.fromkeys(folders))
+
+
 def died(process: ManagedProcess, node: NodeRun | None = None) -> StepFailedError:
-    """The failure that an unexpected end of `process` is."""
+    """The failure that an unexpected end of `process` is: what it said that it fails of, if it did.
+
+    That can be known before any step on its nodes has begun, while others are still being started.
+    """
+    reasons = _not_hosted(process, node)
+    if reasons:
+        return reasons[0].joined(reasons[1:])
     names = process.planned.nodes
     doing = f" while {node.doing}" if node is not None and node.doing else ""
     subject = node.name if node is not None else process.name
@@ -548,15 +560,28 @@ def _not_run(process: ManagedProcess) -> str:
     return f", as of a program that {why}: {process.planned.argv[0]!r}"
 
 
-def _not_hosted(node: NodeRun, error: HostFailedError) -> StepFailedError:
-    """The failure of a process to host one of its nodes, which need not be `node`."""
-    name = error.node or node.name
+def _not_hosted(process: ManagedProcess, node: NodeRun | None) -> list[StepFailedError]:
+    """Return why a process cannot host its nodes, as far as it has said so.
+
+    Args:
+        process: one that we started.
+        node: the subject where the process names none.
+    """
+    name = process.name if node is None else node.name
+    log = str(process.log.path)
+    failures = () if process.channel is None else process.channel.failures
+    return [_start_failed(each, name, process=process.name, log=log) for each in failures]
+
+
+def _start_failed(error: HostFailedError, name: str, **process: str) -> StepFailedError:
+    """The failure of a process to host one of its nodes, by default `name`."""
+    name = error.node or name
     message = error.message
     return StepFailedError(
         message if message.startswith("cannot") else f"cannot start {name!r}: {message}",
         rule=START_FAILED,
         subject=name,
-        **_process_of(node),
+        **process,
     )
 
 

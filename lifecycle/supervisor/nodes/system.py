@@ -26,8 +26,7 @@ from lifecycle.supervisor.health.liveliness import SilenceMonitor
 from lifecycle.supervisor.nodes.driver import ACTIVE, INACTIVE, NodeCondition, NodeDriver
 from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.supervisor.processes.logs import LogDirectory
-from lifecycle.supervisor.processes.patience import own_starved_s
-from lifecycle.supervisor.processes.process import ManagedProcess
+from lifecycle.supervisor.processes.process import ManagedProcess, own_starved_s
 from lifecycle.supervisor.run.events import (
     Emitter,
     NodeChanged,
@@ -212,6 +211,12 @@ _CONDITIONS = {
 _DEMAND_S = 0.1
 _OFFER_S = 5.0
 
+_REPORTING = {
+    True: (Reach.CONFIGURED, Reach.CONNECTED, Reach.ACTIVE),
+    False: (Reach.STARTED, Reach.ACTIVE),
+}
+"""How far a node has come that has something to report, by whether it is managed."""
+
 _REFRESH_S = 1.0
 """A host answers from its executor within a millisecond; this long it is busy or hung."""
 
@@ -237,7 +242,7 @@ class NodeRun:
     """One node of the plan as it runs.
 
     Attributes:
-        driver: None for a node that is not managed.
+        driver: None for a node that nothing holds.
         process: None for a node that this supervisor does not start.
         reach: how far it is brought up.
         doing: what it does or waits for at this moment, for messages; empty when nothing.
@@ -543,7 +548,7 @@ class System:
             node
             for node in self.nodes.values()
             if node.driver is not None
-            and node.reach in (Reach.CONFIGURED, Reach.CONNECTED, Reach.ACTIVE)
+            and node.reach in _REPORTING[node.planned.managed]
             and not node.stuck
             and node.name not in self.liveliness.silent
         ]

@@ -27,8 +27,7 @@ from lifecycle.supervisor.processes.fork_server_main import (
     ForkRequest,
 )
 from lifecycle.supervisor.processes.orphans import children, descendants
-from lifecycle.supervisor.processes.patience import starved_s
-from lifecycle.supervisor.processes.process import ProcessExit, SpawnRequest
+from lifecycle.supervisor.processes.process import ProcessExit, SpawnRequest, starved_s
 from lifecycle.supervisor.run.events import Emitter, Notice
 
 _STATUS_WAIT_S = 1.0

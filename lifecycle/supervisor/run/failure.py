@@ -62,7 +62,7 @@ class StepFailedError(BringUpError):
 
     def joined(self, others: Iterable[StepFailedError]) -> StepFailedError:
         """Return this one with more that failed, but for what it names already."""
-        for each in others:
+        for each in [one for other in others for one in other.every]:
             named = {(one.rule, one.subject) for one in self.every}
             processes = {one.process for one in self.every if one.process}
             # A process that says why it cannot go on, and then ends, has failed once.

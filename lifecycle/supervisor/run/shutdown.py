@@ -16,13 +16,13 @@ from lifecycle.node import Operation
 from lifecycle.supervisor.connections.desired_state import Step
 from lifecycle.supervisor.nodes.driver import ACTIVE, FINALIZED, INACTIVE
 from lifecycle.supervisor.nodes.system import NodeRun, System
-from lifecycle.supervisor.processes.patience import patient
 from lifecycle.supervisor.processes.process import (
     COMMAND_ESCALATION,
     ESCALATION,
     STARTING_ESCALATION,
     STUCK_ESCALATION,
     ManagedProcess,
+    patient,
 )
 from lifecycle.supervisor.run.events import Emitter, Notice, ProcessState, Reach, WiringChanged
 

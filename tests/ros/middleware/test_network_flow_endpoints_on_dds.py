@@ -25,8 +25,8 @@ from lifecycle.middleware import (
     create_subscription,
     get_network_flow_endpoints,
 )
+from lifecycle.middleware.fastdds import nfe
 from lifecycle.middleware.fastdds.dscp import get_dscp
-from lifecycle.middleware.rcl import unique as creation
 from lifecycle.network.nfe import TransportProtocol, UniqueRequirement
 
 MakeNode = Callable[..., Node]
@@ -206,13 +206,13 @@ def test_ports_used_up_are_named_as_the_reason(monkeypatch: pytest.MonkeyPatch) 
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
         port = taken.getsockname()[1]
-        monkeypatch.setattr(creation, "_UNIQUE_PORTS", range(port, port + 1))
-        assert creation._subscription_hint() == (
+        monkeypatch.setattr(nfe, "_UNIQUE_PORTS", range(port, port + 1))
+        assert nfe._subscription_hint() == (
             f"all 1 ports {port}–{port} of this host are taken; Fast DDS frees one only when the "
             "participant that used it ends: restart the processes whose nodes were disconnected "
             "and connected again"
         )
-    assert creation._subscription_hint() == (
+    assert nfe._subscription_hint() == (
         "ask for optionally_required, or set RMW_IMPLEMENTATION=rmw_fastrtps_cpp"
     )
 

@@ -12,8 +12,8 @@ from planning import built_with, planned, publisher
 from std_msgs.msg import String
 
 from lifecycle import LifecycleNode, codec
-from lifecycle.graph.dds import GRAPH_QOS
 from lifecycle.graph.messages import GraphMessage, Heartbeat, decode
+from lifecycle.graph.transport import GRAPH_QOS
 from lifecycle.verify.observation import NodeConfiguration
 from lifecycle.verify.tool_filter import GRAPH_TOPIC
 

@@ -139,8 +139,8 @@ def test_a_blocking_call_in_a_hosted_callback_is_an_error_and_not_a_deadlock(sta
         (
             "Plain",
             (
-                "cannot manage /one: 'hosted:Plain' is not a LifecycleNode; subclass "
-                "lifecycle.LifecycleNode, or say `managed: false`"
+                "cannot manage /one: 'hosted:Plain' makes a plain node, a Plain; say "
+                "`managed: false`, or subclass lifecycle.LifecycleNode"
             ),
         ),
     ],

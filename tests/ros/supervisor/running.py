@@ -11,6 +11,7 @@ import json
 import os
 import queue
 import re
+import select
 import signal
 import subprocess
 import sys
@@ -256,7 +257,8 @@ class Up:
     def close(self) -> None:
         """End whatever still runs, with what it would leave in /dev/shm.
 
-        Who is killed still holds its ports for a moment, and the next test may get this domain.
+        Who is killed still holds its ports until its last thread has ended, and the next test may
+        get this domain.
         """
         used: set[str] = set()
         deadline = time.monotonic() + BOUND_S
@@ -264,9 +266,8 @@ class Up:
             assert time.monotonic() < deadline, f"cannot be killed: {alive}"
             used |= segments_of(each.pid for each in alive)
             for each in alive:
-                with contextlib.suppress(psutil.NoSuchProcess):
-                    each.kill()
-            time.sleep(0.01)
+                with contextlib.suppress(psutil.NoSuchProcess, ProcessLookupError):
+                    _kill(each, deadline)
         if used:
             sweep(used)
         self.process.wait(BOUND_S)
@@ -281,6 +282,16 @@ class Up:
         self.process.wait(BOUND_S)
         self._readers[1].join(BOUND_S)
         return "".join(self._heard)
+
+
+def _kill(process: psutil.Process, deadline: float) -> None:
+    """Kill a process and wait until all its threads have ended: its main one may do so first."""
+    descriptor = os.pidfd_open(process.pid)
+    try:
+        process.kill()
+        select.select([descriptor], [], [], max(0.0, deadline - time.monotonic()))
+    finally:
+        os.close(descriptor)
 
 
 def _is(event: Event, kind: str, fields: Mapping[str, object]) -> bool:

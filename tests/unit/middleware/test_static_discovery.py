@@ -14,8 +14,7 @@ from lifecycle.middleware.fastdds.participant_profile import (
     find_endpoint,
     own_endpoints,
 )
-from lifecycle.plan.connections.static_endpoints import GRAPH_TOPIC, GRAPH_TYPE
-from lifecycle.plan.model import StaticEndpoint, StaticParticipant
+from lifecycle.plan.model import GRAPH_TOPIC, GRAPH_TYPE, StaticEndpoint, StaticParticipant
 
 _STRING = "std_msgs::msg::dds_::String_"
 

@@ -33,6 +33,10 @@ class Managed:
     state: NodeState = NodeState.UNCONFIGURED
     listener: Callable[[Any], None] = lambda _: None
 
+    @property
+    def reported(self) -> NodeState:
+        return self.state
+
     def add_listener(self, listener: Callable[[Any], None]) -> None:
         self.listener = listener
 
@@ -43,7 +47,7 @@ class Node:
 
     def become(self, state: NodeState) -> None:
         self.lifecycle.state = state
-        self.lifecycle.listener(self)
+        self.lifecycle.listener(self.lifecycle)
 
 
 @pytest.fixture
@@ -63,7 +67,7 @@ def dog(sign: Sign, overlong: list[float]) -> Watchdog:
 
 def added(dog: Watchdog, name: str) -> Node:
     node = Node(name)
-    dog.add(node)  # type: ignore[arg-type]
+    dog.add(node.lifecycle)  # type: ignore[arg-type]
     return node
 
 

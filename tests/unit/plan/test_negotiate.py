@@ -19,7 +19,7 @@ from lifecycle.plan import (
     Terms,
     negotiate,
 )
-from lifecycle.plan.connections.contacts import Contact
+from lifecycle.plan.connections.hosts import Contact
 from lifecycle.plan.negotiation.parties import transports_of
 
 STRING = "std_msgs/msg/String"

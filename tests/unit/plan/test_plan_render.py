@@ -40,6 +40,7 @@ order
 
 nodes
   /robot/camera (managed, process camera, machine robot, endpoints declared)
+    held by its state machine until verified
     publisher       /robot/video             sensor_msgs/msg/CompressedImage
         BEST_EFFORT VOLATILE KEEP_LAST(1); unique strictly_required; EF = DSCP 46 = TOS 184 (0xb8);
         5QI 85; at most 5 ms; in _camera_flow_0
@@ -51,6 +52,7 @@ nodes
         RELIABLE VOLATILE KEEP_LAST(10)
     action server   /robot/dock              robot/action/Dock
   /viewer (managed, process viewer, machine operator, endpoints declared)
+    held by its state machine until verified
     subscription    /robot/video             sensor_msgs/msg/CompressedImage
         BEST_EFFORT VOLATILE KEEP_LAST(1); unique strictly_required
     subscription    /robot/battery           sensor_msgs/msg/BatteryState

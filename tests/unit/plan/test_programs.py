@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import sys
 import time
@@ -9,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.manifest.model import EndpointKind, Run, RunKind
+from lifecycle.manifest.model import EndpointKind, Position, Run, RunKind
 from lifecycle.plan.programs import Resolution, resolve_programs
 from tests.builders import endpoint, manifest, node, publisher, subscription
 
@@ -85,7 +86,11 @@ def test_a_class_with_all_its_handlers_is_found_and_nothing_is_run(folder: Path)
         ),
         (
             "pkg.mod:helper",
-            "cannot use 'helper' of pkg.mod (pkg/mod.py:2) as a class: it is a function",
+            (
+                "cannot host the nodes of 'helper': it calls rclpy.spin (pkg/mod.py:2), which "
+                "their host does; name the node's class, or a function that returns nodes without "
+                "spinning them"
+            ),
         ),
         ("broken:Talker", "cannot import 'broken': broken.py:1: invalid syntax"),
         ("talk", "cannot read 'talk'; write package.module:Class"),
@@ -95,7 +100,7 @@ def test_what_python_would_refuse_is_an_error(folder: Path, reference: str, mess
     write(folder, talk=TALKER, broken="class class")
     (folder / "pkg").mkdir()
     (folder / "pkg" / "__init__.py").write_text("from . import mod\n")
-    (folder / "pkg" / "mod.py").write_text("class Plain: ...\ndef helper(): ...\n")
+    (folder / "pkg" / "mod.py").write_text("class Plain: ...\ndef helper(): rclpy.spin(Plain())\n")
     found = [line.replace(f"{folder}/", "") for line in said(python(reference))]
     assert found == [message]
 
@@ -287,3 +292,66 @@ def test_a_hundred_nodes_of_one_class_are_read_once(folder: Path) -> None:
     began = time.process_time()
     assert resolve_programs(system, environment=os.environ) == Resolution()
     assert time.process_time() - began < 5
+
+
+FOREIGN = """
+import rclpy
+from rclpy.lifecycle import LifecycleNode
+from rclpy.node import Node
+class Plain(Node):
+    def __init__(self, device, *, rate=10):
+        super().__init__("plain")
+class Managed(LifecycleNode): ...
+def both(word): return [Plain(word), Managed("m")]
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "managed", "arguments", "message"),
+    [
+        ("Plain", False, {"device": "/dev/null", "rate": 5}, ""),
+        ("Managed", True, {}, ""),
+        ("both", True, {"word": "hi"}, ""),
+        (
+            "Plain",
+            True,
+            {"device": "/dev/null"},
+            (
+                "cannot manage 'talker': Plain (them.py) is a plain node; write 'managed: false'; "
+                "it is held by its executor until the system is verified"
+            ),
+        ),
+        (
+            "Plain",
+            False,
+            {"device": "/dev/null", "rat": 5},
+            "cannot give Plain (them.py) an argument 'rat'; did you mean 'rate'?",
+        ),
+        (
+            "both",
+            False,
+            {},
+            "cannot call both (them.py) without word; give it under 'run: {arguments: …}'",
+        ),
+    ],
+)
+def test_how_a_class_of_others_is_called_is_checked(
+    folder: Path, name: str, managed: bool, arguments: dict[str, str], message: str
+) -> None:
+    write(folder, them=FOREIGN)
+    run = Run(kind=RunKind.PYTHON, python=f"them:{name}", arguments=tuple(arguments.items()))
+    found = resolve_programs(manifest(node("talker", run=run, managed=managed)), environment={})
+    assert said(found) == ([message] if message else [])
+
+
+def test_modules_are_found_beside_the_manifest_and_on_pythonpath(folder: Path) -> None:
+    (folder / "src").mkdir()
+    write(folder / "src", them=FOREIGN)
+    environment = (("PYTHONPATH", str(folder / "src")),)
+    run = Run(kind=RunKind.PYTHON, python="them:Managed")
+    assert said(resolve_programs(manifest(node("talker", run=run)), environment={})) != []
+    given = dataclasses.replace(run, environment=environment)
+    assert said(resolve_programs(manifest(node("talker", run=given)), environment={})) == []
+    at = Position(file=str(folder / "src" / "them.lifecycle.yaml"), line=1, column=1)
+    beside = dataclasses.replace(node("talker", run=run), at=at)
+    assert said(resolve_programs(manifest(beside), environment={})) == []

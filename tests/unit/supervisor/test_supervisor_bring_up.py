@@ -10,11 +10,12 @@ import pytest
 
 from lifecycle.errors import BringUpError
 from lifecycle.manifest.model import Condition, RunKind, Timeouts
-from lifecycle.node.host.control import Operation
+from lifecycle.node.host.control import HostSpec, Operation
 from lifecycle.supervisor.gate.gate import Gate, Permit, VerificationError
 from lifecycle.supervisor.gate.verification_loop import ChangeCounter, VerificationLoop
 from lifecycle.supervisor.health.process_monitor import ProcessMonitor
 from lifecycle.supervisor.nodes.bring_up import ALSO_S, Gathering
+from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.supervisor.processes.process import ProcessExit
 from lifecycle.supervisor.run.events import Notice, ProcessChanged, ProcessState, Reach, RequestSent
 from lifecycle.supervisor.run.failure import StepFailedError, with_failure
@@ -464,6 +465,37 @@ def test_a_process_is_blamed_once_for_each_node_that_it_cannot_host_and_for_no_o
         assert _failed(caught) == [
             ("run.start-failed", "/b", f"cannot start '/b': {error}"),
             ("run.start-failed", "/c", "cannot import 'm:C': no module 'm'"),
+        ]
+        await _down(world)
+
+    run(main())
+
+
+def test_a_process_that_ends_before_a_step_of_its_nodes_has_begun_is_blamed_for_what_it_reported(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        world = _world(tmp_path, *(planned_node(key, process="all") for key in "abc"))
+        error = "ModuleNotFoundError: No module named 'camera_driver'"
+        world.spawner.unhosted["all"] = {"/b": error, "/c": error}
+        process = world.system.processes["all"]
+
+        async def start_others() -> None:
+            spec = HostSpec(
+                system="s",
+                process="all",
+                domain_id=0,
+                discovery_range=world.system.plan.discovery_range,
+                nodes=world.system.plan.nodes,
+            )
+            await process.spawn(world.spawner, ControlChannel(spec, world.system.on_host_event))
+            await asyncio.sleep(60.0)
+
+        with pytest.raises(StepFailedError) as caught:
+            await ProcessMonitor(world.system).during(start_others())
+        assert _failed(caught) == [
+            ("run.start-failed", "/b", f"cannot start '/b': {error}"),
+            ("run.start-failed", "/c", f"cannot start '/c': {error}"),
         ]
         await _down(world)
 

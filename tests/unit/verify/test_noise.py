@@ -90,6 +90,7 @@ GET_PARAMETERS = "rcl_interfaces/srv/GetParameters"
         (PUB, "/ns/a", "/lifecycle/graph", STRING),
         (SUB, "/b", "/lifecycle/graph", STRING),
         (CLIENT, "/b", "/ns/a/change_state", "lifecycle_msgs/srv/ChangeState"),
+        (PUB, "/a", "/reset/_service_event", "std_srvs/srv/Trigger_Event"),
     ],
 )
 def test_an_endpoint_of_a_client_library_is_noise(
@@ -105,6 +106,8 @@ def test_an_endpoint_of_a_client_library_is_noise(
         (PUB, "/a", "/clock", STRING),  # a simulator's main output
         (SERVER, "/a", "/b/get_parameters", GET_PARAMETERS),  # offered under another node's name
         (PUB, "/a", "/b/transition_event", STRING),
+        (PUB, "/a", "/reset/_service_event", STRING),
+        (SUB, "/a", "/reset/_service_event", "std_srvs/srv/Trigger_Event"),
         (PUB, "", "/lifecycle/graph", STRING),  # the first sign of a node that nobody knows
         (SERVER, "/a", "/a/get_map", STRING),
         (PUB, "/a", "/a/get_parameters", GET_PARAMETERS),

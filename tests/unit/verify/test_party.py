@@ -11,7 +11,7 @@ from lifecycle.manifest.qos import QosProfile
 from lifecycle.network.connection_url import Peer
 from lifecycle.network.medium import CONNECTABLE, RMW_DEFAULT
 from lifecycle.network.nfe import UniqueRequirement
-from lifecycle.plan.connections.contacts import Contact
+from lifecycle.plan.connections.hosts import Contact
 from lifecycle.plan.model import ParticipantConnections, PlannedNode, PlannedParticipant
 from lifecycle.plan.negotiation.data_layer import Party, PartyEndpoint
 from lifecycle.supervisor.connections.negotiation import party_of

@@ -1,4 +1,4 @@
-"""Tables of the network room: read from the package, or refused."""
+"""Tables that ship inside the package: read as what is asked for, or refused."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import dataclasses
 
 import pytest
 
+from lifecycle.codec import read_table
 from lifecycle.network.five_qi import DscpMapping, dscp_mappings
-from lifecycle.network.tables import read_table
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,0 +1,256 @@
+"""Nodes of rclpy's own classes: their construction, their endpoints and their state machine.
+
+Owns: hooks into rclpy.node.Node, by which a process that hosts nodes gives them their planned names
+and knows each publisher, subscription, service, client and action that they make; and the state
+machine of rclpy.lifecycle's nodes, driven in this process: rclpy 7 swallows what its callbacks
+raise, and an invalid request by service ends the process (rclpy/lifecycle/node.py).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import sys
+import traceback
+from collections.abc import Callable
+from typing import Any, Protocol
+
+from lifecycle_msgs.msg import Transition
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
+from rclpy.lifecycle import LifecycleNodeMixin, TransitionCallbackReturn
+from rclpy.node import Node
+
+from lifecycle.manifest import EndpointKind
+
+RCLError = _rclpy.RCLError
+
+_FACTORIES = (
+    ("create_publisher", EndpointKind.PUBLISHER),
+    ("create_subscription", EndpointKind.SUBSCRIPTION),
+    ("create_service", EndpointKind.SERVICE_SERVER),
+    ("create_client", EndpointKind.SERVICE_CLIENT),
+)
+_REMOVERS = ("destroy_publisher", "destroy_subscription", "destroy_service", "destroy_client")
+_ACTIONS = {
+    ("rclpy.action.server", "ActionServer"): EndpointKind.ACTION_SERVER,
+    ("rclpy.action.client", "ActionClient"): EndpointKind.ACTION_CLIENT,
+}
+
+
+class NodeHooks(Protocol):
+    """What is notified of the nodes of a process."""
+
+    def constructing(
+        self, node: Node, name: str, options: dict[str, Any]
+    ) -> contextlib.AbstractContextManager[tuple[str, dict[str, Any]]]:
+        """Wrap rclpy's constructor; yields the name and keywords to construct with."""
+
+    def endpoint_made(self, node: Node, kind: EndpointKind, entity: Any) -> None:
+        """One of a node's factories, or an action's constructor, is about to return."""
+
+    def endpoint_removed(self, node: Node, entity: Any) -> None:
+        """An entity is about to be destroyed."""
+
+
+def follow_nodes(hooks: NodeHooks) -> None:
+    """Notify `hooks` of every node of this process from now on, whatever class it is of."""
+    initialise = Node.__init__
+
+    @functools.wraps(initialise)
+    def construct(self: Node, node_name: str, **options: Any) -> None:
+        with hooks.constructing(self, node_name, options) as (name, changed):
+            initialise(self, name, **changed)
+
+    Node.__init__ = construct
+    for name, kind in _FACTORIES:
+        setattr(Node, name, _noting(getattr(Node, name), kind, hooks))
+    for name in _REMOVERS:
+        setattr(Node, name, _forgetting(getattr(Node, name), hooks))
+    Node.add_waitable = _noting_actions(Node.add_waitable, hooks)
+
+
+def _noting(make: Callable[..., Any], kind: EndpointKind, hooks: NodeHooks) -> Callable[..., Any]:
+    @functools.wraps(make)
+    def create(self: Node, *arguments: Any, **options: Any) -> Any:
+        entity = make(self, *arguments, **options)
+        hooks.endpoint_made(self, kind, entity)
+        return entity
+
+    return create
+
+
+def _forgetting(destroy: Callable[..., Any], hooks: NodeHooks) -> Callable[..., Any]:
+    @functools.wraps(destroy)
+    def remove(self: Node, entity: Any) -> Any:
+        hooks.endpoint_removed(self, entity)
+        return destroy(self, entity)
+
+    return remove
+
+
+def _noting_actions(add: Callable[..., Any], hooks: NodeHooks) -> Callable[..., Any]:
+    @functools.wraps(add)
+    def add_waitable(self: Node, waitable: Any) -> None:
+        add(self, waitable)
+        names = ((each.__module__, each.__name__) for each in type(waitable).__mro__)
+        kind = next((_ACTIONS[each] for each in names if each in _ACTIONS), None)
+        if kind is None:
+            return
+        # rclpy 7 does not keep the name; its constructor, which calls this, has it.
+        name = sys._getframe(1).f_locals.get("action_name", "")  # noqa: SLF001
+        waitable.action_name = name
+        hooks.endpoint_made(self, kind, waitable)
+
+    return add_waitable
+
+
+def interface_of(entity: Any) -> type[Any]:
+    """Return the message, service or action class of one of rclpy's endpoints."""
+    for name in ("msg_type", "srv_type", "_action_type"):
+        found = getattr(entity, name, None)
+        if found is not None:
+            return found  # type: ignore[no-any-return]
+    raise TypeError(f"cannot tell the interface of {entity!r}")
+
+
+class MachineOwner(Protocol):
+    """What the state machine asks and notifies."""
+
+    def may_activate(self) -> bool:
+        """Whether an activate request may be carried out now."""
+
+    def state_changed(self) -> None:
+        """The state is another one: read `label`."""
+
+    def complain(self, text: str) -> None:
+        """Log why a request or a callback failed."""
+
+
+_BY_LABEL = {
+    "configure": "trigger_configure",
+    "activate": "trigger_activate",
+    "deactivate": "trigger_deactivate",
+    "cleanup": "trigger_cleanup",
+    "shutdown": "trigger_shutdown",
+}
+_CHANGE = "_LifecycleNodeMixin__change_state"
+
+
+class RclpyStateMachine:
+    """The state machine of one node of rclpy.lifecycle, driven by its own methods.
+
+    Args:
+        node: whose class derives from LifecycleNodeMixin.
+        owner: decides on activation, and is notified.
+    """
+
+    def __init__(self, node: LifecycleNodeMixin, owner: MachineOwner) -> None:
+        self._node = node
+        self._owner = owner
+        self._change = getattr(node, _CHANGE)
+        # Both its service and its trigger_ methods come by here.
+        setattr(node, _CHANGE, self._request)
+        callbacks = node._callbacks  # noqa: SLF001 - registered once, by its constructor
+        for state, callback in tuple(callbacks.items()):
+            callbacks[state] = self._reporting(callback)
+        service = getattr(node, "_service_change_state", None)
+        if service is not None:
+            service.callback = self._serving(service.callback)
+
+    @property
+    def label(self) -> str:
+        """Of the state, as lifecycle_msgs/State has it."""
+        return str(self._node._state_machine.current_state[1])  # noqa: SLF001
+
+    def change(self, transition: str) -> Any:
+        """Run a transition, callbacks included, and return what its callback returned.
+
+        Args:
+            transition: configure, activate, deactivate, cleanup or shutdown.
+
+        Raises:
+            RCLError: not possible in this state, or not now.
+        """
+        return getattr(self._node, _BY_LABEL[transition])()
+
+    def _request(self, transition_id: int) -> Any:
+        if transition_id == Transition.TRANSITION_ACTIVATE and not self._owner.may_activate():
+            raise RCLError("the gate of its supervisor is closed")
+        try:
+            return self._change(transition_id)
+        finally:
+            self._owner.state_changed()
+
+    def _reporting(self, callback: Callable[[Any], Any]) -> Callable[[Any], Any]:
+        name = getattr(callback, "__name__", "a callback")
+
+        @functools.wraps(callback)
+        def call(previous: Any) -> Any:
+            self._owner.state_changed()
+            try:
+                returned = callback(previous)
+            except Exception:
+                self._owner.complain(traceback.format_exc())
+                raise
+            if isinstance(returned, TransitionCallbackReturn):
+                return returned
+            self._owner.complain(
+                f"cannot use {returned!r}, returned by {name}; return a TransitionCallbackReturn"
+            )
+            return TransitionCallbackReturn.ERROR
+
+        return call
+
+    def _serving(self, callback: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+        @functools.wraps(callback)
+        def answer(request: Any, response: Any) -> Any:
+            try:
+                return callback(request, response)
+            except RCLError as error:
+                reason = str(error).splitlines()[0].partition(", at /")[0]
+                asked = request.transition.label or f"number {request.transition.id}"
+                self._owner.complain(
+                    f"cannot take transition {asked} in state {self.label!r}: {reason}"
+                )
+                response.success = False
+                return response
+
+        return answer
+
+
+def is_rclpy_managed(node: object) -> bool:
+    """Whether an object, or a class, is of rclpy.lifecycle."""
+    if isinstance(node, type):
+        return issubclass(node, LifecycleNodeMixin)
+    return isinstance(node, LifecycleNodeMixin)
+
+
+class Watching:
+    """What an executor of ours waits for that belongs to no node: add it as if it were one.
+
+    Events of nodes whose own executor does not run, or is another one.
+    """
+
+    def __init__(self) -> None:
+        self.executor: Any = None
+        self._timers: list[Any] = []
+        self._subscriptions: list[Any] = []
+        self._guards: list[Any] = []
+        self._clients: list[Any] = []
+        self._services: list[Any] = []
+        self._Node__waitables: list[Any] = []
+
+    def add_waitable(self, waitable: Any) -> None:
+        """Wait for it from now on."""
+        self._Node__waitables.append(waitable)
+        self._wake()
+
+    def remove_waitable(self, waitable: Any) -> None:
+        """Wait for it no more; again is harmless."""
+        with contextlib.suppress(ValueError):
+            self._Node__waitables.remove(waitable)
+        self._wake()
+
+    def _wake(self) -> None:
+        if self.executor is not None:
+            self.executor.wake()

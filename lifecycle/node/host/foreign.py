@@ -1,0 +1,526 @@
+"""Nodes of rclpy's own classes, and whatever a function returns, hosted as planned nodes.
+
+Owns: `Adoption`, which gives the nodes that a class or function of the user's constructs the names,
+parameters, remaps and participants of the plan; and `ForeignNode`, one such node: its report, what
+holds it before the gate opens, and its transitions where its class is rclpy.lifecycle's.
+
+A plain node is held by its executor, which is not run, and by its publishers: what it publishes is
+dropped, as before any subscription is matched, but for the last messages of TRANSIENT_LOCAL, which
+are sent once it is released. A node of rclpy.lifecycle runs from the start, since its services must
+answer, and its plain publishers are held until it is activated through the gate.
+"""
+
+from __future__ import annotations
+
+import collections
+import contextlib
+import inspect
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any, Protocol
+
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.logging import LoggingSeverity
+from rclpy.node import Node
+from rclpy.serialization import serialize_message
+from rclpy.time_source import TimeSource
+
+from lifecycle.errors import BringUpError, LifecycleError
+from lifecycle.manifest import EndpointKind
+from lifecycle.middleware import (
+    RCLError,
+    RclpyStateMachine,
+    ServerWatch,
+    Watching,
+    is_rclpy_managed,
+)
+from lifecycle.node import configuration
+from lifecycle.node.actions import resolve_action_name
+from lifecycle.node.author import parameters
+from lifecycle.node.author.managed import HostedState, Managed, Undeclared
+from lifecycle.node.author.node import LifecycleNode
+from lifecycle.node.author.spec import Construction, Mode, constructing, ros_arguments
+from lifecycle.node.configuration import ConfigurationChanges
+from lifecycle.node.connections.connections import Connections
+from lifecycle.node.endpoints.mapping import MatchWatch
+from lifecycle.node.lifecycle.execution import SUCCESS, Result
+from lifecycle.node.lifecycle.gate import GatedPublisher, NodeGate
+from lifecycle.node.lifecycle.machine import CallbackOutcome, RefusedError
+from lifecycle.plan import PlannedNode
+from lifecycle.verify import NodeConfiguration
+
+if TYPE_CHECKING:
+    from rclpy.publisher import Publisher
+
+    from lifecycle.node.lifecycle.gate import Later
+
+_STEADY = ("unconfigured", "inactive", "active", "finalized")
+_CONNECTED = ("inactive", "activating", "active", "deactivating")
+"""Where a node of rclpy.lifecycle has its data layer, which it makes in on_configure."""
+
+
+class Spinner(Protocol):
+    """What runs the callbacks of nodes, see NodeLoop."""
+
+    def spin(self, node: Node) -> None:
+        """Run a node's callbacks from now on."""
+
+    def rest(self, node: Node) -> None:
+        """Run no callback of a node that begins from now on."""
+
+
+class HeldPublisher(GatedPublisher):
+    """A publisher of a node that does not know of the gate.
+
+    What TRANSIENT_LOCAL would keep for late subscriptions is kept, and sent once the gate opens:
+    such a node may publish once, in its constructor.
+    """
+
+    def __init__(self, publisher: Publisher, warn: Callable[[str], None]) -> None:
+        super().__init__(publisher, warn)
+        qos = publisher.qos_profile
+        self._keeps = qos.durability.name == "TRANSIENT_LOCAL"
+        depth = None if qos.history.name == "KEEP_ALL" else qos.depth or 1
+        self._kept: collections.deque[Any] = collections.deque(maxlen=depth)
+
+    def open(self) -> None:
+        """Publish as rclpy does, first what was kept."""
+        super().open()
+        while self._kept:
+            self._publisher.publish(self._kept.popleft())
+
+    def _drop(self, msg: object) -> None:
+        if self._keeps:
+            # As it is now: its author may change it later.
+            self._kept.append(msg if isinstance(msg, bytes) else serialize_message(msg))
+        elif not self._warned:
+            self._warned = True
+            self._warn(
+                f"the gate is closed: what is published on {self._publisher.topic!r} is dropped "
+                "until the system is verified"
+            )
+
+
+class ForeignNode:
+    """One hosted node of which the class is not ours; it offers the host what `Managed` does.
+
+    Args:
+        node: constructed by rclpy so far; its class's constructor may have more to do.
+        spec: what it was planned to be.
+        supervisor: name of the system whose gate holds it; empty for none.
+        spinner: runs its callbacks.
+        later: runs a function in the host's executor.
+        watching: has the events of its endpoints.
+
+    Attributes:
+        configuration_changes: notifies of each change of its configuration.
+    """
+
+    is_marked = False
+    """No endpoint has a participant of its own."""
+
+    def __init__(
+        self,
+        node: Node,
+        spec: PlannedNode,
+        *,
+        supervisor: str,
+        spinner: Spinner,
+        later: Later,
+        watching: Watching,
+    ) -> None:
+        self._node = node
+        self._spec = spec
+        self._supervisor = supervisor
+        self._spinner = spinner
+        self._watching = watching
+        self._group = ReentrantCallbackGroup()
+        self._gate = NodeGate()
+        self._watches: dict[int, MatchWatch | ServerWatch] = {}
+        self._connections = Connections(node)
+        self._listeners: list[Callable[[Any], None]] = []
+        self._let_through = not supervisor
+        self._machine: RclpyStateMachine | None = None
+        self.configuration_changes = ConfigurationChanges(
+            later, self.get_configuration, failed=node.get_logger().error
+        )
+        self._made = Undeclared(self.configuration_changes.touch)
+        node.add_post_set_parameters_callback(lambda _: self.configuration_changes.touch())
+        if self._let_through:
+            self._gate.open()
+
+    @property
+    def full_name(self) -> str:
+        """Fully qualified node name."""
+        return str(self._node.get_fully_qualified_name())
+
+    @property
+    def node(self) -> Node:
+        """The rclpy node."""
+        return self._node
+
+    @property
+    def spec(self) -> PlannedNode:
+        """What it was planned to be."""
+        return self._spec
+
+    @property
+    def reported(self) -> HostedState:
+        """Its state; a plain node has none."""
+        if self._machine is None:
+            return HostedState(label="", connected=True, steady=True)
+        label = self._machine.label
+        return HostedState(label=label, connected=label in _CONNECTED, steady=label in _STEADY)
+
+    def add_listener(self, listener: Callable[[Any], None]) -> None:
+        """Call `listener(self)` after every change of state, whatever caused it."""
+        self._listeners.append(listener)
+
+    # What its class makes.
+
+    def made(self, kind: EndpointKind, entity: Any) -> None:
+        """Note an endpoint, hold it if it publishes, and watch who is matched with it."""
+        callback = getattr(entity, "callback", None) if kind is EndpointKind.SUBSCRIPTION else None
+        if isinstance(getattr(callback, "__self__", None), TimeSource):
+            return  # /clock belongs to rclpy
+        if kind in (EndpointKind.ACTION_SERVER, EndpointKind.ACTION_CLIENT):
+            entity.action_name = resolve_action_name(self._node, entity.action_name)
+        if kind is EndpointKind.PUBLISHER:
+            self._gate.add(entity, HeldPublisher(entity, self._node.get_logger().warning))
+        touch = self.configuration_changes.touch
+        if kind.is_topic:
+            # In the host's executor: the node's own need not run.
+            sink: Any = self._watching
+            self._watches[id(entity)] = MatchWatch(sink, entity, self._group, lambda _: touch())
+        elif kind in (EndpointKind.SERVICE_CLIENT, EndpointKind.ACTION_CLIENT):
+            self._watches[id(entity)] = ServerWatch(self._node, entity, touch)
+        self._made.add(kind, entity)
+
+    def removed(self, entity: Any) -> None:
+        """Forget an endpoint that is about to be destroyed."""
+        watch = self._watches.pop(id(entity), None)
+        if watch is not None:
+            watch.stop()
+        self._gate.remove(entity)
+        self._made.remove(entity)
+
+    def constructed(self) -> None:
+        """Its class's constructor has returned: hold it, or have it spun."""
+        if self._spec.log_level:
+            self._node.get_logger().set_level(LoggingSeverity[self._spec.log_level.upper()])
+        if self._spec.managed and is_rclpy_managed(self._node):
+            self._machine = RclpyStateMachine(self._node, self)
+        if self._machine is not None or self._let_through:
+            self._spinner.spin(self._node)
+
+    # What its host asks of it.
+
+    def get_configuration(self) -> NodeConfiguration:
+        """Return its identity and its endpoints as they are."""
+        if self._connections.own.has_shared_memory is None:
+            self._connections.look_at_shared_memory()
+        reported = self.reported
+        return configuration.collect_foreign(
+            self._node,
+            reported.label,
+            connected=reported.connected,
+            spec=self._spec,
+            own=self._connections.own,
+            endpoints=self._made.beside(()),
+        )
+
+    def serve_interface(self) -> None:
+        """Do nothing: it has no node interface."""
+
+    @property
+    def interface(self) -> Any:
+        """Raise: it has no node interface.
+
+        Raises:
+            LifecycleError: always.
+        """
+        raise LifecycleError(
+            f"cannot move the endpoints of {self.full_name}: its class is not a "
+            "lifecycle.LifecycleNode, and makes them itself",
+            hint="subclass lifecycle.LifecycleNode, or write data_layer.authority: nodes",
+        )
+
+    async def change_for_supervisor(self, operation: str) -> Result:
+        """Do what the supervisor asked for; its activate is the gate's permit.
+
+        Raises:
+            RefusedError: not possible in its state.
+        """
+        if operation == "activate":
+            self._release()
+        elif operation == "deactivate":
+            result = self._transition(operation)
+            self._hold()
+            return result
+        result = self._transition(operation)
+        if operation == "activate" and result.outcome is not CallbackOutcome.SUCCESS:
+            self._hold()
+        return result
+
+    async def bring_up(self) -> Result:
+        """Configure and activate without a supervisor; stops at what does not succeed."""
+        result = SUCCESS
+        for operation in ("configure", "activate"):
+            result = self._transition(operation)
+            if result.outcome is not CallbackOutcome.SUCCESS:
+                break
+        return result
+
+    async def shut_down(self, reason: str) -> Result:  # noqa: ARG002 - as Managed's
+        """Bring it to finalized, where it has states."""
+        if self._machine is None or not self.reported.steady:
+            return SUCCESS
+        return SUCCESS if self._machine.label == "finalized" else self._transition("shutdown")
+
+    # What its state machine asks and notifies (middleware's MachineOwner).
+
+    def may_activate(self) -> bool:
+        """Whether its supervisor has let it through."""
+        return self._let_through
+
+    def state_changed(self) -> None:
+        """Tell the listeners; what leaves the data layer behind is not what was verified."""
+        if self._supervisor and self.reported.label in ("unconfigured", "finalized"):
+            self._let_through = False
+            self._gate.close()
+        for listener in self._listeners:
+            listener(self)
+
+    def complain(self, text: str) -> None:
+        """Log it."""
+        self._node.get_logger().error(text)
+
+    def _release(self) -> None:
+        self._let_through = True
+        self._gate.open()
+        if self._machine is None:
+            self._spinner.spin(self._node)
+
+    def _hold(self) -> None:
+        self._let_through = False
+        self._gate.close()
+        if self._machine is None:
+            self._spinner.rest(self._node)
+
+    def _transition(self, operation: str) -> Result:
+        """Run one of its transitions; what its class knows nothing of succeeds at once."""
+        if self._machine is None or operation in ("connect", "disconnect"):
+            return SUCCESS
+        before = self._machine.label
+        if operation == "deactivate" and before == "inactive":
+            return SUCCESS  # another client was faster
+        try:
+            returned = self._machine.change(operation)
+        except RCLError as error:
+            raise RefusedError(f"cannot {operation} in state {before!r}") from error
+        outcome = CallbackOutcome[returned.name]
+        if outcome is CallbackOutcome.SUCCESS:
+            return SUCCESS
+        why = f"{self.full_name}: on_{operation} returned {returned.name}"
+        self.complain(why)
+        return Result(outcome=outcome, error=why)
+
+
+Hosted = Managed | ForeignNode
+"""What a host knows of one of its nodes."""
+
+Carrying = Callable[[PlannedNode], contextlib.AbstractContextManager[Any]]
+
+
+class Adoption:
+    """Makes nodes of the user's classes and functions, each as one planned node.
+
+    Args:
+        carrying: yields the context that a planned node is to be constructed on.
+        host: makes the ForeignNode of an rclpy node and its plan.
+        supervisor: name of the system whose gate holds the nodes; empty for none.
+        use_global_arguments: nodes take remaps from the process's own --ros-args.
+
+    Attributes:
+        made: rclpy node by key of the plan, with its ForeignNode unless it is one of ours.
+    """
+
+    def __init__(
+        self,
+        carrying: Carrying,
+        host: Callable[[Node, PlannedNode], ForeignNode],
+        *,
+        supervisor: str = "",
+        mode: Mode | None = Mode.MANUAL,
+        use_global_arguments: bool = False,
+    ) -> None:
+        self._carrying = carrying
+        self._host = host
+        self._supervisor = supervisor
+        self._mode = mode
+        self._use_global_arguments = use_global_arguments
+        self._waiting: list[PlannedNode] = []
+        self._current: PlannedNode | None = None
+        self._taken: PlannedNode | None = None
+        self._foreign: dict[int, ForeignNode] = {}
+        self.made: dict[str, tuple[Node, ForeignNode | None]] = {}
+
+    def make(
+        self, planned: PlannedNode, group: Sequence[PlannedNode], what: Callable[..., Any]
+    ) -> tuple[str, ...]:
+        """Construct a planned node, and those of its group that the same call makes.
+
+        Args:
+            planned: the node that is to be made.
+            group: all that `what` may make, `planned` among them.
+            what: the class or function.
+
+        Returns:
+            The keys of what was made.
+
+        Raises:
+            LifecycleError: something else was made. What the class or function raises passes.
+        """
+        before = set(self.made)
+        self._waiting = [each for each in group if each.key not in self.made]
+        self._current = planned
+        try:
+            with constructing(self):
+                returned = what(**_keywords(planned, what))
+        finally:
+            self._waiting, self._current = [], None
+        self._check(planned, what, returned)
+        keys = tuple(key for key in self.made if key not in before)
+        for key in keys:
+            foreign = self.made[key][1]
+            if foreign is not None:
+                foreign.constructed()
+        return keys
+
+    def _check(self, planned: PlannedNode, what: Callable[..., Any], returned: object) -> None:
+        reference = planned.run.python
+        nodes = [each for each in _each(returned) if isinstance(each, Node)]
+        if planned.key not in self.made:
+            names = ", ".join(each.get_fully_qualified_name() for each in nodes) or repr(returned)
+            raise BringUpError(
+                f"cannot use {reference!r}: it made {names}, and no node for {planned.full_name}",
+                hint="return the node, or a list of nodes; the host spins them",
+            )
+        known = {id(node) for node, _ in self.made.values()}
+        for each in nodes:
+            if id(each) not in known:
+                name = each.get_fully_qualified_name()
+                raise BringUpError(
+                    f"cannot host {name}, which {reference!r} returns: no node is declared for it "
+                    f"beside {planned.full_name}",
+                    hint=f"add a node of that name with the same `run:` and `process: "
+                    f"{planned.process}`",
+                )
+        if not isinstance(what, type) and not nodes:
+            raise BringUpError(
+                f"cannot use {reference!r}: it returns {returned!r} and must return its nodes",
+                hint="it must neither spin nor destroy them: the host does",
+            )
+
+    # What constructors ask: LifecycleNode's by author/spec.py, all others by middleware's hooks.
+
+    def take(self, name: str, namespace: str | None) -> Construction | None:
+        """Return the construction of a LifecycleNode that is about to be made."""
+        planned = self._take(name, namespace)
+        if planned is None:
+            return None
+        self._taken = planned
+        return Construction(
+            spec=planned,
+            mode=self._mode,
+            use_global_arguments=self._use_global_arguments,
+            # Of a plain node no states are driven.
+            supervisor=self._supervisor if planned.managed else "",
+        )
+
+    @contextlib.contextmanager
+    def constructing(
+        self, node: Node, name: str, options: dict[str, Any]
+    ) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Have rclpy construct a node as planned; one that is not planned is not touched."""
+        ours = isinstance(node, LifecycleNode)
+        planned = self._taken if ours else self._take(name, options.get("namespace"))
+        self._taken = None
+        if planned is None:
+            yield name, options
+            return
+        refuse_unmanaged(planned, type(node))
+        if not ours:
+            name, options = planned.name, self._options(planned, options)
+        with self._carrying(planned) as context:
+            yield name, {**options, "context": context}
+        foreign = None if ours and planned.managed else self._host(node, planned)
+        if foreign is not None:
+            self._foreign[id(node)] = foreign
+        self.made[planned.key] = (node, foreign)
+
+    def endpoint_made(self, node: Node, kind: EndpointKind, entity: Any) -> None:
+        """An endpoint of a node exists now."""
+        foreign = self._foreign.get(id(node))
+        if foreign is not None:
+            foreign.made(kind, entity)
+
+    def endpoint_removed(self, node: Node, entity: Any) -> None:
+        """An endpoint of a node is about to be destroyed."""
+        foreign = self._foreign.get(id(node))
+        if foreign is not None:
+            foreign.removed(entity)
+
+    def _take(self, name: str, namespace: str | None) -> PlannedNode | None:
+        """Choose whose construction this is: by name among the group, else the one asked for."""
+        full = f"/{(namespace or '').strip('/')}/{name}".replace("//", "/")
+        chosen = (
+            next((each for each in self._waiting if each.full_name == full), None)
+            or next((each for each in self._waiting if each.name == name), None)
+            or next((each for each in self._waiting if each is self._current), None)
+        )
+        if chosen is not None:
+            self._waiting.remove(chosen)
+        return chosen
+
+    def _options(self, planned: PlannedNode, options: dict[str, Any]) -> dict[str, Any]:
+        given = options.get("parameter_overrides") or ()
+        return {
+            **options,
+            "namespace": planned.namespace,
+            "cli_args": [*ros_arguments(planned), *(options.get("cli_args") or ())],
+            "parameter_overrides": [*given, *parameters.overrides(planned)],
+            "use_global_arguments": self._use_global_arguments,
+        }
+
+
+def refuse_unmanaged(planned: PlannedNode, node_class: type) -> None:
+    """Raise unless a class can be what the plan says.
+
+    Raises:
+        LifecycleError: it is to be managed, and knows nothing of that.
+    """
+    known = issubclass(node_class, LifecycleNode) or is_rclpy_managed(node_class)
+    if planned.managed and not known:
+        raise LifecycleError(
+            f"cannot manage {planned.full_name}: {planned.run.python!r} makes a plain node, a "
+            f"{node_class.__name__}",
+            hint="say `managed: false`, or subclass lifecycle.LifecycleNode",
+        )
+
+
+def _keywords(planned: PlannedNode, what: Callable[..., Any]) -> dict[str, Any]:
+    """Return what a class or function is called with; one that needs a `node_name` gets it."""
+    keywords = {
+        name: list(value) if isinstance(value, tuple) else value
+        for name, value in planned.run.arguments
+    }
+    wanted = inspect.signature(what).parameters.get("node_name")
+    if wanted is not None and wanted.default is wanted.empty:
+        keywords.setdefault("node_name", planned.name)
+    return keywords
+
+
+def _each(returned: object) -> Iterable[object]:
+    if isinstance(returned, (list, tuple, set, frozenset)):
+        return returned
+    return (returned,)

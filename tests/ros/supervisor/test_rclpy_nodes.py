@@ -1,0 +1,220 @@
+"""`run: python` with classes that rclpy's own users write, none of them changed for us."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import running
+import yaml
+from running import Up, verb
+
+_NODES = "tests.ros.supervisor.rclpy_nodes"
+_STRING = "std_msgs/msg/String"
+_LATCHED = {"depth": 1, "durability": "TRANSIENT_LOCAL"}
+LIMITS = {"start_s": 8, "configure_s": 8, "connect_s": 8, "activate_s": 8, "silent_s": 8}
+
+
+def node(reference: str, *, interface: dict[str, Any] | None = None, **keys: Any) -> dict[str, Any]:
+    run = {"python": reference if ":" in reference else f"{_NODES}:{reference}"}
+    for key in ("arguments", "executor", "threads", "environment", "working_directory"):
+        if key in keys:
+            run[key] = keys.pop(key)
+    return {"run": run, "interface": interface or {}, "timeouts": LIMITS, **keys}
+
+
+TALKS = {
+    "publishers": [
+        {"name": "words", "type": _STRING, "qos": {"depth": 7}},
+        {"name": "name", "type": _STRING, "qos": _LATCHED},
+    ],
+    "service_servers": [{"name": "reset", "type": "std_srvs/srv/Trigger"}],
+}
+HEARS = {
+    "subscriptions": [
+        {"name": "words", "type": _STRING, "qos": {"depth": 10}},
+        {"name": "name", "type": _STRING, "qos": _LATCHED},
+    ]
+}
+
+
+def write(directory: Path, domain_id: int, nodes: dict[str, Any], **keys: Any) -> Path:
+    document = {
+        "manifest_version": 1,
+        "system": "foreign",
+        "discovery": {"domain_id": domain_id, "range": "localhost"},
+        "nodes": nodes,
+        **keys,
+    }
+    file = directory / "foreign.lifecycle.yaml"
+    file.write_text(yaml.safe_dump(document))
+    return file
+
+
+def log_of(up: Up, process: str) -> str:
+    (path,) = (up.runtime / "log").glob(f"*/{process}.log")
+    return path.read_text(encoding="utf-8")
+
+
+def is_proven(up: Up) -> bool:
+    verdict = up.of_kind("verdict")[-1]["verdict"]
+    return (verdict["verdict"], verdict["findings"]) == ("ok", [])
+
+
+def test_plain_nodes_are_verified_completely_and_released(
+    fresh_domain: int, tmp_path: Path, wait_until: Any
+) -> None:
+    manifest = write(
+        tmp_path,
+        fresh_domain,
+        {
+            "talker": node(
+                "Talker",
+                managed=False,
+                interface=TALKS,
+                namespace="/there",
+                remap={"words": "/words"},
+                arguments={"word": "hi", "period_s": 0.05},
+                parameters={"loud": True},
+            ),
+            "listener": node(
+                "Listener", managed=False, interface=HEARS, remap={"name": "/there/name"}
+            ),
+        },
+        policy={"unverifiable": "block"},
+    )
+    with running.up(manifest, runtime=tmp_path) as up:
+        up.until("system", reached="active")
+        wait_until(lambda: "heard HI" in log_of(up, "listener"))
+        wait_until(lambda: "heard talker" in log_of(up, "listener"))
+        assert "heard CONSTRUCTED" not in log_of(up, "listener")
+        assert is_proven(up)
+        assert verb("pause", str(manifest), runtime=tmp_path).returncode == 0
+        assert verb("resume", str(manifest), runtime=tmp_path).returncode == 0
+        assert verb("down", str(manifest), runtime=tmp_path).returncode == 0
+        assert up.finish() == 0
+        up.assert_gate_held()
+        up.assert_nothing_left()
+
+
+def test_a_plain_node_does_nothing_while_the_gate_is_closed(
+    fresh_domain: int, tmp_path: Path
+) -> None:
+    more = {"publishers": [*TALKS["publishers"], {"name": "shouts", "type": _STRING}]}
+    manifest = write(
+        tmp_path,
+        fresh_domain,
+        {
+            "talker": node("Talker", managed=False, interface={**TALKS, **more}),
+            "listener": node("Listener", managed=False, interface=HEARS),
+        },
+    )
+    with running.up(manifest, "--timeout", "3", runtime=tmp_path) as up:
+        assert up.finish() == 4
+        assert [each["message"] for each in up.verdict["findings"]] == [
+            "cannot find the publisher of /shouts that /talker declares"
+        ]
+        assert "heard" not in log_of(up, "listener")
+        assert "/words is dropped" in log_of(up, "talker").replace("'", "").replace(
+            "words", "/words"
+        )
+
+
+def test_a_node_of_rclpy_lifecycle_is_driven_by_its_own_state_machine(
+    fresh_domain: int, tmp_path: Path, wait_until: Any
+) -> None:
+    says = [
+        {"name": "words", "type": _STRING, "qos": {"depth": 7}},
+        {"name": "status", "type": _STRING, "qos": {"depth": 1}},
+    ]
+    hears = [{"name": "words", "type": _STRING, "qos": {"depth": 10}}]
+    manifest = write(
+        tmp_path,
+        fresh_domain,
+        {
+            "managed": node("Managed", interface={"publishers": says}),
+            "listener": node(
+                "Listener",
+                managed=False,
+                interface={"subscriptions": hears},
+                endpoints="open",
+                after={"managed": "configured"},
+                executor="events",
+            ),
+        },
+        policy={"unverifiable": "block"},
+    )
+    with running.up(manifest, runtime=tmp_path) as up:
+        states = [
+            up.until("node", node="/managed", state=each)["state"]
+            for each in ("configuring", "inactive", "activating", "active")
+        ]
+        assert states[-1] == "active"
+        up.met("system", reached="active")
+        wait_until(lambda: "heard managed" in log_of(up, "listener"))
+        assert is_proven(up)
+        assert verb("down", str(manifest), runtime=tmp_path).returncode == 0
+        assert up.finish() == 0
+        up.assert_gate_held()
+
+
+def test_a_function_may_return_several_nodes_of_one_process(
+    fresh_domain: int, tmp_path: Path, wait_until: Any
+) -> None:
+    # Beside the manifest, and not where `up` was started.
+    (tmp_path / "beside.py").write_text(f"from {_NODES} import pair")
+    shared = {"process": "both", "managed": False, "arguments": {"word": "pair"}}
+    manifest = write(
+        tmp_path,
+        fresh_domain,
+        {
+            # By the names that the code gives them.
+            "talker": node("beside:pair", interface=TALKS, **shared),
+            "ears": node("beside:pair", interface=HEARS, **shared),
+        },
+    )
+    with running.up(manifest, runtime=tmp_path) as up:
+        up.until("system", reached="active")
+        wait_until(lambda: "[ears]: heard pair" in log_of(up, "both"))
+        assert is_proven(up)
+
+
+def test_callbacks_run_in_several_threads_where_the_executor_has_them(
+    fresh_domain: int, tmp_path: Path
+) -> None:
+    adder = {
+        "service_servers": [{"name": each, "type": "std_srvs/srv/SetBool"} for each in _SERVICES],
+        "service_clients": [{"name": "inner", "type": "std_srvs/srv/SetBool"}],
+        "action_servers": [{"name": "count", "type": "test_msgs/action/Fibonacci"}],
+    }
+    calls = {"service_clients": [{"name": "outer", "type": "std_srvs/srv/SetBool"}]}
+    manifest = write(
+        tmp_path,
+        fresh_domain,
+        {
+            "adder": node("Adder", managed=False, interface=adder, executor="multi", threads=2),
+            "caller": node("Caller", managed=False, interface=calls),
+        },
+        policy={"unverifiable": "block"},
+    )
+    with running.up(manifest, "--stop-after", "30", runtime=tmp_path) as up:
+        up.until("gate")
+        assert is_proven(up)
+        # Its callback raises with the answer: the process ends.
+        up.until("process", process="caller", state="exited")
+        assert "RuntimeError: answered True" in log_of(up, "caller")
+
+
+_SERVICES = ("inner", "outer")
+
+
+def test_what_a_callback_of_rclpy_lifecycle_raises_is_logged_and_ends_the_bring_up(
+    fresh_domain: int, tmp_path: Path
+) -> None:
+    manifest = write(tmp_path, fresh_domain, {"broken": node("Broken")})
+    with running.up(manifest, runtime=tmp_path) as up:
+        assert up.finish() == 6
+        assert [each["message"] for each in up.verdict["findings"]] == [
+            "cannot configure '/broken': /broken: on_configure returned ERROR"
+        ]
+        assert "OSError: no such camera" in log_of(up, "broken")
