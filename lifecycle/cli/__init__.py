@@ -17,7 +17,7 @@ import traceback
 import click
 
 from lifecycle.cli.standard_streams import own_streams
-from lifecycle.errors import ExitCode, LifecycleError
+from lifecycle.errors import ExitCode, LifecycleError, UsageError
 from lifecycle.printable import lines
 
 VERBS: dict[str, str] = {
@@ -56,7 +56,13 @@ class _Verbs(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Look first whether a verb that needs the RMW can have it."""
+        """Look first whether there is such a verb, and one that needs the RMW can have it."""
+        if args and args[0] not in VERBS and not args[0].startswith("-"):
+            from difflib import get_close_matches
+
+            close = get_close_matches(args[0], VERBS, n=1)
+            hint = f"did you mean {close[0]!r}?" if close else "lifecycle --help lists the verbs"
+            raise UsageError(f"cannot find the verb {args[0]!r}", hint=hint)
         if args and args[0] in _PARTICIPANTS and not {"-h", "--help"} & {*args}:
             from lifecycle.middleware import check_rmw
 
