@@ -12,7 +12,7 @@ import contextlib
 import functools
 import sys
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 from lifecycle_msgs.msg import Transition
@@ -30,6 +30,10 @@ _FACTORIES = (
     ("create_service", EndpointKind.SERVICE_SERVER),
     ("create_client", EndpointKind.SERVICE_CLIENT),
 )
+_POSITIONAL = {
+    EndpointKind.PUBLISHER: ("msg_type", "topic", "qos_profile"),
+    EndpointKind.SUBSCRIPTION: ("msg_type", "topic", "callback", "qos_profile"),
+}
 _REMOVERS = ("destroy_publisher", "destroy_subscription", "destroy_service", "destroy_client")
 _ACTIONS = {
     ("rclpy.action.server", "ActionServer"): EndpointKind.ACTION_SERVER,
@@ -45,11 +49,23 @@ class NodeHooks(Protocol):
     ) -> contextlib.AbstractContextManager[tuple[str, dict[str, Any]]]:
         """Wrap rclpy's constructor; yields the name and keywords to construct with."""
 
+    def make_endpoint(self, node: Node, kind: EndpointKind, arguments: Mapping[str, Any]) -> Any:
+        """Make an endpoint that a factory was asked for; None has rclpy make it.
+
+        Args:
+            node: whose it is to be.
+            kind: publisher or subscription.
+            arguments: of the factory, by name.
+        """
+
     def endpoint_made(self, node: Node, kind: EndpointKind, entity: Any) -> None:
         """One of a node's factories, or an action's constructor, is about to return."""
 
     def endpoint_removed(self, node: Node, entity: Any) -> None:
         """An entity is about to be destroyed."""
+
+    def node_removed(self, node: Node) -> None:
+        """A node is about to be destroyed."""
 
 
 def follow_nodes(hooks: NodeHooks) -> None:
@@ -67,12 +83,27 @@ def follow_nodes(hooks: NodeHooks) -> None:
     for name in _REMOVERS:
         setattr(Node, name, _forgetting(getattr(Node, name), hooks))
     Node.add_waitable = _noting_actions(Node.add_waitable, hooks)
+    destroy = Node.destroy_node
+
+    @functools.wraps(destroy)
+    def destroy_node(self: Node) -> None:
+        hooks.node_removed(self)
+        destroy(self)
+
+    Node.destroy_node = destroy_node
 
 
 def _noting(make: Callable[..., Any], kind: EndpointKind, hooks: NodeHooks) -> Callable[..., Any]:
+    names = _POSITIONAL.get(kind)
+
     @functools.wraps(make)
     def create(self: Node, *arguments: Any, **options: Any) -> Any:
-        entity = make(self, *arguments, **options)
+        entity = None
+        if names is not None:
+            given = {**dict(zip(names, arguments, strict=False)), **options}
+            entity = hooks.make_endpoint(self, kind, given)
+        if entity is None:
+            entity = make(self, *arguments, **options)
         hooks.endpoint_made(self, kind, entity)
         return entity
 

@@ -15,12 +15,14 @@ from __future__ import annotations
 import collections
 import contextlib
 import inspect
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Protocol
 
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.logging import LoggingSeverity
 from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
 from rclpy.serialization import serialize_message
 from rclpy.time_source import TimeSource
 
@@ -31,8 +33,10 @@ from lifecycle.middleware import (
     RclpyStateMachine,
     ServerWatch,
     Watching,
+    create_subscription,
     is_rclpy_managed,
 )
+from lifecycle.network import UniqueRequirement
 from lifecycle.node import configuration
 from lifecycle.node.actions import resolve_action_name
 from lifecycle.node.author import parameters
@@ -40,17 +44,15 @@ from lifecycle.node.author.managed import HostedState, Managed, Undeclared
 from lifecycle.node.author.node import LifecycleNode
 from lifecycle.node.author.spec import Construction, Mode, constructing, ros_arguments
 from lifecycle.node.configuration import ConfigurationChanges
-from lifecycle.node.connections.connections import Connections
+from lifecycle.node.connections.connections import Connection, Connections
 from lifecycle.node.endpoints.mapping import MatchWatch
 from lifecycle.node.lifecycle.execution import SUCCESS, Result
 from lifecycle.node.lifecycle.gate import GatedPublisher, NodeGate
 from lifecycle.node.lifecycle.machine import CallbackOutcome, RefusedError
-from lifecycle.plan import PlannedNode
+from lifecycle.plan import PlannedEndpoint, PlannedNode
 from lifecycle.verify import NodeConfiguration
 
 if TYPE_CHECKING:
-    from rclpy.publisher import Publisher
-
     from lifecycle.node.lifecycle.gate import Later
 
 _STEADY = ("unconfigured", "inactive", "active", "finalized")
@@ -115,9 +117,6 @@ class ForeignNode:
         configuration_changes: notifies of each change of its configuration.
     """
 
-    is_marked = False
-    """No endpoint has a participant of its own."""
-
     def __init__(
         self,
         node: Node,
@@ -137,6 +136,7 @@ class ForeignNode:
         self._gate = NodeGate()
         self._watches: dict[int, MatchWatch | ServerWatch] = {}
         self._connections = Connections(node)
+        self._apart: dict[int, Connection] = {}  # by id of what is not on the node's participant
         self._listeners: list[Callable[[Any], None]] = []
         self._let_through = not supervisor
         self._machine: RclpyStateMachine | None = None
@@ -195,8 +195,71 @@ class ForeignNode:
             self._watches[id(entity)] = ServerWatch(self._node, entity, touch)
         self._made.add(kind, entity)
 
+    def make(self, kind: EndpointKind, given: Mapping[str, Any]) -> Any:
+        """Make a planned endpoint with a flow of its own, as its factory was asked for it.
+
+        Returns:
+            None for what rclpy is to make.
+
+        Raises:
+            LifecycleError: its participant or its flow cannot be made.
+        """
+        planned = self._planned(kind, given.get("topic"))
+        if planned is None or given.get("qos_overriding_options") is not None:
+            return None
+        carrier = next(
+            (each for each in self._spec.participants if each.name == planned.participant), None
+        )
+        qos = given["qos_profile"]
+        options: dict[str, Any] = {
+            "callback_group": given.get("callback_group"),
+            "event_callbacks": given.get("event_callbacks"),
+        }
+        if kind is EndpointKind.SUBSCRIPTION:
+            options |= {"unique": planned.unique, "raw": given.get("raw", False)}
+        elif "publisher_class" in given:
+            options["publisher_class"] = given["publisher_class"]
+        profile = QoSProfile(depth=qos) if isinstance(qos, int) else qos
+        called: tuple[Any, ...] = (profile,)
+        if kind is EndpointKind.SUBSCRIPTION:
+            called = (given["callback"], profile)
+        if carrier is None:
+            if kind is EndpointKind.PUBLISHER:
+                return None  # no RMW makes one unique on a participant that others use
+            make: Callable[..., Any] = create_subscription
+            return make(self._node, given["msg_type"], given["topic"], *called, **options)
+        connection = self._connections.carrier(carrier)
+        assert connection.participant is not None
+        make = connection.participant.create_publisher
+        if kind is EndpointKind.SUBSCRIPTION:
+            make = connection.participant.create_subscription
+        entity = make(given["msg_type"], planned.resolved, *called, **options)
+        self._apart[id(entity)] = connection
+        for event in entity.event_handlers:
+            self._node.add_waitable(event)
+        return entity
+
+    def _planned(self, kind: EndpointKind, topic: object) -> PlannedEndpoint | None:
+        """Return what is planned of an endpoint, if it is more than rclpy does."""
+        wanted = [
+            each
+            for each in self._spec.endpoints
+            if each.kind is kind
+            and (each.participant or each.unique is not UniqueRequirement.NOT_REQUIRED)
+        ]
+        if not wanted or not isinstance(topic, str):
+            return None
+        resolved = self._node.resolve_topic_name(topic)
+        return next((each for each in wanted if each.resolved == resolved), None)
+
     def removed(self, entity: Any) -> None:
         """Forget an endpoint that is about to be destroyed."""
+        connection = self._apart.pop(id(entity), None)
+        if connection is not None and connection.participant is not None:
+            for event in entity.event_handlers:
+                self._node.remove_waitable(event)
+            if isinstance(entity, Publisher):
+                connection.participant.destroy_endpoint(entity)
         watch = self._watches.pop(id(entity), None)
         if watch is not None:
             watch.stop()
@@ -224,9 +287,24 @@ class ForeignNode:
             reported.label,
             connected=reported.connected,
             spec=self._spec,
-            own=self._connections.own,
-            endpoints=self._made.beside(()),
+            connections=self._connections,
+            endpoints=(
+                (kind, entity, self._apart.get(id(entity), self._connections.own))
+                for kind, entity in self._made.beside(())
+            ),
         )
+
+    @property
+    def is_marked(self) -> bool:
+        """Whether the plan says what DSCP any of its endpoints sends with."""
+        return any(each.dscp is not None for each in self._spec.endpoints)
+
+    def close(self) -> None:
+        """Take its further participants away: it is being destroyed."""
+        for watch in self._watches.values():
+            watch.stop()
+        self._watches.clear()
+        self._connections.close_all()
 
     def serve_interface(self) -> None:
         """Do nothing: it has no node interface."""
@@ -457,6 +535,17 @@ class Adoption:
         if foreign is not None:
             self._foreign[id(node)] = foreign
         self.made[planned.key] = (node, foreign)
+
+    def make_endpoint(self, node: Node, kind: EndpointKind, arguments: Mapping[str, Any]) -> Any:
+        """Make an endpoint that is planned otherwise than rclpy would make it; else None."""
+        foreign = self._foreign.get(id(node))
+        return None if foreign is None else foreign.make(kind, arguments)
+
+    def node_removed(self, node: Node) -> None:
+        """A node is about to be destroyed."""
+        foreign = self._foreign.pop(id(node), None)
+        if foreign is not None:
+            foreign.close()
 
     def endpoint_made(self, node: Node, kind: EndpointKind, entity: Any) -> None:
         """An endpoint of a node exists now."""

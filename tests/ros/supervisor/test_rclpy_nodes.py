@@ -218,3 +218,40 @@ def test_what_a_callback_of_rclpy_lifecycle_raises_is_logged_and_ends_the_bring_
             "cannot configure '/broken': /broken: on_configure returned ERROR"
         ]
         assert "OSError: no such camera" in log_of(up, "broken")
+
+
+def test_flows_of_plain_nodes_are_unique_and_marked_as_the_manifest_asks(
+    fresh_domain: int, tmp_path: Path, wait_until: Any
+) -> None:
+    alone = {"unique": "strictly_required"}
+    manifest = write(
+        tmp_path,
+        fresh_domain,
+        {
+            "talker": node(
+                "Talker",
+                managed=False,
+                interface=TALKS,
+                flows={"publishers": {"words": {**alone, "dscp": "EF"}}},
+            ),
+            "listener": node(
+                "Listener",
+                managed=False,
+                interface=HEARS,
+                flows={"subscriptions": {"words": alone}},
+            ),
+        },
+        links=[{"topic": "/words", "from": "talker", "to": "listener", "unique": "strongly"}],
+        policy={"unverifiable": "block"},
+    )
+    with running.up(manifest, runtime=tmp_path) as up:
+        up.until("system", reached="active")
+        wait_until(lambda: "heard hello" in log_of(up, "listener"))
+        assert is_proven(up)
+        flows = up.of_kind("verdict")[-1]["verdict"]["flows"]
+        assert [(each["unique"], each["dscp"]) for each in flows if each["topic"] == "/words"] == [
+            ("strongly", 46)
+        ]
+        assert verb("down", str(manifest), runtime=tmp_path).returncode == 0
+        assert up.finish() == 0
+        up.assert_nothing_left()
