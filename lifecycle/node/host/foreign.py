@@ -19,6 +19,11 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Protocol
 
 from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.event_handler import (
+    EventHandler,
+    QoSPublisherEventType,
+    QoSSubscriptionEventType,
+)
 from rclpy.logging import LoggingSeverity
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -53,9 +58,16 @@ from lifecycle.plan import PlannedEndpoint, PlannedNode
 from lifecycle.verify import NodeConfiguration
 
 if TYPE_CHECKING:
+    from rclpy.callback_groups import CallbackGroup
+
     from lifecycle.node.lifecycle.gate import Later
 
 _STEADY = ("unconfigured", "inactive", "active", "finalized")
+_MATCHED = {
+    # Equal numbers of the two types compare equal.
+    EndpointKind.PUBLISHER: QoSPublisherEventType.RCL_PUBLISHER_MATCHED,
+    EndpointKind.SUBSCRIPTION: QoSSubscriptionEventType.RCL_SUBSCRIPTION_MATCHED,
+}
 _CONNECTED = ("inactive", "activating", "active", "deactivating")
 """Where a node of rclpy.lifecycle has its data layer, which it makes in on_configure."""
 
@@ -68,6 +80,51 @@ class Spinner(Protocol):
 
     def rest(self, node: Node) -> None:
         """Run no callback of a node that begins from now on."""
+
+    def call_soon(self, task: Callable[..., Any], *arguments: object) -> None:
+        """Run a function, sync or async, where callbacks of nodes run."""
+
+
+class SharedMatch:
+    """A matched event that a node's own code handles, and its host needs.
+
+    rmw counts the changes for one handler: two in different executors take them from each other.
+
+    Args:
+        node: whose it is.
+        event: its own handler.
+        group: that the host's executor runs it in.
+        watching: has it from now on.
+        changed: called for each event.
+        forward: has the node's callback called with the status.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        event: EventHandler,
+        group: CallbackGroup,
+        watching: Watching,
+        *,
+        changed: Callable[[], None],
+        forward: Callable[[Callable[[Any], Any], Any], None],
+    ) -> None:
+        self._event = event
+        self._watching = watching
+        callback = event.callback
+
+        def handle(status: Any) -> None:
+            changed()
+            forward(callback, status)
+
+        node.remove_waitable(event)
+        event.callback = handle
+        event.callback_group = group
+        watching.add_waitable(event)
+
+    def stop(self) -> None:
+        """Wait for it no more: its endpoint is about to be destroyed."""
+        self._watching.remove_waitable(self._event)
 
 
 class HeldPublisher(GatedPublisher):
@@ -134,11 +191,13 @@ class ForeignNode:
         self._watching = watching
         self._group = ReentrantCallbackGroup()
         self._gate = NodeGate()
-        self._watches: dict[int, MatchWatch | ServerWatch] = {}
+        self._watches: dict[int, MatchWatch | SharedMatch | ServerWatch] = {}
+        self._unspun: dict[Callable[[Any], Any], Any] = {}
         self._connections = Connections(node)
         self._apart: dict[int, Connection] = {}  # by id of what is not on the node's participant
         self._listeners: list[Callable[[Any], None]] = []
         self._let_through = not supervisor
+        self._is_spun = False
         self._machine: RclpyStateMachine | None = None
         self.configuration_changes = ConfigurationChanges(
             later, self.get_configuration, failed=node.get_logger().error
@@ -189,11 +248,39 @@ class ForeignNode:
         touch = self.configuration_changes.touch
         if kind.is_topic:
             # In the host's executor: the node's own need not run.
-            sink: Any = self._watching
-            self._watches[id(entity)] = MatchWatch(sink, entity, self._group, lambda _: touch())
+            self._watches[id(entity)] = self._match_watch(kind, entity)
         elif kind in (EndpointKind.SERVICE_CLIENT, EndpointKind.ACTION_CLIENT):
             self._watches[id(entity)] = ServerWatch(self._node, entity, touch)
         self._made.add(kind, entity)
+
+    def _match_watch(self, kind: EndpointKind, entity: Any) -> MatchWatch | SharedMatch:
+        touch = self.configuration_changes.touch
+        for event in entity.event_handlers:
+            if event.event_type == _MATCHED[kind]:
+                return SharedMatch(
+                    self._node,
+                    event,
+                    self._group,
+                    self._watching,
+                    changed=touch,
+                    forward=self._forward,
+                )
+        sink: Any = self._watching
+        return MatchWatch(sink, entity, self._group, lambda _: touch())
+
+    def _forward(self, callback: Callable[[Any], Any], status: Any) -> None:
+        """Have a callback of its own called; while it is not spun, the last time once it is."""
+        if self._is_spun:
+            self._spinner.call_soon(callback, status)
+        else:
+            self._unspun[callback] = status
+
+    def _spin(self) -> None:
+        self._is_spun = True
+        self._spinner.spin(self._node)
+        for callback, status in self._unspun.items():
+            self._spinner.call_soon(callback, status)
+        self._unspun.clear()
 
     def make(self, kind: EndpointKind, given: Mapping[str, Any]) -> Any:
         """Make a planned endpoint with a flow of its own, as its factory was asked for it.
@@ -273,7 +360,7 @@ class ForeignNode:
         if self._spec.managed and is_rclpy_managed(self._node):
             self._machine = RclpyStateMachine(self._node, self)
         if self._machine is not None or self._let_through:
-            self._spinner.spin(self._node)
+            self._spin()
 
     # What its host asks of it.
 
@@ -376,12 +463,13 @@ class ForeignNode:
         self._let_through = True
         self._gate.open()
         if self._machine is None:
-            self._spinner.spin(self._node)
+            self._spin()
 
     def _hold(self) -> None:
         self._let_through = False
         self._gate.close()
         if self._machine is None:
+            self._is_spun = False
             self._spinner.rest(self._node)
 
     def _transition(self, operation: str) -> Result:

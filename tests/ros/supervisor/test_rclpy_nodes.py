@@ -88,6 +88,7 @@ def test_plain_nodes_are_verified_completely_and_released(
         wait_until(lambda: "heard HI" in log_of(up, "listener"))
         wait_until(lambda: "heard talker" in log_of(up, "listener"))
         assert "heard CONSTRUCTED" not in log_of(up, "listener")
+        wait_until(lambda: "matched with 1" in log_of(up, "talker"))
         assert is_proven(up)
         assert verb("pause", str(manifest), runtime=tmp_path).returncode == 0
         assert verb("resume", str(manifest), runtime=tmp_path).returncode == 0
