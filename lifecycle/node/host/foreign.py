@@ -551,7 +551,7 @@ class Adoption:
         self._current = planned
         try:
             with constructing(self):
-                returned = what(**_keywords(planned, what))
+                returned = what(**keywords(planned, what))
         finally:
             self._waiting, self._current = [], None
         self._check(planned, what, returned)
@@ -685,7 +685,7 @@ def refuse_unmanaged(planned: PlannedNode, node_class: type) -> None:
         )
 
 
-def _keywords(planned: PlannedNode, what: Callable[..., Any]) -> dict[str, Any]:
+def keywords(planned: PlannedNode, what: Callable[..., Any]) -> dict[str, Any]:
     """Return what a class or function is called with; one that needs a `node_name` gets it."""
     keywords = {
         name: list(value) if isinstance(value, tuple) else value

@@ -81,3 +81,22 @@ class Plain(Node):
 
 
 NOT_A_CLASS = 1
+
+
+def nothing() -> None:
+    """Make a node and return nothing."""
+    Plain()
+
+
+def two() -> list[Node]:
+    """Return two nodes."""
+    return [Node("first"), Node("second")]
+
+
+class WithHelper(Node):
+    """Makes a second node in its constructor."""
+
+    def __init__(self, node_name: str) -> None:
+        super().__init__(node_name)
+        self.helper = Node("helper")
+        self.helper.create_publisher(String, "out", 3)

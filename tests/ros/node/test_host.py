@@ -304,3 +304,45 @@ def test_what_hosts_are_forked_from_imports_only_what_every_node_needs() -> None
         modules.split()
     )
     assert also == "True"
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        (
+            "nothing",
+            (
+                "cannot use 'hosted:nothing': it returns None and must return its nodes; it must "
+                "neither spin nor destroy them: the host does"
+            ),
+        ),
+        (
+            "two",
+            (
+                "cannot host /second, which 'hosted:two' returns: no node is declared for it "
+                "beside /one; add a node of that name with the same `run:` and `process: one`"
+            ),
+        ),
+    ],
+)
+def test_a_function_returns_exactly_the_nodes_that_are_declared(
+    start: Start, name: str, reason: str
+) -> None:
+    host = start(hosted("one", name, managed=False))
+    assert host.read() == Event(kind="failed", node="/one", ok=False, error=reason)
+    assert host.wait() == 1
+
+
+def test_a_node_that_another_makes_is_hosted_where_it_is_declared(start: Start) -> None:
+    out = dataclasses.replace(publisher("out"), resolved="/there/out")
+    host = start(
+        hosted("main", "WithHelper", managed=False),
+        hosted("helper", "WithHelper", out, managed=False, namespace="/there"),
+    )
+    told = host.do("/there/helper", Operation.GET_CONFIGURATION).configuration
+    assert told is not None
+    (report,) = told.endpoints
+    assert (report.name, report.resolved, report.mapped) == ("out", "/there/out", True)
+    assert report.qos is not None
+    assert report.qos.depth == 3
+    assert host.do("/main", ACTIVATE).ok
