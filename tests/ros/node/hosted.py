@@ -6,6 +6,7 @@ import sys
 import time
 from typing import Any
 
+import rclpy
 from rclpy.node import Node
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -81,6 +82,14 @@ class Plain(Node):
 
 
 NOT_A_CLASS = 1
+
+
+class Ending(Node):
+    """Shuts rclpy down, as scripts do once they have what they want."""
+
+    def __init__(self) -> None:
+        super().__init__("ending")
+        self.create_timer(0.01, rclpy.shutdown)
 
 
 def nothing() -> None:

@@ -333,6 +333,14 @@ def test_a_function_returns_exactly_the_nodes_that_are_declared(
     assert host.wait() == 1
 
 
+def test_a_node_that_shuts_rclpy_down_ends_its_process_well(start: Start) -> None:
+    host = start(hosted("one", "Ending", managed=False))
+    host.until("ready")
+    host.ask("/one", ACTIVATE)
+    assert host.wait() == 0
+    assert "rclpy was shut down by a node's own code" in host.log.read_text()
+
+
 def test_a_node_that_another_makes_is_hosted_where_it_is_declared(start: Start) -> None:
     out = dataclasses.replace(publisher("out"), resolved="/there/out")
     host = start(

@@ -212,7 +212,11 @@ _SERVICES = ("inner", "outer")
 def test_what_a_callback_of_rclpy_lifecycle_raises_is_logged_and_ends_the_bring_up(
     fresh_domain: int, tmp_path: Path
 ) -> None:
-    manifest = write(tmp_path, fresh_domain, {"broken": node("Broken")})
+    (tmp_path / "src").mkdir()
+    (tmp_path / "src" / "elsewhere.py").write_text(f"from {_NODES} import Broken")
+    environment = {"PYTHONPATH": str(tmp_path / "src")}
+    broken = node("elsewhere:Broken", environment=environment)
+    manifest = write(tmp_path, fresh_domain, {"broken": broken})
     with running.up(manifest, runtime=tmp_path) as up:
         assert up.finish() == 6
         assert [each["message"] for each in up.verdict["findings"]] == [
