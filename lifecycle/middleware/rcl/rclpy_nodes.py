@@ -12,7 +12,7 @@ import contextlib
 import functools
 import sys
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any, Protocol
 
 from lifecycle_msgs.msg import Transition
@@ -270,6 +270,21 @@ class Watching:
         self._clients: list[Any] = []
         self._services: list[Any] = []
         self._Node__waitables: list[Any] = []
+
+    def take_services(self, node: Node, services: Collection[Any]) -> None:
+        """Serve what a node offers, whoever spins the node; destroy them before it."""
+        for each in services:
+            node._services.remove(each)  # noqa: SLF001 - what Node.destroy_service does
+            self._services.append(each)
+        self._wake()
+
+    def drop_services(self, services: Collection[Any]) -> None:
+        """Destroy what was taken; again is harmless."""
+        for each in services:
+            if each in self._services:
+                self._services.remove(each)
+                each.destroy()
+        self._wake()
 
     def add_waitable(self, waitable: Any) -> None:
         """Wait for it from now on."""

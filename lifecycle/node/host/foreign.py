@@ -15,8 +15,9 @@ from __future__ import annotations
 import collections
 import contextlib
 import inspect
+import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, NoReturn, Protocol
 
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.event_handler import (
@@ -30,6 +31,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.serialization import serialize_message
 from rclpy.time_source import TimeSource
+from std_srvs.srv import Trigger
 
 from lifecycle.errors import BringUpError, LifecycleError
 from lifecycle.manifest import EndpointKind
@@ -50,7 +52,9 @@ from lifecycle.node.author.node import LifecycleNode
 from lifecycle.node.author.spec import Construction, Mode, constructing, ros_arguments
 from lifecycle.node.configuration import ConfigurationChanges
 from lifecycle.node.connections.connections import Connection, Connections
+from lifecycle.node.connections.data_layer import RemoteInterface
 from lifecycle.node.endpoints.mapping import MatchWatch
+from lifecycle.node.host.control import INTERFACE_ON_DEMAND
 from lifecycle.node.lifecycle.execution import SUCCESS, Result
 from lifecycle.node.lifecycle.gate import GatedPublisher, NodeGate
 from lifecycle.node.lifecycle.machine import CallbackOutcome, RefusedError
@@ -159,6 +163,30 @@ class HeldPublisher(GatedPublisher):
             )
 
 
+class Immovable:
+    """The node interface of a node that has none.
+
+    Args:
+        node: fully qualified name.
+    """
+
+    def __init__(self, node: str) -> None:
+        self._node = node
+
+    def map_to(self, endpoint: str, connection: str) -> NoReturn:
+        """Raise: its own code makes its endpoints.
+
+        Raises:
+            LifecycleError: always.
+        """
+        del endpoint, connection
+        raise LifecycleError(
+            f"cannot move the endpoints of {self._node}: its class is not a "
+            "lifecycle.LifecycleNode, and makes them itself",
+            hint="subclass lifecycle.LifecycleNode, or write data_layer.authority: nodes",
+        )
+
+
 class ForeignNode:
     """One hosted node of which the class is not ours; it offers the host what `Managed` does.
 
@@ -198,6 +226,7 @@ class ForeignNode:
         self._listeners: list[Callable[[Any], None]] = []
         self._let_through = not supervisor
         self._is_spun = False
+        self._is_ours = False
         self._machine: RclpyStateMachine | None = None
         self.configuration_changes = ConfigurationChanges(
             later, self.get_configuration, failed=node.get_logger().error
@@ -206,6 +235,33 @@ class ForeignNode:
         node.add_post_set_parameters_callback(lambda _: self.configuration_changes.touch())
         if self._let_through:
             self._gate.open()
+        self._services = self._serve()
+
+    def _serve(self) -> tuple[Any, ...]:
+        """Offer what others know our nodes by; the host answers, also while the node is held."""
+        before = set(self._node.services)
+        self._is_ours = True
+        Node.create_service(
+            self._node, Trigger, "~/get_configuration", self._describe, callback_group=self._group
+        )
+        immovable: Any = Immovable(self.full_name)
+        remote = RemoteInterface(
+            self._node, immovable, log=self._node.get_logger().error, group=self._group
+        )
+        remote.serve(but=INTERFACE_ON_DEMAND)
+        self._is_ours = False
+        services = tuple(each for each in self._node.services if each not in before)
+        self._watching.take_services(self._node, services)
+        return services
+
+    def _describe(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        try:
+            response.message = configuration.to_json(self.get_configuration())
+            response.success = True
+        except Exception as error:  # noqa: BLE001 - asking must not end the node
+            self.complain(traceback.format_exc())
+            response.message = f"cannot describe this node: {error!r}"
+        return response
 
     @property
     def full_name(self) -> str:
@@ -238,6 +294,8 @@ class ForeignNode:
 
     def made(self, kind: EndpointKind, entity: Any) -> None:
         """Note an endpoint, hold it if it publishes, and watch who is matched with it."""
+        if self._is_ours:
+            return
         callback = getattr(entity, "callback", None) if kind is EndpointKind.SUBSCRIPTION else None
         if isinstance(getattr(callback, "__self__", None), TimeSource):
             return  # /clock belongs to rclpy
@@ -391,6 +449,7 @@ class ForeignNode:
         for watch in self._watches.values():
             watch.stop()
         self._watches.clear()
+        self._watching.drop_services(self._services)
         self._connections.close_all()
 
     def serve_interface(self) -> None:
@@ -403,11 +462,7 @@ class ForeignNode:
         Raises:
             LifecycleError: always.
         """
-        raise LifecycleError(
-            f"cannot move the endpoints of {self.full_name}: its class is not a "
-            "lifecycle.LifecycleNode, and makes them itself",
-            hint="subclass lifecycle.LifecycleNode, or write data_layer.authority: nodes",
-        )
+        Immovable(self.full_name).map_to("", "")
 
     async def change_for_supervisor(self, operation: str) -> Result:
         """Do what the supervisor asked for; its activate is the gate's permit.

@@ -91,6 +91,9 @@ def test_plain_nodes_are_verified_completely_and_released(
         wait_until(lambda: "matched with 1" in log_of(up, "talker"))
         assert is_proven(up)
         assert verb("pause", str(manifest), runtime=tmp_path).returncode == 0
+        # Held again, it still reports to whoever asks.
+        held = verb("verify", str(manifest), "--strict", runtime=tmp_path)
+        assert held.returncode == 0, held.stdout
         assert verb("resume", str(manifest), runtime=tmp_path).returncode == 0
         assert verb("down", str(manifest), runtime=tmp_path).returncode == 0
         assert up.finish() == 0
