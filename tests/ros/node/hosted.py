@@ -7,6 +7,7 @@ import time
 from typing import Any
 
 import rclpy
+from rclpy.lifecycle import LifecycleNode as RclpyLifecycleNode
 from rclpy.node import Node
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -109,3 +110,11 @@ class WithHelper(Node):
         super().__init__(node_name)
         self.helper = Node("helper")
         self.helper.create_publisher(String, "out", 3)
+
+
+class Theirs(RclpyLifecycleNode):
+    """A managed node of rclpy's own."""
+
+    def __init__(self) -> None:
+        super().__init__("theirs")
+        self.create_publisher(String, "out", 1)

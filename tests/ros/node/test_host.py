@@ -354,3 +354,27 @@ def test_a_node_that_another_makes_is_hosted_where_it_is_declared(start: Start) 
     assert report.qos is not None
     assert report.qos.depth == 3
     assert host.do("/main", ACTIVATE).ok
+
+
+def test_a_node_of_rclpy_lifecycle_is_activated_by_its_supervisor_alone(
+    start: Start, fresh_domain: int
+) -> None:
+    host = start(hosted("one", "Theirs", publisher("out")))
+    with driver_in(fresh_domain) as driver:
+        host.until("ready")
+        # What rclpy itself answers with an exception that ends the process.
+        assert not driver.change("/one", label="deactivate")
+        assert driver.set("/one", "configure")
+        assert not driver.set("/one", "activate")
+        assert driver.state("/one") == (2, "inactive")
+        active = host.do("/one", ACTIVATE)
+        assert (active.ok, active.state, active.connected) == (True, "active", True)
+        assert driver.set("/one", "deactivate")
+        assert driver.set("/one", "activate")  # once let through, by any client
+        assert driver.set("/one", "deactivate")
+        assert driver.set("/one", "cleanup")
+        assert driver.set("/one", "configure")
+        assert not driver.set("/one", "activate")
+    host.hang_up()
+    assert host.wait() == 0
+    assert "cannot take transition number 3 in state 'inactive': the gate" in host.log.read_text()
