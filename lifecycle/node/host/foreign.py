@@ -113,6 +113,7 @@ class SharedMatch:
         changed: Callable[[], None],
         forward: Callable[[Callable[[Any], Any], Any], None],
     ) -> None:
+        self._node = node
         self._event = event
         self._watching = watching
         callback = event.callback
@@ -127,8 +128,9 @@ class SharedMatch:
         watching.add_waitable(event)
 
     def stop(self) -> None:
-        """Wait for it no more: its endpoint is about to be destroyed."""
+        """Wait for it no more: its endpoint is about to be destroyed, by its node."""
         self._watching.remove_waitable(self._event)
+        self._node.add_waitable(self._event)
 
 
 class HeldPublisher(GatedPublisher):

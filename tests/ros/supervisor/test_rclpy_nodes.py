@@ -97,6 +97,7 @@ def test_plain_nodes_are_verified_completely_and_released(
         assert verb("resume", str(manifest), runtime=tmp_path).returncode == 0
         assert verb("down", str(manifest), runtime=tmp_path).returncode == 0
         assert up.finish() == 0
+        assert "Traceback" not in log_of(up, "talker")
         up.assert_gate_held()
         up.assert_nothing_left()
 
@@ -113,7 +114,7 @@ def test_a_plain_node_does_nothing_while_the_gate_is_closed(
             "listener": node("Listener", managed=False, interface=HEARS),
         },
     )
-    with running.up(manifest, "--timeout", "3", runtime=tmp_path) as up:
+    with running.up(manifest, "--timeout", "2", runtime=tmp_path) as up:
         assert up.finish() == 4
         assert [each["message"] for each in up.verdict["findings"]] == [
             "cannot find the publisher of /shouts that /talker declares"
