@@ -18,7 +18,7 @@ from planning import publisher, subscription
 from std_msgs.msg import String
 
 from lifecycle import codec
-from lifecycle.manifest.model import DiscoveryRange, Timeouts
+from lifecycle.manifest.model import DiscoveryRange, Executor, Run, RunKind, Timeouts
 from lifecycle.node.host.control import Command, Event, HostSpec, Operation
 
 HERE = Path(__file__).parent
@@ -378,3 +378,26 @@ def test_a_node_of_rclpy_lifecycle_is_activated_by_its_supervisor_alone(
     host.hang_up()
     assert host.wait() == 0
     assert "cannot take transition number 3 in state 'inactive': the gate" in host.log.read_text()
+
+
+@pytest.mark.parametrize("executor", [Executor.MULTI, Executor.EVENTS])
+def test_nodes_of_every_kind_share_an_executor_with_threads_of_its_own(
+    start: Start, executor: Executor
+) -> None:
+    def run(name: str) -> Run:
+        return Run(kind=RunKind.PYTHON, python=f"hosted:{name}", executor=executor)
+
+    host = start(
+        hosted("ours", "Echo", publisher("out"), subscription("in"), run=run("Echo")),
+        hosted("theirs", "Theirs", publisher("out"), run=run("Theirs")),
+        hosted("plain", "WithHelper", managed=False, run=run("WithHelper")),
+    )
+    host.until("ready")
+    for each in (CONFIGURE, CONNECT, ACTIVATE, Operation.DEACTIVATE, ACTIVATE):
+        assert host.do("/ours", each).ok
+        assert host.do("/theirs", each).ok
+    for each in (ACTIVATE, Operation.DEACTIVATE, ACTIVATE):
+        assert host.do("/plain", each).ok
+    host.hang_up()
+    assert host.wait() == 0
+    assert "Traceback" not in host.log.read_text()
