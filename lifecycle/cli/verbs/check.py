@@ -25,8 +25,17 @@ from lifecycle.cli.report import (
     written_or_said,
 )
 from lifecycle.codec import Count, to_json
-from lifecycle.errors import ExitCode, LifecycleError
-from lifecycle.manifest import Diagnostic, Manifest, ManifestError, Position, Severity, load
+from lifecycle.errors import ExitCode, LifecycleError, UsageError
+from lifecycle.manifest import (
+    ArgumentDeclaration,
+    Diagnostic,
+    Manifest,
+    ManifestError,
+    Position,
+    Severity,
+    declared_arguments,
+    load,
+)
 from lifecycle.plan import Resolution, UnresolvedProgram, check_plan, effective_domain
 from lifecycle.printable import json_text, lines
 
@@ -226,6 +235,9 @@ def _legal(text: str) -> str:
     metavar="NAME",
     help="The machine that this host is; default: all whose address is this host's.",
 )
+@click.option(
+    "--arguments", "lists", is_flag=True, help="List the arguments that it takes, and end."
+)
 @report_option
 def command(
     *,
@@ -234,6 +246,7 @@ def command(
     format_: str,
     strict: bool,
     machine: str,
+    lists: bool,
     report: Path | None,
 ) -> int:
     """Check MANIFEST: schema, names, QoS compatibility, order, flows, and what its nodes run.
@@ -242,6 +255,8 @@ def command(
     `lifecycle up` would find them here. Needs no ROS. Exits with 0 if it can be used, with 3 if
     not; under --strict with 5 if all that is missing is something that could not be resolved.
     """
+    if lists:
+        return _list(manifest, format_, others=bool(assignments or strict or machine or report))
     try:
         found = check(manifest, assignments, strict=strict, machine=machine)
     except LifecycleError as error:
@@ -254,6 +269,30 @@ def command(
     shown = {"text": lines, "json": json_text, "sarif": json_text}.get(format_, str)
     click.echo(shown(text))
     return found.exit_code(strict=strict) or unwritten
+
+
+def _list(path: str, format_: str, *, others: bool) -> int:
+    if others or format_ not in ("text", "json"):
+        raise UsageError(
+            "cannot use --arguments with anything but --format text or json",
+            hint=f"lifecycle check {path} --arguments",
+        )
+    found = declared_arguments(path)
+    if format_ == "json":
+        click.echo(json_text(to_json(found).decode()))
+    else:
+        text = "\n".join(map(_argument, found)) or f"{path} takes no arguments"
+        click.echo(lines(text))
+    return ExitCode.OK
+
+
+def _argument(each: ArgumentDeclaration) -> str:
+    """Return `rate:=10  frames per second; allowed: 5, 10`."""
+    value = "VALUE" if each.default is None else each.default
+    about = [each.description, "required" if each.default is None else ""]
+    about += [f"allowed: {', '.join(each.choices)}"] if each.choices else []
+    said = "; ".join(filter(None, about))
+    return f"{each.name}:={value}  {said}".rstrip()
 
 
 def _write(report: Path, found: CheckReport, *, strict: bool) -> ExitCode:
