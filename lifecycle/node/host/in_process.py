@@ -10,6 +10,7 @@ import collections
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from rclpy.context import Context
@@ -26,7 +27,9 @@ from lifecycle.middleware import (
     to_rclpy,
 )
 from lifecycle.node.author.node import LifecycleNode
-from lifecycle.node.author.spec import Construction, Mode, constructing, load_class
+from lifecycle.node.author.spec import Construction, Mode, constructing
+from lifecycle.node.host.foreign import keywords
+from lifecycle.node.host.hosting import maker_of
 from lifecycle.node.lifecycle.execution import Result
 from lifecycle.node.lifecycle.machine import CallbackOutcome
 from lifecycle.plan import PlannedNode
@@ -63,10 +66,13 @@ class NodeInProcess:
                 f"cannot run {planned.full_name} in this process: it is no Python class",
                 hint="bring the system up instead: the fixture lifecycle_system",
             )
-        node_class = load_class(planned.run.python)
-        if not issubclass(node_class, LifecycleNode):
+        folder = str(Path(planned.at.file).absolute().parent)
+        node_class = maker_of(planned, (folder,))
+        if not (isinstance(node_class, type) and issubclass(node_class, LifecycleNode)):
             raise UsageError(
-                f"cannot run {planned.full_name}: {planned.run.python!r} is not a LifecycleNode"
+                f"cannot run {planned.full_name} in this process: {planned.run.python!r} is no "
+                "class of lifecycle.LifecycleNode",
+                hint="bring the system up instead: the fixture lifecycle_system",
             )
         self._planned = planned
         self._changed = threading.Condition()
@@ -87,7 +93,7 @@ class NodeInProcess:
         )
         try:
             with participant_settings(self._context, settings), constructing(construction):
-                self.node: LifecycleNode = node_class()
+                self.node: LifecycleNode = node_class(**keywords(planned, node_class))
         except BaseException:
             self._executor.shutdown()
             self._context.try_shutdown()
