@@ -21,4 +21,5 @@ from .host.control import Operation as Operation
 from .host.host import needed_by as needed_by
 from .host.host import preload as preload
 from .host.host import serve as serve
+from .host.in_process import NodeInProcess as NodeInProcess
 from .host.standalone import run as run

@@ -19,6 +19,7 @@ import click
 
 from lifecycle.cli.common import format_option, manifest_arguments, parse_assignments, resolve
 from lifecycle.cli.report import (
+    annotation,
     report_format,
     report_option,
     write_report,
@@ -81,7 +82,7 @@ class CheckReport:
 
 
 def write_check(report: CheckReport, format_: str, *, strict: bool) -> str:
-    """Return a report as "text", "json", "sarif" or "junit".
+    """Return a report as "text", "json", "sarif", "junit" or "github" (text and annotations).
 
     Args:
         report: what was found.
@@ -95,6 +96,16 @@ def write_check(report: CheckReport, format_: str, *, strict: bool) -> str:
     if format_ == "junit":
         return _junit(report, strict=strict)
     lines = [*map(str, report.diagnostics), *map(str, report.unresolved), summary(report)]
+    if format_ == "github":
+        lines += [
+            annotation(
+                "error" if strict else each.severity.value,
+                each.rule,
+                f"{each.message}; {each.hint}" if each.hint else each.message,
+                at=f"{each.at.file}:{each.at.line}:{each.at.column}",
+            )
+            for each in report.diagnostics
+        ]
     return "\n".join(lines)
 
 
@@ -225,7 +236,7 @@ def _legal(text: str) -> str:
 
 @click.command()
 @manifest_arguments
-@format_option("text", "json", "sarif", "junit")
+@format_option("text", "json", "sarif", "junit", "github")
 @click.option(
     "--strict", is_flag=True, help="Let warnings and what could not be resolved fail it, too."
 )
@@ -266,8 +277,9 @@ def command(
     unwritten = ExitCode.OK if report is None else _write(report, found, strict=strict)
     text = write_check(found, format_, strict=strict)
     # Names of files are anybody's.
-    shown = {"text": lines, "json": json_text, "sarif": json_text}.get(format_, str)
-    click.echo(shown(text))
+    shown = {"text": lines, "github": lines, "json": json_text, "sarif": json_text}
+
+    click.echo(shown.get(format_, str)(text))
     return found.exit_code(strict=strict) or unwritten
 
 
