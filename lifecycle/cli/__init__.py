@@ -2,8 +2,7 @@
 
 A verb's module is imported only when it is used, so that ROS-free verbs start fast. Each module
 `lifecycle.cli.verbs.NAME` holds one click command named `command` whose function returns an exit
-code (None means 0); the small ones that talk to a running supervisor are together in `control`, as
-`NAME_command`.
+code (None means 0); small ones share a module, `control` for one, as `NAME_command`.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ import traceback
 import click
 
 from lifecycle.cli.standard_streams import own_streams
-from lifecycle.errors import ExitCode, LifecycleError
+from lifecycle.errors import ExitCode, LifecycleError, UsageError
 from lifecycle.printable import lines
 
 VERBS: dict[str, str] = {
@@ -37,11 +36,15 @@ VERBS: dict[str, str] = {
     "capture": "write a manifest from a running system, gaps marked",
     "run": "run one node of a manifest in this terminal, without a supervisor",
     "ports": "DDS port arithmetic and platform limits",
+    "init": "make a package of one's own: nodes, manifest, tests, CI workflow",
+    "schema": "print the manifest's JSON Schema, or install it for editors",
 }
 
-
-_CONTROL = frozenset({"pause", "resume", "restart", "down", "status"})
-"""Verbs that talk to a running supervisor."""
+_ELSEWHERE = {
+    **dict.fromkeys(("pause", "resume", "restart", "down", "status"), "control"),
+    "schema": "init",
+}
+"""Verb → module that has it, as `VERB_command`; all others have a module of their name."""
 
 _PARTICIPANTS = frozenset({"up", "verify", "flows", "graph", "capture", "run"})
 """Verbs that make participants, here or in processes that they start."""
@@ -53,7 +56,13 @@ class _Verbs(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Look first whether a verb that needs the RMW can have it."""
+        """Look first whether there is such a verb, and one that needs the RMW can have it."""
+        if args and args[0] not in VERBS and not args[0].startswith("-"):
+            from difflib import get_close_matches
+
+            close = get_close_matches(args[0], VERBS, n=1)
+            hint = f"did you mean {close[0]!r}?" if close else "lifecycle --help lists the verbs"
+            raise UsageError(f"cannot find the verb {args[0]!r}", hint=hint)
         if args and args[0] in _PARTICIPANTS and not {"-h", "--help"} & {*args}:
             from lifecycle.middleware import check_rmw
 
@@ -72,9 +81,8 @@ class _Verbs(click.Group):
         """Import the verb's module, see above."""
         if cmd_name not in VERBS:
             return None
-        module, name = cmd_name, "command"
-        if cmd_name in _CONTROL:
-            module, name = "control", f"{cmd_name}_command"
+        module = _ELSEWHERE.get(cmd_name, cmd_name)
+        name = f"{cmd_name}_command" if cmd_name in _ELSEWHERE else "command"
         found = getattr(importlib.import_module(f"lifecycle.cli.verbs.{module}"), name)
         assert isinstance(found, click.Command)
         return found

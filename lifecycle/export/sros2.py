@@ -209,6 +209,7 @@ def _node_profile(node: PlannedNode) -> Profile:
         for name in (*NODE_SERVICES, *OUR_SERVICES)
         if node.managed or name not in {*_MANAGED, *OUR_SERVICES}
     }
+    services |= {name for name in OUR_SERVICES if node.holds}
     allowed = {(each.kind, each.resolved) for each in node.endpoints}
     allowed |= {(EndpointKind.SERVICE_SERVER, f"{node.full_name}/{name}") for name in services}
     allowed |= {
@@ -237,7 +238,7 @@ def _supervisor_profile(plan: Plan, machine: str) -> Profile:
         (EndpointKind.SUBSCRIPTION, GRAPH_TOPIC),
     }
     for node in plan.nodes:
-        names = {*NODE_SERVICES, *(OUR_SERVICES if node.managed else ())}
+        names = {*NODE_SERVICES, *(OUR_SERVICES if node.holds else ())}
         if not node.managed:
             names -= _MANAGED
         allowed |= {(EndpointKind.SERVICE_CLIENT, f"{node.full_name}/{name}") for name in names}

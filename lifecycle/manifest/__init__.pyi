@@ -15,7 +15,9 @@ from .flows import ResolvedNeed as ResolvedNeed
 from .installed_types import installed_hash as installed_hash
 from .installed_types import join as join
 from .installed_types import search_prefixes as search_prefixes
+from .loading import ArgumentDeclaration as ArgumentDeclaration
 from .loading import Loaded as Loaded
+from .loading import declared_arguments as declared_arguments
 from .loading import load as load
 from .model import TOLERATED_NODES as TOLERATED_NODES
 from .model import After as After

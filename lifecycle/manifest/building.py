@@ -342,7 +342,7 @@ def _known(value: Scalar) -> bool | int | float | str:
     return value
 
 
-__all__ = ["Findings", "build_node", "quantities"]
+__all__ = ["Findings", "build_node", "build_parameters", "quantities"]
 
 _PROGRAMS = ("python", "command", "package", "executable", "component", "container", "ros_args")
 _POSITIONED = (
@@ -371,7 +371,7 @@ def build_node(
         found: findings are appended here.
     """
     namespace = cursor.text("namespace").strip("/")
-    parameters = _parameters(cursor, found)
+    parameters = build_parameters(cursor, found)
     interface = build_interface(cursor, base=base, environment=environment, found=found)
     return cursor.build(
         Node,
@@ -483,8 +483,8 @@ def _check_python_keys(cursor: Cursor, kind: RunKind, found: Findings) -> None:
             found.append(error("manifest.threads", at, message, hint))
 
 
-def _parameters(node: Cursor, found: Findings) -> dict[str, tuple[ParameterValue, Position]]:
-    """Flatten parameter mappings into dotted names, as rcl's parameter files do."""
+def build_parameters(node: Cursor, found: Findings) -> dict[str, tuple[ParameterValue, Position]]:
+    """Flatten `parameters:` of a node, group or document into dotted names, as rcl's files do."""
     flat: dict[str, tuple[ParameterValue, Position]] = {}
     pending = list(reversed(list(node.entries("parameters"))))
     while pending:

@@ -14,7 +14,7 @@ import dataclasses
 import ipaddress
 import os
 import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 
@@ -38,10 +38,12 @@ from lifecycle.manifest.model import (
     Policy,
 )
 from lifecycle.manifest.schema import MANIFEST, nearest, read_schema, validate
+from lifecycle.manifest.shared import Shared, settle
 from lifecycle.manifest.yaml import include
-from lifecycle.manifest.yaml.arguments import substitute
+from lifecycle.manifest.yaml.arguments import CONDITIONS, Substituted, substitute
 from lifecycle.manifest.yaml.document import Cursor, Document, Place, Value, error, warning
 from lifecycle.manifest.yaml.source import is_outside, read_document
+from lifecycle.manifest.yaml.substitutions import Programs, Surroundings, folder_of
 from lifecycle.manifest.yaml.yaml_parser import quote
 from lifecycle.network import DscpMapping, TransportPriorityMapping, dscp_mappings, parse_mapping
 
@@ -121,6 +123,7 @@ def build_manifest(
     environment: Mapping[str, str],
     unsound: Collection[Place],
     found: Findings,
+    machine: str = THIS_HOST,
 ) -> Manifest:
     """Build what one document declares, its includes not yet joined.
 
@@ -132,9 +135,10 @@ def build_manifest(
         environment: for AMENT_PREFIX_PATH, where interfaces by reference are searched.
         unsound: links to leave out, which keep their place in the list.
         found: findings are appended here; with an error among them, what is wrong is left out.
+        machine: of nodes that name none.
     """
     nodes = tuple(
-        build_node(key, cursor, base=base, machine=THIS_HOST, environment=environment, found=found)
+        build_node(key, cursor, base=base, machine=machine, environment=environment, found=found)
         for key, cursor in root.entries("nodes")
     )
     return Manifest(
@@ -233,17 +237,29 @@ def load(
         ManifestError: with every error and warning, sorted by position.
     """
     variables = os.environ if environment is None else environment
-    loading = _Loading(variables)
     origin = include.Origin.of(Path(path))
+    loading = _Loading(variables, origin)
     manifest = loading.read(origin, arguments, ())
     found = loading.found
 
     def every() -> tuple[Diagnostic, ...]:
-        quoted = _without_outside_text(found, os.fspath(path), variables)
+        quoted = _without_outside_text(found, os.fspath(path), variables, loading.outside)
         return _sorted(quoted, loading.files)
 
     if manifest is None:
         raise ManifestError(every())
+    manifest = settle(_without_left_out(manifest))
+    if not manifest.nodes and manifest.left_out:
+        at = Position(file=manifest.path, line=1, column=1)
+        message = "cannot run a system without nodes: conditions leave out all of them"
+        found.append(
+            error(
+                "manifest.condition",
+                at,
+                message,
+                "lifecycle check --arguments lists what they follow",
+            )
+        )
     if wrong := [each for each in found if each.severity is Severity.ERROR]:
         part = partial(manifest, wrong, lost=loading.lost, machines=loading.machines)
         found += check_sound(part, environment=variables)
@@ -252,6 +268,69 @@ def load(
     if any(each.severity is Severity.ERROR for each in found):
         raise ManifestError(every())
     return Loaded(manifest=manifest, warnings=every())
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class ArgumentDeclaration:
+    """An argument that a manifest takes: `rate:=5.0` on the command line.
+
+    Attributes:
+        default: as it is written, substitutions unresolved; None for one that is required.
+        choices: the only values allowed; empty if any is.
+    """
+
+    name: str
+    default: str | None
+    choices: tuple[str, ...]
+    description: str
+    at: Position
+
+
+def declared_arguments(path: str | Path) -> tuple[ArgumentDeclaration, ...]:
+    """Return the arguments that one manifest declares, in their order, whatever else is in it.
+
+    Raises:
+        ManifestError: it cannot be read, or its `arguments:` are none.
+    """
+    document = read_document(path, shown=os.fspath(path))
+    wrong = [each for place, each in validate(document) if place[:1] == ("arguments",)]
+    if wrong:
+        raise ManifestError(_sorted(wrong, [document.file]))
+    return tuple(
+        ArgumentDeclaration(
+            name=name,
+            default=cursor.text("default") if "default" in cursor else None,
+            choices=tuple(each.value.text for each in cursor.items("choices")),
+            description=cursor.text("description"),
+            at=cursor.key_at,
+        )
+        for name, cursor in Cursor.root(document).entries("arguments")
+    )
+
+
+def _without_left_out(manifest: Manifest) -> Manifest:
+    """Return a manifest whose nodes wait for no node that is left out, and links have both ends."""
+    there = {node.key for node in manifest.nodes}
+    exact = {key for key in manifest.left_out if not key.endswith("/")} - there
+    prefixes = tuple(key for key in manifest.left_out if key.endswith("/"))
+
+    def is_left_out(key: str) -> bool:
+        return key not in there and (key in exact or key.startswith(prefixes))
+
+    if not manifest.left_out:
+        return manifest
+    nodes = tuple(
+        dataclasses.replace(
+            node, after=tuple(each for each in node.after if not is_left_out(each.node))
+        )
+        for node in manifest.nodes
+    )
+    links = tuple(
+        link
+        for link in manifest.links
+        if not is_left_out(link.from_node) and not is_left_out(link.to_node)
+    )
+    return dataclasses.replace(manifest, nodes=nodes, links=links)
 
 
 _SEGMENTS = re.compile(r"[^.\[]+")
@@ -307,7 +386,7 @@ def partial(
     flaws: dict[tuple[str, str], set[str]] = {}
     sections: set[str] = set()
     for each in wrong:
-        section, *inside = _SEGMENTS.findall(each.at.path)[:3] or [""]
+        section, *inside = _inside_groups(each.at.path)[:3] or [""]
         if section == "nodes" and inside:
             flaws.setdefault((each.at.file, inside[0]), set()).add(_part(inside[1:]))
         else:
@@ -329,7 +408,15 @@ def partial(
 
 def _place(node: Node) -> tuple[str, str]:
     """The file and the key by which findings name a node; an include may have given it a prefix."""
-    return node.at.file, _SEGMENTS.findall(node.at.path)[1]
+    return node.at.file, _inside_groups(node.at.path)[1]
+
+
+def _inside_groups(path: str) -> list[str]:
+    """Return the steps of a place, those to the group that it is in left out."""
+    steps = _SEGMENTS.findall(path)
+    while steps[:1] == ["groups"] and len(steps) > 2:
+        steps = steps[2:]
+    return steps
 
 
 def _part(inside: Iterable[str | int]) -> str:
@@ -369,6 +456,35 @@ SUFFIX = ".lifecycle.yaml"
 """What a manifest's name ends in; plain `.yaml` belongs to ROS launch files."""
 
 
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class _Reading:
+    """One file while it is read: places in it are counted from its root.
+
+    Attributes:
+        chain: the manifests that include it, and itself.
+        unsound: places of what is wrong.
+        left_out: places that conditions leave out.
+    """
+
+    origin: include.Origin
+    chain: tuple[include.Origin, ...]
+    unsound: tuple[Place, ...]
+    left_out: tuple[Place, ...]
+
+    def leaves_out(self, each: Cursor) -> bool:
+        """Whether an entry of `include` or `groups` is left out."""
+        return (*each.document.place, *each.place) in self.left_out
+
+    def is_unsound(self, each: Cursor, keys: Collection[str]) -> bool:
+        """Whether an entry cannot be used; where there are `keys`, because of them alone."""
+        place = (*each.document.place, *each.place)
+        inside = [found[len(place) :] for found in self.unsound if found[: len(place)] == place]
+        return any(not keys or not found or found[0] in keys for found in inside)
+
+
+NOTHING = Shared(machine=THIS_HOST)
+
+
 class _Loading:
     """One run over a manifest and its includes.
 
@@ -377,14 +493,18 @@ class _Loading:
         files: as they were read.
         machines: names of all that are declared; None if not all are known.
         lost: keys of nodes that are declared and could not be built; None if there may be any.
+        outside: (file, line, column) of values that hold text of files that is not to be quoted.
     """
 
-    def __init__(self, environment: Mapping[str, str]) -> None:
+    def __init__(self, environment: Mapping[str, str], outermost: include.Origin) -> None:
         self.found: list[Diagnostic] = []
         self.files: list[str] = []
         self.machines: frozenset[str] | None = frozenset()
         self.lost: frozenset[str] | None = frozenset()
+        self.outside: set[tuple[str, int, int]] = set()
         self._environment = environment
+        self._path = os.fspath(outermost.path)
+        self._programs = Programs(environment)
         self._documents = 0
         self._outermost: Manifest | None = None
 
@@ -393,8 +513,10 @@ class _Loading:
         origin: include.Origin,
         given: Mapping[str, str],
         chain: tuple[include.Origin, ...],
+        *,
         entry: Cursor | None = None,
         prefix: str = "",
+        shared: Shared = NOTHING,
     ) -> Manifest | None:
         """Read one manifest and what it includes.
 
@@ -404,6 +526,7 @@ class _Loading:
             chain: the manifests that include it, outermost first.
             entry: the include that names it.
             prefix: what all its includes put before its keys.
+            shared: what the including manifests and groups share.
 
         Returns:
             What is declared, as far as it is sound; None if the file cannot be read at all.
@@ -417,10 +540,15 @@ class _Loading:
             return None
         self.found += flaws
         self._check_suffix(document)
-        substituted = substitute(document, given, self._environment, include=entry)
+        substituted = self._substituted(document, origin, given, entry)
         document = substituted.document
-        self.found += substituted.diagnostics
-        violations = validate(document, ignore=substituted.broken)
+        emptied = [
+            place[:-1]
+            for place in substituted.left_out
+            if (around := document.find(place[:-1])) is not None and not around.data
+        ]
+        ignore = [*substituted.broken, *substituted.left_out, *emptied]
+        violations = validate(document, ignore=ignore)
         self.found += [each for _, each in violations]
         unsound = [*substituted.broken, *(place for place, _ in violations)]
         root = Cursor.root(sound(document, unsound))
@@ -432,19 +560,126 @@ class _Loading:
             environment=self._environment,
             unsound=links(unsound),
             found=self.found,
+            machine=shared.machine,
         )
         self.machines = _union(self.machines, entries(document, "machines"))
-        self.lost = _union(self.lost, lost(document, root.document), prefix)
         self._check_outermost(root, manifest)
-        for each in Cursor.root(document).items("include") if _is_list(document) else ():
-            if not any(place[: len(each.place)] == each.place for place in unsound):
-                manifest = self._include(manifest, each, (*chain, origin), prefix)
-            else:
+        reading = _Reading(
+            origin=origin,
+            chain=(*chain, origin),
+            unsound=tuple(unsound),
+            left_out=substituted.left_out,
+        )
+        return self._contents(
+            reading, root, manifest, document=document, prefix=prefix, shared=shared
+        )
+
+    def _substituted(
+        self,
+        document: Document,
+        origin: include.Origin,
+        given: Mapping[str, str],
+        entry: Cursor | None,
+    ) -> Substituted:
+        surroundings = Surroundings(
+            environment=self._environment,
+            folder=folder_of(origin.path),
+            outermost=self._path,
+            programs=self._programs,
+        )
+        unquotable = [
+            name
+            for name, each in (entry.entries("arguments") if entry else ())
+            if (each.document.file, each.value.line, each.value.column) in self.outside
+        ]
+        found = substitute(document, given, surroundings, include=entry, unquotable=unquotable)
+        self.found += found.diagnostics
+        self.outside |= {(document.file, line, column) for line, column in found.outside}
+        for place in found.left_out:
+            self.found += _misspelt(document, place)
+        return found
+
+    def _contents(
+        self,
+        reading: _Reading,
+        root: Cursor,
+        manifest: Manifest,
+        *,
+        document: Document,
+        prefix: str,
+        shared: Shared,
+    ) -> Manifest:
+        """Give the nodes of a document or group what they share, and add groups and includes."""
+        shared = shared.inner(root, self.found)
+        self.lost = _union(self.lost, lost(document, root.document), prefix)
+        manifest = dataclasses.replace(
+            manifest,
+            nodes=tuple(shared.given_to(node) for node in manifest.nodes),
+            left_out=tuple(
+                str(place[-1])
+                for place in reading.left_out
+                if place[:-1] == (*document.place, "nodes")
+            ),
+        )
+        for each in Cursor.root(document).items("include") if _is_list(document, "include") else ():
+            if reading.leaves_out(each):
+                key = each.text("prefix")
+                here = (f"{key}/",) if key and "$(" not in key else ()
+                manifest = dataclasses.replace(manifest, left_out=(*manifest.left_out, *here))
+            elif reading.is_unsound(each, ()):
                 self._unread()
+            else:
+                manifest = self._include(manifest, each, reading.chain, prefix, shared)
+        for each in Cursor.root(document).items("groups") if _is_list(document, "groups") else ():
+            if reading.leaves_out(each):
+                keys = tuple(_keys_of(each.value))
+                manifest = dataclasses.replace(manifest, left_out=(*manifest.left_out, *keys))
+            elif reading.is_unsound(each, ("namespace", "prefix", "machine", *CONDITIONS)):
+                self._unread()
+            else:
+                manifest = self._group(reading, manifest, each, prefix, shared)
         return manifest
 
+    def _group(
+        self, reading: _Reading, outer: Manifest, entry: Cursor, prefix: str, shared: Shared
+    ) -> Manifest:
+        place = (*entry.document.place, *entry.place)
+        document = Document(file=entry.document.file, root=entry.value, place=place)
+        unsound = [each[len(place) :] for each in reading.unsound if each[: len(place)] == place]
+        root = Cursor.root(sound(document, unsound))
+        nodes = tuple(
+            build_node(
+                key,
+                cursor,
+                base=reading.origin.path.parent,
+                machine=root.text("machine", shared.machine),
+                environment=self._environment,
+                found=self.found,
+            )
+            for key, cursor in root.entries("nodes")
+        )
+        inner = Manifest(
+            path=outer.path, system="", nodes=nodes, machines=_machines(root, nodes, self.found)
+        )
+        own = root.text("prefix")
+        inner = self._contents(
+            reading,
+            root,
+            inner,
+            document=document,
+            prefix=include.join_key(prefix, own),
+            shared=shared,
+        )
+        inner = include.move(inner, prefix=own, namespace=root.text("namespace"))
+        return include.join(outer, inner, entry.at, self.found, what="group")
+
     def _include(
-        self, outer: Manifest, entry: Cursor, chain: tuple[include.Origin, ...], prefix: str
+        self,
+        outer: Manifest,
+        entry: Cursor,
+        chain: tuple[include.Origin, ...],
+        prefix: str,
+        shared: Shared,
     ) -> Manifest:
         origin = include.locate(entry, chain, self.found)
         if origin is None:
@@ -459,7 +694,14 @@ class _Loading:
             return outer
         given = {name: each.value.text for name, each in entry.entries("arguments")}
         own = entry.text("prefix")
-        inner = self.read(origin, given, chain, entry, include.join_key(prefix, own))
+        inner = self.read(
+            origin,
+            given,
+            chain,
+            entry=entry,
+            prefix=include.join_key(prefix, own),
+            shared=shared,
+        )
         if inner is None:
             self._unread()
             return outer
@@ -504,8 +746,33 @@ def _union(
     return known | {include.join_key(prefix, key) for key in keys}
 
 
-def _is_list(document: Document) -> bool:
-    section = document.find(("include",))
+def _misspelt(document: Document, place: Place) -> list[Diagnostic]:
+    """Return what is wrong with something that is left out, whatever its substitutions become."""
+    value = document.find(place)
+    if value is None:
+        return []
+    part = Document(file=document.file, root=value, place=place)
+    kind = str(place[-2]).removesuffix("s")
+    return [each for _, each in validate(part, definition=kind, is_resolved=False)]
+
+
+def _keys_of(group: Value) -> Iterator[str]:
+    """Yield the keys of nodes in a group that is left out; with "/" at the end, a prefix."""
+    data = group.data if isinstance(group.data, Mapping) else {}
+    prefix = data["prefix"].text if "prefix" in data else ""
+    if prefix:
+        yield f"{prefix}/"
+        return
+    nodes = data["nodes"].data if "nodes" in data else {}
+    yield from nodes if isinstance(nodes, Mapping) else ()
+    for key in ("include", "groups"):
+        items = data[key].data if key in data else ()
+        for each in items if isinstance(items, tuple) else ():
+            yield from _keys_of(each)
+
+
+def _is_list(document: Document, key: str) -> bool:
+    section = document.find((key,))
     return section is not None and isinstance(section.data, tuple)
 
 
@@ -518,15 +785,31 @@ _READING = ("yaml.", "manifest.", "nodl.", "check.parameter")
 
 
 def _without_outside_text(
-    found: Sequence[Diagnostic], manifest: str, environment: Mapping[str, str]
+    found: Sequence[Diagnostic],
+    manifest: str,
+    environment: Mapping[str, str],
+    read: Collection[tuple[str, int, int]],
 ) -> list[Diagnostic]:
-    """Return findings that quote nothing of files outside the manifest's tree."""
+    """Return findings that quote nothing of files outside the manifest's tree.
+
+    Args:
+        found: findings.
+        manifest: the outermost manifest.
+        environment: for AMENT_PREFIX_PATH.
+        read: values that hold text which `$(file …)` has read from such a file.
+    """
     outside: dict[str, bool] = {}
     kept = []
     for each in found:
         file = each.at.file
         if file not in outside:
             outside[file] = is_outside(file, manifest, environment)
+        if _mark(each) in read and each.rule != "manifest.substitution":
+            each = dataclasses.replace(  # noqa: PLW2901 - the same finding, without the text
+                each,
+                message=f"cannot use what is written here ({each.rule})",
+                hint=f"not quoted, as $(file …) read it outside the folder of {manifest}",
+            )
         if outside[file] and each.rule.startswith(_READING) and each.rule not in _QUOTES_NOTHING:
             each = dataclasses.replace(  # noqa: PLW2901 - the same finding, without the text
                 each,

@@ -411,6 +411,7 @@ class Node(NodeDeclaration):
             `where`.
         written_paths: paths as the manifest writes them, by place: `parameter_files.0`,
             `run.working_directory`; what other fields have of them is absolute.
+        shared: parts that are written for several nodes, by path as in `positions`.
     """
 
     process: str = ""
@@ -420,6 +421,7 @@ class Node(NodeDeclaration):
     connections: tuple[ConnectionDeclaration, ...] = ()
     positions: tuple[tuple[str, Position], ...] = ()
     written_paths: tuple[tuple[str, str], ...] = ()
+    shared: frozenset[str] = frozenset()
 
     def where(self, part: str) -> Position:
         """Return the position of a part of this node; the node's own if that is not known."""
@@ -620,6 +622,8 @@ class Manifest(SystemDeclaration):
         path: the file it was read from, as the user wrote it.
         arguments: resolved values by name.
         positions: where values of `discovery:` and `data_layer:` are, by path, `discovery.mode`.
+        left_out: keys of the nodes that `if:` or `unless:` leaves out, as far as they are known;
+            one that ends in `/` is the prefix of a group or include.
     """
 
     path: str
@@ -628,6 +632,7 @@ class Manifest(SystemDeclaration):
     nodes: tuple[Node, ...] = ()
     links: tuple[Link, ...] = ()
     positions: tuple[tuple[str, Position], ...] = ()
+    left_out: tuple[str, ...] = ()
 
     def where(self, path: str, section: Position) -> Position:
         """Return the position of a value; that of its section where it is not written."""

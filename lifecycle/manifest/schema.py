@@ -264,22 +264,27 @@ def read_schema(name: str) -> Mapping[str, Any]:
 
 
 def validate(
-    document: Document, *, definition: str = "", ignore: Collection[Place] = ()
+    document: Document,
+    *,
+    definition: str = "",
+    ignore: Collection[Place] = (),
+    is_resolved: bool = True,
 ) -> tuple[tuple[Place, Diagnostic], ...]:
-    """Check a document whose substitutions are resolved.
+    """Check a document.
 
     Args:
         document: what to check.
         definition: name under `$defs` of the manifest's schema, for a part of a manifest that
             is in a file of its own; the whole manifest if empty.
         ignore: values already reported; nothing is reported about them or anything inside.
+        is_resolved: its substitutions are; of one that is left out they never will be.
 
     Returns:
         Every violation and the value it is about, at most `MAX_FINDINGS`, in no particular order.
     """
     found: list[tuple[Place, Diagnostic]] = []
     seen: set[tuple[Place, str]] = set()
-    errors = _validator(definition).iter_errors(document.root.plain())
+    errors = _validator(definition, is_resolved).iter_errors(document.root.plain())
     broken = list(violations(errors))
     enums = {each.place for each in broken if each.keyword == "enum"}
     # The allowed values are more precise than that they are strings.
@@ -301,8 +306,9 @@ def validate(
 
 
 @functools.cache
-def _validator(definition: str) -> Draft202012Validator:
-    schema = _resolved_only(read_schema(MANIFEST))
+def _validator(definition: str, is_resolved: bool) -> Draft202012Validator:
+    whole = read_schema(MANIFEST)
+    schema = _resolved_only(whole) if is_resolved else whole
     assert isinstance(schema, dict)
     if definition:
         schema = {"$defs": schema["$defs"], "$ref": f"#/$defs/{definition}"}

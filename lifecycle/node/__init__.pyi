@@ -9,7 +9,7 @@ from .author.node import FAILURE as FAILURE
 from .author.node import SUCCESS as SUCCESS
 from .author.node import LifecycleNode as LifecycleNode
 from .author.node import TransitionCallbackReturn as TransitionCallbackReturn
-from .author.spec import load_class as load_class
+from .author.spec import load_nodes as load_nodes
 from .connections.connection_status import ConnectionEvent as ConnectionEvent
 from .connections.connection_status import ConnectionEventKind as ConnectionEventKind
 from .connections.connections import Connection as Connection
@@ -21,4 +21,5 @@ from .host.control import Operation as Operation
 from .host.host import needed_by as needed_by
 from .host.host import preload as preload
 from .host.host import serve as serve
+from .host.in_process import NodeInProcess as NodeInProcess
 from .host.standalone import run as run

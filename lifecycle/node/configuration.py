@@ -43,12 +43,12 @@ from lifecycle.middleware import (
 from lifecycle.network import InternetProtocol, Medium, NetworkFlowEndpoint, TransportProtocol
 from lifecycle.node.author import parameters
 from lifecycle.node.author.declaring import interface_name
-from lifecycle.node.connections.connections import Connection
+from lifecycle.node.connections.connections import Connection, Connections
 from lifecycle.node.connections.data_layer import NodeDataLayer
 from lifecycle.node.endpoints.making import CLIENTS, wire_name
 from lifecycle.node.endpoints.mapping import Mapping, count_peers
 from lifecycle.node.lifecycle.machine import NodeState
-from lifecycle.plan import PARADIGMS, SERIALIZATIONS, PlannedNode
+from lifecycle.plan import PARADIGMS, SERIALIZATIONS, PlannedEndpoint, PlannedNode
 from lifecycle.verify import ConnectionReport, EndpointReport, Identity, NodeConfiguration
 
 if TYPE_CHECKING:
@@ -152,8 +152,8 @@ def collect_foreign(
     *,
     connected: bool,
     spec: PlannedNode,
-    own: Connection,
-    endpoints: Iterable[tuple[EndpointKind, Any]],
+    connections: Connections,
+    endpoints: Iterable[tuple[EndpointKind, Any, Connection]],
 ) -> NodeConfiguration:
     """Return the configuration of a node of which the class is not ours, as it is now.
 
@@ -162,20 +162,18 @@ def collect_foreign(
         state: lifecycle_msgs/State label; empty for a plain node.
         connected: its data layer is made.
         spec: what it was planned to be.
-        own: its participant.
-        endpoints: kind and rclpy object of what it has made.
+        connections: its participant, and those that give endpoints flows of their own.
+        endpoints: kind, rclpy object and connection of what it has made.
     """
     declared = {(each.kind, each.resolved): each for each in spec.endpoints}
     reports: list[EndpointReport] = []
-    for kind, entity in endpoints:
+    for kind, entity, connection in endpoints:
         try:
-            report = _undeclared_report(node, kind, entity, own)
+            report = _undeclared_report(node, kind, entity, connection)
         except InvalidHandle:
             continue  # destroyed meanwhile
         planned = declared.pop((kind, report.resolved), None)
-        reports.append(
-            report if planned is None else dataclasses.replace(report, name=planned.name)
-        )
+        reports.append(report if planned is None else _named(report, planned, connection))
     reports += [
         EndpointReport(
             kind=each.kind,
@@ -187,15 +185,36 @@ def collect_foreign(
         )
         for each in declared.values()
     ]
-    topics = [each for each in reports if each.mapped and each.kind.is_topic]
-    connection = ConnectionReport(
-        name="",
-        urls=spec.connections.urls,
-        established=all(each.matched for each in topics),
-        mappings=tuple(each.kind.spell(each.name) for each in reports if each.mapped and each.name),
-    )
     return _document(
-        node, state, connected=connected, endpoints=tuple(reports), connections=(connection,)
+        node,
+        state,
+        connected=connected,
+        endpoints=tuple(reports),
+        connections=tuple(
+            _foreign_connection(each, spec, reports)
+            for each in (connections.own, *connections.named)
+        ),
+    )
+
+
+def _named(
+    report: EndpointReport, planned: PlannedEndpoint, connection: Connection
+) -> EndpointReport:
+    error = connection.warning if planned.enforce_dscp else ""
+    return dataclasses.replace(report, name=planned.name, unique=planned.unique, error=error)
+
+
+def _foreign_connection(
+    connection: Connection, spec: PlannedNode, reports: Iterable[EndpointReport]
+) -> ConnectionReport:
+    urls = connection.urls or (() if connection.name else spec.connections.urls)
+    on = [each for each in reports if each.mapped and each.connection == connection.name]
+    return ConnectionReport(
+        name=connection.name,
+        urls=urls,
+        node_name=connection.node_name,
+        established=all(each.matched for each in on if each.kind.is_topic),
+        mappings=tuple(each.kind.spell(each.name) for each in on if each.name),
     )
 
 
@@ -285,12 +304,12 @@ def _report(node: Node, mapping: Mapping) -> EndpointReport:
     witness = node if hidden is None else hidden.node
     report = _with_matches(report, witness, entity)
     return dataclasses.replace(
-        report, nfes=_nfes(endpoint.kind, entity, connection), dscp=_dscp(mapping)
+        report, nfes=_nfes(endpoint.kind, entity, connection), dscp=_dscp(connection)
     )
 
 
 def _undeclared_report(
-    node: Node, kind: EndpointKind, entity: Any, own: Connection | None = None
+    node: Node, kind: EndpointKind, entity: Any, connection: Connection | None = None
 ) -> EndpointReport:
     """Report an endpoint that no interface declares; it has no name but the one on the wire."""
     resolved = wire_name(entity)
@@ -298,11 +317,21 @@ def _undeclared_report(
     report = EndpointReport(
         kind=kind, name="", resolved=resolved, type=interface_name(interface), mapped=True
     )
-    if own is not None and kind in CLIENTS:
+    if connection is None:
+        connection = Connection(name="")
+    elif kind in CLIENTS:
         return dataclasses.replace(report, server_matched=is_server_matched(entity))
     if not kind.is_topic:
         return report
-    return dataclasses.replace(_with_matches(report, node, entity), nfes=_nfes(kind, entity, own))
+    hidden = connection.participant
+    report = _with_matches(report, node if hidden is None else hidden.node, entity)
+    return dataclasses.replace(
+        report,
+        nfes=_nfes(kind, entity, connection),
+        dscp=_dscp(connection),
+        connection=connection.name,
+        participant=connection.node_name,
+    )
 
 
 def _with_matches(report: EndpointReport, witness: Node, entity: Any) -> EndpointReport:
@@ -368,9 +397,9 @@ def _nfes(
     return nfes
 
 
-def _dscp(mapping: Mapping) -> int | None:
+def _dscp(connection: Connection | None) -> int | None:
     try:
-        return None if mapping.connection is None else mapping.connection.read_dscp()
+        return None if connection is None else connection.read_dscp()
     except MiddlewareError:
         return None  # likewise: sockets that cannot be read are "not read"
 

@@ -2,6 +2,7 @@ from .build import build_plan as build_plan
 from .build import check_plan as check_plan
 from .build import effective_domain as effective_domain
 from .build import effective_range as effective_range
+from .build import started_by_others as started_by_others
 from .build import with_files_of_now as with_files_of_now
 from .comparison import PlanDifference as PlanDifference
 from .comparison import PlanNotice as PlanNotice

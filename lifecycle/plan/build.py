@@ -13,7 +13,7 @@ import dataclasses
 import functools
 import hashlib
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 
 from lifecycle.errors import UsageError
 from lifecycle.manifest import (
@@ -35,6 +35,7 @@ from lifecycle.manifest import (
     ParticipantGroup,
     Position,
     ResolvedNeed,
+    Run,
     RunKind,
     SystemDeclaration,
     UniqueHow,
@@ -223,7 +224,12 @@ def _process(
     )
 
 
-def build_plan(manifest: Manifest, *, environment: Mapping[str, str] | None = None) -> Plan:
+def build_plan(
+    manifest: Manifest,
+    *,
+    environment: Mapping[str, str] | None = None,
+    domain_id: int | None = None,
+) -> Plan:
     """Plan a system: resolve every name, group processes, place publishers, order nodes.
 
     The same manifest and environment always give the same plan.
@@ -232,12 +238,16 @@ def build_plan(manifest: Manifest, *, environment: Mapping[str, str] | None = No
         manifest: valid, as `lifecycle.manifest.loading` returns it.
         environment: variables to read ROS_DOMAIN_ID, ROS_AUTOMATIC_DISCOVERY_RANGE,
             RMW_IMPLEMENTATION and AMENT_PREFIX_PATH from; None takes this process's own.
+        domain_id: 0–232, in the place of the manifest's; None leaves that.
 
     Raises:
         PlanError: the manifest cannot be planned here, for example an executable is missing.
         UsageError: ROS_DOMAIN_ID or ROS_AUTOMATIC_DISCOVERY_RANGE is needed and not legal.
     """
     variables = os.environ if environment is None else environment
+    if domain_id is not None:
+        discovery = dataclasses.replace(manifest.discovery, domain_id=domain_id)
+        manifest = dataclasses.replace(manifest, discovery=discovery)
     domain_id = effective_domain(manifest.discovery, variables)
     discovery_range = effective_range(manifest.discovery, variables)
     rmw = variables.get("RMW_IMPLEMENTATION", "") or DEFAULT_RMW
@@ -279,6 +289,47 @@ def with_files_of_now(plan: Plan) -> Plan:
         for node in plan.nodes
     )
     return dataclasses.replace(plan, nodes=nodes)
+
+
+def started_by_others(plan: Plan, names: Collection[str]) -> Plan:
+    """Return a plan that starts all but some nodes: it waits for those, as for attached ones.
+
+    Args:
+        plan: of the whole system.
+        names: keys or fully qualified names.
+
+    Raises:
+        UsageError: no such node, or another one of its process is not named.
+    """
+    chosen = set()
+    for name in names:
+        found = [each.key for each in plan.nodes if name in (each.key, each.full_name)]
+        if not found:
+            known = ", ".join(each.key for each in plan.nodes) or "none"
+            raise UsageError(f"cannot leave out node {name!r}; nodes of {plan.system}: {known}")
+        chosen.update(found)
+    for process in plan.processes:
+        left = chosen.intersection(process.nodes)
+        if left and len(left) < len(process.nodes):
+            others = ", ".join(each for each in process.nodes if each not in left)
+            raise UsageError(
+                f"cannot leave out {min(left)!r} alone: its process runs {others}, too",
+                hint="name all of them, or give it a process of its own in the manifest",
+            )
+    attached = Run(kind=RunKind.ATTACH)
+    return dataclasses.replace(
+        plan,
+        nodes=tuple(
+            dataclasses.replace(each, run=attached) if each.key in chosen else each
+            for each in plan.nodes
+        ),
+        processes=tuple(
+            dataclasses.replace(each, run=attached, argv=())
+            if chosen.issuperset(each.nodes)
+            else each
+            for each in plan.processes
+        ),
+    )
 
 
 def check_plan(

@@ -98,8 +98,8 @@ class ParameterFiles:
                 optional = given.optional and (name not in found or found[name].optional)
                 found[name] = given._replace(optional=optional)
         for name, value in node.parameters:
-            at = node.where(f"parameters.{name}")
-            found[name] = _Given(value, GIVEN, optional=False, at=at)
+            place = f"parameters.{name}"
+            found[name] = _Given(value, GIVEN, place in node.shared, node.where(place))
         return found
 
     def _file(self, path: str) -> _GivenFile:

@@ -168,6 +168,7 @@ class Sources:
     """
 
     def __init__(self, folders: Sequence[str]) -> None:
+        self._folders = tuple(folders)
         self._paths = [*folders, *(each for each in sys.path if each)]
         self._modules: dict[str, _Module] = {}
 
@@ -418,7 +419,8 @@ class Sources:
         file: Path | None = None
         for index in range(len(parts)):
             so_far = ".".join(parts[: index + 1])
-            file, inside = _find(so_far, parts[index], paths, top=index == 0)
+            first = self._folders if index == 0 else ()
+            file, inside = _find(so_far, parts[index], paths, first=first)
             if inside is None and index + 1 < len(parts):
                 raise NotThereError(
                     f"cannot import {name!r}: {so_far!r} is no package ({_shown(file)})"
@@ -430,9 +432,16 @@ class Sources:
 
 
 def _find(
-    name: str, part: str, paths: Sequence[str], *, top: bool
+    name: str, part: str, paths: Sequence[str], *, first: Sequence[str]
 ) -> tuple[Path | None, Sequence[str] | None]:
-    """Return a module's file and, of a package, where its modules are."""
+    """Return a module's file and, of a package, where its modules are.
+
+    Args:
+        name: of the module, in full.
+        part: its last part.
+        paths: where it is looked for.
+        first: those of them that are no installation, for a module of the top; empty for others.
+    """
     spaces = []
     for path in paths:
         base = Path(path) / part
@@ -449,8 +458,8 @@ def _find(
             spaces.append(str(base))
     if spaces:
         return None, spaces
-    if top:
-        return _by_finders(name)
+    if first:
+        return _by_finders(name, first)
     raise NotThereError(f"cannot find module {name!r}", hint=_looked_in(paths))
 
 
@@ -462,7 +471,7 @@ def _still(init: Path, name: str) -> None:
             raise UnknownError(f"{name} changes how its modules are found ({word})")
 
 
-def _by_finders(name: str) -> tuple[Path | None, Sequence[str] | None]:
+def _by_finders(name: str, first: Sequence[str]) -> tuple[Path | None, Sequence[str] | None]:
     """Ask what else finds modules here: built in, frozen, editable installations."""
     for finder in sys.meta_path:
         if finder is importlib.machinery.PathFinder:
@@ -483,7 +492,7 @@ def _by_finders(name: str) -> tuple[Path | None, Sequence[str] | None]:
         raise UnknownError(f"{name} may be in {archives[0]}")
     raise NotThereError(
         f"cannot find module {name!r}",
-        hint=f"it is looked for in {Path.cwd()} and in what is installed",
+        hint=f"it is looked for in {', '.join(first)} and in what is installed",
     )
 
 

@@ -19,14 +19,24 @@ import click
 
 from lifecycle.cli.common import format_option, manifest_arguments, parse_assignments, resolve
 from lifecycle.cli.report import (
+    annotation,
     report_format,
     report_option,
     write_report,
     written_or_said,
 )
 from lifecycle.codec import Count, to_json
-from lifecycle.errors import ExitCode, LifecycleError
-from lifecycle.manifest import Diagnostic, Manifest, ManifestError, Position, Severity, load
+from lifecycle.errors import ExitCode, LifecycleError, UsageError
+from lifecycle.manifest import (
+    ArgumentDeclaration,
+    Diagnostic,
+    Manifest,
+    ManifestError,
+    Position,
+    Severity,
+    declared_arguments,
+    load,
+)
 from lifecycle.plan import Resolution, UnresolvedProgram, check_plan, effective_domain
 from lifecycle.printable import json_text, lines
 
@@ -72,7 +82,7 @@ class CheckReport:
 
 
 def write_check(report: CheckReport, format_: str, *, strict: bool) -> str:
-    """Return a report as "text", "json", "sarif" or "junit".
+    """Return a report as "text", "json", "sarif", "junit" or "github" (text and annotations).
 
     Args:
         report: what was found.
@@ -86,6 +96,16 @@ def write_check(report: CheckReport, format_: str, *, strict: bool) -> str:
     if format_ == "junit":
         return _junit(report, strict=strict)
     lines = [*map(str, report.diagnostics), *map(str, report.unresolved), summary(report)]
+    if format_ == "github":
+        lines += [
+            annotation(
+                "error" if strict else each.severity.value,
+                each.rule,
+                f"{each.message}; {each.hint}" if each.hint else each.message,
+                at=f"{each.at.file}:{each.at.line}:{each.at.column}",
+            )
+            for each in report.diagnostics
+        ]
     return "\n".join(lines)
 
 
@@ -216,7 +236,7 @@ def _legal(text: str) -> str:
 
 @click.command()
 @manifest_arguments
-@format_option("text", "json", "sarif", "junit")
+@format_option("text", "json", "sarif", "junit", "github")
 @click.option(
     "--strict", is_flag=True, help="Let warnings and what could not be resolved fail it, too."
 )
@@ -226,6 +246,9 @@ def _legal(text: str) -> str:
     metavar="NAME",
     help="The machine that this host is; default: all whose address is this host's.",
 )
+@click.option(
+    "--arguments", "lists", is_flag=True, help="List the arguments that it takes, and end."
+)
 @report_option
 def command(
     *,
@@ -234,6 +257,7 @@ def command(
     format_: str,
     strict: bool,
     machine: str,
+    lists: bool,
     report: Path | None,
 ) -> int:
     """Check MANIFEST: schema, names, QoS compatibility, order, flows, and what its nodes run.
@@ -242,6 +266,8 @@ def command(
     `lifecycle up` would find them here. Needs no ROS. Exits with 0 if it can be used, with 3 if
     not; under --strict with 5 if all that is missing is something that could not be resolved.
     """
+    if lists:
+        return _list(manifest, format_, others=bool(assignments or strict or machine or report))
     try:
         found = check(manifest, assignments, strict=strict, machine=machine)
     except LifecycleError as error:
@@ -251,9 +277,34 @@ def command(
     unwritten = ExitCode.OK if report is None else _write(report, found, strict=strict)
     text = write_check(found, format_, strict=strict)
     # Names of files are anybody's.
-    shown = {"text": lines, "json": json_text, "sarif": json_text}.get(format_, str)
-    click.echo(shown(text))
+    shown = {"text": lines, "github": lines, "json": json_text, "sarif": json_text}
+
+    click.echo(shown.get(format_, str)(text))
     return found.exit_code(strict=strict) or unwritten
+
+
+def _list(path: str, format_: str, *, others: bool) -> int:
+    if others or format_ not in ("text", "json"):
+        raise UsageError(
+            "cannot use --arguments with anything but --format text or json",
+            hint=f"lifecycle check {path} --arguments",
+        )
+    found = declared_arguments(path)
+    if format_ == "json":
+        click.echo(json_text(to_json(found).decode()))
+    else:
+        text = "\n".join(map(_argument, found)) or f"{path} takes no arguments"
+        click.echo(lines(text))
+    return ExitCode.OK
+
+
+def _argument(each: ArgumentDeclaration) -> str:
+    """Return `rate:=10  frames per second; allowed: 5, 10`."""
+    value = "VALUE" if each.default is None else each.default
+    about = [each.description, "required" if each.default is None else ""]
+    about += [f"allowed: {', '.join(each.choices)}"] if each.choices else []
+    said = "; ".join(filter(None, about))
+    return f"{each.name}:={value}  {said}".rstrip()
 
 
 def _write(report: Path, found: CheckReport, *, strict: bool) -> ExitCode:

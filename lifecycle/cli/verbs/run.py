@@ -6,6 +6,7 @@ Owns: finding the node in the plan; a node that is not a Python class replaces t
 from __future__ import annotations
 
 import os
+from pathlib import Path
 from typing import NoReturn
 
 import click
@@ -72,17 +73,13 @@ def find_node(plan: Plan, name: str) -> PlannedNode:
 
 def _run_class(plan: Plan, planned: PlannedNode, arguments: list[str], *, lifecycle: str) -> int:
     # Late: everything before this works without ROS, and says what is wrong without it.
-    from lifecycle.node import LifecycleNode, load_class, run
+    from lifecycle.node import load_nodes, run
 
+    beside = str(Path(planned.at.file).absolute().parent)
     if planned.run.working_directory:
         os.chdir(planned.run.working_directory)
-    node_class = load_class(planned.run.python)
-    if not issubclass(node_class, LifecycleNode):
-        raise UsageError(
-            f"cannot run {planned.full_name}: {planned.run.python!r} is not a LifecycleNode"
-        )
     run(
-        node_class,
+        load_nodes(planned.run.python, (beside,)),
         lifecycle=lifecycle,
         spec=planned,
         domain_id=plan.domain_id,

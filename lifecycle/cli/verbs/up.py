@@ -65,6 +65,20 @@ if TYPE_CHECKING:
     is_flag=True,
     help="Say how long each stage of bring-up took, once it is over or has failed.",
 )
+@click.option(
+    "--except",
+    "without",
+    multiple=True,
+    metavar="NODE",
+    help="Do not start it, but wait for it: `lifecycle run MANIFEST NODE --manual`, in a debugger. "
+    "May be given several times.",
+)
+@click.option(
+    "--domain",
+    type=click.IntRange(0, 232),
+    metavar="ID",
+    help="The domain, in the place of the manifest's.",
+)
 @targets_option(
     "--program",
     "Program this network with the verified flows while active; may be given several times.",
@@ -83,6 +97,8 @@ def command(
     machine: str,
     keep_going: bool,
     timings: bool,
+    without: tuple[str, ...],
+    domain: int | None,
     targets: tuple[str, ...],
     mapping: str,
     flow_labels: bool,
@@ -109,10 +125,13 @@ def command(
             forerunner = Forerunner(without=_tokens(program))
             try:
                 from lifecycle.cli.up_output import output
-                from lifecycle.plan import build_plan
+                from lifecycle.plan import build_plan, started_by_others
                 from lifecycle.supervisor import Until, UpOptions, ended_early, up
 
-                plan = build_plan(load_manifest(manifest, assignments, machine=machine).manifest)
+                loaded = load_manifest(manifest, assignments, machine=machine)
+                plan = build_plan(loaded.manifest, domain_id=domain)
+                if without:
+                    plan = started_by_others(plan, without)
                 written.begin(plan)
                 options = UpOptions(
                     until=Until(until),

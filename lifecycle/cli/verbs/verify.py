@@ -15,7 +15,7 @@ from lifecycle.printable import lines
 
 @click.command("verify")
 @manifest_arguments
-@format_option("text", "json", "junit", "sarif")
+@format_option("text", "json", "junit", "sarif", "github")
 @timeout_option(5.0, "How long a graph that is not ok may still become so.")
 @click.option("--strict", is_flag=True, help="Exit 5 if anything could not be verified.")
 @report_option

@@ -18,7 +18,7 @@ from lifecycle.manifest.checks.system import (
     spell,
     usable_rules,
 )
-from lifecycle.manifest.diagnostics import Diagnostic, Position
+from lifecycle.manifest.diagnostics import Diagnostic, Position, Severity
 from lifecycle.manifest.model import EndpointKind, EndpointPolicy, Node
 from lifecycle.manifest.names import (
     RemapKind,
@@ -123,7 +123,13 @@ def check_remaps(system: DeclaredSystem) -> Iterator[Diagnostic]:
                 yield error("check.remap-rule", _place(node, match), rule.message, rule.hint)
             else:
                 rules.append((match, rule))
-        yield from _unused(node, rules)
+        shared = {node.where(each) for each in node.shared}
+        # A rule for many nodes is one for those that have the name.
+        yield from (
+            finding
+            for finding in _unused(node, rules)
+            if finding.severity is Severity.ERROR or finding.at not in shared
+        )
         yield from _collisions(node, resolved.get(node.key, []))
 
 

@@ -134,7 +134,7 @@ def _given(node: Node) -> Iterator[Diagnostic]:
                 yield error(
                     "check.parameter-type", at, message, suggestion(value, declaration.type)
                 )
-        elif declared and not is_implicit(name):
+        elif declared and not is_implicit(name) and f"parameters.{name}" not in node.shared:
             message = f"cannot set parameter {name!r}: the interface declares no such parameter"
             hint = did_you_mean(name, declared) or "declare it under 'interface.parameters'"
             yield error("check.parameter-undeclared", at, message, hint)
@@ -144,7 +144,8 @@ def _no_effect(node: Node) -> Iterator[Diagnostic]:
     """Warn of values that an attached node is judged by but never given."""
     if node.run.kind is not RunKind.ATTACH:
         return
-    places = [(f"parameters.{name}", "parameters") for name, _ in node.parameters[:1]]
+    own = [f"parameters.{name}" for name, _ in node.parameters]
+    places = [(place, "parameters") for place in own if place not in node.shared]
     places += [
         (f"parameter_files.{i}", "parameter files") for i in range(len(node.parameter_files))
     ]

@@ -1,30 +1,37 @@
-"""Launch-like arguments of a manifest and `$(arg …)`, `$(env …)` substitutions in its values.
+"""Launch-like arguments of a manifest, substitutions in its values, and `if:` and `unless:`.
 
-Owns: `$(arg NAME)`, `$(env NAME [DEFAULT])`, `$$(` for a literal `$(`, and where argument values
-are taken from: given as `name:=value`, else the default. A substitution never adds structure: its
-text is never parsed as YAML again, it only takes the type of a scalar where it is one whole
-unquoted value. Pure; the environment is injected.
+Owns: where argument values are taken from: given as `name:=value`, else the default; which nodes,
+includes and groups a document leaves out by their conditions, whose other substitutions are then
+not looked at; what a value becomes. What is inside `$(…)` is `substitutions`'. A substitution never
+adds structure: its text is never parsed as YAML again, it only takes the type of a scalar where it
+is one whole unquoted value.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.diagnostics import Diagnostic
 from lifecycle.manifest.schema import did_you_mean
 from lifecycle.manifest.yaml.document import Cursor, Document, Place, Scalar, Value, error
+from lifecycle.manifest.yaml.substitutions import (
+    NOWHERE,
+    Substitution,
+    Surroundings,
+    Text,
+    decide,
+    parse_text,
+    truth,
+)
 from lifecycle.manifest.yaml.yaml_parser import MAX_FINDINGS, quote, resolve
 
 MAX_TEXT = 1 << 20
 """Characters that the substitutions of one document may produce."""
 
-_PIECE = re.compile(r"\$(\$\()|\$\(([^()]*)(\)?)")
-_WORDS = re.compile(r"\s*(\S+)(?:\s+(\S+)(?:\s(.*))?)?\Z", re.DOTALL)
-_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
-_ALLOWED = "write $(arg NAME), $(env NAME) or $(env NAME DEFAULT); $$( is a literal $("
+CONDITIONS = ("if", "unless")
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,22 +40,28 @@ class Substituted:
 
     Attributes:
         arguments: (name, value) in the order of declaration.
-        broken: values that could not be substituted; they are reported in `diagnostics` and stay
-            in `document` as written.
+        broken: values that could not be substituted, and what has a condition that could not be
+            read; they are reported in `diagnostics` and stay in `document` as written.
+        left_out: nodes, includes and groups whose condition does not hold. Nodes are no longer in
+            `document`; the others are, as written, so that those after them keep their numbers.
+        outside: (line, column) of values that hold text of files that is not to be quoted.
     """
 
     document: Document
     arguments: tuple[tuple[str, str], ...]
     diagnostics: tuple[Diagnostic, ...]
     broken: tuple[Place, ...]
+    left_out: tuple[Place, ...] = ()
+    outside: frozenset[tuple[int, int]] = frozenset()
 
 
 def substitute(
     document: Document,
     given: Mapping[str, str],
-    environment: Mapping[str, str],
+    surroundings: Surroundings = NOWHERE,
     *,
     include: Cursor | None = None,
+    unquotable: Collection[str] = (),
 ) -> Substituted:
     """Resolve a document's arguments, then every substitution in its values.
 
@@ -56,22 +69,20 @@ def substitute(
         document: as read, not yet validated; what is malformed in `arguments:` is passed over, the
             schema reports it.
         given: values by argument name, from the command line or from an including manifest.
-        environment: what `$(env NAME)` sees.
+        surroundings: what substitutions read from outside.
         include: the entry of the including manifest that gives the values.
+        unquotable: arguments whose given value is text that is not to be quoted.
     """
-    work = _Substitution(document, environment, include)
+    work = _Substitution(document, surroundings, include)
+    work.unquotable = {*unquotable} & given.keys()
     work.resolve_arguments(given)
-    root = document.root
-    assert isinstance(root.data, Mapping)
-    data = {
-        key: value if key == "arguments" else work.value(value, (key,))
-        for key, value in root.data.items()
-    }
     return Substituted(
-        document=dataclasses.replace(document, root=dataclasses.replace(root, data=data)),
+        document=dataclasses.replace(document, root=work.system(document.root)),
         arguments=tuple(work.values.items()),
         diagnostics=tuple(work.found),
         broken=tuple(work.broken),
+        left_out=tuple(work.left_out),
+        outside=frozenset(work.outside),
     )
 
 
@@ -79,13 +90,17 @@ class _Substitution:
     """One run over one document."""
 
     def __init__(
-        self, document: Document, environment: Mapping[str, str], include: Cursor | None
+        self, document: Document, surroundings: Surroundings, include: Cursor | None
     ) -> None:
         self.values: dict[str, str] = {}
         self.found: list[Diagnostic] = []
         self.broken: list[Place] = []
+        self.left_out: list[Place] = []
+        self.outside: set[tuple[int, int]] = set()
+        self.unquotable: set[str] = set()  # arguments that hold text of files outside
+        self._reads_outside = False
         self._document = document
-        self._environment = environment
+        self._surroundings = surroundings
         self._include = include
         self._declared: tuple[str, ...] = ()
         self._settled: set[str] = set()
@@ -141,6 +156,8 @@ class _Substitution:
         if isinstance(default.data, (tuple, Mapping)) or default.data is None:
             return None
         resolved = self.value(default, (*place, "default"))
+        if (default.line, default.column) in self.outside:
+            self.unquotable.add(str(place[-1]))
         return None if (*place, "default") in self.broken else resolved.text
 
     def _check_choice(self, name: str, value: str, place: Place) -> None:
@@ -155,6 +172,76 @@ class _Substitution:
                 f"cannot set {name} to {quote(value)}; allowed: {', '.join(allowed)}",
                 did_you_mean(value, allowed),
             )
+
+    def system(self, value: Value, place: Place = ()) -> Value:
+        """Return a document's root, or a group, without the nodes that are left out."""
+        if not isinstance(value.data, Mapping):
+            return self.value(value, place)
+        data = dict(value.data)
+        for key, each in value.data.items():
+            inside = (*place, key)
+            if key == "nodes" and isinstance(each.data, Mapping):
+                data[key] = self._nodes(each, each.data, inside)
+            elif key in ("include", "groups") and isinstance(each.data, tuple):
+                items = tuple(
+                    self._item(item, (*inside, index)) for index, item in enumerate(each.data)
+                )
+                data[key] = dataclasses.replace(each, data=items)
+            elif key not in CONDITIONS and (place or key != "arguments"):
+                data[key] = self.value(each, inside)
+        return dataclasses.replace(value, data=data)
+
+    def _nodes(self, value: Value, nodes: Mapping[str, Value], place: Place) -> Value:
+        kept = {}
+        for key, node in nodes.items():
+            inside = (*place, key)
+            known = self._conditions(node, inside)
+            if known is None:
+                continue
+            kept[key] = node if inside in self.broken else self.value(known, inside)
+        return dataclasses.replace(value, data=kept)
+
+    def _item(self, value: Value, place: Place) -> Value:
+        known = self._conditions(value, place)
+        if known is None or place in self.broken:
+            return value
+        return self.system(known, place) if place[-2] == "groups" else self.value(known, place)
+
+    def _conditions(self, value: Value, place: Place) -> Value | None:
+        """Return what has `if:` or `unless:` with their values; None if it is left out.
+
+        Where one cannot be read it is `broken`.
+        """
+        if not isinstance(value.data, Mapping):
+            return value
+        written = [key for key in CONDITIONS if key in value.data]
+        known: dict[str, Value] = {}
+        for key in written:
+            inside = (*place, key)
+            each = self.value(value.data[key], inside)
+            holds = None if isinstance(each.data, (tuple, Mapping)) else truth(each.text)
+            if inside in self.broken:
+                self.broken[-1] = place
+                return value
+            if holds is None:
+                message = f"cannot use {key} {quote(each.plain())}; allowed: true, false, 1, 0"
+                hint = "write $(equals A B), $(not A), $(and A B) or $(or A B)"
+                self._break(inside, place, message, hint)
+                return value
+            known[key] = dataclasses.replace(each, data=holds)
+        if len(written) > 1:
+            message = "cannot use if and unless together"
+            hint = "write if: $(and A $(not B))"
+            self._break((*place, "unless"), place, message, hint)
+            return value
+        if known and known[written[0]].data is not (written[0] == "if"):
+            self.left_out.append(place)
+            return None
+        return dataclasses.replace(value, data={**value.data, **known}) if known else value
+
+    def _break(self, at: Place, place: Place, message: str, hint: str) -> None:
+        self._report("manifest.condition", at, message, hint)
+        self.broken.append(place)
 
     def value(self, value: Value, place: Place) -> Value:
         """Return `value` with every substitution inside it resolved."""
@@ -174,20 +261,25 @@ class _Substitution:
         return self._scalar(value, place)
 
     def _scalar(self, value: Value, place: Place) -> Value:
+        text, self._reads_outside = "", False
         try:
-            text = _PIECE.sub(lambda match: self._piece(match, place), value.text)
+            parts = parse_text(value.text)
+            text = self._text(parts, place)
             self._spend(text)
-            whole = _PIECE.fullmatch(value.text)
             data: Scalar = text
             # An empty string stays one, instead of becoming null.
-            if whole and not whole[1] and not value.quoted and text:
+            whole = len(parts) == 1 and isinstance(parts[0], Substitution)
+            if whole and not value.quoted and text:
                 data = resolve(text)
         except LifecycleError as problem:
             if problem.message:
                 self._report("manifest.substitution", place, problem.message, problem.hint)
         except ValueError as problem:
-            self._report("yaml.number", place, f"cannot use {quote(text)}: {problem}")
+            shown = "this" if self._reads_outside else quote(text)
+            self._report("yaml.number", place, f"cannot use {shown}: {problem}")
         else:
+            if self._reads_outside:
+                self.outside.add((value.line, value.column))
             return dataclasses.replace(value, data=data, text=text)
         self.broken.append(place)
         return value
@@ -201,39 +293,67 @@ class _Substitution:
             message = f"cannot substitute more than {MAX_TEXT} characters in one document"
             raise LifecycleError("" if exhausted else message)
 
-    def _piece(self, match: re.Match[str], place: Place) -> str:
+    def _text(self, parts: Text, place: Place) -> str:
+        return "".join(
+            each if isinstance(each, str) else self._substituted(each, place) for each in parts
+        )
+
+    def _substituted(self, each: Substitution, place: Place) -> str:
         """Return the text of one `$(…)`.
 
         Raises:
             LifecycleError: why there is none; without message where that is already reported.
         """
-        if match[1]:
-            return "$("
-        words = _WORDS.match(match[2].strip())
-        kind, name, default = words.groups() if words else (None, None, None)
-        if match[3] and name and _NAME.match(name):
-            if kind == "env":
-                return self._variable(name, default)
-            if kind == "arg" and default is None:
-                return self._argument(name, place)
-            if kind == "arg":
-                raise LifecycleError(
-                    f"cannot give a default in {quote(match[0])}",
-                    hint=f"declare it: arguments: {{{name}: {{default: …}}}}",
-                )
-        raise LifecycleError(f"cannot substitute {quote(match[0])}", hint=_ALLOWED)
-
-    def _variable(self, name: str, default: str | None) -> str:
-        found = self._environment.get(name, default)
-        if found is None:
-            raise LifecycleError(
-                f"cannot find the environment variable {name!r}",
-                hint=f"set it, or write $(env {name} DEFAULT)",
+        if each.kind == "arg":
+            return self._argument("".join(map(str, each.words[0])), place)
+        if each.kind == "env":
+            name, *default = each.words
+            return self._surroundings.variable(
+                "".join(map(str, name)),
+                (lambda: self._text(default[0], place)) if default else None,
             )
-        return found
+        if each.kind == "command" and each.is_one_quoted:
+            # $(command 'xacro $(arg model)'), as launch files have it, is several words.
+            words = self._words_of(each.words[0], place)
+        else:
+            words = [self._text(word, place) for word in each.words]
+        return self._of_words(each, words)
+
+    def _of_words(self, each: Substitution, words: list[str]) -> str:
+        if each.kind == "command":
+            return self._command(words, each.written)
+        if each.kind not in ("file", "find-pkg-share"):
+            return decide(each.kind, words, each.written)
+        if len(words) != 1:
+            message = f"cannot substitute {quote(each.written)}; it takes one word"
+            raise LifecycleError(message, hint="put a word that has spaces in quotes")
+        if each.kind == "find-pkg-share":
+            return self._surroundings.package_share(words[0])
+        text, is_outside = self._surroundings.file(words[0])
+        self._reads_outside |= is_outside
+        return text
+
+    def _words_of(self, parts: Text, place: Place) -> list[str]:
+        """Split text at its spaces; what a substitution in it becomes is never split."""
+        words = [""]
+        for each in parts:
+            if not isinstance(each, str):
+                words[-1] += self._substituted(each, place)
+                continue
+            first, *rest = re.split(r"\s+", each)
+            words[-1] += first
+            words += rest
+        return [each for each in words if each]
+
+    def _command(self, words: list[str], written: str) -> str:
+        if not words or not words[0]:
+            message = f"cannot substitute {quote(written)}; it names no program"
+            raise LifecycleError(message, hint="write $(command PROGRAM ARGUMENT …)")
+        return self._surroundings.programs.output(words, self._surroundings.folder)
 
     def _argument(self, name: str, place: Place) -> str:
         if name in self.values:
+            self._reads_outside |= name in self.unquotable
             return self.values[name]
         if name not in self._declared:
             declared = ", ".join(self._declared)

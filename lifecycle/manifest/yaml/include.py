@@ -109,7 +109,12 @@ def move(manifest: Manifest, *, prefix: str, namespace: str) -> Manifest:
         )
         for link in manifest.links
     )
-    return dataclasses.replace(manifest, nodes=tuple(new.values()), links=links)
+    return dataclasses.replace(
+        manifest,
+        nodes=tuple(new.values()),
+        links=links,
+        left_out=tuple(join_key(prefix, each) for each in manifest.left_out),
+    )
 
 
 def _move_node(node: Node, prefix: str, namespace: str) -> Node:
@@ -158,7 +163,9 @@ def _topic(node: Node, name: str) -> str:
         return ""
 
 
-def join(outer: Manifest, inner: Manifest, at: Position, found: Findings) -> Manifest:
+def join(
+    outer: Manifest, inner: Manifest, at: Position, found: Findings, *, what: str = "include"
+) -> Manifest:
     """Add an included manifest to the one that includes it.
 
     The discovery, network, data layer and policy of the including one hold.
@@ -168,6 +175,7 @@ def join(outer: Manifest, inner: Manifest, at: Position, found: Findings) -> Man
         inner: the included one, moved to its place.
         at: the include.
         found: findings are appended here.
+        what: what it came by, an include or a group.
     """
     nodes = {node.key: node for node in outer.nodes}
     for node in inner.nodes:
@@ -176,7 +184,8 @@ def join(outer: Manifest, inner: Manifest, at: Position, found: Findings) -> Man
             message = (
                 f"cannot include the node {quote(node.key)}: {_place(first.at)} declares it too"
             )
-            found.append(error("manifest.duplicate-node", at, message, "give the include a prefix"))
+            hint = f"give the {what} a prefix"
+            found.append(error("manifest.duplicate-node", at, message, hint))
     machines = {machine.name: machine for machine in outer.machines}
     for machine in inner.machines:
         _join_machine(machines.setdefault(machine.name, machine), machine, found)
@@ -185,6 +194,7 @@ def join(outer: Manifest, inner: Manifest, at: Position, found: Findings) -> Man
         nodes=tuple(nodes.values()),
         machines=tuple(machines.values()),
         links=(*outer.links, *inner.links),
+        left_out=(*outer.left_out, *inner.left_out),
     )
 
 

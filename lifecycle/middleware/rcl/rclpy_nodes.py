@@ -12,7 +12,7 @@ import contextlib
 import functools
 import sys
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
 from typing import Any, Protocol
 
 from lifecycle_msgs.msg import Transition
@@ -30,6 +30,10 @@ _FACTORIES = (
     ("create_service", EndpointKind.SERVICE_SERVER),
     ("create_client", EndpointKind.SERVICE_CLIENT),
 )
+_POSITIONAL = {
+    EndpointKind.PUBLISHER: ("msg_type", "topic", "qos_profile"),
+    EndpointKind.SUBSCRIPTION: ("msg_type", "topic", "callback", "qos_profile"),
+}
 _REMOVERS = ("destroy_publisher", "destroy_subscription", "destroy_service", "destroy_client")
 _ACTIONS = {
     ("rclpy.action.server", "ActionServer"): EndpointKind.ACTION_SERVER,
@@ -45,11 +49,23 @@ class NodeHooks(Protocol):
     ) -> contextlib.AbstractContextManager[tuple[str, dict[str, Any]]]:
         """Wrap rclpy's constructor; yields the name and keywords to construct with."""
 
+    def make_endpoint(self, node: Node, kind: EndpointKind, arguments: Mapping[str, Any]) -> Any:
+        """Make an endpoint that a factory was asked for; None has rclpy make it.
+
+        Args:
+            node: whose it is to be.
+            kind: publisher or subscription.
+            arguments: of the factory, by name.
+        """
+
     def endpoint_made(self, node: Node, kind: EndpointKind, entity: Any) -> None:
         """One of a node's factories, or an action's constructor, is about to return."""
 
     def endpoint_removed(self, node: Node, entity: Any) -> None:
         """An entity is about to be destroyed."""
+
+    def node_removed(self, node: Node) -> None:
+        """A node is about to be destroyed."""
 
 
 def follow_nodes(hooks: NodeHooks) -> None:
@@ -67,12 +83,27 @@ def follow_nodes(hooks: NodeHooks) -> None:
     for name in _REMOVERS:
         setattr(Node, name, _forgetting(getattr(Node, name), hooks))
     Node.add_waitable = _noting_actions(Node.add_waitable, hooks)
+    destroy = Node.destroy_node
+
+    @functools.wraps(destroy)
+    def destroy_node(self: Node) -> None:
+        hooks.node_removed(self)
+        destroy(self)
+
+    Node.destroy_node = destroy_node
 
 
 def _noting(make: Callable[..., Any], kind: EndpointKind, hooks: NodeHooks) -> Callable[..., Any]:
+    names = _POSITIONAL.get(kind)
+
     @functools.wraps(make)
     def create(self: Node, *arguments: Any, **options: Any) -> Any:
-        entity = make(self, *arguments, **options)
+        entity = None
+        if names is not None:
+            given = {**dict(zip(names, arguments, strict=False)), **options}
+            entity = hooks.make_endpoint(self, kind, given)
+        if entity is None:
+            entity = make(self, *arguments, **options)
         hooks.endpoint_made(self, kind, entity)
         return entity
 
@@ -239,6 +270,21 @@ class Watching:
         self._clients: list[Any] = []
         self._services: list[Any] = []
         self._Node__waitables: list[Any] = []
+
+    def take_services(self, node: Node, services: Collection[Any]) -> None:
+        """Serve what a node offers, whoever spins the node; destroy them before it."""
+        for each in services:
+            node._services.remove(each)  # noqa: SLF001 - what Node.destroy_service does
+            self._services.append(each)
+        self._wake()
+
+    def drop_services(self, services: Collection[Any]) -> None:
+        """Destroy what was taken; again is harmless."""
+        for each in services:
+            if each in self._services:
+                self._services.remove(each)
+                each.destroy()
+        self._wake()
 
     def add_waitable(self, waitable: Any) -> None:
         """Wait for it from now on."""

@@ -21,7 +21,7 @@ from rclpy.task import Future
 from rclpy.timer import Timer
 
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest import EndpointKind, EndpointPolicy
+from lifecycle.manifest import EndpointKind
 from lifecycle.node import configuration
 from lifecycle.node.author import parameters
 from lifecycle.node.author.declaring import DeclaredInCode
@@ -387,9 +387,8 @@ class Managed:
 
     def get_configuration(self) -> NodeConfiguration:
         """Return this node's identity and its endpoints as they are."""
-        undeclared: tuple[tuple[EndpointKind, Any], ...] = ()
-        if self.spec.endpoint_policy is EndpointPolicy.OPEN:
-            undeclared = self.undeclared.beside(self.data_layer.entities)
+        # Whatever the policy: what a node says of itself is known before discovery shows it.
+        undeclared = self.undeclared.beside(self.data_layer.entities)
         return configuration.collect(self._node, self.state, self.spec, self.data_layer, undeclared)
 
     # What the controller asks for (controller.Node).

@@ -321,6 +321,11 @@ CallbackReturn = Any
 """What a callback may return: rclpy's TransitionCallbackReturn, or None for SUCCESS."""
 
 
+def _any_signature(callback: Callable[..., CallbackReturn]) -> Callable[..., CallbackReturn]:
+    """Type a callback so that who overrides it may leave `state` out, or write `async def`."""
+    return callback
+
+
 class LifecycleNode(Declarations, LocalInterface, RclpyLifecycle, GatedFactories):
     """A ROS 2 managed node whose endpoints are declared, not scattered through its code.
 
@@ -507,32 +512,40 @@ class LifecycleNode(Declarations, LocalInterface, RclpyLifecycle, GatedFactories
 
     # Callbacks of the author.
 
+    @_any_signature
     def on_configure(self, state: LifecycleState) -> CallbackReturn:
         """Read parameters, take resources. Endpoints are declared but do not exist yet."""
         return self._call_managed("on_configure", state)
 
+    @_any_signature
     def on_connect(self, state: LifecycleState) -> CallbackReturn:
         """The data layer is made: endpoints exist, clients can be used, data does not flow."""
 
+    @_any_signature
     def on_activate(self, state: LifecycleState) -> CallbackReturn:
         """Start working; data flows once this has succeeded."""
         return self._call_managed("on_activate", state)
 
+    @_any_signature
     def on_deactivate(self, state: LifecycleState) -> CallbackReturn:
         """Stop working; data has stopped flowing already."""
         return self._call_managed("on_deactivate", state)
 
+    @_any_signature
     def on_disconnect(self, state: LifecycleState) -> CallbackReturn:
         """The data layer is about to be removed."""
 
+    @_any_signature
     def on_cleanup(self, state: LifecycleState) -> CallbackReturn:
         """Give back what on_configure took."""
         return self._call_managed("on_cleanup", state)
 
+    @_any_signature
     def on_shutdown(self, state: LifecycleState) -> CallbackReturn:
         """The last call, from any state; endpoints are removed after it."""
         return self._call_managed("on_shutdown", state)
 
+    @_any_signature
     def on_error(self, state: LifecycleState) -> CallbackReturn:
         """A callback ended in ERROR: SUCCESS says the node is as new, FAILURE finalizes it."""
         return self._call_managed("on_error", state)

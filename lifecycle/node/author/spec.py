@@ -29,7 +29,6 @@ from lifecycle.plan import PlannedNode
 
 if TYPE_CHECKING:
     from rclpy.context import Context
-    from rclpy.node import Node
 
 
 class Mode(enum.Enum):
@@ -206,15 +205,3 @@ def _look_in(folders: Iterable[str]) -> tuple[str, ...]:
         if each not in sys.path:
             sys.path.insert(0, each)
     return tuple(dict.fromkeys([str(Path.cwd()), *folders, *given]))
-
-
-def load_class(reference: str, folders: Iterable[str] = ()) -> type[Node]:
-    """Import `package.module:Class`, as `load_nodes`.
-
-    Raises:
-        BringUpError: likewise, or it is a function.
-    """
-    found = load_nodes(reference, folders)
-    if isinstance(found, type):
-        return found
-    raise BringUpError(f"cannot use {reference!r}: a class is needed, and it is a function")

@@ -15,14 +15,23 @@ from __future__ import annotations
 import collections
 import contextlib
 import inspect
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+import traceback
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NoReturn, Protocol
 
 from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.event_handler import (
+    EventHandler,
+    QoSPublisherEventType,
+    QoSSubscriptionEventType,
+)
 from rclpy.logging import LoggingSeverity
 from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
 from rclpy.serialization import serialize_message
 from rclpy.time_source import TimeSource
+from std_srvs.srv import Trigger
 
 from lifecycle.errors import BringUpError, LifecycleError
 from lifecycle.manifest import EndpointKind
@@ -31,8 +40,10 @@ from lifecycle.middleware import (
     RclpyStateMachine,
     ServerWatch,
     Watching,
+    create_subscription,
     is_rclpy_managed,
 )
+from lifecycle.network import UniqueRequirement
 from lifecycle.node import configuration
 from lifecycle.node.actions import resolve_action_name
 from lifecycle.node.author import parameters
@@ -40,20 +51,27 @@ from lifecycle.node.author.managed import HostedState, Managed, Undeclared
 from lifecycle.node.author.node import LifecycleNode
 from lifecycle.node.author.spec import Construction, Mode, constructing, ros_arguments
 from lifecycle.node.configuration import ConfigurationChanges
-from lifecycle.node.connections.connections import Connections
+from lifecycle.node.connections.connections import Connection, Connections
+from lifecycle.node.connections.data_layer import RemoteInterface
 from lifecycle.node.endpoints.mapping import MatchWatch
+from lifecycle.node.host.control import INTERFACE_ON_DEMAND
 from lifecycle.node.lifecycle.execution import SUCCESS, Result
 from lifecycle.node.lifecycle.gate import GatedPublisher, NodeGate
 from lifecycle.node.lifecycle.machine import CallbackOutcome, RefusedError
-from lifecycle.plan import PlannedNode
+from lifecycle.plan import PlannedEndpoint, PlannedNode
 from lifecycle.verify import NodeConfiguration
 
 if TYPE_CHECKING:
-    from rclpy.publisher import Publisher
+    from rclpy.callback_groups import CallbackGroup
 
     from lifecycle.node.lifecycle.gate import Later
 
 _STEADY = ("unconfigured", "inactive", "active", "finalized")
+_MATCHED = {
+    # Equal numbers of the two types compare equal.
+    EndpointKind.PUBLISHER: QoSPublisherEventType.RCL_PUBLISHER_MATCHED,
+    EndpointKind.SUBSCRIPTION: QoSSubscriptionEventType.RCL_SUBSCRIPTION_MATCHED,
+}
 _CONNECTED = ("inactive", "activating", "active", "deactivating")
 """Where a node of rclpy.lifecycle has its data layer, which it makes in on_configure."""
 
@@ -66,6 +84,53 @@ class Spinner(Protocol):
 
     def rest(self, node: Node) -> None:
         """Run no callback of a node that begins from now on."""
+
+    def call_soon(self, task: Callable[..., Any], *arguments: object) -> None:
+        """Run a function, sync or async, where callbacks of nodes run."""
+
+
+class SharedMatch:
+    """A matched event that a node's own code handles, and its host needs.
+
+    rmw counts the changes for one handler: two in different executors take them from each other.
+
+    Args:
+        node: whose it is.
+        event: its own handler.
+        group: that the host's executor runs it in.
+        watching: has it from now on.
+        changed: called for each event.
+        forward: has the node's callback called with the status.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        event: EventHandler,
+        group: CallbackGroup,
+        watching: Watching,
+        *,
+        changed: Callable[[], None],
+        forward: Callable[[Callable[[Any], Any], Any], None],
+    ) -> None:
+        self._node = node
+        self._event = event
+        self._watching = watching
+        callback = event.callback
+
+        def handle(status: Any) -> None:
+            changed()
+            forward(callback, status)
+
+        node.remove_waitable(event)
+        event.callback = handle
+        event.callback_group = group
+        watching.add_waitable(event)
+
+    def stop(self) -> None:
+        """Wait for it no more: its endpoint is about to be destroyed, by its node."""
+        self._watching.remove_waitable(self._event)
+        self._node.add_waitable(self._event)
 
 
 class HeldPublisher(GatedPublisher):
@@ -100,6 +165,30 @@ class HeldPublisher(GatedPublisher):
             )
 
 
+class Immovable:
+    """The node interface of a node that has none.
+
+    Args:
+        node: fully qualified name.
+    """
+
+    def __init__(self, node: str) -> None:
+        self._node = node
+
+    def map_to(self, endpoint: str, connection: str) -> NoReturn:
+        """Raise: its own code makes its endpoints.
+
+        Raises:
+            LifecycleError: always.
+        """
+        del endpoint, connection
+        raise LifecycleError(
+            f"cannot move the endpoints of {self._node}: its class is not a "
+            "lifecycle.LifecycleNode, and makes them itself",
+            hint="subclass lifecycle.LifecycleNode, or write data_layer.authority: nodes",
+        )
+
+
 class ForeignNode:
     """One hosted node of which the class is not ours; it offers the host what `Managed` does.
 
@@ -114,9 +203,6 @@ class ForeignNode:
     Attributes:
         configuration_changes: notifies of each change of its configuration.
     """
-
-    is_marked = False
-    """No endpoint has a participant of its own."""
 
     def __init__(
         self,
@@ -135,10 +221,14 @@ class ForeignNode:
         self._watching = watching
         self._group = ReentrantCallbackGroup()
         self._gate = NodeGate()
-        self._watches: dict[int, MatchWatch | ServerWatch] = {}
+        self._watches: dict[int, MatchWatch | SharedMatch | ServerWatch] = {}
+        self._unspun: dict[Callable[[Any], Any], Any] = {}
         self._connections = Connections(node)
+        self._apart: dict[int, Connection] = {}  # by id of what is not on the node's participant
         self._listeners: list[Callable[[Any], None]] = []
         self._let_through = not supervisor
+        self._is_spun = False
+        self._is_ours = False
         self._machine: RclpyStateMachine | None = None
         self.configuration_changes = ConfigurationChanges(
             later, self.get_configuration, failed=node.get_logger().error
@@ -147,6 +237,33 @@ class ForeignNode:
         node.add_post_set_parameters_callback(lambda _: self.configuration_changes.touch())
         if self._let_through:
             self._gate.open()
+        self._services = self._serve()
+
+    def _serve(self) -> tuple[Any, ...]:
+        """Offer what others know our nodes by; the host answers, also while the node is held."""
+        before = set(self._node.services)
+        self._is_ours = True
+        Node.create_service(
+            self._node, Trigger, "~/get_configuration", self._describe, callback_group=self._group
+        )
+        immovable: Any = Immovable(self.full_name)
+        remote = RemoteInterface(
+            self._node, immovable, log=self._node.get_logger().error, group=self._group
+        )
+        remote.serve(but=INTERFACE_ON_DEMAND)
+        self._is_ours = False
+        services = tuple(each for each in self._node.services if each not in before)
+        self._watching.take_services(self._node, services)
+        return services
+
+    def _describe(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        try:
+            response.message = configuration.to_json(self.get_configuration())
+            response.success = True
+        except Exception as error:  # noqa: BLE001 - asking must not end the node
+            self.complain(traceback.format_exc())
+            response.message = f"cannot describe this node: {error!r}"
+        return response
 
     @property
     def full_name(self) -> str:
@@ -179,6 +296,8 @@ class ForeignNode:
 
     def made(self, kind: EndpointKind, entity: Any) -> None:
         """Note an endpoint, hold it if it publishes, and watch who is matched with it."""
+        if self._is_ours:
+            return
         callback = getattr(entity, "callback", None) if kind is EndpointKind.SUBSCRIPTION else None
         if isinstance(getattr(callback, "__self__", None), TimeSource):
             return  # /clock belongs to rclpy
@@ -189,14 +308,105 @@ class ForeignNode:
         touch = self.configuration_changes.touch
         if kind.is_topic:
             # In the host's executor: the node's own need not run.
-            sink: Any = self._watching
-            self._watches[id(entity)] = MatchWatch(sink, entity, self._group, lambda _: touch())
+            self._watches[id(entity)] = self._match_watch(kind, entity)
         elif kind in (EndpointKind.SERVICE_CLIENT, EndpointKind.ACTION_CLIENT):
             self._watches[id(entity)] = ServerWatch(self._node, entity, touch)
         self._made.add(kind, entity)
 
+    def _match_watch(self, kind: EndpointKind, entity: Any) -> MatchWatch | SharedMatch:
+        touch = self.configuration_changes.touch
+        for event in entity.event_handlers:
+            if event.event_type == _MATCHED[kind]:
+                return SharedMatch(
+                    self._node,
+                    event,
+                    self._group,
+                    self._watching,
+                    changed=touch,
+                    forward=self._forward,
+                )
+        sink: Any = self._watching
+        return MatchWatch(sink, entity, self._group, lambda _: touch())
+
+    def _forward(self, callback: Callable[[Any], Any], status: Any) -> None:
+        """Have a callback of its own called; while it is not spun, the last time once it is."""
+        if self._is_spun:
+            self._spinner.call_soon(callback, status)
+        else:
+            self._unspun[callback] = status
+
+    def _spin(self) -> None:
+        self._is_spun = True
+        self._spinner.spin(self._node)
+        for callback, status in self._unspun.items():
+            self._spinner.call_soon(callback, status)
+        self._unspun.clear()
+
+    def make(self, kind: EndpointKind, given: Mapping[str, Any]) -> Any:
+        """Make a planned endpoint with a flow of its own, as its factory was asked for it.
+
+        Returns:
+            None for what rclpy is to make.
+
+        Raises:
+            LifecycleError: its participant or its flow cannot be made.
+        """
+        planned = self._planned(kind, given.get("topic"))
+        if planned is None or given.get("qos_overriding_options") is not None:
+            return None
+        carrier = next(
+            (each for each in self._spec.participants if each.name == planned.participant), None
+        )
+        qos = given["qos_profile"]
+        options: dict[str, Any] = {
+            "callback_group": given.get("callback_group"),
+            "event_callbacks": given.get("event_callbacks"),
+        }
+        if kind is EndpointKind.SUBSCRIPTION:
+            options |= {"unique": planned.unique, "raw": given.get("raw", False)}
+        elif "publisher_class" in given:
+            options["publisher_class"] = given["publisher_class"]
+        profile = QoSProfile(depth=qos) if isinstance(qos, int) else qos
+        called: tuple[Any, ...] = (profile,)
+        if kind is EndpointKind.SUBSCRIPTION:
+            called = (given["callback"], profile)
+        if carrier is None:
+            if kind is EndpointKind.PUBLISHER:
+                return None  # no RMW makes one unique on a participant that others use
+            make: Callable[..., Any] = create_subscription
+            return make(self._node, given["msg_type"], given["topic"], *called, **options)
+        connection = self._connections.carrier(carrier)
+        assert connection.participant is not None
+        make = connection.participant.create_publisher
+        if kind is EndpointKind.SUBSCRIPTION:
+            make = connection.participant.create_subscription
+        entity = make(given["msg_type"], planned.resolved, *called, **options)
+        self._apart[id(entity)] = connection
+        for event in entity.event_handlers:
+            self._node.add_waitable(event)
+        return entity
+
+    def _planned(self, kind: EndpointKind, topic: object) -> PlannedEndpoint | None:
+        """Return what is planned of an endpoint, if it is more than rclpy does."""
+        wanted = [
+            each
+            for each in self._spec.endpoints
+            if each.kind is kind
+            and (each.participant or each.unique is not UniqueRequirement.NOT_REQUIRED)
+        ]
+        if not wanted or not isinstance(topic, str):
+            return None
+        resolved = self._node.resolve_topic_name(topic)
+        return next((each for each in wanted if each.resolved == resolved), None)
+
     def removed(self, entity: Any) -> None:
         """Forget an endpoint that is about to be destroyed."""
+        connection = self._apart.pop(id(entity), None)
+        if connection is not None and connection.participant is not None:
+            for event in entity.event_handlers:
+                self._node.remove_waitable(event)
+            if isinstance(entity, Publisher):
+                connection.participant.destroy_endpoint(entity)
         watch = self._watches.pop(id(entity), None)
         if watch is not None:
             watch.stop()
@@ -210,7 +420,7 @@ class ForeignNode:
         if self._spec.managed and is_rclpy_managed(self._node):
             self._machine = RclpyStateMachine(self._node, self)
         if self._machine is not None or self._let_through:
-            self._spinner.spin(self._node)
+            self._spin()
 
     # What its host asks of it.
 
@@ -224,9 +434,25 @@ class ForeignNode:
             reported.label,
             connected=reported.connected,
             spec=self._spec,
-            own=self._connections.own,
-            endpoints=self._made.beside(()),
+            connections=self._connections,
+            endpoints=(
+                (kind, entity, self._apart.get(id(entity), self._connections.own))
+                for kind, entity in self._made.beside(())
+            ),
         )
+
+    @property
+    def is_marked(self) -> bool:
+        """Whether the plan says what DSCP any of its endpoints sends with."""
+        return any(each.dscp is not None for each in self._spec.endpoints)
+
+    def close(self) -> None:
+        """Take its further participants away: it is being destroyed."""
+        for watch in self._watches.values():
+            watch.stop()
+        self._watches.clear()
+        self._watching.drop_services(self._services)
+        self._connections.close_all()
 
     def serve_interface(self) -> None:
         """Do nothing: it has no node interface."""
@@ -238,11 +464,7 @@ class ForeignNode:
         Raises:
             LifecycleError: always.
         """
-        raise LifecycleError(
-            f"cannot move the endpoints of {self.full_name}: its class is not a "
-            "lifecycle.LifecycleNode, and makes them itself",
-            hint="subclass lifecycle.LifecycleNode, or write data_layer.authority: nodes",
-        )
+        Immovable(self.full_name).map_to("", "")
 
     async def change_for_supervisor(self, operation: str) -> Result:
         """Do what the supervisor asked for; its activate is the gate's permit.
@@ -298,12 +520,13 @@ class ForeignNode:
         self._let_through = True
         self._gate.open()
         if self._machine is None:
-            self._spinner.spin(self._node)
+            self._spin()
 
     def _hold(self) -> None:
         self._let_through = False
         self._gate.close()
         if self._machine is None:
+            self._is_spun = False
             self._spinner.rest(self._node)
 
     def _transition(self, operation: str) -> Result:
@@ -385,7 +608,7 @@ class Adoption:
         self._current = planned
         try:
             with constructing(self):
-                returned = what(**_keywords(planned, what))
+                returned = what(**keywords(planned, what))
         finally:
             self._waiting, self._current = [], None
         self._check(planned, what, returned)
@@ -458,6 +681,17 @@ class Adoption:
             self._foreign[id(node)] = foreign
         self.made[planned.key] = (node, foreign)
 
+    def make_endpoint(self, node: Node, kind: EndpointKind, arguments: Mapping[str, Any]) -> Any:
+        """Make an endpoint that is planned otherwise than rclpy would make it; else None."""
+        foreign = self._foreign.get(id(node))
+        return None if foreign is None else foreign.make(kind, arguments)
+
+    def node_removed(self, node: Node) -> None:
+        """A node is about to be destroyed."""
+        foreign = self._foreign.pop(id(node), None)
+        if foreign is not None:
+            foreign.close()
+
     def endpoint_made(self, node: Node, kind: EndpointKind, entity: Any) -> None:
         """An endpoint of a node exists now."""
         foreign = self._foreign.get(id(node))
@@ -508,7 +742,7 @@ def refuse_unmanaged(planned: PlannedNode, node_class: type) -> None:
         )
 
 
-def _keywords(planned: PlannedNode, what: Callable[..., Any]) -> dict[str, Any]:
+def keywords(planned: PlannedNode, what: Callable[..., Any]) -> dict[str, Any]:
     """Return what a class or function is called with; one that needs a `node_name` gets it."""
     keywords = {
         name: list(value) if isinstance(value, tuple) else value

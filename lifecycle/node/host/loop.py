@@ -251,7 +251,7 @@ class NodeLoop:
         while not self._done:
             try:
                 self._turn()
-            except Exception as error:  # noqa: BLE001, PERF203 - the user's code: reported
+            except (Exception, SystemExit) as error:  # noqa: BLE001, PERF203 - the user's code
                 self._failed(error)
         if self._own is not self._executor:
             self._own.shutdown(_LEAVE_S)
@@ -282,10 +282,20 @@ class NodeLoop:
                 self._own.spin_once(_SPIN_S)
             except (ShutdownException, ExternalShutdownException):  # noqa: PERF203
                 return
-            except Exception as error:  # noqa: BLE001 - the user's code: reported
+            except (Exception, SystemExit) as error:  # noqa: BLE001 - the user's code: reported
                 self._failed(error)
+                if not self._context.ok():
+                    return
 
-    def _failed(self, error: Exception) -> None:
+    def _failed(self, error: Exception | SystemExit) -> None:
+        if not self._context.ok():
+            sys.stderr.write("rclpy was shut down by a node's own code: its process ends\n")
+            self._done = True  # no transition can be run without it
+            return
+        if isinstance(error, SystemExit):
+            code = error.code if isinstance(error.code, int) else int(error.code is not None)
+            self.stop("a callback raised SystemExit", code=code)
+            return
         traceback.print_exception(error)
         if todo := hint(error):
             sys.stderr.write(f"{todo}\n")

@@ -20,27 +20,33 @@ import sys
 import threading
 import traceback
 import typing
-from collections.abc import Callable
-from typing import NoReturn
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import rclpy
 from rclpy.signals import SignalHandlerOptions
 
 from lifecycle.errors import ExitCode
-from lifecycle.manifest import Timeouts
+from lifecycle.manifest import Run, RunKind, Timeouts
 from lifecycle.middleware import (
     AlivePublisher,
     BusySign,
     Overdue,
     ParticipantSettings,
+    follow_nodes,
     node_topic,
     participant_settings,
 )
 from lifecycle.node.author.node import LifecycleNode
 from lifecycle.node.author.spec import Construction, Mode, constructing, parse_mode
+from lifecycle.node.host.foreign import Adoption, ForeignNode, Hosted, keywords
 from lifecycle.node.host.loop import NodeLoop, Watchdog, on_signal
 from lifecycle.node.lifecycle.machine import CallbackOutcome
 from lifecycle.plan import PlannedNode
+
+if TYPE_CHECKING:
+    from rclpy.context import Context
+    from rclpy.node import Node
 
 _REPEATED_AFTER_S = (0.1, 0.3)
 """Fast DDS repeats what was lost after up to 3 s: too late for a silence."""
@@ -107,7 +113,7 @@ class OwnLiveliness:
 
 
 def run(
-    node_class: type[LifecycleNode],
+    node_class: Callable[..., Any],
     *,
     lifecycle: str | None = None,
     spec: PlannedNode | None = None,
@@ -123,7 +129,8 @@ def run(
         ...     lifecycle.run(Talker, lifecycle="auto")
 
     Args:
-        node_class: constructed without arguments.
+        node_class: of a LifecycleNode, constructed with what `spec` gives it. With a `spec` any
+            class of rclpy nodes will do, or a function that returns one.
         lifecycle: "auto" brings the node up, "manual" leaves that to others; None leaves it to
             what the class's constructor says.
         spec: the node's part of a plan; None for a node that declares its endpoints in code.
@@ -145,33 +152,83 @@ def run(
     )
     context = rclpy.get_default_context()
     liveliness = OwnLiveliness((spec.timeouts if spec is not None else Timeouts()).silent_s)
-    loop = NodeLoop(context, liveliness.watchdog)
+    planned = Run(kind=RunKind.PYTHON) if spec is None else spec.run
+    loop = NodeLoop(
+        context, liveliness.watchdog, executor=planned.executor, threads=planned.threads
+    )
     with on_signal(lambda number: _on_signal(number, loop, report, interrupted)):
+        if spec is not None and not _is_ours(node_class):
+            _adopt(node_class, spec, loop, context=context, report=report, mode=mode)
+            loop.spin_and_exit()
         construction = Construction(
             spec=spec, mode=mode, context=context, use_global_arguments=True
         )
         with constructing(construction), participant_settings(context, _settings(spec)):
-            node = node_class()
+            node: LifecycleNode = node_class(**({} if spec is None else keywords(spec, node_class)))
         loop.add(node, node.lifecycle)
         liveliness.open(node, loop.tell_names)
         node.lifecycle.add_listener(lambda _: report(f"{_name(node)}: {_state(node)}"))
         report(f"{_name(node)}: {_state(node)}")
         if node.lifecycle.mode is Mode.AUTO:
-            loop.call_soon(_bring_up, node, loop, report)
+            loop.call_soon(_bring_up, node.lifecycle, loop, report)
         loop.spin_and_exit()
     raise AssertionError("spin_and_exit returned")
 
 
-async def _bring_up(node: LifecycleNode, loop: NodeLoop, report: Callable[[str], None]) -> None:
+def _is_ours(node_class: Callable[..., Any]) -> bool:
+    return isinstance(node_class, type) and issubclass(node_class, LifecycleNode)
+
+
+def _adopt(
+    maker: Callable[..., Any],
+    spec: PlannedNode,
+    loop: NodeLoop,
+    *,
+    context: Context,
+    report: Callable[[str], None],
+    mode: Mode | None,
+) -> None:
+    """Make a node of others as planned; nothing holds it but its own states."""
+
+    @contextlib.contextmanager
+    def carrying(planned: PlannedNode) -> Iterator[Context]:
+        with participant_settings(context, _settings(planned)):
+            yield context
+
+    def host(node: Node, planned: PlannedNode) -> ForeignNode:
+        return ForeignNode(
+            node,
+            planned,
+            supervisor="",
+            spinner=loop,
+            later=loop.call_beside,
+            watching=loop.watching,
+        )
+
+    adoption = Adoption(carrying, host, mode=mode, use_global_arguments=True)
+    follow_nodes(adoption)
+    adoption.make(spec, [spec], maker)
+    node, foreign = adoption.made[spec.key]
+    hosted: Hosted = foreign or node.lifecycle
+    loop.add(node, hosted)
+    name = hosted.full_name
+    hosted.add_listener(lambda _: report(f"{name}: {hosted.reported.label}"))
+    report(f"{name}: {hosted.reported.label or 'running'}")
+    if mode is Mode.AUTO and spec.managed:
+        loop.call_soon(_bring_up, hosted, loop, report)
+
+
+async def _bring_up(hosted: Hosted, loop: NodeLoop, report: Callable[[str], None]) -> None:
+    name = hosted.full_name
     try:
-        result = await node.lifecycle.bring_up()
+        result = await hosted.bring_up()
     except Exception as error:  # noqa: BLE001 - shown, then the process ends
         traceback.print_exc()
-        report(f"cannot bring up {_name(node)}: {error}")
+        report(f"cannot bring up {name}: {error}")
     else:
         if result.outcome is CallbackOutcome.SUCCESS:
             return
-        report(f"cannot bring up {_name(node)}: {result.error}")
+        report(f"cannot bring up {name}: {result.error}")
     loop.stop("a failed bring-up", code=ExitCode.BRING_UP_FAILED)
 
 

@@ -91,6 +91,10 @@ class ForkServerProcess:
             self.popen.wait()
 
 
+_OF_SERVICE_MANAGER = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
+"""The supervisor's own, run/service_manager.py: a node that has them could report in its place."""
+
+
 class Forerunner:
     """A fork server that is started before the manifest is read, to import while we do.
 
@@ -104,7 +108,8 @@ class Forerunner:
 
     def __init__(self, *, preload: bool = True, without: Collection[str] = ()) -> None:
         self.run_id = new_run_id()
-        environment = {name: text for name, text in os.environ.items() if name not in without}
+        hidden = {*without, *_OF_SERVICE_MANAGER}
+        environment = {name: text for name, text in os.environ.items() if name not in hidden}
         self.process = ForkServerProcess(
             preload=preload, environment={**environment, RUN_VARIABLE: self.run_id}
         )

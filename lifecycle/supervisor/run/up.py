@@ -52,6 +52,7 @@ from lifecycle.supervisor.run.options import (
     own_machines,
 )
 from lifecycle.supervisor.run.records import Records, noting
+from lifecycle.supervisor.run.service_manager import ServiceManager
 from lifecycle.supervisor.run.session import Session
 from lifecycle.supervisor.run.signals import Ending
 from lifecycle.verify import NOT_JUDGED
@@ -161,9 +162,8 @@ def _up(
 ) -> UpResult:
     """Do what `up` says, where a signal is only noted."""
     processes = local_processes(plan, options.machine)
-    emit = Emitter()
-    for listener in listeners:
-        emit.listen(listener)
+    service = ServiceManager.of(os.environ)
+    emit = _emitter((*listeners, service.on_event))
     forerunner = _preloading(forerunner, plan, options, processes)
     try:
         directory = RunDirectory.acquire(
@@ -187,6 +187,7 @@ def _up(
 
         async def run(leaving: contextlib.AsyncExitStack) -> UpResult:
             nonlocal records
+            leaving.callback(service.watch())
             logs = log_directory(os.environ, plan.system)
             system = System(
                 plan,
@@ -238,6 +239,13 @@ def _up(
         forerunner.close()
         _sweep(records)
         directory.release()
+
+
+def _emitter(listeners: Iterable[Listener]) -> Emitter:
+    emit = Emitter()
+    for listener in listeners:
+        emit.listen(listener)
+    return emit
 
 
 async def _leaving_last(

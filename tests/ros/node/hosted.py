@@ -6,6 +6,8 @@ import sys
 import time
 from typing import Any
 
+import rclpy
+from rclpy.lifecycle import LifecycleNode as RclpyLifecycleNode
 from rclpy.node import Node
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -81,3 +83,38 @@ class Plain(Node):
 
 
 NOT_A_CLASS = 1
+
+
+class Ending(Node):
+    """Shuts rclpy down, as scripts do once they have what they want."""
+
+    def __init__(self) -> None:
+        super().__init__("ending")
+        self.create_timer(0.01, rclpy.shutdown)
+
+
+def nothing() -> None:
+    """Make a node and return nothing."""
+    Plain()
+
+
+def two() -> list[Node]:
+    """Return two nodes."""
+    return [Node("first"), Node("second")]
+
+
+class WithHelper(Node):
+    """Makes a second node in its constructor."""
+
+    def __init__(self, node_name: str) -> None:
+        super().__init__(node_name)
+        self.helper = Node("helper")
+        self.helper.create_publisher(String, "out", 3)
+
+
+class Theirs(RclpyLifecycleNode):
+    """A managed node of rclpy's own."""
+
+    def __init__(self) -> None:
+        super().__init__("theirs")
+        self.create_publisher(String, "out", 1)

@@ -18,7 +18,7 @@ from planning import publisher, subscription
 from std_msgs.msg import String
 
 from lifecycle import codec
-from lifecycle.manifest.model import DiscoveryRange, Timeouts
+from lifecycle.manifest.model import DiscoveryRange, Executor, Run, RunKind, Timeouts
 from lifecycle.node.host.control import Command, Event, HostSpec, Operation
 
 HERE = Path(__file__).parent
@@ -304,3 +304,100 @@ def test_what_hosts_are_forked_from_imports_only_what_every_node_needs() -> None
         modules.split()
     )
     assert also == "True"
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        (
+            "nothing",
+            (
+                "cannot use 'hosted:nothing': it returns None and must return its nodes; it must "
+                "neither spin nor destroy them: the host does"
+            ),
+        ),
+        (
+            "two",
+            (
+                "cannot host /second, which 'hosted:two' returns: no node is declared for it "
+                "beside /one; add a node of that name with the same `run:` and `process: one`"
+            ),
+        ),
+    ],
+)
+def test_a_function_returns_exactly_the_nodes_that_are_declared(
+    start: Start, name: str, reason: str
+) -> None:
+    host = start(hosted("one", name, managed=False))
+    assert host.read() == Event(kind="failed", node="/one", ok=False, error=reason)
+    assert host.wait() == 1
+
+
+def test_a_node_that_shuts_rclpy_down_ends_its_process_well(start: Start) -> None:
+    host = start(hosted("one", "Ending", managed=False))
+    host.until("ready")
+    host.ask("/one", ACTIVATE)
+    assert host.wait() == 0
+    assert "rclpy was shut down by a node's own code" in host.log.read_text()
+
+
+def test_a_node_that_another_makes_is_hosted_where_it_is_declared(start: Start) -> None:
+    out = dataclasses.replace(publisher("out"), resolved="/there/out")
+    host = start(
+        hosted("main", "WithHelper", managed=False),
+        hosted("helper", "WithHelper", out, managed=False, namespace="/there"),
+    )
+    told = host.do("/there/helper", Operation.GET_CONFIGURATION).configuration
+    assert told is not None
+    (report,) = told.endpoints
+    assert (report.name, report.resolved, report.mapped) == ("out", "/there/out", True)
+    assert report.qos is not None
+    assert report.qos.depth == 3
+    assert host.do("/main", ACTIVATE).ok
+
+
+def test_a_node_of_rclpy_lifecycle_is_activated_by_its_supervisor_alone(
+    start: Start, fresh_domain: int
+) -> None:
+    host = start(hosted("one", "Theirs", publisher("out")))
+    with driver_in(fresh_domain) as driver:
+        host.until("ready")
+        # What rclpy itself answers with an exception that ends the process.
+        assert not driver.change("/one", label="deactivate")
+        assert driver.set("/one", "configure")
+        assert not driver.set("/one", "activate")
+        assert driver.state("/one") == (2, "inactive")
+        active = host.do("/one", ACTIVATE)
+        assert (active.ok, active.state, active.connected) == (True, "active", True)
+        assert driver.set("/one", "deactivate")
+        assert driver.set("/one", "activate")  # once let through, by any client
+        assert driver.set("/one", "deactivate")
+        assert driver.set("/one", "cleanup")
+        assert driver.set("/one", "configure")
+        assert not driver.set("/one", "activate")
+    host.hang_up()
+    assert host.wait() == 0
+    assert "cannot take transition number 3 in state 'inactive': the gate" in host.log.read_text()
+
+
+@pytest.mark.parametrize("executor", [Executor.MULTI, Executor.EVENTS])
+def test_nodes_of_every_kind_share_an_executor_with_threads_of_its_own(
+    start: Start, executor: Executor
+) -> None:
+    def run(name: str) -> Run:
+        return Run(kind=RunKind.PYTHON, python=f"hosted:{name}", executor=executor)
+
+    host = start(
+        hosted("ours", "Echo", publisher("out"), subscription("in"), run=run("Echo")),
+        hosted("theirs", "Theirs", publisher("out"), run=run("Theirs")),
+        hosted("plain", "WithHelper", managed=False, run=run("WithHelper")),
+    )
+    host.until("ready")
+    for each in (CONFIGURE, CONNECT, ACTIVATE, Operation.DEACTIVATE, ACTIVATE):
+        assert host.do("/ours", each).ok
+        assert host.do("/theirs", each).ok
+    for each in (ACTIVATE, Operation.DEACTIVATE, ACTIVATE):
+        assert host.do("/plain", each).ok
+    host.hang_up()
+    assert host.wait() == 0
+    assert "Traceback" not in host.log.read_text()

@@ -163,3 +163,27 @@ def test_a_node_whose_reader_went_away_lives_on(start: Start, neighbour: Driver)
     neighbour.spin_until(lambda: len(heard) > 1)
     process.send_signal(signal.SIGTERM)
     assert process.wait(30) == 0
+
+
+@pytest.mark.parametrize(
+    ("class_", "managed", "states"),
+    [
+        ("Talker", False, ["running"]),
+        ("Managed", True, ["unconfigured", "configuring", "inactive", "activating", "active"]),
+    ],
+)
+def test_a_node_of_rclpy_runs_alone_too(
+    start: Start, tmp_path: Path, class_: str, managed: bool, states: list[str]
+) -> None:
+    manifest = tmp_path / "alone.lifecycle.yaml"
+    manifest.write_text(
+        "manifest_version: 1\nsystem: alone\nnodes:\n  node:\n"
+        f"    run: {{python: 'tests.ros.supervisor.rclpy_nodes:{class_}'}}\n"
+        f"    managed: {str(managed).lower()}\n    endpoints: open\n"
+    )
+    process = lifecycle_run(start, str(manifest), "node")
+    said = read_until(process, f"/node: {states[-1]}")
+    assert said == [f"/node: {each}" for each in states]
+    process.send_signal(signal.SIGTERM)
+    out, errors = process.communicate(timeout=30)
+    assert (process.returncode, out.splitlines()[0]) == (0, "SIGTERM: shutting down"), errors

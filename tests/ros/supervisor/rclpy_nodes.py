@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import rclpy
 from rclpy.action import ActionServer
+from rclpy.event_handler import PublisherEventCallbacks, QoSPublisherMatchedInfo
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -20,7 +21,8 @@ class Talker(Node):
         self.declare_parameter("loud", False)
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.name = self.create_publisher(String, "name", latched)
-        self.words = self.create_publisher(String, "words", 7)
+        events = PublisherEventCallbacks(matched=self.matched)
+        self.words = self.create_publisher(String, "words", 7, event_callbacks=events)
         self.word = word
         self.create_timer(period_s, self.tick)
         self.create_service(Trigger, "reset", lambda _, response: response)
@@ -33,6 +35,9 @@ class Talker(Node):
 
     def tick(self) -> None:
         self.say(self.word)
+
+    def matched(self, status: QoSPublisherMatchedInfo) -> None:
+        self.get_logger().info(f"matched with {status.current_count}")
 
 
 class Listener(Node):

@@ -88,11 +88,16 @@ def test_plain_nodes_are_verified_completely_and_released(
         wait_until(lambda: "heard HI" in log_of(up, "listener"))
         wait_until(lambda: "heard talker" in log_of(up, "listener"))
         assert "heard CONSTRUCTED" not in log_of(up, "listener")
+        wait_until(lambda: "matched with 1" in log_of(up, "talker"))
         assert is_proven(up)
         assert verb("pause", str(manifest), runtime=tmp_path).returncode == 0
+        # Held again, it still reports to whoever asks.
+        held = verb("verify", str(manifest), "--strict", runtime=tmp_path)
+        assert held.returncode == 0, held.stdout
         assert verb("resume", str(manifest), runtime=tmp_path).returncode == 0
         assert verb("down", str(manifest), runtime=tmp_path).returncode == 0
         assert up.finish() == 0
+        assert "Traceback" not in log_of(up, "talker")
         up.assert_gate_held()
         up.assert_nothing_left()
 
@@ -109,7 +114,7 @@ def test_a_plain_node_does_nothing_while_the_gate_is_closed(
             "listener": node("Listener", managed=False, interface=HEARS),
         },
     )
-    with running.up(manifest, "--timeout", "3", runtime=tmp_path) as up:
+    with running.up(manifest, "--timeout", "2", runtime=tmp_path) as up:
         assert up.finish() == 4
         assert [each["message"] for each in up.verdict["findings"]] == [
             "cannot find the publisher of /shouts that /talker declares"
@@ -211,10 +216,51 @@ _SERVICES = ("inner", "outer")
 def test_what_a_callback_of_rclpy_lifecycle_raises_is_logged_and_ends_the_bring_up(
     fresh_domain: int, tmp_path: Path
 ) -> None:
-    manifest = write(tmp_path, fresh_domain, {"broken": node("Broken")})
+    (tmp_path / "src").mkdir()
+    (tmp_path / "src" / "elsewhere.py").write_text(f"from {_NODES} import Broken")
+    environment = {"PYTHONPATH": str(tmp_path / "src")}
+    broken = node("elsewhere:Broken", environment=environment)
+    manifest = write(tmp_path, fresh_domain, {"broken": broken})
     with running.up(manifest, runtime=tmp_path) as up:
         assert up.finish() == 6
         assert [each["message"] for each in up.verdict["findings"]] == [
             "cannot configure '/broken': /broken: on_configure returned ERROR"
         ]
         assert "OSError: no such camera" in log_of(up, "broken")
+
+
+def test_flows_of_plain_nodes_are_unique_and_marked_as_the_manifest_asks(
+    fresh_domain: int, tmp_path: Path, wait_until: Any
+) -> None:
+    alone = {"unique": "strictly_required"}
+    manifest = write(
+        tmp_path,
+        fresh_domain,
+        {
+            "talker": node(
+                "Talker",
+                managed=False,
+                interface=TALKS,
+                flows={"publishers": {"words": {**alone, "dscp": "EF"}}},
+            ),
+            "listener": node(
+                "Listener",
+                managed=False,
+                interface=HEARS,
+                flows={"subscriptions": {"words": alone}},
+            ),
+        },
+        links=[{"topic": "/words", "from": "talker", "to": "listener", "unique": "strongly"}],
+        policy={"unverifiable": "block"},
+    )
+    with running.up(manifest, runtime=tmp_path) as up:
+        up.until("system", reached="active")
+        wait_until(lambda: "heard hello" in log_of(up, "listener"))
+        assert is_proven(up)
+        flows = up.of_kind("verdict")[-1]["verdict"]["flows"]
+        assert [(each["unique"], each["dscp"]) for each in flows if each["topic"] == "/words"] == [
+            ("strongly", 46)
+        ]
+        assert verb("down", str(manifest), runtime=tmp_path).returncode == 0
+        assert up.finish() == 0
+        up.assert_nothing_left()

@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -659,3 +660,26 @@ def test_a_run_directory_and_its_socket_are_there_while_a_system_is_and_not_long
         assert path.is_dir()
         assert run.finish() == ExitCode.OK
         assert list(path.parent.iterdir()) == []
+
+
+def test_systemd_is_notified_once_the_system_is_verified_and_active(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(tmp_path / "notify"))
+        manager.settimeout(BOUND_S)
+        variables = {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "500000"}
+        run = Up(pair(tmp_path, fresh_domain), runtime=tmp_path, variables=variables)
+        try:
+            sent: list[str] = []
+            while "READY=1" not in sent:
+                sent += manager.recv(4096).decode().split("\n")
+            assert "WATCHDOG=1" in sent
+            run.until("system", reached="active")
+            run.assert_gate_held()
+            run.signal(signal.SIGTERM)
+            while "STOPPING=1" not in sent:
+                sent += manager.recv(4096).decode().split("\n")
+            assert run.finish() == ExitCode.OK
+        finally:
+            run.close()

@@ -160,3 +160,34 @@ def test_a_domain_of_the_environment_that_is_none_is_refused_as_up_refuses_it(
         "cannot use ROS_DOMAIN_ID='233': a domain is a number from 0 to 232; unset it, or set "
         "discovery.domain_id in the manifest\n"
     )
+
+
+def test_the_arguments_of_a_manifest_are_listed_whatever_else_is_wrong_with_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    manifest = tmp_path / "arm.lifecycle.yaml"
+    manifest.write_text(
+        "manifest_version: 1\nsystem: arm\narguments:\n"
+        "  robot: {description: its name}\n"
+        "  rate: {default: 10, choices: [5, 10]}\n"
+        "  where: {default: $(env HOME /)}\n"
+        "nodez: {}\n"
+    )
+    assert main(["check", str(manifest), "--arguments"]) == 0
+    assert capsys.readouterr().out == (
+        "robot:=VALUE  its name; required\nrate:=10  allowed: 5, 10\nwhere:=$(env HOME /)\n"
+    )
+    assert main(["check", str(manifest), "--arguments", "--format", "json"]) == 0
+    listed = json.loads(capsys.readouterr().out)
+    assert [(each["name"], each["default"]) for each in listed] == [
+        ("robot", None),
+        ("rate", "10"),
+        ("where", "$(env HOME /)"),
+    ]
+    assert main(["check", str(manifest), "--arguments", "rate:=5"]) == 2
+    manifest.write_text("manifest_version: 1\nsystem: arm\narguments: {rate: {defalt: 1}}\n")
+    assert main(["check", str(manifest), "--arguments"]) == 3
+    assert "arguments.rate.defalt: cannot use the unknown key" in capsys.readouterr().err
+    manifest.write_text("manifest_version: 1\nsystem: arm\nnodes: {}\n")
+    assert main(["check", str(manifest), "--arguments"]) == 0
+    assert capsys.readouterr().out == f"{manifest} takes no arguments\n"

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
 from lifecycle.manifest.yaml.arguments import MAX_TEXT, Substituted, substitute
 from lifecycle.manifest.yaml.source import parse
+from lifecycle.manifest.yaml.substitutions import NOWHERE
 
 NONE: dict[str, str] = {}
 
@@ -15,7 +18,8 @@ NONE: dict[str, str] = {}
 def _substitute(
     text: str, given: dict[str, str] = NONE, environment: dict[str, str] = NONE
 ) -> Substituted:
-    return substitute(parse(text, file="f"), given, environment)
+    around = dataclasses.replace(NOWHERE, environment=environment)
+    return substitute(parse(text, file="f"), given, around)
 
 
 def _value(written: str, value: str) -> object:
@@ -84,7 +88,7 @@ def test_any_text_with_dollars_is_substituted_or_refused(text: str) -> None:
         document = parse(f"v: {quoted}\n", file="f")
     except Exception:  # noqa: BLE001 - not every character may stand in YAML
         return
-    result = substitute(document, {}, {})
+    result = substitute(document, {})
     if "$(" not in text:
         assert result.document.find(("v",)) == document.find(("v",))
     assert {each.at.path for each in result.diagnostics} <= {"v"}

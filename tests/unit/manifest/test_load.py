@@ -63,6 +63,8 @@ def test_the_system(every_key: Manifest) -> None:
         "recorder",
         "driver",
         "far/listener",
+        "group/idle",
+        "group/idler",
     ]
 
 
@@ -90,6 +92,8 @@ def test_machines_with_this_host_added_for_nodes_that_name_none(every_key: Manif
         "local",
         "local",
         "local",
+        "here",
+        "here",
     ]
 
 
@@ -114,6 +118,7 @@ def test_the_fields_of_a_node(every_key: Manifest) -> None:
     assert (talker.name, talker.namespace, talker.process) == ("speaker", "/robot", "main")
     assert talker.managed
     assert talker.parameters == (
+        ("use_sim_time", False),
         ("rate", 10),
         ("pid.p", 1.5),
         ("pid.limits", (0.0, 1.0)),
@@ -121,7 +126,7 @@ def test_the_fields_of_a_node(every_key: Manifest) -> None:
         ("verbose", False),
     )
     assert talker.parameter_files == (str(VALID / "parts" / "speaker.params.yaml"),)
-    assert talker.remap == (("words", "/chatter"),)
+    assert talker.remap == (("words", "/chatter"), ("unused", "/nowhere"))
     assert talker.timeouts == Timeouts(
         start_s=20.0,
         configure_s=1.5,
@@ -134,17 +139,31 @@ def test_the_fields_of_a_node(every_key: Manifest) -> None:
     )
     assert talker.endpoints is EndpointPolicy.OPEN
     assert talker.log_level == "debug"
-    assert (talker.at.line, talker.at.column, talker.at.path) == (15, 3, "nodes.talker")
+    assert (talker.at.line, talker.at.column, talker.at.path) == (29, 3, "nodes.talker")
 
 
 def test_what_a_node_is_when_nothing_is_said(every_key: Manifest) -> None:
     driver = _node(every_key, "driver")
     assert (driver.name, driver.namespace, driver.process) == ("driver", "/", "")
     assert driver.managed
-    assert driver.parameters == driver.parameter_files == driver.remap == driver.after == ()
+    assert driver.parameter_files == driver.after == ()
     assert driver.timeouts == Timeouts()
     assert driver.endpoints is EndpointPolicy.DECLARED
     assert driver.log_level == ""
+
+
+def test_what_many_nodes_share_reaches_those_that_have_nothing_nearer(every_key: Manifest) -> None:
+    talker, driver = _node(every_key, "talker"), _node(every_key, "driver")
+    # Its interface declares parameters, and none of that name.
+    assert "shared" not in dict(talker.parameters)
+    assert driver.parameters == (("shared", 1), ("use_sim_time", False))
+    assert driver.remap == (("unused", "/nowhere"),)
+    assert driver.where("parameters.shared").path == "parameters.shared"
+    idler = _node(every_key, "group/idler")
+    assert (idler.namespace, idler.machine) == ("/group", "here")
+    assert idler.parameters == (("shared", 2), ("use_sim_time", True))
+    assert idler.remap == (("unused", "/somewhere"),)
+    assert idler.at.path == "groups[0].groups[0].nodes.idler"
 
 
 def test_after(every_key: Manifest) -> None:

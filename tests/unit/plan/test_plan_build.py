@@ -13,12 +13,14 @@ from lifecycle import codec
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest.model import Discovery, DiscoveryRange, EndpointKind, Run, RunKind
 from lifecycle.network.nfe import UniqueRequirement
-from lifecycle.plan import Plan, build_plan, model
+from lifecycle.plan import Plan, build_plan, model, started_by_others
 from tests.builders import (
     endpoint,
     manifest,
     node,
+    plan_of,
     planned,
+    planned_node,
     publisher,
     subscription,
     teleop,
@@ -162,3 +164,22 @@ def test_the_schema_names_exactly_the_fields_of_the_plan():
 
 def test_a_subscription_alone_makes_no_flow():
     assert planned(node("one", subscription("a"))).flows == ()
+
+
+def test_nodes_that_others_start_are_waited_for_as_attached_ones() -> None:
+    plan = plan_of(
+        planned_node("a"), planned_node("b", process="two"), planned_node("c", process="two")
+    )
+    left = started_by_others(plan, ["/a"])
+    assert [each.run.kind for each in left.nodes] == [
+        RunKind.ATTACH,
+        RunKind.PYTHON,
+        RunKind.PYTHON,
+    ]
+    assert [each.run.kind for each in left.processes] == [RunKind.ATTACH, RunKind.PYTHON]
+    with pytest.raises(UsageError, match="cannot leave out node 'x'; nodes of robot: a, b, c"):
+        started_by_others(plan, ["x"])
+    with pytest.raises(UsageError, match="cannot leave out 'b' alone: its process runs c, too"):
+        started_by_others(plan, ["b"])
+    both = started_by_others(plan, ["b", "c"])
+    assert [each.run.kind for each in both.processes] == [RunKind.PYTHON, RunKind.ATTACH]

@@ -1,0 +1,208 @@
+"""`lifecycle init` and `lifecycle schema`: a package of one's own, and what editors read.
+
+Owns: the files of a new package (their texts are in cli/template/, `@NAME@` stands for its name),
+and where schemas are copied to. Needs no ROS.
+"""
+
+from __future__ import annotations
+
+import json
+import keyword
+import os
+import re
+import shlex
+import sys
+from collections.abc import Iterator, Mapping
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from lifecycle.errors import ExitCode, UsageError
+
+if TYPE_CHECKING:
+    from importlib.abc import Traversable
+
+_PLACEHOLDER = "@NAME@"
+_RENAMED = {
+    "package": "@NAME@",
+    "system.lifecycle.yaml": "@NAME@.lifecycle.yaml",
+    "marker": "@NAME@",
+}
+"""Names in cli/template/ that are others in a package."""
+
+_MANIFEST_SCHEMA = "manifest.v1.schema.json"
+
+
+@click.command("init")
+@click.argument("name", metavar="NAME")
+@click.option(
+    "--directory",
+    type=click.Path(file_okay=False, path_type=Path),
+    metavar="DIRECTORY",
+    help="Where to make it; default: NAME, here.",
+)
+def command(name: str, directory: Path | None) -> int:
+    """Make a package of one's own, NAME: nodes, their manifest, tests, and a CI workflow.
+
+    It is a Python package with tests that pass, and a colcon package, too (ament_python). NAME has
+    lower-case letters, digits and underscores.
+    """
+    _check_name(name)
+    root = Path(name) if directory is None else directory
+    files = {root / path: text for path, text in package_files(name).items()}
+    _write_new(root, files)
+    where = shlex.quote(str(root))
+    click.echo(
+        f"made {name!r} in {str(root)!r}: {len(files)} files\n"
+        f"  cd {where}\n"
+        "  pip install --editable '.[ros,test]'    # beside /opt/ros: '.[test]'\n"
+        f"  lifecycle up manifests/{name}.lifecycle.yaml --stop-after 3\n"
+        "  pytest"
+    )
+    return ExitCode.OK
+
+
+def package_files(name: str) -> dict[str, str]:
+    """Return the files of a new package: path in it → text."""
+    found = dict(_template(resources.files("lifecycle.cli") / "template", "", name))
+    found[f"schemas/{_MANIFEST_SCHEMA}"] = _schema_text(_MANIFEST_SCHEMA)
+    return dict(sorted(found.items()))
+
+
+def _template(folder: Traversable, path: str, name: str) -> Iterator[tuple[str, str]]:
+    for each in folder.iterdir():
+        plain = each.name.removesuffix(".in")
+        renamed = _RENAMED.get(plain, plain).replace(_PLACEHOLDER, name)
+        if each.is_dir():
+            yield from _template(each, f"{path}{renamed}/", name)
+        elif plain != each.name:
+            text = each.read_text(encoding="utf-8").replace(_PLACEHOLDER, name)
+            yield f"{path}{renamed}", text
+
+
+def _check_name(name: str) -> None:
+    """Insist on a name that both Python and ROS 2 take for a package, REP-144.
+
+    Raises:
+        UsageError: one of them would not.
+    """
+    what = ""
+    if not re.fullmatch(r"[a-z][a-z0-9]*(_[a-z0-9]+)*", name) or len(name) < 2:
+        what = "write lower-case letters, digits and single underscores, a letter first"
+    elif keyword.iskeyword(name) or name in sys.stdlib_module_names:
+        what = "Python has a module or a keyword of that name"
+    elif name in ("lifecycle", "tests"):
+        what = "it would hide a package that its own tests import"
+    if what:
+        raise UsageError(f"cannot make a package {name!r}: {what}")
+
+
+def _write_new(root: Path, files: Mapping[Path, str]) -> None:
+    """Write files none of which is there yet.
+
+    Raises:
+        UsageError: one is, or cannot be written.
+    """
+    there = [path for path in files if os.path.lexists(path)]
+    if there:
+        raise UsageError(
+            f"cannot make a package in {str(root)!r}: {str(there[0])!r} is there already",
+            hint="give --directory DIRECTORY",
+        )
+    for path, text in files.items():
+        _write(path, text)
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise UsageError(f"cannot write {str(path)!r}: {error.strerror}") from error
+
+
+def _schema_text(file: str) -> str:
+    return (resources.files("lifecycle") / "_schemas" / file).read_text(encoding="utf-8")
+
+
+def _schemas() -> dict[str, str]:
+    """Return the schemas that are shipped: `manifest` → `manifest.v1.schema.json`."""
+    folder = resources.files("lifecycle") / "_schemas"
+    names = sorted(each.name for each in folder.iterdir() if each.name.endswith(".schema.json"))
+    return {each.partition(".")[0]: each for each in names}
+
+
+@click.command("schema")
+@click.argument("name", default="manifest", metavar="[NAME]")
+@click.option(
+    "--url",
+    is_flag=True,
+    help="Print only where `$schema` finds it: a URL that stays the same for this user.",
+)
+@click.option(
+    "--install",
+    "to",
+    is_flag=False,
+    flag_value="",
+    type=str,
+    metavar="[DIRECTORY]",
+    help="Copy all schemas to DIRECTORY (default: the user's data directory, where --url points), "
+    "and associate *.lifecycle.yaml with the manifest's in ./.vscode, where that is.",
+)
+def schema_command(name: str, *, url: bool, to: str | None) -> int:
+    """Print a JSON Schema: of the manifest, or NAME: check, graph, plan or verdict.
+
+    Editors complete and explain a manifest that begins with the line which --install prints.
+    """
+    schemas = _schemas()
+    if name not in schemas:
+        raise UsageError(f"cannot find schema {name!r}; there are: {', '.join(schemas)}")
+    if to is not None:
+        return _install(schemas, Path(to) if to else None)
+    if url:
+        click.echo((_data_directory() / schemas[name]).as_uri())
+    else:
+        click.echo(_schema_text(schemas[name]).rstrip("\n"))
+    return ExitCode.OK
+
+
+def _data_directory() -> Path:
+    """Return where this user's schemas are, XDG Base Directory Specification."""
+    data = os.environ.get("XDG_DATA_HOME") or "~/.local/share"
+    return Path(data).expanduser().absolute() / "lifecycle" / "schemas"
+
+
+def _install(schemas: Mapping[str, str], to: Path | None) -> ExitCode:
+    folder = to or _data_directory()
+    for file in schemas.values():
+        _write(folder / file, _schema_text(file))
+    manifest = folder / schemas["manifest"]
+    reference = manifest.as_uri() if to is None else f"{to.as_posix()}/{manifest.name}"
+    click.echo(
+        f"copied {len(schemas)} schemas to {str(folder)!r}; a manifest begins with\n"
+        f"# yaml-language-server: $schema={reference}"
+    )
+    if Path(".vscode").is_dir():
+        _associate(Path(".vscode/settings.json"), reference)
+    return ExitCode.OK
+
+
+def _associate(settings: Path, reference: str) -> None:
+    """Associate every manifest of a VS Code workspace with a schema, as its YAML extension does."""
+    entry = {reference: "*.lifecycle.yaml"}
+    try:
+        text = settings.read_text(encoding="utf-8") if settings.exists() else "{}"
+        document: Any = json.loads(text)
+    except (OSError, ValueError):
+        document = None
+    if not isinstance(document, dict) or not isinstance(document.get("yaml.schemas", {}), dict):
+        click.echo(f'add to {settings}: "yaml.schemas": {json.dumps(entry)}')
+        return
+    associated = document.setdefault("yaml.schemas", {})
+    for each in [each for each, globs in associated.items() if globs == "*.lifecycle.yaml"]:
+        del associated[each]
+    associated.update(entry)
+    _write(settings, json.dumps(document, indent=2) + "\n")
+    click.echo(f"associated *.lifecycle.yaml with it in {settings}")

@@ -1,0 +1,117 @@
+"""What nodes share: `parameters:`, `remap:`, `machine:` … of documents and groups, by nearness.
+
+Owns: how values that are written for many nodes reach each of them; what is nearer to a node wins:
+the node itself, its parameter files, its group, the groups around it, its document, the documents
+that include that. A shared parameter is for the nodes that have it, as under `/**` in a parameter
+file: an interface without it is not given it, and where a node lacks it nothing is wrong.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+
+from lifecycle.manifest.building import Findings, build_parameters
+from lifecycle.manifest.checks.parameters import is_implicit, read_sections, shown_path
+from lifecycle.manifest.checks.system import full_name
+from lifecycle.manifest.diagnostics import Position
+from lifecycle.manifest.model import Manifest, Node, ParameterValue
+from lifecycle.manifest.yaml.document import Cursor, error
+
+SIM_TIME = "use_sim_time"
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Shared:
+    """What all nodes of a document or group get that have nothing nearer.
+
+    Attributes:
+        parameters: value and place, by name.
+        remap: new name and place, by the name in the node's code.
+        machine: where a node runs that names no machine.
+    """
+
+    machine: str
+    parameters: Mapping[str, tuple[ParameterValue, Position]] = dataclasses.field(
+        default_factory=dict
+    )
+    remap: Mapping[str, tuple[str, Position]] = dataclasses.field(default_factory=dict)
+
+    def inner(self, cursor: Cursor, found: Findings) -> Shared:
+        """Return what holds inside a document or group.
+
+        Args:
+            cursor: its root.
+            found: findings are appended here.
+        """
+        parameters = build_parameters(cursor, found)
+        sim_time = cursor.get(SIM_TIME)
+        if sim_time is not None and SIM_TIME in parameters:
+            message = f"cannot set {SIM_TIME} twice"
+            found.append(
+                error("manifest.duplicate-parameter", sim_time.key_at, message, "remove one")
+            )
+        elif sim_time is not None and isinstance(sim_time.scalar, bool):
+            parameters[SIM_TIME] = (sim_time.scalar, sim_time.key_at)
+        remap = {name: (each.value.text, each.key_at) for name, each in cursor.entries("remap")}
+        return Shared(
+            machine=cursor.text("machine", self.machine),
+            parameters={**self.parameters, **parameters},
+            remap={**self.remap, **remap},
+        )
+
+    def given_to(self, node: Node) -> Node:
+        """Return a node with what it does not set itself."""
+        if not self.parameters and not self.remap:
+            return node
+        own = dict(node.parameters)
+        parameters = {name: each for name, each in self.parameters.items() if name not in own}
+        rules = dict(node.remap)
+        remap = {name: each for name, each in self.remap.items() if name not in rules}
+        positions = {
+            **{f"parameters.{name}": at for name, (_, at) in parameters.items()},
+            **{f"remap.{name}": at for name, (_, at) in remap.items()},
+        }
+        return dataclasses.replace(
+            node,
+            parameters=(
+                *((name, value) for name, (value, _) in parameters.items()),
+                *node.parameters,
+            ),
+            # rcl takes the first rule that matches: the node's own.
+            remap=(*node.remap, *((name, target) for name, (target, _) in remap.items())),
+            shared=node.shared | positions.keys(),
+            positions=(*node.positions, *positions.items()),
+        )
+
+
+def settle(manifest: Manifest) -> Manifest:
+    """Take from nodes the shared parameters that their files set, and those they do not declare.
+
+    Args:
+        manifest: with all that it includes, so that each node has its full name.
+    """
+    nodes = tuple(_settled(node, manifest.path) for node in manifest.nodes)
+    return dataclasses.replace(manifest, nodes=nodes)
+
+
+def _settled(node: Node, manifest: str) -> Node:
+    shared = {name for name, _ in node.parameters if f"parameters.{name}" in node.shared}
+    if not shared:
+        return node
+    if node.interface.parameters:
+        declared = {each.name for each in node.interface.parameters}
+        kept = {name for name in shared if name in declared or is_implicit(name)}
+    else:
+        kept = set(shared)
+    for path in node.parameter_files if kept else ():
+        sections, _ = read_sections(path, shown=shown_path(path, manifest))
+        for section in sections:
+            if section.matches(full_name(node)):
+                kept -= {name for name, _, _ in section.parameters}
+    gone = shared - kept
+    return dataclasses.replace(
+        node,
+        parameters=tuple(each for each in node.parameters if each[0] not in gone),
+        shared=node.shared - {f"parameters.{name}" for name in gone},
+    )

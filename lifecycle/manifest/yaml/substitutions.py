@@ -1,0 +1,419 @@
+"""Substitutions `$(…)` in values: their syntax, nested too; files read and programs run for them.
+
+Owns: the text of a value taken apart (`parse_text`), what `$(find-pkg-share …)`, `$(file …)` and
+`$(command …)` read from outside, each bounded in time and size, and the words of conditions. What
+`$(arg …)` is belongs to `arguments`. Nothing is computed: `$(eval …)` is refused.
+
+A program is run as its words stand, by no shell, once in a load however often it is written.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+import re
+import selectors
+import shlex
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import IO
+
+from lifecycle.errors import LifecycleError
+from lifecycle.manifest.diagnostics import ManifestError
+from lifecycle.manifest.installed_types import find_resource, list_resources, search_prefixes
+from lifecycle.manifest.schema import did_you_mean
+from lifecycle.manifest.yaml.source import MAX_BYTES, decode, is_outside, read_bytes
+from lifecycle.manifest.yaml.yaml_parser import quote
+
+MAX_DEPTH = 8
+"""Substitutions inside each other."""
+
+COMMAND_S = 10.0
+"""Seconds that one program may take."""
+
+ALLOWED = (
+    "write $(arg NAME), $(env NAME), $(env NAME DEFAULT), $(find-pkg-share PACKAGE), $(file PATH), "
+    "$(command PROGRAM …), $(equals A B), $(not-equals A B), $(not A), $(and A B) or $(or A B); "
+    "$$( is a literal $("
+)
+
+_RAW = ("arg", "env")
+_WORDS = ("find-pkg-share", "file", "command", "not", "and", "or", "equals", "not-equals")
+_KIND = re.compile(r"\s*([^\s()$'\"]*)")
+_SPACE = re.compile(r"\s*")
+_NAMED = re.compile(r"\s*\S+\s+(\S+)(?:\s(.*))?\Z", re.DOTALL)
+_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
+_ELSEWHERE = {
+    "eval": "a manifest computes nothing; write $(equals A B), $(not-equals A B), $(not A), "
+    "$(and A B) or $(or A B), or have an argument give the value",
+    "var": "write $(arg NAME)",
+    "optenv": "write $(env NAME DEFAULT)",
+    "dirname": "leave it out: paths are relative to the manifest",
+    "find-pkg-prefix": "write $(find-pkg-share PACKAGE)/../..",
+    "exec-in-pkg": "write run: {package: PACKAGE, executable: EXECUTABLE}",
+    "find-exec": "write run: {command: [PROGRAM]}, which is looked for on PATH",
+    "file-content": "write $(file PATH)",
+    "anon": "write the name that the node is to have: a plan names every node",
+}
+"""What launch files have and manifests have otherwise, by what is written there."""
+
+Text = tuple["str | Substitution", ...]
+"""Text of a value in its parts."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Substitution:
+    """One `$(…)`.
+
+    Attributes:
+        kind: `arg`, `command`, ….
+        written: as it is written.
+        words: what follows the kind; of `arg` and `env` the name, and the default if there is one.
+        is_one_quoted: it is one word in quotes.
+    """
+
+    kind: str
+    written: str
+    words: tuple[Text, ...]
+    is_one_quoted: bool = False
+
+
+def parse_text(text: str) -> Text:
+    """Take a value's text apart.
+
+    Raises:
+        LifecycleError: what is wrong with a substitution in it.
+    """
+    parts, _ = _parse(text, 0, "", 0)
+    return parts
+
+
+def _parse(text: str, at: int, end: str, depth: int) -> tuple[Text, int]:
+    """Return what stands before one of the characters `end`, and where that is."""
+    parts: list[str | Substitution] = []
+    begin = at
+    while at < len(text) and text[at] not in end:
+        if text.startswith("$$(", at):
+            parts.append(f"{text[begin:at]}$(")
+            begin = at = at + 3
+        elif text.startswith("$(", at):
+            parts.append(text[begin:at])
+            found, at = _substitution(text, at, depth + 1)
+            parts.append(found)
+            begin = at
+        else:
+            at += 1
+    parts.append(text[begin:at])
+    return tuple(each for each in parts if each), at
+
+
+def _substitution(text: str, begin: int, depth: int) -> tuple[Substitution, int]:
+    if depth > MAX_DEPTH:
+        raise LifecycleError(f"cannot substitute more than {MAX_DEPTH} levels inside each other")
+    match = _KIND.match(text, begin + 2)
+    assert match is not None
+    kind = match[1]
+    if kind in _RAW:
+        return _raw(text, begin, kind, depth)
+    if kind in _WORDS:
+        return _worded(text, begin, kind, match.end(), depth)
+    whole = text[begin : _closing(text, begin)]
+    hint = _ELSEWHERE.get(kind, ALLOWED)
+    raise LifecycleError(f"cannot substitute {quote(whole)}", hint=hint)
+
+
+def _closing(text: str, begin: int) -> int:
+    """Return where a substitution that is none ends, for messages."""
+    open_ = 0
+    for at in range(begin, len(text)):
+        open_ += {"(": 1, ")": -1}.get(text[at], 0)
+        if open_ == 0 and text[at] == ")":
+            return at + 1
+    return len(text)
+
+
+def _raw(text: str, begin: int, kind: str, depth: int) -> tuple[Substitution, int]:
+    """Read `$(env NAME DEFAULT)`, whose default is text with anything but parentheses."""
+    parts, at = _parse(text, begin + 2, "()", depth)
+    written = text[begin : at + 1]
+    if text[at : at + 1] != ")":
+        raise LifecycleError(f"cannot substitute {quote(text[begin:at])}", hint=ALLOWED)
+    first, *rest = parts
+    named = _NAMED.match(first if rest else first.rstrip()) if isinstance(first, str) else None
+    if named is None or not _NAME.match(named[1]) or (rest and named[2] is None):
+        raise LifecycleError(f"cannot substitute {quote(written)}", hint=ALLOWED)
+    name, default = named.groups()
+    if rest and isinstance(rest[-1], str):
+        rest[-1] = rest[-1].rstrip()
+    if kind == "arg" and default is not None:
+        raise LifecycleError(
+            f"cannot give a default in {quote(written)}",
+            hint=f"declare it: arguments: {{{name}: {{default: …}}}}",
+        )
+    words: tuple[Text, ...] = ((name,),) if default is None else ((name,), (default, *rest))
+    return Substitution(kind=kind, written=written, words=words), at + 1
+
+
+def _worded(text: str, begin: int, kind: str, at: int, depth: int) -> tuple[Substitution, int]:
+    """Read words, in quotes or not, up to the closing parenthesis."""
+    words: list[Text] = []
+    quoted: list[bool] = []
+    while True:
+        space = _SPACE.match(text, at)
+        assert space is not None
+        at = space.end()
+        mark = text[at : at + 1]
+        if mark == ")":
+            written = text[begin : at + 1]
+            one = quoted == [True]
+            found = Substitution(kind=kind, written=written, words=tuple(words), is_one_quoted=one)
+            return found, at + 1
+        if mark in ("", "("):
+            whole = text[begin : _closing(text, begin)]
+            raise LifecycleError(f"cannot substitute {quote(whole)}", hint=ALLOWED)
+        is_quoted = mark in "'\""
+        word, at = _parse(text, at + is_quoted, mark if is_quoted else " \t\r\n()", depth)
+        if is_quoted:
+            if at >= len(text):
+                message = f"cannot find the closing {mark} in {quote(text[begin:])}"
+                raise LifecycleError(message)
+            at += 1
+        words.append(word)
+        quoted.append(is_quoted)
+
+
+def truth(text: str) -> bool | None:
+    """Return what a condition's text means, as launch reads it; None if it means neither."""
+    return {"true": True, "1": True, "false": False, "0": False}.get(text.strip().lower())
+
+
+def decide(kind: str, words: list[str], written: str) -> str:
+    """Return `true` or `false` of a `$(not …)`, `$(equals …)` and the others.
+
+    Raises:
+        LifecycleError: too few or too many words, or one that is neither true nor false.
+    """
+    least, most = {"not": (1, 1), "and": (2, None), "or": (2, None)}.get(kind, (2, 2))
+    if len(words) < least or (most is not None and len(words) > most):
+        needs = {"not": "one word", "and": "two or more words", "or": "two or more words"}
+        message = f"cannot substitute {quote(written)}; it takes {needs.get(kind, 'two words')}"
+        raise LifecycleError(message, hint="put a word that is empty or has spaces in quotes")
+    if kind in ("equals", "not-equals"):
+        return _spelled((words[0] == words[1]) == (kind == "equals"))
+    truths = [truth(each) for each in words]
+    for word, each in zip(words, truths, strict=True):
+        if each is None:
+            message = f"cannot use {quote(word)} in {quote(written)}; allowed: true, false, 1, 0"
+            raise LifecycleError(message)
+    if kind == "not":
+        return _spelled(not truths[0])
+    return _spelled(all(truths) if kind == "and" else any(truths))
+
+
+def _spelled(value: object) -> str:
+    return "true" if value else "false"
+
+
+class Programs:
+    """What programs have written, each run once in a load.
+
+    Args:
+        environment: of the programs.
+    """
+
+    def __init__(self, environment: Mapping[str, str]) -> None:
+        self._environment = dict(environment)
+        self._ran: dict[tuple[str, ...], str | LifecycleError] = {}
+
+    def output(self, words: list[str], folder: str) -> str:
+        """Return what a program writes to its standard output, without the last line break.
+
+        Args:
+            words: program and arguments; no shell reads them.
+            folder: what it is started in, and where a relative program is looked for.
+
+        Raises:
+            LifecycleError: it is not there, fails, takes too long, or writes too much or no text.
+        """
+        key = (folder, *words)
+        if key not in self._ran:
+            try:
+                self._ran[key] = self._run(words, folder)
+            except LifecycleError as problem:
+                self._ran[key] = problem
+        found = self._ran[key]
+        if isinstance(found, LifecycleError):
+            raise found
+        return found
+
+    def _run(self, words: list[str], folder: str) -> str:
+        name = words[0]
+        # With a slash it is a path, else it is looked for on PATH: as execvp does.
+        path = os.path.join(folder, name) if "/" in name else name  # noqa: PTH118
+        program = shutil.which(path, path=self._environment.get("PATH"))
+        if program is None:
+            where = "there is no such program" if "/" in name else "no such program on PATH"
+            hint = "each word is one argument: write $(command PROGRAM ARGUMENT …)"
+            if " " not in name:
+                hint = "install it, or source the setup file of its workspace"
+            raise LifecycleError(f"cannot run {quote(name)}: {where}", hint=hint)
+        try:
+            process = subprocess.Popen(
+                [os.path.abspath(program), *words[1:]],  # noqa: PTH100
+                cwd=folder,
+                env=self._environment,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                start_new_session=True,
+            )
+        except (OSError, ValueError) as problem:
+            why = getattr(problem, "strerror", None) or problem
+            raise LifecycleError(f"cannot run {quote(name)}: {why}") from problem
+        try:
+            out, err = _read(process, name)
+        finally:
+            # Whatever it has started ends with it, before its group's number can be another's.
+            with contextlib.suppress(OSError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+        shown = quote(" ".join(words), limit=200)
+        if process.returncode:
+            said = err.decode("utf-8", "replace").strip().splitlines()[-1:]
+            ended = (
+                f"exit status {process.returncode}"
+                if process.returncode > 0
+                else f"signal {-process.returncode}"
+            )
+            why = f": {quote(said[0], limit=300)}" if said else ""
+            hint = f"run it: {shlex.join(words)}"
+            raise LifecycleError(f"cannot use {shown}: it ended with {ended}{why}", hint=hint)
+        try:
+            return _without_last_break(decode(out, file=name))
+        except ManifestError as problem:
+            message = problem.diagnostics[0].message.removeprefix("cannot read ")
+            raise LifecycleError(f"cannot use what {shown} writes: {message}") from problem
+
+
+def _read(process: subprocess.Popen[bytes], name: str) -> tuple[bytes, bytes]:
+    """Read both streams of a program to their end and wait for its end, within the limits."""
+    assert process.stdout is not None
+    assert process.stderr is not None
+    held: dict[IO[bytes], bytearray] = {process.stdout: bytearray(), process.stderr: bytearray()}
+    deadline = time.monotonic() + COMMAND_S
+    late = LifecycleError(f"cannot wait for {quote(name)}: it takes more than {COMMAND_S:g} s")
+    with selectors.DefaultSelector() as selector, process.stdout, process.stderr:
+        for stream in held:
+            selector.register(stream, selectors.EVENT_READ)
+        while selector.get_map():
+            left = deadline - time.monotonic()
+            ready = selector.select(left) if left > 0 else []
+            if not ready:
+                raise late
+            for key, _ in ready:
+                stream = next(each for each in held if each is key.fileobj)
+                data = os.read(stream.fileno(), 1 << 16)
+                if not data:
+                    selector.unregister(stream)
+                held[stream] += data
+                if len(held[stream]) > MAX_BYTES:
+                    if stream is process.stdout:
+                        message = f"cannot use {quote(name)}: it writes more than {MAX_BYTES} bytes"
+                        raise LifecycleError(message)
+                    del held[stream][:-4096]
+        try:
+            # Ends that nobody reads are no ends: it may have closed its streams and run on.
+            process.wait(max(deadline - time.monotonic(), 0.01))
+        except subprocess.TimeoutExpired:
+            raise late from None
+        return bytes(held[process.stdout]), bytes(held[process.stderr])
+
+
+def _without_last_break(text: str) -> str:
+    return text.removesuffix("\n").removesuffix("\r")
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Surroundings:
+    """What substitutions of one document read from outside.
+
+    Attributes:
+        environment: variables, and AMENT_PREFIX_PATH with them.
+        folder: what relative paths start from, where programs are started.
+        outermost: path of the manifest that includes all others.
+    """
+
+    environment: Mapping[str, str]
+    folder: str
+    outermost: str
+    programs: Programs
+
+    def variable(self, name: str, default: Callable[[], str] | None) -> str:
+        """Return an environment variable; the default where it is not set.
+
+        Raises:
+            LifecycleError: it is not set, and there is no default.
+        """
+        found = self.environment.get(name)
+        if found is None and default is not None:
+            return default()
+        if found is None:
+            raise LifecycleError(
+                f"cannot find the environment variable {name!r}",
+                hint=f"set it, or write $(env {name} DEFAULT)",
+            )
+        return found
+
+    def package_share(self, name: str) -> str:
+        """Return `PREFIX/share/NAME` of an installed package.
+
+        Raises:
+            LifecycleError: no prefix has it.
+        """
+        prefixes = search_prefixes(self.environment)
+        found = None
+        if name and "/" not in name and "\0" not in name:
+            found = find_resource("packages", name, prefixes)
+        if found is None:
+            hint = did_you_mean(name, list_resources("packages", prefixes))
+            raise LifecycleError(
+                f"cannot find the package {quote(name)}",
+                hint=hint or "source the setup file of the workspace that holds it",
+            )
+        # PREFIX/share/ament_index/resource_index/packages/NAME
+        return str(found.parents[3] / name)
+
+    def file(self, path: str) -> tuple[str, bool]:
+        """Return a file's text, without the last line break, and whether it is not to be quoted.
+
+        Raises:
+            LifecycleError: there is none, it is too long, or it is no text.
+        """
+        full = os.path.join(self.folder, path)  # noqa: PTH118
+        try:
+            text = decode(read_bytes(full, file=path), file=path)
+        except ManifestError as problem:
+            found = problem.diagnostics[0]
+            reason = found.message.removeprefix("cannot read ").replace(" as a manifest", "")
+            if found.message.startswith("cannot open "):
+                reason = found.message.rpartition(": ")[2]
+            elif (found.at.line, found.at.column) != (1, 1):
+                reason = f"line {found.at.line}: {reason}"
+            if is_outside(full, self.outermost, self.environment):
+                reason = "it is no text file that can be read"
+            raise LifecycleError(f"cannot read {quote(path, limit=200)}: {reason}") from problem
+        return _without_last_break(text), is_outside(full, self.outermost, self.environment)
+
+
+NOWHERE = Surroundings(environment={}, folder=os.curdir, outermost="", programs=Programs({}))
+"""For documents that are not of a file."""
+
+
+def folder_of(path: Path) -> str:
+    """Return the folder of a file so that a program's working directory does not matter."""
+    return os.path.abspath(path.parent)  # noqa: PTH100 - a link stays the path that users know

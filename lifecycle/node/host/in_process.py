@@ -1,0 +1,312 @@
+"""Run one node of a plan inside a test's own process, with a peer to exchange messages with.
+
+Owns: `NodeInProcess`: the thread that spins the node, the peer's endpoints, and the bounded way
+out. Nothing is supervised or verified; pytest's fixture `lifecycle_node` makes these.
+"""
+
+from __future__ import annotations
+
+import collections
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from rclpy.context import Context
+from rclpy.executors import ExternalShutdownException, ShutdownException
+from rclpy.node import Node
+
+from lifecycle.errors import BringUpError, UsageError
+from lifecycle.manifest import EndpointKind, RunKind
+from lifecycle.middleware import (
+    NodeExecutor,
+    ParticipantSettings,
+    import_interface,
+    participant_settings,
+    to_rclpy,
+)
+from lifecycle.node.author.node import LifecycleNode
+from lifecycle.node.author.spec import Construction, Mode, constructing
+from lifecycle.node.host.foreign import keywords
+from lifecycle.node.host.hosting import maker_of
+from lifecycle.node.lifecycle.execution import Result
+from lifecycle.node.lifecycle.machine import CallbackOutcome
+from lifecycle.plan import PlannedNode
+
+WAIT_S = 10.0
+"""For a message, an answer or a log line; it ends with what is waited for."""
+
+_WAYS = {
+    "unconfigured": (),
+    "inactive": ("configure", "connect"),
+    "active": ("configure", "connect", "activate"),
+}
+_ROSOUT = "/rosout"
+
+
+class NodeInProcess:
+    """A managed node of a manifest in this process, spun by a thread until `close`.
+
+    Its methods may be called from any thread but that one. An exception that a callback of the
+    node raises is raised by whichever of them is called next.
+
+    Args:
+        planned: a managed node that is a Python class.
+        domain_id: 0–232.
+
+    Attributes:
+        node: the user's own object.
+        peer: an ordinary rclpy node beside it, spun by the same thread.
+    """
+
+    def __init__(self, planned: PlannedNode, *, domain_id: int) -> None:
+        if planned.run.kind is not RunKind.PYTHON:
+            raise UsageError(
+                f"cannot run {planned.full_name} in this process: it is no Python class",
+                hint="bring the system up instead: the fixture lifecycle_system",
+            )
+        folder = str(Path(planned.at.file).absolute().parent)
+        node_class = maker_of(planned, (folder,))
+        if not (isinstance(node_class, type) and issubclass(node_class, LifecycleNode)):
+            raise UsageError(
+                f"cannot run {planned.full_name} in this process: {planned.run.python!r} is no "
+                "class of lifecycle.LifecycleNode",
+                hint="bring the system up instead: the fixture lifecycle_system",
+            )
+        self._planned = planned
+        self._changed = threading.Condition()
+        self._error: BaseException | None = None
+        self._received: dict[str, collections.deque[Any]] = {}
+        self._publishers: dict[str, Any] = {}
+        self._clients: dict[str, Any] = {}
+        self._logs: list[str] = []
+        self._closed = False
+        self._context = Context()
+        self._context.init(args=[], domain_id=domain_id)
+        self._executor = NodeExecutor(context=self._context)
+        construction = Construction(spec=planned, mode=Mode.MANUAL, context=self._context)
+        settings = ParticipantSettings.of(
+            planned.connections,
+            transports=planned.transports,
+            max_datagram_bytes=planned.max_datagram_bytes,
+        )
+        try:
+            with participant_settings(self._context, settings), constructing(construction):
+                self.node: LifecycleNode = node_class(**keywords(planned, node_class))
+        except BaseException:
+            self._executor.shutdown()
+            self._context.try_shutdown()
+            raise
+        self.peer = Node("lifecycle_test_peer", context=self._context, enable_rosout=False)
+        self._make_peers()
+        for each in (self.node, self.peer):
+            self._executor.add_node(each)
+        self._thread = threading.Thread(target=self._spin, name=planned.full_name, daemon=True)
+        self._thread.start()
+
+    def _make_peers(self) -> None:
+        from rcl_interfaces.msg import Log
+        from rclpy.qos import DurabilityPolicy, QoSProfile
+
+        rosout = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.peer.create_subscription(Log, _ROSOUT, self._take_log, rosout)
+        for each in self._planned.endpoints:
+            qos = to_rclpy(each.qos)
+            if each.kind is EndpointKind.PUBLISHER:
+                taken = self._received[each.name] = collections.deque()
+                self.peer.create_subscription(
+                    import_interface(each.type), each.resolved, self._taker(taken), qos
+                )
+            elif each.kind is EndpointKind.SUBSCRIPTION:
+                self._publishers[each.name] = self.peer.create_publisher(
+                    import_interface(each.type), each.resolved, qos
+                )
+            elif each.kind is EndpointKind.SERVICE_SERVER:
+                self._clients[each.name] = self.peer.create_client(
+                    import_interface(each.type), each.resolved
+                )
+
+    def _taker(self, taken: collections.deque[Any]) -> Callable[[Any], None]:
+        def take(message: Any) -> None:
+            with self._changed:
+                taken.append(message)
+                self._changed.notify_all()
+
+        return take
+
+    def _take_log(self, message: Any) -> None:
+        if message.name == self.node.get_logger().name:
+            with self._changed:
+                self._logs.append(message.msg)
+                self._changed.notify_all()
+
+    def _spin(self) -> None:
+        try:
+            while True:
+                self._executor.next_callback()()
+        except (ShutdownException, ExternalShutdownException):
+            pass
+        except BaseException as error:  # noqa: BLE001 - raised in the test's thread
+            with self._changed:
+                self._error = error
+                self._changed.notify_all()
+
+    @property
+    def state(self) -> str:
+        """lifecycle_msgs/State label."""
+        return self.node.lifecycle.state.seen.label
+
+    @property
+    def logs(self) -> tuple[str, ...]:
+        """What the node has logged so far, all levels that it publishes on /rosout."""
+        with self._changed:
+            return tuple(self._logs)
+
+    def bring_to(self, state: str) -> None:
+        """Bring an unconfigured node to "inactive" (connected) or "active", matched with its peer.
+
+        Raises:
+            UsageError: no such state.
+            BringUpError: a transition failed, or took longer than its deadline.
+        """
+        if state not in _WAYS:
+            raise UsageError(f"cannot bring a node to {state!r}; allowed: {', '.join(_WAYS)}")
+        for transition in _WAYS[state]:
+            self.change(transition)
+        if _WAYS[state]:
+            self._wait(self._is_matched, "cannot match every endpoint with the test's peer")
+
+    def _is_matched(self) -> bool:
+        return (
+            all(each.get_subscription_count() for each in self._publishers.values())
+            and all(self.peer.count_publishers(each) for each in self._topics())
+            and all(each.service_is_ready() for each in self._clients.values())
+        )
+
+    def _topics(self) -> tuple[str, ...]:
+        kind = EndpointKind.PUBLISHER
+        return tuple(each.resolved for each in self._planned.endpoints if each.kind is kind)
+
+    def change(self, transition: str) -> None:
+        """Run a transition of the node, `deactivate` for one.
+
+        Raises:
+            BringUpError: a callback returned FAILURE or ERROR, raised, or took too long.
+            LifecycleError: it is not allowed in this state, or there is none of this name.
+        """
+        result: Result = self.run(lambda: self.node.lifecycle.change(transition), self._limit_s)
+        if result.outcome is not CallbackOutcome.SUCCESS:
+            raise BringUpError(f"cannot {transition} {self._planned.full_name}: {result.error}")
+
+    @property
+    def _limit_s(self) -> float:
+        limits = self._planned.timeouts
+        return limits.configure_s + limits.connect_s + limits.activate_s + WAIT_S
+
+    def run(self, function: Callable[[], Any], timeout_s: float = WAIT_S) -> Any:
+        """Call a function, sync or async, in the thread that spins the node; return its result.
+
+        Raises:
+            TimeoutError: it is not done within `timeout_s` seconds.
+        """
+        done: list[tuple[Any, BaseException | None]] = []
+
+        async def call() -> None:
+            result, error = None, None
+            try:
+                result = function()
+                if hasattr(result, "__await__"):
+                    result = await result
+            except Exception as raised:  # noqa: BLE001 - raised for who called
+                error = raised
+            with self._changed:
+                done.append((result, error))
+                self._changed.notify_all()
+
+        self._executor.create_task(call)
+        self._wait(lambda: done, f"cannot finish {function!r}", timeout_s)
+        result, error = done[0]
+        if error is not None:
+            raise error
+        return result
+
+    def publish(self, subscription: str, message: Any) -> None:
+        """Send a message to a declared subscription, by its declared name."""
+        self._declared(self._publishers, subscription, "subscription").publish(message)
+
+    def received(self, publisher: str, timeout_s: float = WAIT_S) -> Any:
+        """Return the next message, in order, that the node published; by the declared name.
+
+        Raises:
+            TimeoutError: there is none within `timeout_s` seconds.
+        """
+        taken: collections.deque[Any] = self._declared(self._received, publisher, "publisher")
+        self._wait(lambda: taken, f"cannot receive a message of {publisher!r}", timeout_s)
+        with self._changed:
+            return taken.popleft()
+
+    def call(self, service: str, request: Any, timeout_s: float = WAIT_S) -> Any:
+        """Call a declared service server, by its declared name; return the response.
+
+        Raises:
+            TimeoutError: there is none within `timeout_s` seconds.
+        """
+        client = self._declared(self._clients, service, "service server")
+        future = client.call_async(request)
+        self._wait(future.done, f"cannot get an answer of {service!r}", timeout_s)
+        return future.result()
+
+    def wait_for_log(self, text: str, timeout_s: float = WAIT_S) -> str:
+        """Return the first line that the node logged with `text` in it.
+
+        Raises:
+            TimeoutError: there is none within `timeout_s` seconds.
+        """
+        self._wait(
+            lambda: any(text in each for each in self._logs),
+            f"cannot find {text!r} in what was logged",
+            timeout_s,
+        )
+        return next(each for each in self.logs if text in each)
+
+    def _declared(self, known: dict[str, Any], name: str, what: str) -> Any:
+        if name not in known:
+            declared = ", ".join(known) or "none"
+            raise UsageError(
+                f"cannot find {what} {name!r} of {self._planned.full_name}; declared: {declared}"
+            )
+        return known[name]
+
+    def _wait(self, holds: Callable[[], object], what: str, timeout_s: float = WAIT_S) -> None:
+        deadline = time.monotonic() + timeout_s
+        with self._changed:
+            while True:
+                if self._error is not None:
+                    error, self._error = self._error, None
+                    self._closed = True
+                    raise error
+                if holds():
+                    return
+                left_s = deadline - time.monotonic()
+                if left_s <= 0:
+                    raise TimeoutError(f"{what} within {timeout_s:g} s")
+                self._changed.wait(min(left_s, _LOOK_S))
+
+    def close(self) -> None:
+        """Shut the node down and leave the graph; raises what a callback raised meanwhile."""
+        try:
+            if not self._closed:
+                self._closed = True
+                self.run(lambda: self.node.lifecycle.shut_down("the test is over"), self._limit_s)
+        finally:
+            self._executor.shutdown()
+            self._thread.join(WAIT_S)
+            for each in (self.peer, self.node):
+                each.destroy_node()
+            self._context.try_shutdown()
+            self._context.destroy()
+
+
+_LOOK_S = 0.02
+"""How often a match or an answer is looked at, which notifies nobody."""

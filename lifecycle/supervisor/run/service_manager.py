@@ -1,0 +1,104 @@
+"""Notify systemd of a run's readiness, status and watchdog: the sd_notify protocol.
+
+Owns: `ServiceManager`, a listener of events. READY is sent when the system is verified and active,
+never before; WATCHDOG from the supervisor's event loop, so that a supervisor that hangs is ended.
+Source: sd_notify(3), sd_watchdog_enabled(3), systemd.service(5) "Type=notify".
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import socket
+from collections.abc import Callable, Mapping
+
+from lifecycle.printable import one_line
+from lifecycle.supervisor.run.events import (
+    Event,
+    Failure,
+    GateOpened,
+    RunStarted,
+    Stopping,
+    SystemReached,
+    VerdictChanged,
+)
+
+_TIMES_PER_LIMIT = 2
+"""sd_watchdog_enabled(3): send in half of the time that is given."""
+
+
+class ServiceManager:
+    """Reports one run to the service manager that has started this process.
+
+    Args:
+        address: of its socket, NOTIFY_SOCKET; a leading `@` is an abstract one; empty for none.
+        watchdog_s: seconds within which it wants a sign of life; None for never.
+    """
+
+    def __init__(self, address: str, watchdog_s: float | None = None) -> None:
+        self._address = f"\0{address[1:]}" if address.startswith("@") else address
+        self._watchdog_s = watchdog_s
+        self._timer: asyncio.TimerHandle | None = None
+        self._active = False
+        self._system = ""
+
+    @classmethod
+    def of(cls, environment: Mapping[str, str]) -> ServiceManager:
+        """Return the one that an environment names; one that sends nothing where there is none."""
+        address = environment.get("NOTIFY_SOCKET", "")
+        if not address.startswith(("/", "@")):
+            return cls("")
+        with contextlib.suppress(ValueError):
+            pid = int(environment.get("WATCHDOG_PID", "") or os.getpid())
+            limit_us = int(environment.get("WATCHDOG_USEC", ""))
+            if pid == os.getpid() and limit_us > 0:
+                return cls(address, limit_us / 1e6)
+        return cls(address)
+
+    def on_event(self, event: Event) -> None:
+        """Report what an event means for the service."""
+        if isinstance(event, RunStarted):
+            self._system = event.system
+            self._send(STATUS=f"{event.system}: connecting {len(event.nodes)} nodes")
+        elif isinstance(event, GateOpened):
+            trusted = f"; taken on trust: {event.trusted}" if event.trusted else ""
+            self._send(STATUS=f"{self._system}: verified, activating{trusted}")
+        elif isinstance(event, SystemReached) and event.reached == "active":
+            self._active = True
+            self._send(READY="1", STATUS=f"{self._system}: active and verified")
+        elif isinstance(event, VerdictChanged):
+            found = f", {len(event.verdict.findings)} findings" if event.verdict.findings else ""
+            phase = "active" if self._active else "connecting"
+            self._send(STATUS=f"{self._system}: {phase}, {event.verdict.verdict.value}{found}")
+        elif isinstance(event, Failure):
+            self._send(STATUS=f"{self._system}: {event.message}")
+        elif isinstance(event, Stopping):
+            self._active = False
+            self._send(STOPPING="1", STATUS=f"{self._system}: stopping, {event.reason}")
+
+    def watch(self) -> Callable[[], None]:
+        """Send signs of life from the running event loop; return what ends that."""
+        if self._watchdog_s is not None:
+            self._alive(asyncio.get_running_loop(), self._watchdog_s / _TIMES_PER_LIMIT)
+
+        def end() -> None:
+            if self._timer is not None:
+                self._timer.cancel()
+
+        return end
+
+    def _alive(self, loop: asyncio.AbstractEventLoop, period_s: float) -> None:
+        self._send(WATCHDOG="1")
+        self._timer = loop.call_later(period_s, self._alive, loop, period_s)
+
+    def _send(self, **state: str) -> None:
+        """Send without waiting: a service manager that does not read is no reason to stop."""
+        if not self._address:
+            return
+        text = "\n".join(f"{name}={one_line(value)}" for name, value in state.items())
+        with (
+            contextlib.suppress(OSError),
+            socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as sender,
+        ):
+            sender.sendto(text.encode(), self._address)
