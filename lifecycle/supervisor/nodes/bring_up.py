@@ -330,6 +330,11 @@ class BringUp:
             # A plain node reports nothing. Its dependents wait until it is in the graph; if it
             # never is, verification says so.
             node.doing = "waiting to appear in the graph"
+            if self._is_to_be_given(node) and not node.planned.may_end:
+                # What it is judged by must be there before it is.
+                limit_s = node.planned.timeouts.start_s
+                await self._step(node, self._appears(node.name), limit_s, rule=START_FAILED)
+                await self._give(node)
             self._appearing.append(asyncio.ensure_future(self._appear(node)))
 
     async def _appear(self, node: NodeRun) -> None:
@@ -343,12 +348,16 @@ class BringUp:
             await ended(appears)
         if appears.done() and not appears.cancelled():
             appears.result()
-            await self._give(node)
         self._started(node)
+
+    @staticmethod
+    def _is_to_be_given(node: NodeRun) -> bool:
+        given = node.planned.parameters or node.planned.parameter_files
+        return bool(given) and node.planned.run.ros_args is RosArguments.NONE
 
     async def _give(self, node: NodeRun) -> None:
         """Set its parameters where no command line can; what it has not yet, it may have later."""
-        if self._gives is None or node.planned.run.ros_args is not RosArguments.NONE:
+        if self._gives is None or not self._is_to_be_given(node):
             return
         try:
             await self._gives(node.planned)
