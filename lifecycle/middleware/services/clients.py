@@ -8,6 +8,7 @@ so the state is read again (rcl_lifecycle, lifecycle_msgs/srv/*).
 from __future__ import annotations
 
 import asyncio
+import importlib
 from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
 
 from lifecycle_msgs.msg import TransitionEvent
@@ -25,6 +26,7 @@ from lifecycle.manifest import ParameterValue as GivenValue
 from lifecycle.middleware.rcl.graph import GraphObserver
 from lifecycle.middleware.services.parameters import read_parameters, report_parameters
 from lifecycle.middleware.services.service_calls import ServiceCalls, ServiceUnansweredError
+from lifecycle.plan import PlannedNode
 from lifecycle.verify import (
     ConfigurationError,
     NodeConfiguration,
@@ -192,6 +194,53 @@ class NodeClients:
             ServiceUnansweredError: the node serves no parameters, or did not answer.
         """
         return await read_parameters(self._calls, node, timeout_s=timeout_s)
+
+    async def load_component(
+        self, node: PlannedNode, container: str, *, timeout_s: float = TIMEOUT_S
+    ) -> None:
+        """Have a component container load a node (composition_interfaces/srv/LoadNode).
+
+        Args:
+            node: whose run names the component.
+            container: full name of the container's node.
+            timeout_s: seconds, > 0.
+
+        Raises:
+            ServiceUnansweredError: no such container, or no answer.
+            MiddlewareError: composition_interfaces is not installed, or the container refuses.
+        """
+        try:
+            load_node = importlib.import_module("composition_interfaces.srv").LoadNode
+        except ImportError as error:
+            raise MiddlewareError(
+                f"cannot load {node.run.component!r} into {container!r}: composition_interfaces is "
+                "not installed",
+                hint="install it, or start the node as a command",
+            ) from error
+        package, _, plugin = node.run.component.partition("/")
+        request = load_node.Request(
+            package_name=package,
+            plugin_name=plugin,
+            node_name=node.name,
+            node_namespace=node.namespace,
+            remap_rules=[f"{source}:={target}" for source, target in node.remap],
+            parameters=[
+                RclpyParameter(name, value=value).to_parameter_msg()
+                for name, value in node.parameters
+            ],
+        )
+        response = await self._calls.call(
+            f"{container}/_container/load_node",
+            load_node,
+            request,
+            timeout_s=timeout_s,
+            repeat=False,
+        )
+        if not response.success:
+            raise MiddlewareError(
+                f"cannot load {node.run.component!r} into {container!r}: "
+                f"it says {response.error_message!r}"
+            )
 
     async def give_parameters(
         self, node: str, values: Mapping[str, GivenValue], *, timeout_s: float = TIMEOUT_S

@@ -36,7 +36,7 @@ class ActivationGuard:
         """Deactivate at once what is active without the gate having let it through."""
         states = {each.full_name: each.state for each in observation.nodes}
         for node in self._system.nodes.values():
-            if node.planned.managed and node.is_let_through:
+            if node.planned.managed and Operation.ACTIVATE in node.undo:
                 self._tries.pop(node.name, None)
             elif states.get(node.name) == ACTIVE and _is_held(node):
                 self._deactivate(node)

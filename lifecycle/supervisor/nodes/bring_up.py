@@ -140,6 +140,7 @@ class BringUp:
         appears: waits until a node of this name is in the graph.
         recorded: called after each spawn, to keep the record of children true.
         gives: sets the parameters of a running node that its command line does not give it.
+        loads: has the container of this full name load a node.
         wirer: wires each node between its configure and its connect; None leaves it to the nodes.
     """
 
@@ -153,8 +154,10 @@ class BringUp:
         recorded: Callable[[], None],
         wirer: Wirer | None = None,
         gives: Callable[[PlannedNode], Awaitable[None]] | None = None,
+        loads: Callable[[PlannedNode, str], Awaitable[None]] | None = None,
     ) -> None:
         self._gives = gives
+        self._loads = loads
         self._system = system
         self._spawner_of = spawner_of
         self._services = services
@@ -350,6 +353,23 @@ class BringUp:
             appears.result()
         self._started(node)
 
+    async def _load(self, node: NodeRun) -> None:
+        """Have its container load a component, once that runs."""
+        name = node.planned.run.container
+        container = self._system.nodes.get(name)
+        while container is not None and not container.has_reached(Condition.STARTED):
+            node.doing = f"waits to be loaded until {container.name} has started"
+            await container.changed.wait()
+        node.doing = "starting"
+        if self._loads is None:
+            return
+        full_name = name if container is None else container.name
+        try:
+            await self._loads(node.planned, full_name)
+        except MiddlewareError as error:
+            message = f"{error.message}; {error.hint}" if error.hint else error.message
+            raise StepFailedError(message, rule=START_FAILED, subject=node.name) from error
+
     @staticmethod
     def _is_to_be_given(node: NodeRun) -> bool:
         given = node.planned.parameters or node.planned.parameter_files
@@ -435,6 +455,8 @@ class BringUp:
         process = node.process
         if process is None:
             await self._hold_start(node)
+            if node.planned.run.component:
+                await self._load(node)
         else:
             if process.name not in self._starts:
                 self._starts[process.name] = asyncio.ensure_future(self._start_process(process))

@@ -97,6 +97,11 @@ class ObserverParticipant:
         if values:
             await self._graph.clients.give_parameters(node.full_name, values)
 
+    async def load(self, node: PlannedNode, container: str) -> None:
+        """Have a component container load a node; raises MiddlewareError with the reason."""
+        limit_s = node.timeouts.start_s
+        await self._graph.clients.load_component(node, container, timeout_s=limit_s)
+
     async def observe(self, plan: Plan) -> Observation:
         """Return what is there now."""
         return await self._graph.observe(plan)

@@ -249,7 +249,6 @@ class NodeRun:
         stuck: an operation on it was given up: a polite request would wait behind it.
         connections: names of what the authority connected it to, oldest first.
         reports_changes: its host reports unasked when its configuration changes.
-        found: the state in which it ran already when it was adopted; empty if it was not.
     """
 
     def __init__(self, planned: PlannedNode, emit: Emitter) -> None:
@@ -265,7 +264,6 @@ class NodeRun:
         self.stuck = False
         self.connections: tuple[str, ...] = ()
         self.reports_changes = False
-        self.found = ""
         self.changed = asyncio.Event()
         self._emit = emit
 
@@ -278,7 +276,6 @@ class NodeRun:
         self.stuck = False
         self.connections = ()
         self.reports_changes = False
-        self.found = ""
         self.doing = ""
         self.connected = False
         self.state = ""
@@ -293,11 +290,6 @@ class NodeRun:
     def is_to_be_active(self) -> bool:
         """Whether the gate is to activate it."""
         return self.planned.holds and self.planned.state is TargetState.ACTIVE
-
-    @property
-    def is_let_through(self) -> bool:
-        """Whether it may be active: the gate let it through, or it was so when it was adopted."""
-        return Operation.ACTIVATE in self.undo or self.found == TargetState.ACTIVE.value
 
     def starved_s(self) -> float:
         """Return how long its process has waited for a processor, and we to hear of it."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import shlex
 from pathlib import Path
@@ -14,6 +15,7 @@ from lifecycle.manifest.model import (
     Condition,
     DiscoveryRange,
     EndpointKind,
+    RosArguments,
     Run,
     RunKind,
     UniqueHow,
@@ -254,6 +256,18 @@ def executable(prefix: Path, package: str, name: str) -> Path:
     path.write_text("#!/bin/sh\n")
     path.chmod(0o755)
     return path
+
+
+def test_a_process_of_several_nodes_gives_each_its_own_and_a_plain_one_gets_nothing():
+    run = Run(kind=RunKind.COMMAND, command=("pair",))
+    left = node("left", run=run, process="pair", remap=(("scan", "/scan"),))
+    right = node("right", run=run, process="pair", parameters=(("rate", 2.0),))
+    assert shlex.join(command_line([left, right], {})) == (
+        "pair --ros-args -r left:scan:=/scan -p right:rate:=2.0"
+    )
+    assert command_line([node("left", run=run)], {}) == ("pair",)
+    quiet = dataclasses.replace(run, ros_args=RosArguments.NONE)
+    assert command_line([node("right", run=quiet, parameters=(("rate", 2.0),))], {}) == ("pair",)
 
 
 def packaged(name: str = "talker"):
