@@ -175,7 +175,9 @@ def _ros_arguments(node: Node, *, alone: bool) -> Iterator[str]:
         yield from ("-r", f"{rule}:={target}")
     for file in node.parameter_files:
         yield from ("--params-file", file)
-    for name, value in node.parameters:
+    # rcl 9.2 knows a value for one node by the name alone, and so has none for a namespace; the
+    # supervisor sets these.
+    for name, value in node.parameters if alone or node.namespace == "/" else ():
         yield from ("-p", f"{own}{name}:={parameter_text(value)}")
 
 

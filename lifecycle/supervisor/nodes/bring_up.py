@@ -372,8 +372,14 @@ class BringUp:
 
     @staticmethod
     def _is_to_be_given(node: NodeRun) -> bool:
-        given = node.planned.parameters or node.planned.parameter_files
-        return bool(given) and node.planned.run.ros_args is RosArguments.NONE
+        """Whether its command line cannot give it all of its parameters, see `command_line`."""
+        planned, process = node.planned, node.process
+        if process is None or planned.run.kind is not RunKind.COMMAND:
+            return False
+        if planned.run.ros_args is RosArguments.NONE:
+            return bool(planned.parameters or planned.parameter_files)
+        shared = len(process.planned.nodes) > 1
+        return shared and planned.namespace != "/" and bool(planned.parameters)
 
     async def _give(self, node: NodeRun) -> None:
         """Set its parameters where no command line can; what it has not yet, it may have later."""
