@@ -87,7 +87,7 @@ class ParameterReadings:
         Waits for those that were never read, no longer than a node may take to answer.
 
         Args:
-            nodes: full names, which have been listened for.
+            nodes: full names, of which those are read that are listened for.
             reporting: nodes that report their parameters themselves now; they are not read.
 
         Returns:
@@ -96,7 +96,9 @@ class ParameterReadings:
         for name in reporting:
             self.forget(name)
         for name in nodes:
-            names = self._named[name]
+            names = self._named.get(name)
+            if names is None:
+                continue  # another look, at a part of the system, has begun since
             known = self._nodes.get(name)
             if known is None or known.names != names:
                 self.forget(name)
