@@ -76,7 +76,8 @@ class ParameterReadings:
             named: names of parameters by full node name; without any, nothing is subscribed to.
         """
         with self._lock:
-            self._named = dict(named)
+            # Looks at a part of the system go on beside those at all of it.
+            self._named.update(named)
         if named:
             self._loop = asyncio.get_running_loop()
             self._clients.on_parameters(self._changed)
@@ -87,7 +88,7 @@ class ParameterReadings:
         Waits for those that were never read, no longer than a node may take to answer.
 
         Args:
-            nodes: full names, of which those are read that are listened for.
+            nodes: full names, which have been listened for.
             reporting: nodes that report their parameters themselves now; they are not read.
 
         Returns:
@@ -96,9 +97,7 @@ class ParameterReadings:
         for name in reporting:
             self.forget(name)
         for name in nodes:
-            names = self._named.get(name)
-            if names is None:
-                continue  # another look, at a part of the system, has begun since
+            names = self._named[name]
             known = self._nodes.get(name)
             if known is None or known.names != names:
                 self.forget(name)
