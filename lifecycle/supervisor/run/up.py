@@ -40,7 +40,7 @@ from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.forerunner import Forerunner
 from lifecycle.supervisor.processes.fork_server import ForkServer
-from lifecycle.supervisor.processes.logs import check_log_root, log_directory
+from lifecycle.supervisor.processes.logs import begin_logs, check_log_root, log_directory
 from lifecycle.supervisor.processes.orphans import end_run
 from lifecycle.supervisor.run.events import Emitter, Event, Listener, Notice, RunStarted
 from lifecycle.supervisor.run.failure import StepFailedError, Worker, never_connected, with_failure
@@ -188,7 +188,7 @@ def _up(
         async def run(leaving: contextlib.AsyncExitStack) -> UpResult:
             nonlocal records
             leaving.callback(service.watch())
-            logs = log_directory(os.environ, plan.system)
+            logs = begin_logs(log_directory(os.environ, plan.system), plan.system, os.environ)
             system = System(
                 plan,
                 emit=emit,
