@@ -1,5 +1,6 @@
 from .captured import CapturedParameter as CapturedParameter
 from .captured import CapturedSystem as CapturedSystem
+from .captured import Programs as Programs
 from .captured import capture as capture
 from .manifest_yaml import SUFFIX as SUFFIX
 from .manifest_yaml import to_manifest as to_manifest
@@ -10,6 +11,7 @@ from .picture.build import build_picture as build_picture
 from .picture.build import planned_picture as planned_picture
 from .picture.model import Picture as Picture
 from .picture.model import PicturedNodeState as PicturedNodeState
+from .programs import CapturedProgram as CapturedProgram
 from .sros2 import OVERRIDE as OVERRIDE
 from .sros2 import Enclave as Enclave
 from .sros2 import documents as documents

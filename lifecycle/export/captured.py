@@ -7,15 +7,24 @@ assigned to their nodes, everything that the graph does not show named as a gap.
 from __future__ import annotations
 
 import dataclasses
+import math
 import re
 from collections.abc import Iterable, Mapping
 
+from lifecycle.export.programs import (
+    CapturedProgram,
+    CapturedRun,
+    declared_name,
+    process_names,
+    run_of,
+)
 from lifecycle.manifest import (
     DiscoveryRange,
     EndpointKind,
     History,
     ParameterValue,
     QosProfile,
+    TargetState,
     full_name_problem,
     name_problem,
     namespace_problem,
@@ -86,6 +95,8 @@ class CapturedNode:
         managed: it offers the lifecycle services.
         state: lifecycle_msgs/State label; empty if not known.
         parameters: None where it did not answer.
+        run: how its process was started; None where others are to start it.
+        may_end: its process may end by itself: the node does nothing but ask others.
         has_configuration: its own configuration has more than discovery does.
         gaps: what is not known of it, one phrase each.
     """
@@ -102,6 +113,8 @@ class CapturedNode:
     has_configuration: bool
     process_id: int | None
     gaps: tuple[str, ...]
+    run: CapturedRun | None = None
+    may_end: bool = False
 
     @property
     def full_name(self) -> str:
@@ -146,6 +159,7 @@ def capture(
     discovery_range: DiscoveryRange,
     namespaces: tuple[str, ...] = (),
     unsettled: str = "",
+    programs: Programs | None = None,
 ) -> CapturedSystem:
     """Return what `observation` shows; the same for the same content in any order.
 
@@ -158,6 +172,7 @@ def capture(
         discovery_range: likewise.
         namespaces: take only nodes in or below one of these; empty takes all.
         unsettled: what discovery still waited for; empty if it had settled.
+        programs: how the processes of nodes were started; nodes without are attached to.
     """
     configurations = {each.name: each for each in observation.configurations}
     owners = _owners(configurations)
@@ -178,11 +193,14 @@ def capture(
         elif not name or name not in nodes:
             unknown.append(endpoint)
     machines = _machines(configurations, chosen)
-    keys = _keys(chosen)
+    instances = _instances(chosen, programs or {})
+    keys = _keys(each.name for each in instances)
+    shared = _shared(instances, keys)
     gaps = [unsettled] if unsettled else []
     gaps += [f"node {name} is left out: {why}" for name, why in illegal.items() if why]
     gaps += [
-        f"{node.count} nodes are named {name}; they cannot be told apart"
+        f"{node.count} nodes are named {name}; "
+        + ("lifecycle up gives each a name of its own" if _apart(instances, name) else _ALIKE)
         for name, node in chosen.items()
         if node.count > 1
     ]
@@ -198,19 +216,103 @@ def capture(
         machines=machines if len(machines) > 1 else (),
         nodes=tuple(
             _node(
-                node,
-                key=keys[name],
-                endpoints=endpoints[name],
-                configuration=configurations.get(name),
-                parameters=parameters.get(name),
-                why_not="it did not answer" if name in parameters else "it serves none",
+                each,
+                key=keys[each.name],
+                endpoints=[one for one in endpoints[each.node.full_name] if each.has(one)],
+                configuration=configurations.get(each.node.full_name),
+                parameters=parameters.get(each.node.full_name),
+                why_not="it did not answer"
+                if each.node.full_name in parameters
+                else "it serves none",
                 machines=machines if len(machines) > 1 else (),
+                process=shared.get(each.program.process_id, "") if each.program else "",
             )
-            for name, node in chosen.items()
+            for each in instances
         ),
         partial=len(chosen) < len(nodes),
         gaps=tuple(gaps),
     )
+
+
+Programs = Mapping[str, Mapping[str, CapturedProgram]]
+"""By full node name, how the processes of its participants were started, by GUID prefix."""
+
+_ALIKE = "they cannot be told apart"
+_PREFIX_DIGITS = 24
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class _Instance:
+    """A node of the graph, or one of several of a name.
+
+    Attributes:
+        node: as the graph shows it.
+        name: full name that the manifest gives it.
+        program: None where it is not known, or is not to be started again.
+        prefixes: of its participants, where they tell it from others of its name.
+        gap: why there is no program.
+    """
+
+    node: ObservedNode
+    name: str
+    program: CapturedProgram | None = None
+    prefixes: frozenset[str] = frozenset()
+    gap: str = ""
+
+    def has(self, endpoint: ObservedEndpoint) -> bool:
+        """Whether an endpoint of a node of this name may be its own."""
+        prefix = endpoint.gid[:_PREFIX_DIGITS]
+        return not self.prefixes or not prefix or prefix in self.prefixes
+
+
+def _instances(nodes: Mapping[str, ObservedNode], programs: Programs) -> tuple[_Instance, ...]:
+    """Return every node, several of one name apart where they are in processes of their own."""
+    found = []
+    for name, node in nodes.items():
+        by_pid: dict[int, CapturedProgram] = {}
+        prefixes: dict[int, set[str]] = {}
+        for prefix, program in programs.get(name, {}).items():
+            by_pid[program.process_id] = program
+            prefixes.setdefault(program.process_id, set()).add(prefix)
+        if not 1 <= len(by_pid) <= node.count:
+            found.append(_Instance(node=node, name=name))
+            continue
+        if len(by_pid) < node.count:
+            gap = "others of its name are not known by their processes" * (len(by_pid) > 1)
+            by_pid = dict(sorted(by_pid.items())[:1])
+            program = next(iter(by_pid.values()))
+            found.append(_Instance(node=node, name=name, program=program, gap=gap))
+            continue
+        number, free = 1, name
+        for pid, program in sorted(by_pid.items()):
+            apart = frozenset(prefixes[pid]) if len(by_pid) > 1 else frozenset()
+            found.append(_Instance(node=node, name=free, program=program, prefixes=apart))
+            while free in nodes or any(each.name == free for each in found):
+                number += 1
+                free = f"{name}_{number}"
+    return tuple(map(_restartable, found))
+
+
+def _restartable(instance: _Instance) -> _Instance:
+    if instance.program is None or not instance.program.is_of_a_supervisor:
+        return instance
+    return dataclasses.replace(
+        instance, program=None, gap="lifecycle up runs it: its own manifest says how it is started"
+    )
+
+
+def _apart(instances: Iterable[_Instance], name: str) -> bool:
+    return any(each.prefixes for each in instances if each.node.full_name == name)
+
+
+def _shared(instances: Iterable[_Instance], keys: Mapping[str, str]) -> dict[int, str]:
+    """Return names of the processes that several nodes share, by pid."""
+    programs: dict[int, list[CapturedProgram]] = {}
+    for each in instances:
+        if each.program is not None:
+            programs.setdefault(each.program.process_id, []).append(each.program)
+    several = {pid: found[0] for pid, found in programs.items() if len(found) > 1}
+    return process_names(several, set(keys.values()))
 
 
 def _owners(configurations: Mapping[str, NodeConfiguration]) -> dict[str, str]:
@@ -295,7 +397,7 @@ def _address(configuration: NodeConfiguration) -> str:
 
 
 def _node(
-    node: ObservedNode,
+    instance: _Instance,
     *,
     key: str,
     endpoints: Iterable[ObservedEndpoint],
@@ -303,8 +405,10 @@ def _node(
     parameters: tuple[CapturedParameter, ...] | None,
     why_not: str,
     machines: tuple[CapturedMachine, ...],
+    process: str,
 ) -> CapturedNode:
-    namespace, _, name = node.full_name.rpartition("/")
+    node = instance.node
+    namespace, _, name = instance.name.rpartition("/")
     reports = configuration.endpoints if configuration else ()
     gaps = []
     taken: dict[tuple[EndpointKind, str], CapturedEndpoint] = {}
@@ -321,14 +425,31 @@ def _node(
             repeated.append(captured)
         taken.setdefault((captured.kind, captured.name), captured)
     state = node.state or (configuration.state if configuration else "")
-    if node.managed and state != "active":
-        gaps.append(
-            f"it is {state or 'in an unknown state'}; lifecycle verify judges an active system"
-        )
+    if node.managed and state not in TARGETS:
+        gaps.append(f"it is {state or 'in an unknown state'}; it is judged as an active node")
     if node.managed is None:
         gaps.append("nobody tells whether it is managed")
     if parameters is None:
         gaps.append("its parameters are not known: " + why_not)
+    own = tuple(each for each in parameters or () if _is_own(each))
+    run = None
+    if instance.program is not None:
+        run = run_of(
+            instance.program,
+            node.full_name,
+            process=process,
+            renamed=instance.name != node.full_name,
+            parameters=[each.name for each in own if can_be_given(each)],
+            endpoints=list(taken),
+        )
+        gaps += run.gaps
+        taken = {
+            key: dataclasses.replace(each, declared=declared_name(run, node.full_name, *key))
+            if each.declared == each.name
+            else each
+            for key, each in taken.items()
+        }
+    gaps += [instance.gap] if instance.gap else []
     if unset := [each.name for each in parameters or () if not each.type]:
         gaps.append(f"parameters that are declared and not set: {', '.join(sorted(unset))}")
     machine = configuration.identity.machine_id if configuration else ""
@@ -343,15 +464,31 @@ def _node(
         state=state,
         endpoints=tuple(taken.values()),
         repeated=tuple(repeated),
-        parameters=None
-        if parameters is None
-        else tuple(
-            sorted((each for each in parameters if _is_own(each)), key=lambda each: each.name)
-        ),
+        parameters=None if parameters is None else tuple(sorted(own, key=lambda each: each.name)),
         has_configuration=configuration is not None,
         process_id=configuration.identity.process_id if configuration else None,
         gaps=tuple(gaps),
+        run=run,
+        may_end=run is not None and not node.managed and _only_asks(taken),
     )
+
+
+TARGETS = tuple(each.value for each in TargetState)
+"""States that a manifest can ask for."""
+
+
+def _only_asks(endpoints: Iterable[tuple[EndpointKind, str]]) -> bool:
+    asking = (EndpointKind.SERVICE_CLIENT, EndpointKind.ACTION_CLIENT)
+    return all(kind in asking for kind, _ in endpoints)
+
+
+def can_be_given(parameter: CapturedParameter) -> bool:
+    """Whether a manifest can give a parameter the value that it has now."""
+    value = parameter.value
+    if value is None or value == () or parameter.type == "byte_array":
+        return False
+    values = value if isinstance(value, tuple) else (value,)
+    return all(not isinstance(each, float) or math.isfinite(each) for each in values)
 
 
 def _is_own(parameter: CapturedParameter) -> bool:

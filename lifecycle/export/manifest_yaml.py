@@ -16,11 +16,14 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Union
 
 from lifecycle.export.captured import (
+    TARGETS,
     CapturedEndpoint,
     CapturedNode,
     CapturedParameter,
     CapturedSystem,
+    can_be_given,
 )
+from lifecycle.export.programs import CapturedRun
 from lifecycle.manifest import (
     INFINITE_NS,
     DiscoveryRange,
@@ -28,6 +31,8 @@ from lifecycle.manifest import (
     History,
     ParameterValue,
     QosProfile,
+    RosArguments,
+    TargetState,
     expand,
 )
 from lifecycle.network import UniqueRequirement, describe
@@ -125,6 +130,9 @@ def _item(value: Tree, indent: str) -> Iterator[str]:
 
 
 SUFFIX = ".nodl.yaml"
+SCHEMA_COMMENT = "# yaml-language-server: $schema=manifest.v1.schema.json"
+"""For editors, by the name that `lifecycle schema` and a wheel give the file."""
+
 _Spell = Callable[[Scalar], Scalar]
 _WIDTH = 100
 _ANNOUNCED = "history and depth are not announced"
@@ -142,6 +150,7 @@ def to_manifest(system: CapturedSystem, *, references: Mapping[str, str] | None 
             interfaces are written out without it.
     """
     head = [
+        SCHEMA_COMMENT,
         *_comments(
             f"Captured from domain {system.domain_id}, discovery range "
             f"{system.discovery_range.value}. What a graph does not tell is marked: gap."
@@ -232,26 +241,13 @@ _OPPOSITE = {
 
 
 def _node(node: CapturedNode, reference: str) -> Tree:
-    tree: dict[str, Tree] = {"run": {"attach": True}}
-    if node.key != node.name:
-        tree["name"] = node.name
-    if node.machine:
-        tree["machine"] = node.machine
-    if node.namespace != "/":
-        tree["namespace"] = node.namespace
-    tree["managed"] = node.managed
+    tree = _identity(node)
     if node.repeated:
         several = ", ".join(f"{each.kind.value} {each.name}" for each in node.repeated)
         tree["endpoints"] = Noted(
             value="open", note=f"gap: it has several {several}; a manifest names each once"
         )
-    remap = {
-        each.declared: each.name
-        for each in node.endpoints
-        if expand(each.declared, node.name, node.namespace) != each.name
-    }
-    if remap:
-        tree["remap"] = remap
+    tree.update(_given(node))
     interface = reference or _interface(node, spell=_literal)
     if interface:
         tree["interface"] = interface
@@ -263,13 +259,83 @@ def _node(node: CapturedNode, reference: str) -> Tree:
     return Noted(value=tree, note="; ".join(notes)) if notes else tree
 
 
+def _identity(node: CapturedNode) -> dict[str, Tree]:
+    """Return the keys that say what runs, where, and what is expected of it."""
+    run = node.run
+    tree: dict[str, Tree] = {"run": {"attach": True} if run is None else _run(run)}
+    if run is not None and run.process:
+        tree["process"] = run.process
+    if node.key != node.name or (run is not None and run.names):
+        tree["name"] = node.name
+    if node.machine:
+        tree["machine"] = node.machine
+    if node.namespace != "/":
+        tree["namespace"] = node.namespace
+    tree["managed"] = node.managed
+    if node.managed and node.state in TARGETS and node.state != TargetState.ACTIVE.value:
+        tree["state"] = node.state
+    if node.may_end:
+        tree["may_end"] = Noted(
+            value=True, note="gap: it only asks others; whether it ends by itself is not seen"
+        )
+    return tree
+
+
+def _given(node: CapturedNode) -> dict[str, Tree]:
+    """Return the keys that a node is given: its remaps, parameters and log level."""
+    tree: dict[str, Tree] = {}
+    run = node.run
+    remap = {
+        each.declared: each.name
+        for each in node.endpoints
+        if expand(each.declared, node.name, node.namespace) != each.name
+    }
+    remap.update(run.remap if run else ())
+    if remap:
+        tree["remap"] = remap
+    if run is None:
+        return tree
+    if run.parameter_files:
+        tree["parameter_files"] = run.parameter_files
+    values = {
+        each.name: _value(each, _literal) for each in node.parameters or () if can_be_given(each)
+    }
+    if values:
+        tree["parameters"] = values
+    if run.log_level:
+        tree["log_level"] = run.log_level
+    return tree
+
+
+def _run(run: CapturedRun) -> dict[str, Tree]:
+    tree: dict[str, Tree] = {"command": list(map(_literal, run.command))}
+    tree["working_directory"] = str(_literal(run.program.working_directory))
+    if run.program.environment:
+        tree["environment"] = {
+            name: str(_literal(value)) for name, value in run.program.environment
+        }
+    if run.ros_args is not RosArguments.AUTO:
+        tree["ros_args"] = run.ros_args.value
+    return tree
+
+
+def _value(parameter: CapturedParameter, spell: _Spell) -> Tree:
+    value = parameter.value
+    assert value is not None
+    return list(map(spell, value)) if isinstance(value, tuple) else spell(value)
+
+
 def _interface(node: CapturedNode, *, spell: _Spell) -> dict[str, Tree]:
     tree: dict[str, Tree] = {}
     for kind in EndpointKind:
         entries = [_endpoint(each) for each in node.endpoints if each.kind is kind]
         if entries:
             tree[kind.value] = entries
-    parameters = {each.name: _parameter(each, spell) for each in node.parameters or () if each.type}
+    parameters = {
+        each.name: _parameter(each, spell, given=node.run is not None and can_be_given(each))
+        for each in node.parameters or ()
+        if each.type
+    }
     if parameters:
         tree["parameters"] = parameters
     return tree
@@ -315,12 +381,13 @@ def _policy_value(value: str) -> Tree:
     return value
 
 
-def _parameter(parameter: CapturedParameter, spell: _Spell) -> Tree:
+def _parameter(parameter: CapturedParameter, spell: _Spell, *, given: bool) -> Tree:
     tree: dict[str, Tree] = {"type": parameter.type}
     value = parameter.value
-    if value is not None and _is_finite(value):
-        written: Tree = list(map(spell, value)) if isinstance(value, tuple) else spell(value)
-        tree["default_value"] = Noted(value=written, note=f"gap: {_NOW}")
+    if given:
+        pass  # beside the interface, where the node is given it
+    elif value is not None and _is_finite(value):
+        tree["default_value"] = Noted(value=_value(parameter, spell), note=f"gap: {_NOW}")
     elif value is not None:
         tree["type"] = Noted(value=parameter.type, note="gap: its value is not finite")
     if parameter.description:

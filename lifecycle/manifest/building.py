@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import ipaddress
 import os
+import shlex
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
@@ -343,8 +344,11 @@ def _known(value: Scalar) -> bool | int | float | str:
 
 __all__ = ["Findings", "build_node", "build_parameters", "quantities"]
 
-_PROGRAMS = ("python", "command", "package", "executable")
-_POSITIONED = ("machine", "namespace", "name", "process", "run", "interface", "log_level")
+_PROGRAMS = ("python", "command", "package", "executable", "component", "container", "ros_args")
+_POSITIONED = (
+    *("machine", "namespace", "name", "process", "run", "interface", "log_level"),
+    *("state", "may_end"),
+)
 
 
 def build_node(
@@ -412,13 +416,13 @@ def _run(node: Cursor, base: Path, found: Findings) -> Run:
     kind = RunKind.COMMAND
     if "python" in cursor:
         kind = RunKind.PYTHON
+        _refuse(cursor, ("ros_args",), "a Python class: our host gives it no command line", found)
+    elif "component" in cursor:
+        kind = RunKind.ATTACH
+        _refuse(cursor, _OF_A_PROCESS, "a component: its container's process has that", found)
     elif "attach" in cursor:
         kind = RunKind.ATTACH
-        for name in ("environment", "working_directory"):
-            if name in cursor:
-                at = cursor.document.key_at((*cursor.place, name))
-                message = f"cannot set {name} of a node that somebody else starts"
-                found.append(error("manifest.attach", at, message, "remove it"))
+        _refuse(cursor, _OF_A_PROCESS, "a node that somebody else starts", found)
     _check_python_keys(cursor, kind, found)
     folder = cursor.text("working_directory")
     arguments = (
@@ -430,7 +434,36 @@ def _run(node: Cursor, base: Path, found: Findings) -> Run:
         arguments=tuple((name, value) for name, value in arguments if value is not None),
         environment=tuple((name, each.value.text) for name, each in cursor.entries("environment")),
         working_directory=absolute(base, folder) if folder else "",
+        prefix=_words(cursor, "prefix", found),
     )
+
+
+_OF_A_PROCESS = ("environment", "working_directory", "ros_args", "prefix", "output")
+
+
+def _refuse(run: Cursor, names: tuple[str, ...], what: str, found: Findings) -> None:
+    """Report keys of `run` that have no meaning for this way to run a node."""
+    for name in names:
+        if name in run:
+            at = run.document.key_at((*run.place, name))
+            message = f"cannot set {name} of {what}"
+            found.append(error("manifest.attach", at, message, "remove it"))
+
+
+def _words(run: Cursor, key: str, found: Findings) -> tuple[str, ...]:
+    """Return the words of a list, or of a text as a shell splits it."""
+    cursor = run.get(key)
+    if cursor is None:
+        return ()
+    if isinstance(cursor.value.data, tuple):
+        return tuple(each.value.text for each in cursor.items())
+    try:
+        return tuple(shlex.split(cursor.value.text))
+    except ValueError as problem:
+        message = f"cannot split {key} {quote(cursor.value.text)} into words: {problem}"
+        hint = "close the quotation, or write a list of words"
+        found.append(error("manifest.words", cursor.at, message, hint))
+        return ()
 
 
 _OF_PYTHON = ("arguments", "executor", "threads")

@@ -58,6 +58,29 @@ class RunKind(enum.Enum):
     ATTACH = "attach"  # started outside the supervisor
 
 
+class RosArguments(enum.Enum):
+    """Which ROS arguments a command is given."""
+
+    AUTO = "auto"  # those that a key of the node asks for
+    NONE = "none"  # the program parses its own command line
+
+
+class Output(enum.Enum):
+    """Where goes what a process prints."""
+
+    BOTH = "both"
+    SCREEN = "screen"  # no log file
+    LOG = "log"  # the file alone
+
+
+class TargetState(enum.Enum):
+    """Primary state that a managed node is brought to (lifecycle_msgs/State)."""
+
+    UNCONFIGURED = "unconfigured"
+    INACTIVE = "inactive"
+    ACTIVE = "active"
+
+
 class Executor(enum.Enum):
     """Which of rclpy's executors runs the callbacks of a Python process."""
 
@@ -151,6 +174,11 @@ class Run:
         command: argv for COMMAND; empty when `package`/`executable` name it instead.
         package: ament package, resolved through AMENT_PREFIX_PATH at plan time.
         environment: extra variables, (name, value).
+        component: `package/Plugin` that `container` loads; the node's kind is ATTACH then.
+        container: full name of the container's node.
+        ros_args: of a COMMAND.
+        prefix: words before the command line of the process.
+        output: where goes what the process prints.
     """
 
     kind: RunKind
@@ -163,6 +191,11 @@ class Run:
     executable: str = ""
     environment: tuple[tuple[str, str], ...] = ()
     working_directory: str = ""
+    component: str = ""
+    container: str = ""
+    ros_args: RosArguments = RosArguments.AUTO
+    prefix: tuple[str, ...] = ()
+    output: Output = Output.BOTH
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -341,6 +374,8 @@ class NodeDeclaration:
         managed: True for a ROS 2 managed node; False for a plain node.
         parameters: (name, value) given on top of parameter files.
         remap: (from, to) as written.
+        state: where a managed node is brought to, and kept.
+        may_end: its process may end by itself with exit status 0.
     """
 
     key: str
@@ -355,6 +390,8 @@ class NodeDeclaration:
     after: tuple[After, ...] = ()
     timeouts: Timeouts = Timeouts()
     log_level: str = ""
+    state: TargetState = TargetState.ACTIVE
+    may_end: bool = False
     at: Position
 
     @property
@@ -425,12 +462,15 @@ __all__ = [
     "Manifest",
     "Network",
     "Node",
+    "Output",
     "ParameterDeclaration",
     "ParameterValue",
     "Policy",
     "Quantity",
+    "RosArguments",
     "Run",
     "RunKind",
+    "TargetState",
     "Timeouts",
     "UniqueHow",
 ]

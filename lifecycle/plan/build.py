@@ -211,13 +211,15 @@ def _process(
 ) -> PlannedProcess:
     """Plan one process; that its nodes can share it is checked by `manifest.checks`."""
     first = nodes[0]
-    is_command = first.run.kind is RunKind.COMMAND
+    argv: tuple[str, ...] = ()
+    if first.run.kind is RunKind.COMMAND:
+        argv = command_line(nodes, environment)
     return PlannedProcess(
         name=name,
         machine=first.machine,
         run=first.run,
         nodes=tuple(node.key for node in nodes),
-        argv=command_line(first, environment) if is_command else (),
+        argv=(*first.run.prefix, *argv) if argv else (),
         environment=tuple({**dict(graph_variables), **dict(first.run.environment)}.items()),
     )
 

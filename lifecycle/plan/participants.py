@@ -13,10 +13,18 @@ import dataclasses
 import json
 import math
 import os
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from lifecycle.manifest import Node, ParameterValue, ParticipantGroup, Position, Run
+from lifecycle.manifest import (
+    Node,
+    ParameterValue,
+    ParticipantGroup,
+    Position,
+    RosArguments,
+    Run,
+)
 from lifecycle.network import describe
 from lifecycle.plan.model import PlanError, PlannedEndpoint, PlannedParticipant
 
@@ -131,27 +139,54 @@ def participants_cost(count: int, *, others: int = 0) -> ParticipantCost:
     )
 
 
-def command_line(node: Node, environment: Mapping[str, str]) -> tuple[str, ...]:
-    """Return the full argv of a COMMAND node.
+def command_line(nodes: Sequence[Node], environment: Mapping[str, str]) -> tuple[str, ...]:
+    """Return the full argv of a COMMAND process.
 
-    Parameter files precede single parameters, because rcl lets the later one win.
+    It is given ROS arguments only where a key of one of its nodes asks for them. Those of a process
+    with several nodes are for the one node alone; who is to be renamed is known by its key.
+
+    Args:
+        nodes: all of the process, one or more, which share one `run:`.
+        environment: where AMENT_PREFIX_PATH is looked up.
 
     Raises:
         PlanError: the package or its executable cannot be found.
     """
-    argv = list(node.run.command)
-    if not argv:
-        argv = [find_executable(node.run, environment, at=node.at)]
-    argv += ["--ros-args", "-r", f"__node:={node.name}", "-r", f"__ns:={node.namespace}"]
+    run = nodes[0].run
+    argv = list(run.command) or [find_executable(run, environment, at=nodes[0].at)]
+    given: list[str] = []
+    if run.ros_args is not RosArguments.NONE:
+        given = [word for node in nodes for word in _ros_arguments(node, alone=len(nodes) == 1)]
+        levels = dict.fromkeys(node.log_level for node in nodes if node.log_level)
+        given += [word for level in levels for word in ("--log-level", level)]
+    return tuple(argv + ["--ros-args"] * bool(given) + given)
+
+
+def _ros_arguments(node: Node, *, alone: bool) -> Iterator[str]:
+    """Yield what one node asks for. Files precede values, because rcl lets the later one win."""
+    old = "" if alone else f"{node.key.rpartition('/')[2]}:"
+    own = "" if alone else f"{node.name}:"
+    if is_given_name(node):
+        yield from ("-r", f"{old}__node:={node.name}")
+    if node.namespace != "/" or node.where("namespace") is not node.at:
+        yield from ("-r", f"{own}__ns:={node.namespace}")
     for source, target in node.remap:
-        argv += ["-r", f"{source}:={target}"]
+        rule = source if _NODE_PREFIX.match(source) else f"{own}{source}"
+        yield from ("-r", f"{rule}:={target}")
     for file in node.parameter_files:
-        argv += ["--params-file", file]
-    for name, value in node.parameters:
-        argv += ["-p", f"{name}:={parameter_text(value)}"]
-    if node.log_level:
-        argv += ["--log-level", node.log_level]
-    return tuple(argv)
+        yield from ("--params-file", file)
+    # rcl 9.2 knows a value for one node by the name alone, and so has none for a namespace; the
+    # supervisor sets these.
+    for name, value in node.parameters if alone or node.namespace == "/" else ():
+        yield from ("-p", f"{own}{name}:={parameter_text(value)}")
+
+
+_NODE_PREFIX = re.compile(r"\w+:(?!//)", re.ASCII)
+
+
+def is_given_name(node: Node) -> bool:
+    """Whether the manifest writes the name of a node, so that it must be told its name."""
+    return node.where("name") is not node.at
 
 
 def find_executable(run: Run, environment: Mapping[str, str], *, at: Position) -> str:

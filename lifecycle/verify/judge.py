@@ -8,7 +8,7 @@ its arguments. Pure.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from lifecycle.manifest import EndpointKind, EndpointPolicy, UniqueHow
 from lifecycle.network import Medium, NetworkFlowEndpoint, TransportProtocol, is_ip
@@ -155,6 +155,7 @@ def verify(
     stage: Stage,
     machines: frozenset[str] | None = None,
     ahead: frozenset[str] = frozenset(),
+    over: Mapping[str, str] | None = None,
 ) -> Verdict:
     """Judge what was seen of a system against what was planned.
 
@@ -169,8 +170,9 @@ def verify(
             brought up elsewhere and may be active before ours. None: all are ours.
         ahead: fully qualified names of nodes that an earlier gate let through, which may be active
             although this one has not opened yet.
+        over: how the process ended of nodes that may end by themselves, by fully qualified name.
     """
-    view = lay_out(plan, observation, stage, machines=machines, ahead=ahead)
+    view = lay_out(plan, observation, stage, machines=machines, ahead=ahead, over=over or {})
     findings = tuple(finding for check in CHECKS for finding in check(view))
     return Verdict(
         verdict=Outcome.worst(each.outcome for each in findings),

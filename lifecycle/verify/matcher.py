@@ -61,6 +61,7 @@ def lay_out(
     *,
     machines: frozenset[str] | None = None,
     ahead: frozenset[str] = frozenset(),
+    over: Mapping[str, str] | None = None,
 ) -> View:
     """Match everything observed to everything planned; deterministic for any input order."""
     planned = {node.full_name: node for node in plan.nodes}
@@ -100,6 +101,7 @@ def lay_out(
         stage=stage,
         machines=machines,
         ahead=ahead,
+        over=dict(over or {}),
         planned=planned,
         names=names,
         observed=_graph_nodes(observation.nodes, planned, owners, tools),

@@ -144,6 +144,7 @@ class View:
     Attributes:
         machines: names of the machines whose nodes the caller brings up; None: all.
         ahead: full names of the nodes that an earlier gate let through.
+        over: how they ended, of the nodes whose process has ended as it may, by full name.
         planned: nodes of the plan by full name, in plan order.
         observed: nodes of the graph by full name, tools and hidden participants left out, sorted.
         reported: every report, sorted by name.
@@ -166,6 +167,7 @@ class View:
     stage: Stage
     machines: frozenset[str] | None = None
     ahead: frozenset[str] = frozenset()
+    over: dict[str, str] = dataclasses.field(default_factory=dict)
     planned: dict[str, PlannedNode]
     names: DeclaredNames
     observed: dict[str, ObservedNode]

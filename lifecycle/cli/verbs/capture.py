@@ -41,6 +41,11 @@ if TYPE_CHECKING:
     metavar="NAMESPACE",
     help="Take only nodes in or below it; may be given several times.",
 )
+@click.option(
+    "--attach",
+    is_flag=True,
+    help="Write nodes that others start; do not look how their processes were started.",
+)
 @click.option("--system", default="captured", show_default=True, help="Name to give the system.")
 @click.option(
     "--wait",
@@ -56,14 +61,17 @@ def command(
     output: Path | None,
     nodl_dir: Path | None,
     namespaces: tuple[str, ...],
+    attach: bool,
     system: str,
     wait: float,
 ) -> int:
     """Write a manifest of whatever runs in a domain, started by anyone.
 
-    Nodes are attached to, with the interfaces and QoS that discovery shows. What a graph does not
-    tell stands beside a comment: `# gap: …`. The result passes `lifecycle check`, and `lifecycle
-    verify` of the same system is ok. Exits with 4 if no node is there.
+    Nodes of this host are written with the command line, folder and environment of their process,
+    so that `lifecycle up` starts them again; all with the interfaces and QoS that discovery shows,
+    and with the values of their parameters. What cannot be seen stands beside a comment: `# gap: …`
+    The result passes `lifecycle check`, and `lifecycle verify` of the same system is ok. Exits with
+    4 if no node is there.
     """
     from lifecycle.export import to_manifest
     from lifecycle.manifest import Discovery
@@ -78,6 +86,7 @@ def command(
         discovery_range=effective_range(discovery, os.environ),
         namespaces=namespaces,
         wait_s=wait,
+        attach=attach,
     )
     if not captured.nodes:
         below = f" in or below {', '.join(namespaces)}" if namespaces else ""

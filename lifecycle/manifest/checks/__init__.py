@@ -35,6 +35,7 @@ from lifecycle.manifest.checks.nodes import (
     check_order,
     check_ports,
     check_processes,
+    check_programs,
 )
 from lifecycle.manifest.checks.parameters import check_parameter_files, check_parameters
 from lifecycle.manifest.checks.system import DeclaredSystem, Partial
@@ -117,6 +118,7 @@ CHECKS = (
     ),
     Check(run=lambda scope: check_machines(scope.system, scope.machines), machines=True),
     Check(run=lambda scope: check_processes(scope.system), parts=("run",)),
+    Check(run=lambda scope: check_programs(scope.system), parts=("run",)),
     Check(
         run=lambda scope: check_ports(scope.system, scope.needs, scope.environment),
         whole=True,

@@ -1,7 +1,8 @@
 """Checks of where and in which order nodes start: machines, processes, domain, ports, `after`.
 
 Owns: check.unknown-machine, check.process-machine, check.process-run, check.process-environment,
-check.process-name, check.domain, check.ports, check.localhost, check.after-unknown,
+check.process-name, check.ros-args, check.container, check.may-end, check.state,
+check.domain, check.ports, check.localhost, check.after-unknown,
 check.after-self, check.after-cycle, check.after-unmanaged. Port arithmetic is in
 `lifecycle.network`. Pure.
 """
@@ -9,6 +10,7 @@ check.after-self, check.after-cycle, check.after-unmanaged. Port arithmetic is i
 from __future__ import annotations
 
 import functools
+import shlex
 from collections.abc import Collection, Iterator, Mapping
 
 from lifecycle.manifest.checks.system import DeclaredSystem, rmw_of, spell
@@ -24,9 +26,12 @@ from lifecycle.manifest.model import (
     FlowTransport,
     Machine,
     Node,
+    RosArguments,
     Run,
     RunKind,
+    TargetState,
 )
+from lifecycle.manifest.names import full_name_problem
 from lifecycle.manifest.schema import did_you_mean
 from lifecycle.manifest.yaml.document import error, warning
 from lifecycle.network import (
@@ -67,8 +72,9 @@ def check_processes(system: DeclaredSystem) -> Iterator[Diagnostic]:
         if not node.process:
             continue
         at = node.where("process")
-        if node.run.kind is not RunKind.PYTHON:
-            message = f"cannot run {node.key!r} in process {node.process!r}: only 'run: python' can"
+        if node.run.kind is RunKind.ATTACH:
+            what = "its container's process has it" if node.run.component else "others start it"
+            message = f"cannot run {node.key!r} in process {node.process!r}: {what}"
             yield error("check.process-run", at, message, "remove 'process:'")
             continue
         namesake = system.nodes.get(node.process)
@@ -95,18 +101,83 @@ def _apart(node: Node, other: Node, at: Position) -> Iterator[Diagnostic]:
             f"{together}: it runs on machine {other.machine!r}, {node.key!r} on {node.machine!r}"
         )
         yield error("check.process-machine", at, message, "put both on one machine")
+    one, two = node.run, other.run
+    if one.kind is not two.kind or _program(one) != _program(two):
+        message = f"{together}: it runs {_program(two)}, {node.key!r} runs {_program(one)}"
+        hint = "a process that is one command has it at each of its nodes"
+        yield error("check.process-run", at, message, hint)
+        return
     different = [
         name
-        for name, one, two in (
-            ("environment", dict(node.run.environment), dict(other.run.environment)),
-            ("working_directory", node.run.working_directory, other.run.working_directory),
-            ("executor", _executor(node.run), _executor(other.run)),
+        for name, mine, its in (
+            ("environment", dict(one.environment), dict(two.environment)),
+            ("working_directory", one.working_directory, two.working_directory),
+            ("prefix", one.prefix, two.prefix),
+            ("output", one.output, two.output),
+            ("ros_args", one.ros_args, two.ros_args),
+            ("executor", _executor(one), _executor(two)),
         )
-        if one != two
+        if mine != its
     ]
     for name in different:
         message = f"{together}: a process has one {name}, these nodes ask for two"
         yield error("check.process-environment", at, message, f"give both the same 'run.{name}'")
+
+
+def _program(run: Run) -> str:
+    """Return what a process runs, as messages show it; classes of one process may differ."""
+    if run.kind is RunKind.PYTHON:
+        return "Python classes"
+    return shlex.join(run.command) if run.command else f"{run.executable} of {run.package}"
+
+
+def check_programs(system: DeclaredSystem) -> Iterator[Diagnostic]:
+    """Yield findings about what is asked of programs that cannot be had."""
+    for node in system.manifest.nodes:
+        yield from _not_given(node)
+        if node.run.component:
+            yield from _container(node, system)
+        if node.may_end and node.managed:
+            message = f"cannot let {node.key!r} end by itself: a managed node is ended by its gate"
+            yield error("check.may-end", node.where("may_end"), message, "write 'managed: false'")
+        elif node.may_end and node.run.kind is not RunKind.COMMAND:
+            message = f"cannot see how {node.key!r} ends: it is not a command that we start"
+            yield error("check.may-end", node.where("may_end"), message, "remove it")
+        if node.state is not TargetState.ACTIVE and not node.managed:
+            message = f"cannot keep {node.key!r} {node.state.value}: it is not managed"
+            yield error("check.state", node.where("state"), message, "remove 'state:'")
+
+
+def _not_given(node: Node) -> Iterator[Diagnostic]:
+    """Warn of what a command would be given by the ROS arguments that it must not have."""
+    if node.run.ros_args is not RosArguments.NONE:
+        return
+    asked = [f"remap.{name}" for name, _ in node.remap[:1]]
+    asked += ["log_level"] if node.log_level else []
+    for part in asked:
+        key = part.partition(".")[0]
+        message = f"cannot give {key} to {node.key!r}: it has 'ros_args: none'"
+        hint = "write it into its command line, or 'ros_args: auto'"
+        yield warning("check.ros-args", node.where(part), message, hint)
+
+
+def _container(node: Node, system: DeclaredSystem) -> Iterator[Diagnostic]:
+    name = node.run.container
+    at = node.where("run.container")
+    if name.startswith("/"):
+        if problem := full_name_problem(name):
+            yield error("check.container", at, f"cannot load {node.key!r} into {name!r}: {problem}")
+    elif not system.may_exist(name):
+        message = f"cannot load {node.key!r} into {name!r}: there is no such node"
+        hint = did_you_mean(name, system.known) or "others' containers have a full name, '/NAME'"
+        yield error("check.container", at, message, hint)
+    elif name in system.nodes and system.nodes[name].machine != node.machine:
+        other = system.nodes[name]
+        message = (
+            f"cannot load {node.key!r} into {name!r}: it is for machine {node.machine!r}, "
+            f"{name!r} runs on {other.machine!r}"
+        )
+        yield error("check.container", at, message, "put both on one machine")
 
 
 def check_ports(

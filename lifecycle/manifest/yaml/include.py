@@ -14,7 +14,7 @@ from pathlib import Path
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.building import Findings
 from lifecycle.manifest.diagnostics import Position
-from lifecycle.manifest.model import EndpointKind, Link, Machine, Manifest, Node
+from lifecycle.manifest.model import EndpointKind, Link, Machine, Manifest, Node, Run
 from lifecycle.manifest.names import resolve
 from lifecycle.manifest.schema import did_you_mean
 from lifecycle.manifest.yaml.document import Cursor, error
@@ -124,10 +124,18 @@ def _move_node(node: Node, prefix: str, namespace: str) -> Node:
         key=join_key(prefix, node.key),
         namespace="/" + "/".join(part for part in (outer, inner) if part),
         process=join_key(prefix, node.process) if node.process else "",
+        run=_moved_run(node.run, prefix),
         after=tuple(
             dataclasses.replace(each, node=join_key(prefix, each.node)) for each in node.after
         ),
     )
+
+
+def _moved_run(run: Run, prefix: str) -> Run:
+    """Return how a node comes to run; a container that the manifest itself has moves with it."""
+    if not run.container or run.container.startswith("/"):
+        return run
+    return dataclasses.replace(run, container=join_key(prefix, run.container))
 
 
 def join_key(prefix: str, key: str) -> str:

@@ -13,11 +13,12 @@ import os
 import threading
 import time
 import typing
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 
 import rclpy
 from rclpy.node import Node
 
+from lifecycle.export import CapturedProgram
 from lifecycle.manifest import EndpointKind, join
 from lifecycle.middleware.discovery.dead_peers import (
     PROCESS_DIGITS,
@@ -28,6 +29,7 @@ from lifecycle.middleware.discovery.dead_peers import (
 )
 from lifecycle.middleware.discovery.probe import knock_for
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
+from lifecycle.middleware.process.process_table import programs_of
 from lifecycle.middleware.rcl.graph_changes import GraphGuard, on_graph_change
 from lifecycle.middleware.rcl.graph_queries import (
     EndpointInfo,
@@ -361,6 +363,25 @@ class GraphObserver:
         return frozenset(
             each for each in self._stale_node_filter.shown() if each[:PROCESS_DIGITS] in processes
         )
+
+    def programs(self, environment: Mapping[str, str]) -> dict[str, dict[str, CapturedProgram]]:
+        """Return how the processes of this host's nodes were started.
+
+        Args:
+            environment: variables that differ from these are told.
+
+        Returns:
+            By full node name, for each of its participants by GUID prefix (24 hex digits).
+        """
+        homes = self._stale_node_filter.homes()
+        own = next(iter(homes.get(self._name, ())), "")
+        if not own:
+            return {}
+        known = programs_of((each for home in homes.values() for each in home), own, environment)
+        return {
+            name: {each: known[each] for each in home if each in known}
+            for name, home in homes.items()
+        }
 
     def remove_participants(self, prefixes: Iterable[str], pids: Iterable[int]) -> None:
         """Have all participants forget participants whose process is known to be dead.

@@ -8,21 +8,25 @@ so the state is read again (rcl_lifecycle, lifecycle_msgs/srv/*).
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Collection, Sequence
+import importlib
+from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
 
 from lifecycle_msgs.msg import TransitionEvent
 from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
 from rcl_interfaces.msg import Parameter, ParameterEvent, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter as RclpyParameter
 from rclpy.qos import qos_profile_parameter_events
 from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.export import CapturedParameter
+from lifecycle.manifest import ParameterValue as GivenValue
 from lifecycle.middleware.rcl.graph import GraphObserver
 from lifecycle.middleware.services.parameters import read_parameters, report_parameters
 from lifecycle.middleware.services.service_calls import ServiceCalls, ServiceUnansweredError
+from lifecycle.plan import PlannedNode
 from lifecycle.verify import (
     ConfigurationError,
     NodeConfiguration,
@@ -190,6 +194,84 @@ class NodeClients:
             ServiceUnansweredError: the node serves no parameters, or did not answer.
         """
         return await read_parameters(self._calls, node, timeout_s=timeout_s)
+
+    async def load_component(
+        self, node: PlannedNode, container: str, *, timeout_s: float = TIMEOUT_S
+    ) -> None:
+        """Have a component container load a node (composition_interfaces/srv/LoadNode).
+
+        Args:
+            node: whose run names the component.
+            container: full name of the container's node.
+            timeout_s: seconds, > 0.
+
+        Raises:
+            ServiceUnansweredError: no such container, or no answer.
+            MiddlewareError: composition_interfaces is not installed, or the container refuses.
+        """
+        try:
+            load_node = importlib.import_module("composition_interfaces.srv").LoadNode
+        except ImportError as error:
+            raise MiddlewareError(
+                f"cannot load {node.run.component!r} into {container!r}: composition_interfaces is "
+                "not installed",
+                hint="install it, or start the node as a command",
+            ) from error
+        package, _, plugin = node.run.component.partition("/")
+        request = load_node.Request(
+            package_name=package,
+            plugin_name=plugin,
+            node_name=node.name,
+            node_namespace=node.namespace,
+            remap_rules=[f"{source}:={target}" for source, target in node.remap],
+            parameters=[
+                RclpyParameter(name, value=value).to_parameter_msg()
+                for name, value in node.parameters
+            ],
+        )
+        response = await self._calls.call(
+            f"{container}/_container/load_node",
+            load_node,
+            request,
+            timeout_s=timeout_s,
+            repeat=False,
+        )
+        if not response.success:
+            raise MiddlewareError(
+                f"cannot load {node.run.component!r} into {container!r}: "
+                f"it says {response.error_message!r}"
+            )
+
+    async def give_parameters(
+        self, node: str, values: Mapping[str, GivenValue], *, timeout_s: float = TIMEOUT_S
+    ) -> None:
+        """Set those parameters of `node` that it has with another value.
+
+        Raises:
+            ServiceUnansweredError: the node serves no parameters, or did not answer.
+            MiddlewareError: it refuses a value, with its reason.
+        """
+        has = {each.name: each.value for each in await self.get_parameters(node)}
+        wanted = {name: value for name, value in values.items() if has.get(name, value) != value}
+        if not wanted:
+            return
+        response = await self._calls.call(
+            f"{node}/set_parameters",
+            SetParameters,
+            SetParameters.Request(
+                parameters=[
+                    RclpyParameter(name, value=value).to_parameter_msg()
+                    for name, value in wanted.items()
+                ]
+            ),
+            timeout_s=timeout_s,
+            repeat=True,
+        )
+        for name, result in zip(wanted, response.results, strict=False):
+            if not result.successful:
+                raise MiddlewareError(
+                    f"cannot set parameter {name!r} of {node!r}: it says {result.reason!r}"
+                )
 
     async def report_parameters(
         self, node: str, names: Collection[str], *, timeout_s: float = TIMEOUT_S

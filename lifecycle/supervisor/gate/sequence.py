@@ -430,7 +430,7 @@ class GateSequence:
         return tuple(
             each
             for each in self._system.nodes.values()
-            if each.planned.holds and each.reach is not Reach.ACTIVE
+            if each.is_to_be_active and each.reach is not Reach.ACTIVE
         )
 
     def _active(self) -> frozenset[str]:

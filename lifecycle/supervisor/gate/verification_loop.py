@@ -329,6 +329,7 @@ class VerificationLoop:
             stage=stage,
             machines=self._system.machines,
             ahead=self.ahead,
+            over=self._system.over(),
         )
         if self._looker is not None:
             verdict = with_findings(verdict, self._looker.findings())

@@ -44,7 +44,7 @@ async def first_death(system: System, known: set[str]) -> ManagedProcess:
         for exited in done:
             process = living[exited]
             known.add(process.name)
-            if process.state is ProcessState.EXITED:
+            if process.state is ProcessState.EXITED and not process.is_over:
                 return process
 
 

@@ -15,8 +15,8 @@ from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterable
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
-from lifecycle.errors import BringUpError
-from lifecycle.manifest import Condition, RunKind
+from lifecycle.errors import BringUpError, MiddlewareError
+from lifecycle.manifest import Condition, RosArguments, RunKind, TargetState
 from lifecycle.node import HostSpec, Operation
 from lifecycle.plan import PlannedNode
 from lifecycle.supervisor.gate.gate import Permit
@@ -28,7 +28,7 @@ from lifecycle.supervisor.processes.control_channel import (
     HostFailedError,
 )
 from lifecycle.supervisor.processes.process import ManagedProcess, Spawner, patient
-from lifecycle.supervisor.run.events import ProcessState, Reach
+from lifecycle.supervisor.run.events import Notice, ProcessState, Reach
 from lifecycle.supervisor.run.failure import StepFailedError, ended
 from lifecycle.verify import (
     DEADLINE,
@@ -139,6 +139,8 @@ class BringUp:
         services: makes the driver of a managed node that is not ours.
         appears: waits until a node of this name is in the graph.
         recorded: called after each spawn, to keep the record of children true.
+        gives: sets the parameters of a running node that its command line does not give it.
+        loads: has the container of this full name load a node.
         wirer: wires each node between its configure and its connect; None leaves it to the nodes.
     """
 
@@ -151,7 +153,11 @@ class BringUp:
         appears: Callable[[str], Awaitable[None]],
         recorded: Callable[[], None],
         wirer: Wirer | None = None,
+        gives: Callable[[PlannedNode], Awaitable[None]] | None = None,
+        loads: Callable[[PlannedNode, str], Awaitable[None]] | None = None,
     ) -> None:
+        self._gives = gives
+        self._loads = loads
         self._system = system
         self._spawner_of = spawner_of
         self._services = services
@@ -186,7 +192,7 @@ class BringUp:
             VerificationError: something changed after the verdict, and what it is now keeps the
                 gate closed for all that were not asked yet.
         """
-        held = [node for node in self._some(nodes) if node.planned.holds]
+        held = [node for node in self._some(nodes) if node.is_to_be_active]
         try:
             await asyncio.wait_for(
                 self._side_by_side(self._activate(node, permit) for node in held), timeout_s
@@ -327,11 +333,64 @@ class BringUp:
             # A plain node reports nothing. Its dependents wait until it is in the graph; if it
             # never is, verification says so.
             node.doing = "waiting to appear in the graph"
+            if self._is_to_be_given(node) and not node.planned.may_end:
+                # What it is judged by must be there before it is.
+                limit_s = node.planned.timeouts.start_s
+                await self._step(node, self._appears(node.name), limit_s, rule=START_FAILED)
+                await self._give(node)
             self._appearing.append(asyncio.ensure_future(self._appear(node)))
 
     async def _appear(self, node: NodeRun) -> None:
-        await self._appears(node.name)
+        appears = asyncio.ensure_future(self._appears(node.name))
+        waits: set[asyncio.Future[Any]] = {appears}
+        if node.process is not None:
+            waits.add(node.process.ended)
+        try:
+            await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            await ended(appears)
+        if appears.done() and not appears.cancelled():
+            appears.result()
         self._started(node)
+
+    async def _load(self, node: NodeRun) -> None:
+        """Have its container load a component, once that runs."""
+        name = node.planned.run.container
+        container = self._system.nodes.get(name)
+        while container is not None and not container.has_reached(Condition.STARTED):
+            node.doing = f"waits to be loaded until {container.name} has started"
+            await container.changed.wait()
+        node.doing = "starting"
+        if self._loads is None:
+            return
+        full_name = name if container is None else container.name
+        try:
+            await self._loads(node.planned, full_name)
+        except MiddlewareError as error:
+            message = f"{error.message}; {error.hint}" if error.hint else error.message
+            raise StepFailedError(message, rule=START_FAILED, subject=node.name) from error
+
+    @staticmethod
+    def _is_to_be_given(node: NodeRun) -> bool:
+        """Whether its command line cannot give it all of its parameters, see `command_line`."""
+        planned, process = node.planned, node.process
+        if process is None or planned.run.kind is not RunKind.COMMAND:
+            return False
+        if planned.run.ros_args is RosArguments.NONE:
+            return bool(planned.parameters or planned.parameter_files)
+        shared = len(process.planned.nodes) > 1
+        return shared and planned.namespace != "/" and bool(planned.parameters)
+
+    async def _give(self, node: NodeRun) -> None:
+        """Set its parameters where no command line can; what it has not yet, it may have later."""
+        if self._gives is None or not self._is_to_be_given(node):
+            return
+        try:
+            await self._gives(node.planned)
+        except MiddlewareError as error:
+            # Judged by what it has then, which names the parameter.
+            self._system.emit(Notice(message=error.message))
+        self._system.touched.set()
 
     def _started(self, node: NodeRun, standing: NodeCondition | None = None) -> None:
         node.doing = ""
@@ -345,8 +404,12 @@ class BringUp:
         limit_s = node.planned.timeouts.start_s
         standing = await self._step(node, node.driver.start(), limit_s, rule=START_FAILED)
         self._started(node, standing)
+        await self._give(node)
+        if node.planned.state is TargetState.UNCONFIGURED:
+            return
         await self._system.reached(node, Condition.CONFIGURED, "configure")
         await self._operate(node, Operation.CONFIGURE, Reach.CONFIGURED)
+        await self._give(node)
         await self._system.reached(node, Condition.CONNECTED, "connect")
         if self._wirer is not None:
             await self._wirer.ready(node)
@@ -398,6 +461,8 @@ class BringUp:
         process = node.process
         if process is None:
             await self._hold_start(node)
+            if node.planned.run.component:
+                await self._load(node)
         else:
             if process.name not in self._starts:
                 self._starts[process.name] = asyncio.ensure_future(self._start_process(process))
@@ -548,7 +613,7 @@ def died(process: ManagedProcess, node: NodeRun | None = None) -> StepFailedErro
         rule=PROCESS_DIED,
         subject=subject,
         process=process.name,
-        log=str(process.log.path),
+        log=process.log.shown,
     )
 
 
@@ -601,4 +666,4 @@ def _is(doing: str) -> str:
 def _process_of(node: NodeRun) -> dict[str, str]:
     """Return what a failure reports of the process of its node."""
     process = node.process
-    return {} if process is None else {"process": process.name, "log": str(process.log.path)}
+    return {} if process is None else {"process": process.name, "log": process.log.shown}

@@ -10,7 +10,7 @@ import os
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING
 
-from lifecycle.plan import ParticipantConnections, Plan, PlannedNode
+from lifecycle.plan import COMMAND, DEFAULT, ParticipantConnections, Plan, PlannedNode
 from lifecycle.supervisor.health.peer_supervisors import Listener
 from lifecycle.supervisor.nodes.driver import NodeDriver, NodeInterfaceClient, ServiceDriver
 from lifecycle.verify import NodeConfiguration, Observation
@@ -82,6 +82,25 @@ class ObserverParticipant:
     def node_interface(self, node: str) -> NodeInterfaceClient:
         """Return what drives the node interface of any node that has one, by full name."""
         return NodeInterfaceClient(self._graph.clients, node)
+
+    async def give(self, node: PlannedNode) -> None:
+        """Set the parameters that a running node has with other values than its plan gives it.
+
+        Raises:
+            MiddlewareError: it does not answer, or refuses.
+        """
+        values = {
+            each.name: each.value
+            for each in node.expected_parameters
+            if each.value is not None and each.source not in (DEFAULT, COMMAND)
+        }
+        if values:
+            await self._graph.clients.give_parameters(node.full_name, values)
+
+    async def load(self, node: PlannedNode, container: str) -> None:
+        """Have a component container load a node; raises MiddlewareError with the reason."""
+        limit_s = node.timeouts.start_s
+        await self._graph.clients.load_component(node, container, timeout_s=limit_s)
 
     async def observe(self, plan: Plan) -> Observation:
         """Return what is there now."""

@@ -11,13 +11,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import dataclasses
-import functools
 from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Protocol
 
 from lifecycle.errors import BringUpError
-from lifecycle.manifest import Condition, RunKind
+from lifecycle.manifest import Condition, RunKind, TargetState
 from lifecycle.node import INTERFACE_ON_DEMAND, Operation
 from lifecycle.node import Event as HostEvent
 from lifecycle.plan import Plan, PlannedNode, PlannedProcess
@@ -287,6 +286,11 @@ class NodeRun:
         """Fully qualified node name."""
         return self.planned.full_name
 
+    @property
+    def is_to_be_active(self) -> bool:
+        """Whether the gate is to activate it."""
+        return self.planned.holds and self.planned.state is TargetState.ACTIVE
+
     def starved_s(self) -> float:
         """Return how long its process has waited for a processor, and we to hear of it."""
         return own_starved_s() if self.process is None else self.process.starved_s()
@@ -389,9 +393,7 @@ class System:
         self.emit = emit
         own = tuple(processes)
         self.logs = LogDirectory(logs, lambda text: emit(Notice(message=text)))
-        self._process = functools.partial(
-            ManagedProcess, logs=self.logs, emit=emit, variables=variables
-        )
+        self._variables = variables
         self.processes = {
             each.name: self._process(each) for each in own if each.run.kind is not RunKind.ATTACH
         }
@@ -409,6 +411,25 @@ class System:
         self.touched = asyncio.Event()
         self.present: frozenset[str] | None = None
         self.liveliness = SilenceMonitor(emit, self.touched.set, self._is_there)
+
+    def _process(self, planned: PlannedProcess) -> ManagedProcess:
+        nodes = [self.plan.node(key) for key in planned.nodes]
+        return ManagedProcess(
+            planned,
+            logs=self.logs,
+            emit=self.emit,
+            variables=self._variables,
+            nodes={each.full_name: each.key for each in nodes},
+            may_end=bool(nodes) and all(each.may_end for each in nodes),
+        )
+
+    def over(self) -> dict[str, str]:
+        """Return how the process ended of each node that has ended by itself as it may."""
+        return {
+            node.name: str(node.process.ended.result())
+            for node in self.nodes.values()
+            if node.process is not None and node.process.is_over
+        }
 
     def _is_there(self, name: str) -> bool:
         """Whether a node has started, and is in the graph as far as that is known."""

@@ -216,8 +216,10 @@ class ForkServer:
         argv = request.argv
         if request.control is not None:
             descriptors.append(request.control)
-            if any(name.startswith(_FRESH_INTERPRETER) for name, _ in request.environment):
-                argv = (sys.executable, "-m", _HOST, "--control-fd", "{control}")
+            fresh = any(name.startswith(_FRESH_INTERPRETER) for name, _ in request.environment)
+            if fresh or request.prefix:
+                host = (sys.executable, "-m", _HOST, "--control-fd", "{control}")
+                argv = (*request.prefix, *host)
         message = ForkRequest(
             id=self._next,
             argv=argv,

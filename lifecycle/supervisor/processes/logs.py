@@ -16,7 +16,7 @@ import os
 import re
 import socket
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 
 from lifecycle.errors import UsageError
@@ -244,12 +244,14 @@ class ProcessLog:
     Args:
         directory: of the run.
         process: its name.
+        kept: it has a file.
 
     Attributes:
         path: of the file.
     """
 
-    def __init__(self, directory: LogDirectory, process: str) -> None:
+    def __init__(self, directory: LogDirectory, process: str, *, kept: bool = True) -> None:
+        self._kept = kept
         self._tail: collections.deque[str] = collections.deque(maxlen=_TAIL_LINES)
         self._directory = directory
         self._process = process
@@ -264,7 +266,9 @@ class ProcessLog:
 
     def open(self) -> None:
         """Create the file, and its directory where it is missing."""
-        self._open = True
+        self._open = self._kept
+        if not self._kept:
+            return
         try:
             self._descriptor()
         except OSError as error:
@@ -327,6 +331,11 @@ class ProcessLog:
         return self._file
 
     @property
+    def shown(self) -> str:
+        """Its path for messages; empty where there is no file."""
+        return str(self.path) if self._kept else ""
+
+    @property
     def tail(self) -> tuple[str, ...]:
         """The last lines, oldest first."""
         return tuple(self._tail)
@@ -340,6 +349,24 @@ class ProcessLog:
         if self._file is not None:
             os.close(self._file)
             self._file = None
+
+
+_RCL_LINE = re.compile(r"(?:\x1b\[[\d;]*m)*\[[A-Z]+\] \[[\d.]+\] \[([^\]]+)\]: ")
+"""How rcutils writes a line of a logger, unless RCUTILS_CONSOLE_OUTPUT_FORMAT says otherwise."""
+
+
+def logger_of(node: str) -> str:
+    """Return the name of a node's logger: `/robot/camera` logs as `robot.camera`."""
+    return node.strip("/").replace("/", ".")
+
+
+def logger_in(line: str, loggers: Collection[str]) -> str:
+    """Return which of these loggers, or of their children, wrote a line; empty if none did."""
+    found = _RCL_LINE.match(line)
+    name = found[1] if found else ""
+    while name and name not in loggers:
+        name = name.rpartition(".")[0]
+    return name
 
 
 def _missing(lines: int) -> str:

@@ -15,13 +15,20 @@ import dataclasses
 import functools
 import os
 import signal
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
+from lifecycle.manifest import Output
 from lifecycle.plan import PlannedProcess
 from lifecycle.supervisor.processes.control_channel import ControlChannel
-from lifecycle.supervisor.processes.logs import LineReader, LogDirectory, ProcessLog
+from lifecycle.supervisor.processes.logs import (
+    LineReader,
+    LogDirectory,
+    ProcessLog,
+    logger_in,
+    logger_of,
+)
 from lifecycle.supervisor.run.events import Emitter, LogLine, ProcessChanged, ProcessState
 
 CHANGES: dict[ProcessState, frozenset[ProcessState]] = {
@@ -90,6 +97,7 @@ class SpawnRequest:
     Attributes:
         name: of the planned process, for messages.
         argv: command line; empty for a process that serves the control channel as our node host.
+        prefix: words before the command line of a host of ours; `argv` has those of a command.
         environment: (name, value) on top of the spawner's own environment.
         working_directory: empty for the spawner's own.
         stdout: descriptor; the spawner does not close it.
@@ -107,6 +115,7 @@ class SpawnRequest:
     stderr: int
     control: int | None = None
     on_stop: Callable[[bool], None] = _ignore
+    prefix: tuple[str, ...] = ()
 
 
 class Child(Protocol):
@@ -184,6 +193,10 @@ COMMAND_ESCALATION: Escalation = ESCALATION[1:]
 class ManagedProcess:
     """An operating system process of the plan.
 
+    Args:
+        nodes: keys of its nodes by their full names; of several, each has a log file of its own
+            beside the process's, with the lines of its logger.
+
     Attributes:
         planned: what the plan declares of it.
         state: see `CHANGES`.
@@ -193,6 +206,7 @@ class ManagedProcess:
         asked_to_end: `end` was called while it lived.
         on_stop: called with True when a signal stopped it, False when it continues; set before
             `spawn`.
+        may_end: it may end by itself, with exit status 0.
     """
 
     def __init__(
@@ -202,8 +216,11 @@ class ManagedProcess:
         logs: LogDirectory,
         emit: Emitter,
         variables: tuple[tuple[str, str], ...] = (),
+        nodes: Mapping[str, str] | None = None,
+        may_end: bool = False,
     ) -> None:
         self.planned = planned
+        self.may_end = may_end
         self._variables = variables
         self.state = ProcessState.STARTING
         self.channel: ControlChannel | None = None
@@ -211,7 +228,15 @@ class ManagedProcess:
         self.ended: asyncio.Future[ProcessExit] = asyncio.get_running_loop().create_future()
         self.asked_to_end = False
         self.on_stop: Callable[[bool], None] = lambda _: None
-        self.log = ProcessLog(logs, planned.name)
+        kept = planned.run.output is not Output.SCREEN
+        self.log = ProcessLog(logs, planned.name, kept=kept)
+        self._node_logs: dict[str, ProcessLog] = {}
+        if kept and nodes is not None and len(nodes) > 1:
+            self._node_logs = {
+                logger_of(name): ProcessLog(logs, key)
+                for name, key in nodes.items()
+                if key != planned.name
+            }
         self._emit = emit
         self._readers: list[LineReader] = []
 
@@ -232,7 +257,8 @@ class ManagedProcess:
             BringUpError: it cannot be started.
             OSError: the system is out of descriptors.
         """
-        self.log.open()
+        for log in (self.log, *self._node_logs.values()):
+            log.open()
         self._emit(ProcessChanged(process=self.name, state=self.state))
         ends: list[int] = []
         control = None
@@ -255,6 +281,7 @@ class ManagedProcess:
                     stderr=ends[1],
                     control=None if control is None else control.fileno(),
                     on_stop=self.on_stop,
+                    prefix=() if channel is None else self.planned.run.prefix,
                 )
             )
         finally:
@@ -317,8 +344,13 @@ class ManagedProcess:
 
     @property
     def died(self) -> bool:
-        """Whether it ended although it was not asked to."""
-        return self.state is ProcessState.EXITED and not self.asked_to_end
+        """Whether it ended although it was not asked to, and not as it may."""
+        return self.state is ProcessState.EXITED and not self.asked_to_end and not self.is_over
+
+    @property
+    def is_over(self) -> bool:
+        """Whether it has ended by itself as all of its nodes may: with exit status 0."""
+        return self.may_end and self.ended.done() and self.ended.result().status == 0
 
     def _exited(self, exited: asyncio.Future[ProcessExit]) -> None:
         self._change(ProcessState.EXITED, detail=str(exited.result()))
@@ -329,7 +361,8 @@ class ManagedProcess:
             await self.channel.close()
         for reader in self._readers:
             reader.close()
-        self.log.close()
+        for log in (self.log, *self._node_logs.values()):
+            log.close()
 
     def _change(self, state: ProcessState, detail: str = "") -> None:
         self.state = change(self.state, state)
@@ -337,7 +370,10 @@ class ManagedProcess:
 
     def _line(self, stream: str, line: str) -> None:
         self.log.add(line)
-        self._emit(LogLine(process=self.name, stream=stream, line=line))
+        if self._node_logs and (logger := logger_in(line, self._node_logs)):
+            self._node_logs[logger].add(line)
+        if self.planned.run.output is not Output.LOG:
+            self._emit(LogLine(process=self.name, stream=stream, line=line))
 
 
 SLICE_S = 1.0

@@ -347,6 +347,7 @@ def capture_running(
     discovery_range: DiscoveryRange,
     namespaces: tuple[str, ...] = (),
     wait_s: float,
+    attach: bool = False,
 ) -> CapturedSystem:
     """Return what runs in a domain now.
 
@@ -356,16 +357,20 @@ def capture_running(
         discovery_range: how far to look.
         namespaces: take only nodes in or below one of these; empty takes all.
         wait_s: seconds, > 0, that discovery may take to settle.
+        attach: do not look how the processes of this host were started.
 
     Raises:
         MiddlewareError: no participant can be made.
     """
     from lifecycle.graph import Graph
 
+    environment = dict(os.environ)
+
     os.environ["ROS_DOMAIN_ID"] = str(domain_id)
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = discovery_range.name
     with Graph.in_loop(domain_id) as graph:
         observation, parameters, unsettled = asyncio.run(_look(graph, wait_s))
+        programs = {} if attach else graph.discovery.programs(environment)
     return capture(
         observation,
         parameters,
@@ -374,6 +379,7 @@ def capture_running(
         discovery_range=discovery_range,
         namespaces=namespaces,
         unsettled=unsettled,
+        programs=programs,
     )
 
 

@@ -109,6 +109,12 @@ class SessionParticipant(
     The parts are the Protocols of those who use them; here is what the session itself asks.
     """
 
+    async def load(self, node: PlannedNode, container: str) -> None:
+        """Have a component container load a node; raises MiddlewareError with the reason."""
+
+    async def give(self, node: PlannedNode) -> None:
+        """Set the parameters that a running node has with other values than its plan gives it."""
+
     def driver(self, node: PlannedNode) -> NodeDriver:
         """Return the driver of a managed node that is not in a host of ours."""
 
@@ -202,6 +208,8 @@ class Session:
             appears=sightings.appears,
             recorded=self._records.write,
             wirer=self._authority,
+            gives=observer_participant.give,
+            loads=observer_participant.load,
         )
         self._remote_nodes = RemoteNodes(
             system.plan, system.awaited(), observer_participant, self._changes

@@ -41,7 +41,15 @@ DUPLICATE_NODE = Rule(
     outcomes=(Outcome.VIOLATED,),
     fix="stop the other one, or give each its own name or namespace",
 )
-RULES = (MISSING_NODE, UNDECLARED_NODE, DUPLICATE_NODE)
+ENDED_NODE = Rule(
+    id="graph.ended-node",
+    meaning="a node that may end by itself has ended",
+    outcomes=(Outcome.UNVERIFIABLE,),
+    fix="nothing, if its work was to be done once; without `may_end` its end is a failure",
+    concerns_flow=True,
+    heals=Heals.NEVER,
+)
+RULES = (MISSING_NODE, ENDED_NODE, UNDECLARED_NODE, DUPLICATE_NODE)
 
 
 def check(view: View) -> Iterator[Finding]:
@@ -56,8 +64,19 @@ def _missing(view: View) -> Iterator[Finding]:
     for name, node in view.planned.items():
         if name in view.observed:
             continue
+        if name in view.over:
+            yield ENDED_NODE.on_node(
+                Outcome.UNVERIFIABLE,
+                node,
+                expected="node in the graph, or ended by itself",
+                observed=view.over[name],
+                message=f"cannot verify node {name}: it has ended by itself, as it may",
+            )
+            continue
         hint = ""
-        if node.run.kind is RunKind.ATTACH:
+        if node.run.component:
+            hint = f"look at the log of its container {node.run.container}"
+        elif node.run.kind is RunKind.ATTACH:
             hint = "start it: the manifest attaches to it; compare domain, RMW and discovery range"
         elif not view.brings_up(node):
             machine = f" --machine {node.machine}" if node.machine else ""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from lifecycle.manifest import TargetState
 from lifecycle.plan import PlannedNode
 from lifecycle.verify.observation import NodeConfiguration
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
@@ -39,7 +40,14 @@ ACTIVATED_AT_CLOSED_GATE = Rule(
 )
 RULES = (WRONG_STATE, STATE_UNVERIFIABLE, ACTIVATED_AT_CLOSED_GATE)
 
-_STATES = {Stage.CONNECTED: "inactive", Stage.ACTIVE: "active"}
+_INACTIVE = TargetState.INACTIVE.value
+
+
+def _wanted(stage: Stage, node: PlannedNode) -> str:
+    """Return the state that a node must be in: no further than it is to be brought."""
+    if stage is Stage.CONNECTED and node.state is TargetState.ACTIVE:
+        return _INACTIVE
+    return node.state.value
 
 
 def check(view: View) -> Iterator[Finding]:
@@ -50,13 +58,13 @@ def check(view: View) -> Iterator[Finding]:
 
 
 def _judge(view: View, name: str, node: PlannedNode) -> Iterator[Finding]:
-    wanted = _STATES[view.stage]
+    wanted = _wanted(view.stage, node)
     allowed = {wanted}
     ahead = view.stage is Stage.CONNECTED and name in view.ahead
     if ahead or (view.stage is Stage.CONNECTED and not view.brings_up(node)):
         # Another supervisor brings it up, and its gate opens on the same proof, maybe before ours;
         # or an earlier gate let it through, and only others have to pass again.
-        allowed.add("active")
+        allowed.add(node.state.value)
     observed = view.observed.get(name)
     report = view.configurations.get(name)
     # Both sources count: if they disagree one of them is late, and nothing is proven yet.
@@ -69,7 +77,7 @@ def _judge(view: View, name: str, node: PlannedNode) -> Iterator[Finding]:
     passing = {"activating"} if ahead else set()
     wrong = [state for state in states if state not in allowed | passing]
     expected = wanted
-    if view.stage is Stage.CONNECTED and view.ours(node):
+    if view.stage is Stage.CONNECTED and view.ours(node) and wanted == _INACTIVE:
         expected = "inactive, connected"
         if not wrong and report is not None and not report.connected:
             wrong = ["inactive, disconnected"]

@@ -14,7 +14,7 @@ from tests.ros.supervisor.running import BOUND_S, ENOUGH, pair, up, verb
 
 pytestmark = pytest.mark.thorough
 
-_SETTLES = ("--wait", str(BOUND_S / 2))
+_SETTLES = ("--attach", "--wait", str(BOUND_S / 2))
 """It ends once nothing changes any more, which takes a busy machine longer."""
 
 _ACTION_SERVER = ("action server", "/left/dock", "test_msgs/action/Fibonacci")

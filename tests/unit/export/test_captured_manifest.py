@@ -136,6 +136,7 @@ def test_a_captured_system_is_valid_and_verified_by_what_it_was_captured_from(
 def test_what_is_not_told_is_marked_on_its_line(tmp_path: Path) -> None:
     text = to_manifest(captured())
     assert text.startswith(
+        "# yaml-language-server: $schema=manifest.v1.schema.json\n"
         "# Captured from domain 7, discovery range localhost. What a graph does not tell is "
         "marked: gap.\n"
         "# gap: not ours, so that machine, process, flows, DSCP, history and depth are not told: "
@@ -244,7 +245,7 @@ def test_nodl_documents_stand_in_for_interfaces(tmp_path: Path) -> None:
 def test_what_cannot_be_captured_is_named_at_the_top(observation: Observation, gap: str) -> None:
     system = captured(observation)
     assert system.gaps == (gap,)
-    assert to_manifest(system).splitlines()[1] == f"# gap: {gap}"
+    assert to_manifest(system).splitlines()[2] == f"# gap: {gap}"
 
 
 def test_an_endpoint_that_a_manifest_cannot_name_twice_opens_its_node(tmp_path: Path) -> None:
@@ -269,10 +270,10 @@ def test_a_type_that_is_no_ros_type_and_a_state_that_verify_refuses_are_gaps() -
     )
     assert system.nodes[0].gaps == (
         "publishers: /raw has no ROS type: foo::Bar",
-        "it is inactive; lifecycle verify judges an active system",
         "its parameters are not known: it serves none",
     )
     assert system.nodes[0].endpoints == ()
+    assert "    state: inactive\n" in to_manifest(system)
 
 
 def test_some_namespaces_leave_the_others_open(tmp_path: Path) -> None:

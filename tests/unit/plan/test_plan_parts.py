@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import shlex
 from pathlib import Path
@@ -14,6 +15,7 @@ from lifecycle.manifest.model import (
     Condition,
     DiscoveryRange,
     EndpointKind,
+    RosArguments,
     Run,
     RunKind,
     UniqueHow,
@@ -200,7 +202,7 @@ def test_a_process_is_told_its_domain_its_range_and_its_nodes_variables():
 # --- command lines
 
 
-def test_a_command_gets_its_name_remaps_parameters_and_log_level_as_ros_spells_them():
+def test_a_command_gets_its_namespace_remaps_parameters_and_log_level_as_ros_spells_them():
     one = node(
         "talker",
         run=Run(kind=RunKind.COMMAND, command=("/opt/talker", "--fast")),
@@ -210,8 +212,8 @@ def test_a_command_gets_its_name_remaps_parameters_and_log_level_as_ros_spells_t
         parameter_files=("/etc/talker.yaml",),
         log_level="debug",
     )
-    assert shlex.join(command_line(one, {})) == (
-        "/opt/talker --fast --ros-args -r __node:=talker -r __ns:=/robot -r chatter:=/talk"
+    assert shlex.join(command_line([one], {})) == (
+        "/opt/talker --fast --ros-args -r __ns:=/robot -r chatter:=/talk"
         " --params-file /etc/talker.yaml -p rate:=2.0 -p 'name:=\"1\"' --log-level debug"
     )
 
@@ -256,6 +258,18 @@ def executable(prefix: Path, package: str, name: str) -> Path:
     return path
 
 
+def test_a_process_of_several_nodes_gives_each_its_own_and_a_plain_one_gets_nothing():
+    run = Run(kind=RunKind.COMMAND, command=("pair",))
+    left = node("left", run=run, process="pair", remap=(("scan", "/scan"),))
+    right = node("right", run=run, process="pair", parameters=(("rate", 2.0),))
+    assert shlex.join(command_line([left, right], {})) == (
+        "pair --ros-args -r left:scan:=/scan -p right:rate:=2.0"
+    )
+    assert command_line([node("left", run=run)], {}) == ("pair",)
+    quiet = dataclasses.replace(run, ros_args=RosArguments.NONE)
+    assert command_line([node("right", run=quiet, parameters=(("rate", 2.0),))], {}) == ("pair",)
+
+
 def packaged(name: str = "talker"):
     return node("t", run=Run(kind=RunKind.COMMAND, package="demo", executable=name))
 
@@ -264,14 +278,14 @@ def test_an_executable_is_found_under_the_first_prefix_that_has_it(tmp_path: Pat
     executable(tmp_path / "three", "demo", "talker")
     found = executable(tmp_path / "two", "demo", "talker")
     prefixes = ":".join(str(tmp_path / each) for each in ("one", "two", "three"))
-    assert command_line(packaged(), {"AMENT_PREFIX_PATH": prefixes})[0] == str(found)
+    assert command_line([packaged()], {"AMENT_PREFIX_PATH": prefixes})[0] == str(found)
 
 
 def test_a_file_that_may_not_be_executed_is_not_found(tmp_path: Path):
     executable(tmp_path, "demo", "talker").chmod(0o644)
     executable(tmp_path, "demo", "listener")
     with pytest.raises(PlanError) as error:
-        command_line(packaged(), {"AMENT_PREFIX_PATH": str(tmp_path)})
+        command_line([packaged()], {"AMENT_PREFIX_PATH": str(tmp_path)})
     assert error.value.message == (
         "cannot find executable 'talker' of package 'demo': the package has listener"
     )
@@ -279,7 +293,7 @@ def test_a_file_that_may_not_be_executed_is_not_found(tmp_path: Path):
 
 def test_a_missing_package_says_where_it_was_looked_for():
     with pytest.raises(PlanError) as error:
-        command_line(packaged(), {"AMENT_PREFIX_PATH": "/nowhere:/elsewhere"})
+        command_line([packaged()], {"AMENT_PREFIX_PATH": "/nowhere:/elsewhere"})
     assert str(error.value) == (
         "robot.lifecycle.yaml:3:3: cannot find executable 'talker' of package 'demo':"
         " no lib/demo with executables under /nowhere, /elsewhere;"
@@ -289,7 +303,7 @@ def test_a_missing_package_says_where_it_was_looked_for():
 
 def test_no_ament_environment_says_so():
     with pytest.raises(PlanError) as error:
-        command_line(packaged(), {})
+        command_line([packaged()], {})
     assert error.value.message == (
         "cannot find executable 'talker' of package 'demo': AMENT_PREFIX_PATH is empty"
     )

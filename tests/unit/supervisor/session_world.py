@@ -168,6 +168,12 @@ class FakeParticipant:
         self.dropped.append(node)
         self._reports.pop(node, None)
 
+    async def load(self, node: PlannedNode, container: str) -> None:
+        """No container is in this world."""
+
+    async def give(self, node: PlannedNode) -> None:
+        """No node of this world has parameter services."""
+
     def driver(self, node: PlannedNode) -> NodeDriver:
         return ServiceDriver(self.services, node)
 

@@ -87,6 +87,7 @@ class _Bench:
         stage: Stage,
         machines: frozenset[str] | None = None,
         ahead: frozenset[str] = frozenset(),
+        over: object = None,
     ) -> Verdict:
         self.looks.append(self.now)
         self.judged.append(

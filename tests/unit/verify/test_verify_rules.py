@@ -538,9 +538,18 @@ def test_every_rule_has_a_case_in_which_it_fires():
     remote_nodes |= {"graph.unseen-endpoint", "graph.type-definition-differs", "flow.not-measured"}
     remote_nodes |= {each.id for each in RULES if each.id.startswith(("connection.", "param."))}
     remote_nodes |= {each.id for each in RULES if each.id.startswith("run.")}
+    remote_nodes.add("graph.ended-node")  # in a test of its own: nothing of a graph says it
     remote_nodes.add("state.activated-at-closed-gate")  # tests/unit/supervisor, it is the guard's
     fired = {rule for _, expected in FIRES.values() for rule, _, _ in expected}
     assert fired | remote_nodes == {rule.id for rule in RULES}
+
+
+def test_a_node_that_has_ended_as_it_may_is_unverifiable_and_not_missing():
+    seen = drop_node("/viewer")(perfect(PLAN))
+    verdict = verify(PLAN, seen, stage=Stage.CONNECTED, over={"/viewer": "exit status 0"})
+    (finding,) = (each for each in verdict.findings if each.node == "/viewer")
+    assert (finding.rule, finding.outcome) == ("graph.ended-node", Outcome.UNVERIFIABLE)
+    assert finding.message == "cannot verify node /viewer: it has ended by itself, as it may"
 
 
 # --- policies

@@ -1,0 +1,224 @@
+"""What a captured node runs: its process's command line, taken apart where it has ROS arguments.
+
+Owns: `CapturedProgram`, which processes several nodes share, and how `--ros-args` (rcl/arguments.c)
+become keys of a manifest where that means the same; where it does not, the command line stays as it
+was and the manifest appends nothing to it. Pure but for looking whether parameter files are there.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import re
+import tempfile
+from collections.abc import Collection, Iterable, Mapping
+from pathlib import Path
+
+from lifecycle.manifest import (
+    EndpointKind,
+    RosArguments,
+    name_problem,
+    node_name_problem,
+    resolve,
+)
+
+_OURS = "lifecycle.supervisor.processes.fork_server_main"
+"""In the command line of processes that `lifecycle up` has forked."""
+
+_LEVELS = ("debug", "info", "warn", "error", "fatal")
+_WORD = re.compile(r"[^A-Za-z0-9_]+")
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class CapturedProgram:
+    """How a process was started.
+
+    Attributes:
+        argv: its command line; the first word finds the program from where it was looked.
+        working_directory: absolute.
+        environment: (name, value) of what matters and is otherwise here; sorted.
+        withheld: names of variables that matter, whose values are secret or too long.
+    """
+
+    process_id: int
+    argv: tuple[str, ...]
+    working_directory: str
+    environment: tuple[tuple[str, str], ...] = ()
+    withheld: tuple[str, ...] = ()
+
+    @property
+    def is_of_a_supervisor(self) -> bool:
+        """Whether `lifecycle up` runs it: its command line is the fork server's."""
+        return _OURS in self.argv
+
+    def names(self, node: str) -> bool:
+        """Whether it made the name of a node up as it started: with its pid, or a long number."""
+        numbers = re.findall(r"\d+", node)
+        return any(each == str(self.process_id) or len(each) > 5 for each in numbers)
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class CapturedRun:
+    """The keys of a manifest that start a process again.
+
+    Attributes:
+        process: name of a process that several nodes share; empty for one of a single node.
+        ros_args: AUTO where ROS arguments of the command line have become keys.
+        names: the name of the node is one of them.
+    """
+
+    program: CapturedProgram
+    command: tuple[str, ...]
+    process: str = ""
+    ros_args: RosArguments = RosArguments.NONE
+    names: bool = False
+    remap: tuple[tuple[str, str], ...] = ()
+    parameter_files: tuple[str, ...] = ()
+    log_level: str = ""
+    gaps: tuple[str, ...] = ()
+
+
+def run_of(
+    program: CapturedProgram,
+    node: str,
+    *,
+    process: str = "",
+    renamed: bool = False,
+    parameters: Collection[str] = (),
+    endpoints: Collection[tuple[EndpointKind, str]] = (),
+) -> CapturedRun:
+    """Return how to start the process of a node again.
+
+    Args:
+        program: how it was started.
+        node: full name of the node.
+        process: name of the process, where several nodes share it.
+        renamed: the manifest gives the node another name than it has.
+        parameters: names of those whose values the manifest gives.
+        endpoints: kind and full name of each endpoint that the manifest declares.
+    """
+    gaps: tuple[str, ...] = ()
+    if program.withheld:
+        gaps = (f"not told of its environment: {', '.join(program.withheld)}",)
+    run = CapturedRun(program=program, command=program.argv, process=process, gaps=gaps)
+    if process:
+        return run
+    made_up = renamed or program.names(node.rpartition("/")[2])
+    if "--ros-args" not in program.argv:
+        return dataclasses.replace(run, ros_args=RosArguments.AUTO, names=True) if made_up else run
+    taken = _taken_apart(run, node, parameters)
+    if taken is None or not _resolves(taken, node, endpoints):
+        return run
+    return dataclasses.replace(taken, names=taken.names or made_up)
+
+
+def _taken_apart(run: CapturedRun, node: str, parameters: Collection[str]) -> CapturedRun | None:
+    """Make keys of ROS arguments; None where they do not mean what the keys would."""
+    argv = run.program.argv
+    start = argv.index("--ros-args")
+    own, words = argv[:start], list(argv[start + 1 :])
+    if "--" in words or "--ros-args" in words:
+        return None
+    rest: list[str] = []
+    while words:
+        option = words.pop(0)
+        if option in ("-r", "--remap") and words:
+            remapped = _remapped(run, node, words.pop(0))
+            if remapped is None:
+                return None
+            run = remapped
+        elif option in ("-p", "--param") and words:
+            word = words.pop(0)
+            rest += [] if word.partition(":=")[0] in parameters else [option, word]
+        elif option == "--params-file" and words:
+            run = _with_file(run, words.pop(0))
+        elif option == "--log-level" and words and words[0].lower() in _LEVELS:
+            run = dataclasses.replace(run, log_level=words.pop(0).lower())
+        else:
+            rest.append(option)
+    command = (*own, *(["--ros-args", *rest] if rest else []))
+    return dataclasses.replace(run, command=command, ros_args=RosArguments.AUTO)
+
+
+def _remapped(run: CapturedRun, node: str, rule: str) -> CapturedRun | None:
+    """Return a run with one more remap rule; None where no key means the same."""
+    namespace, _, name = node.rpartition("/")
+    left, separator, right = rule.partition(":=")
+    if left in ("__node", "__name") and right == name:
+        return dataclasses.replace(run, names=True)
+    if left == "__ns" and right.rstrip("/") == namespace:
+        return run  # the manifest has the namespace of every node
+    if not separator or left.startswith("__") or ":" in left or left in dict(run.remap):
+        return None
+    return dataclasses.replace(run, remap=(*run.remap, (left, right)))
+
+
+def _with_file(run: CapturedRun, word: str) -> CapturedRun:
+    file = os.path.normpath(Path(run.program.working_directory) / word)
+    if _is_kept(file):
+        return dataclasses.replace(run, parameter_files=(*run.parameter_files, file))
+    gap = f"it was given the parameter file {word}, which does not stay"
+    return dataclasses.replace(run, gaps=(*run.gaps, gap))
+
+
+def _is_kept(file: str) -> bool:
+    """Whether a parameter file is there, and is none that launch makes and removes."""
+    of_launch = Path(file).name.startswith("launch_params_")
+    in_temporary = file.startswith(f"{tempfile.gettempdir()}/")
+    return Path(file).is_file() and not (of_launch and in_temporary)
+
+
+def _resolves(run: CapturedRun, node: str, endpoints: Iterable[tuple[EndpointKind, str]]) -> bool:
+    """Whether every endpoint gets its name of now when the manifest's remaps are applied."""
+    return all(resolved(run, node, kind, name) == name for kind, name in endpoints)
+
+
+def declared_name(run: CapturedRun | None, node: str, kind: EndpointKind, name: str) -> str:
+    """Return the name that a node uses for an endpoint; the full one where that is not known."""
+    for source, _ in run.remap if run else ():
+        if not name_problem(source) and _resolve(run, node, kind, source) == name:
+            return source
+    return name
+
+
+def resolved(run: CapturedRun, node: str, kind: EndpointKind, name: str) -> str:
+    """Return where an endpoint of a name as it is declared ends up."""
+    return _resolve(run, node, kind, declared_name(run, node, kind, name))
+
+
+def _resolve(run: CapturedRun | None, node: str, kind: EndpointKind, name: str) -> str:
+    namespace, _, base = node.rpartition("/")
+    return resolve(
+        name,
+        node_name=base,
+        namespace=namespace or "/",
+        remap=run.remap if run else (),
+        kind=kind,
+    )
+
+
+def process_names(shared: Mapping[int, CapturedProgram], taken: Collection[str]) -> dict[int, str]:
+    """Return a name for each process that several nodes share, by pid.
+
+    Args:
+        shared: those processes by pid.
+        taken: keys of nodes, which no process may have.
+    """
+    names: dict[int, str] = {}
+    for pid, program in shared.items():
+        base = _stem(program.argv)
+        free, number = base, 2
+        while free in names.values() or free in taken:
+            free, number = f"{base}_{number}", number + 1
+        names[pid] = free
+    return names
+
+
+def _stem(argv: tuple[str, ...]) -> str:
+    """Return a word for what a command line runs: the script or module of Python's, its file."""
+    words = list(argv)
+    word = words[0]
+    if re.match(r"python[\d.]*$", Path(word).name) and len(words) > 1:
+        word = next((each for each in words[1:] if not each.startswith("-")), word)
+    stem = _WORD.sub("_", Path(word).name.removesuffix(".py")).strip("_")
+    return "process" if node_name_problem(stem) else stem

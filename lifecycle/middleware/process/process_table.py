@@ -1,0 +1,132 @@
+"""How the processes that run were started: command line, folder and environment (/proc, proc(5)).
+
+Owns: which process of this host a participant belongs to, by its GUID prefix; and which of its
+environment variables matter to who starts it again. Reads /proc, and runs nothing.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from lifecycle.export import CapturedProgram
+from lifecycle.middleware.discovery.dead_peers import is_of_process
+
+_LONGEST_VALUE = 8192
+
+_OF_A_SESSION = re.compile(
+    "_|_ROS_WHEELS_.*|LIFECYCLE_.*|SHLVL|PWD|OLDPWD|SHELL|HOME|USER|LOGNAME|MAIL|HOSTNAME|LANG|LC_.*"
+    "|TERM|TERM_.*|COLORTERM|COLUMNS|LINES|LS_COLORS|LESS.*|PAGER|EDITOR|VISUAL|PS[1-4]|PROMPT.*"
+    "|HIST.*|VTE_.*|KONSOLE_.*|GNOME_.*|WINDOWID|WINDOWPATH|TMUX.*|STY|SSH_.*|XDG_.*|DBUS_.*|GPG_.*"
+    "|DESKTOP_.*|SESSION_.*|DISPLAY|WAYLAND_DISPLAY|XAUTHORITY|INVOCATION_ID|JOURNAL_STREAM"
+    "|SYSTEMD_.*|NOTIFY_SOCKET|WATCHDOG_.*|MANAGERPID|LISTEN_.*|SUDO_.*|VIRTUAL_ENV_PROMPT"
+    "|PYTEST_.*|ROS_DOMAIN_ID|ROS_AUTOMATIC_DISCOVERY_RANGE|ROS_LOG_DIR"
+)
+"""Variables of a login, of who started it, or that a manifest says otherwise."""
+
+_SECRET = re.compile(
+    "TOKEN|SECRET|PASSW|CREDENTIAL|PRIVATE|(API|ACCESS)_?KEY|AUTH(?!OR)", re.IGNORECASE
+)
+
+_PATHS = ("PATH", "MANPATH", "INFOPATH")
+"""Lists of folders that matter only by what they have and we have not."""
+
+_ROS_LIBRARY = re.compile(r"/lib(rmw|rcl|fastrtps|fastdds|ddsc|zenohc)[^/]*\.so")
+
+
+def programs_of(
+    participants: Iterable[str], own: str, environment: Mapping[str, str]
+) -> dict[str, CapturedProgram]:
+    """Return how the processes of participants on this host were started, by GUID prefix.
+
+    Args:
+        participants: GUID prefixes, 24 hex digits each.
+        own: that of a participant of this process.
+        environment: variables that differ from these are told.
+    """
+    pids = tuple(int(each.name) for each in Path("/proc").iterdir() if each.name.isdecimal())
+    found = {}
+    for prefix in dict.fromkeys(participants):
+        fits = [pid for pid in pids if is_of_process(prefix, pid, own) and _speaks_ros(pid)]
+        programs = [each for pid in fits if (each := read_program(pid, environment))]
+        # Fast DDS keeps 16 bits of a pid: of two that fit nobody can say which it is.
+        if len(programs) == 1:
+            found[prefix] = programs[0]
+    return found
+
+
+def read_program(pid: int, environment: Mapping[str, str]) -> CapturedProgram | None:
+    """Return how a process was started; None where that cannot be read or written down.
+
+    Args:
+        pid: of a process on this host.
+        environment: variables that differ from these are told.
+    """
+    folder = Path(f"/proc/{pid}")
+    try:
+        words = (folder / "cmdline").read_bytes().split(b"\0")[:-1]
+        argv = tuple(each.decode() for each in words)
+        variables = _variables((folder / "environ").read_bytes())
+        directory = str((folder / "cwd").readlink())
+        executable = str((folder / "exe").readlink())
+    except (OSError, UnicodeDecodeError):
+        return None
+    if not argv or not argv[0]:
+        return None
+    told = {
+        name: value
+        for name, value in variables.items()
+        if _matters(name, value, environment.get(name))
+    }
+    withheld = tuple(
+        sorted(each for each in told if _SECRET.search(each) or len(told[each]) > _LONGEST_VALUE)
+    )
+    program = _program(argv[0], directory, variables.get("PATH", os.defpath), executable)
+    if "/" not in argv[0] and shutil.which(argv[0], path=environment.get("PATH")) == program:
+        program = argv[0]
+    return CapturedProgram(
+        process_id=pid,
+        argv=(program, *argv[1:]),
+        working_directory=directory,
+        environment=tuple(
+            (name, value) for name, value in sorted(told.items()) if name not in withheld
+        ),
+        withheld=withheld,
+    )
+
+
+def _variables(block: bytes) -> dict[str, str]:
+    pairs = (each.decode(errors="replace").partition("=") for each in block.split(b"\0") if each)
+    return {name: value for name, _, value in pairs}
+
+
+def _matters(name: str, value: str, ours: str | None) -> bool:
+    if value == ours or _OF_A_SESSION.fullmatch(name) or not re.fullmatch(r"[A-Za-z_]\w*", name):
+        return False
+    if name in _PATHS:
+        known = (ours or "").split(os.pathsep)
+        return name == "PATH" and not set(value.split(os.pathsep)) <= set(known)
+    return True
+
+
+def _program(word: str, directory: str, path: str, executable: str) -> str:
+    """Return what execvp(3) found for the first word of a command line, as it was found.
+
+    A program may show another first word than it was started by; then it is its file.
+    """
+    if "/" in word:
+        return word if (Path(directory) / word).exists() else executable
+    folders = os.pathsep.join(str(Path(directory) / each) for each in path.split(os.pathsep))
+    return shutil.which(word, path=folders) or executable
+
+
+def _speaks_ros(pid: int) -> bool:
+    """Whether a process has a middleware loaded."""
+    try:
+        maps = Path(f"/proc/{pid}/maps").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return False
+    return _ROS_LIBRARY.search(maps) is not None
