@@ -321,7 +321,7 @@ def _observer_participant(plan: Plan, options: UpOptions, emit: Emitter) -> Obse
             observer_participant = ObserverParticipant.open(
                 plan.domain_id,
                 connections,
-                guests=wires and dynamic and plan.policy.undeclared_nodes is EndpointPolicy.OPEN,
+                unplanned=wires and dynamic and plan.policy.undeclared_nodes is EndpointPolicy.OPEN,
                 events=wires and (dynamic or layer.events),
             )
         if number + 1 == OBSERVER_TRIES or observer_participant.reaches_servers():
