@@ -34,6 +34,7 @@ VERBS: dict[str, str] = {
     "graph": "picture of what runs, beside what was declared",
     "export": "write a manifest as files of another system: access control of sros2",
     "capture": "write a manifest from a running system, gaps marked",
+    "logs": "show what the processes of the latest run have written, or follow it",
     "run": "run one node of a manifest in this terminal, without a supervisor",
     "ports": "DDS port arithmetic and platform limits",
     "init": "make a package of one's own: nodes, manifest, tests, CI workflow",

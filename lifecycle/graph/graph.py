@@ -50,7 +50,7 @@ class Graph:
         silent_after_s: float = SILENT_AFTER_S,
         quiet_s: float = QUIET_S,
         burst_s: float = BURST_S,
-        guests: bool = False,
+        unplanned: bool = False,
     ) -> None:
         """Put the layers together; with a thread of its own the graph also follows every node."""
         self.scheduler = scheduler
@@ -66,7 +66,7 @@ class Graph:
             self.events,
             quiet_s=quiet_s,
             burst_s=burst_s,
-            guests=guests,
+            unplanned=unplanned,
             follows=isinstance(scheduler, ThreadScheduler),
         )
         self.state = self._observer.state
@@ -118,7 +118,7 @@ class Graph:
         connections: ParticipantConnections | None = None,
         *,
         messages: bool = False,
-        guests: bool = False,
+        unplanned: bool = False,
         quiet_s: float = QUIET_S,
         burst_s: float = BURST_S,
     ) -> Graph:
@@ -131,7 +131,7 @@ class Graph:
             domain_id: 0–232.
             connections: how the participant is connected; None leaves it to the RMW.
             messages: receive what nodes report about themselves; a change is worth another look.
-            guests: also ask nodes that are not planned, as far as they have our node interface.
+            unplanned: also ask nodes that are not planned, as far as they have our node interface.
             quiet_s: a burst of changes is over when nothing changed for so long, ≥ 0.
             burst_s: a burst is cut off after so long, ≥ quiet_s.
 
@@ -144,7 +144,7 @@ class Graph:
             messages=messages,
             quiet_s=quiet_s,
             burst_s=burst_s,
-            guests=guests,
+            unplanned=unplanned,
         )
 
     # -- judging

@@ -243,7 +243,7 @@ class Notices:
     def __init__(self, senders: Mapping[str, Sender]) -> None:
         self._senders = senders
         self._given: dict[str, set[str]] = {}
-        """Sender of notices → whom they are about."""
+        """Sender of notices → the node that they are about."""
 
     def hold(
         self,

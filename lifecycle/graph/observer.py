@@ -119,7 +119,7 @@ class Observer:
         events: layer 2; `state` is kept on it, and its scheduler is where everything runs.
         quiet_s: a burst of changes is over when nothing changed for so long, ≥ 0.
         burst_s: a burst is cut off after so long, ≥ quiet_s.
-        guests: `observe` also asks nodes that are not planned, as far as they have our node
+        unplanned: `observe` also asks nodes that are not planned, as far as they have our node
             interface.
         follows: read every node whenever it changes, as programs want it that ask the state;
             else nodes are asked by `observe` only, as who judges wants it.
@@ -137,7 +137,7 @@ class Observer:
         *,
         quiet_s: float = QUIET_S,
         burst_s: float = BURST_S,
-        guests: bool = False,
+        unplanned: bool = False,
         follows: bool = False,
     ) -> None:
         self.state = GraphState(events, self._read)
@@ -147,7 +147,7 @@ class Observer:
         self._events = events
         self._quiet_s = quiet_s
         self._burst_s = burst_s
-        self._guests = guests
+        self._unplanned = unplanned
         self._follows = follows
         self._seen: frozenset[str] = frozenset()
         self._asked: set[str] = set()
@@ -263,11 +263,11 @@ class Observer:
                 )
             )
         )
-        if self._guests:
+        if self._unplanned:
             answers.update(
                 await asyncio.gather(
                     *(
-                        self._ask_guest(node)
+                        self._ask_unplanned(node)
                         for node in nodes
                         if node.managed
                         and node.full_name not in planned
@@ -288,7 +288,7 @@ class Observer:
         )
         return name, (state, configuration)
 
-    async def _ask_guest(self, node: ObservedNode) -> tuple[str, Answer]:
+    async def _ask_unplanned(self, node: ObservedNode) -> tuple[str, Answer]:
         name = node.full_name
         configuration = await self._ask_configuration(name)
         if configuration is None:

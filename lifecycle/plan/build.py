@@ -143,7 +143,7 @@ def _topics(node: PlannedNode, kind: EndpointKind) -> Iterable[str]:
 
 def _flow(pair: tuple[str, str, str], named: Sequence[Link]) -> PlannedFlow:
     topic, publisher, subscription = pair
-    told = [link.transport for link in named if link.transport is not FlowTransport.ANY]
+    asked = [link.transport for link in named if link.transport is not FlowTransport.ANY]
     delays = [link.max_delay_ms for link in named if link.max_delay_ms is not None]
     return PlannedFlow(
         topic=topic,
@@ -154,7 +154,7 @@ def _flow(pair: tuple[str, str, str], named: Sequence[Link]) -> PlannedFlow:
         ),
         max_delay_ms=min(delays, default=None),
         linked=bool(named),
-        transport=next(iter(told), FlowTransport.ANY),
+        transport=next(iter(asked), FlowTransport.ANY),
         quantities=tuple(each for link in named for each in link.quantities),
     )
 

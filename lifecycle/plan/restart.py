@@ -27,12 +27,12 @@ that are negotiated while a system runs, and of groups' (negotiate.GROUP_PORTS_F
 OBSERVER_PORTS_FROM = 3000
 """Likewise, of observers that a discovery server did not accept."""
 
-Heard = Mapping[str, Mapping[str, tuple[str, ...]]]
+Reported = Mapping[str, Mapping[str, tuple[str, ...]]]
 """What nodes report as their connections: full node name → connection, empty for the node's own
 participant → URLs."""
 
 _LAST_PORT = 65535
-_NOTHING: Heard = MappingProxyType({})
+_NOTHING: Reported = MappingProxyType({})
 
 _Place = tuple[str, str]
 """A participant: key of its node and base name of the hidden node; for nodes' own participant,
@@ -57,19 +57,21 @@ class _Listener:
         return bool(self.url.peers or self.url.server)
 
 
-def restarted(plan: Plan, keys: Collection[str], *, first: Plan, heard: Heard = _NOTHING) -> Plan:
+def restarted(
+    plan: Plan, keys: Collection[str], *, first: Plan, reported: Reported = _NOTHING
+) -> Plan:
     """Return the plan as it is once these nodes are started again.
 
     Args:
         plan: as the system runs.
         keys: of all nodes of the processes that are started again.
         first: the plan before anything was started again.
-        heard: what the nodes of other supervisors report, which restart them without notice.
+        reported: what the nodes of other supervisors report, which restart them without notice.
 
     Raises:
         PlanError: a host has no ports left.
     """
-    original, current = _listeners(first), _listeners(plan, heard)
+    original, current = _listeners(first), _listeners(plan, reported)
     processes = {node.process for node in first.nodes if node.key in keys}
     own = {place for place in original if not place[1] and place[0] in processes}
     new = {
@@ -150,7 +152,7 @@ def is_restarted_url(planned: str, reported: str, *, first_port: int) -> bool:
     return dataclasses.replace(now, port=was.port, peers=was.peers) == was
 
 
-def _listeners(plan: Plan, heard: Heard = _NOTHING) -> dict[_Place, _Listener]:
+def _listeners(plan: Plan, reported: Reported = _NOTHING) -> dict[_Place, _Listener]:
     """Return every participant with a TCP port, in plan order, observers first."""
     hosts = hosts_of(plan)
     found: dict[_Place, _Listener] = {}
@@ -158,7 +160,7 @@ def _listeners(plan: Plan, heard: Heard = _NOTHING) -> dict[_Place, _Listener]:
         for url in _with_port(connections.urls):
             found["", machine] = _Listener(host=hosts.host(machine), url=url)
     for node in plan.nodes:
-        said = heard.get(node.full_name, {})
+        said = reported.get(node.full_name, {})
         host = hosts.host(node.machine)
         for url in _with_port(said.get("") or node.connections.urls):
             found[node.process, ""] = _Listener(host=host, url=url)

@@ -11,6 +11,8 @@ from .control.status import NodeStatus as NodeStatus
 from .control.status import SystemStatus as SystemStatus
 from .gate.gate import closes as closes
 from .processes.forerunner import Forerunner as Forerunner
+from .processes.logs import ros_log_root as ros_log_root
+from .processes.logs import runs_of as runs_of
 from .run.events import Emitter as Emitter
 from .run.events import Event as Event
 from .run.events import Failure as Failure

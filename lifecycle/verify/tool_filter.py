@@ -361,9 +361,9 @@ def fold_actions(endpoints: Iterable[ObservedEndpoint]) -> tuple[ObservedEndpoin
 def _action_hash(parts: Iterable[ObservedEndpoint]) -> str | None:
     """Return the type hash of an action from those of its parts; None while one is not seen."""
     hashes = {part.name.rpartition("/")[2]: part.type_hash for part in parts}
-    told = [hashes[part] for part in ("send_goal", "get_result", "feedback")]
-    known = [each for each in told if each is not None]
-    return join(known) if len(known) == len(told) else None
+    found = [hashes[part] for part in ("send_goal", "get_result", "feedback")]
+    known = [each for each in found if each is not None]
+    return join(known) if len(known) == len(found) else None
 
 
 class Owners:

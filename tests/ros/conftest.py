@@ -13,7 +13,7 @@ import re
 import socket
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -88,23 +88,35 @@ def shared_domain() -> Iterator[int]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _shared_memory() -> Iterator[set[str]]:
-    """Fail the run if a segment that it made is left and unused at its end."""
-    seen: set[str] = set()
+def _shared_memory() -> Iterator[dict[str, str]]:
+    """Fail the run if a segment that it made is left and unused at its end, and say since when.
+
+    By name of the file: the test after which it was first left; empty while it was not.
+    """
+    seen: dict[str, str] = {}
     yield seen
+    left = {name: seen.get(name, "") for name in _left(seen)}
+    assert left == {}, "shared memory files were left behind"
+
+
+def _left(seen: Collection[str]) -> list[str]:
     # Unique ports (7000–7399) are the same in every domain: another run may have one by now.
-    left = [name for name in leftovers(only=seen) if not re.search(r"port7[0-3]\d\d(?!\d)", name)]
-    assert left == [], "shared memory files were left behind"
+    return [each for each in leftovers(only=seen) if not re.search(r"port7[0-3]\d\d(?!\d)", each)]
 
 
 @pytest.fixture(autouse=True)
-def _note_shared_memory(_shared_memory: set[str]) -> Iterator[None]:
+def _note_shared_memory(
+    _shared_memory: dict[str, str], request: pytest.FixtureRequest
+) -> Iterator[None]:
     """Note what is used, and fail the test whose participants would haunt those that follow."""
     me = psutil.Process()
     before = segments_of([me.pid])
     yield
     after = segments_of([me.pid])
-    _shared_memory |= after | segments_of([child.pid for child in me.children(recursive=True)])
+    for name in after | segments_of([child.pid for child in me.children(recursive=True)]):
+        _shared_memory.setdefault(name, "")
+    for name in _left(_shared_memory):
+        _shared_memory[name] = _shared_memory.get(name) or request.node.nodeid
     assert after - before == set(), (
         "a participant of this test is still there: destroy all that belongs to it"
     )

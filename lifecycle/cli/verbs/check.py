@@ -276,9 +276,8 @@ def command(
         raise
     unwritten = ExitCode.OK if report is None else _write(report, found, strict=strict)
     text = write_check(found, format_, strict=strict)
-    # Names of files are anybody's.
+    # Names of files are not ours to trust.
     shown = {"text": lines, "github": lines, "json": json_text, "sarif": json_text}
-
     click.echo(shown.get(format_, str)(text))
     return found.exit_code(strict=strict) or unwritten
 

@@ -179,7 +179,7 @@ class Export:
                 click.echo(lines(f"left out: {each}"), err=True)
 
 
-_NOBODY_S = 1.5
+_EMPTY_GRAPH_S = 1.5
 """Some node of what runs is seen within so long; a system without any is waited for if asked."""
 
 
@@ -233,8 +233,8 @@ def _show(
         follow_running(plan, lambda seen: echo_while_read(render_flows(seen.flows, format_)))
     asked = click.get_current_context().get_parameter_source("timeout")
     waits = asked is not click.core.ParameterSource.DEFAULT or supervisor_of(os.environ, plan, "")
-    nobody_s = None if waits else _NOBODY_S
-    seen = judge_running(plan, timeout_s=timeout, strict=False, nobody_s=nobody_s)
+    empty_graph_s = None if waits else _EMPTY_GRAPH_S
+    seen = judge_running(plan, timeout_s=timeout, strict=False, empty_graph_s=empty_graph_s)
     if seen.where:
         click.echo(lines(seen.where), err=True)
     if exporter is not None:

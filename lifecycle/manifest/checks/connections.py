@@ -365,8 +365,8 @@ def _is_settled(each: Incompatibility) -> bool:
     Every preset of rmw but one has SYSTEM_DEFAULT there, and DDS's default is AUTOMATIC (DDS 1.4
     §2.2.3), which satisfies everything but a request for MANUAL_BY_TOPIC.
     """
-    told = (each.offered, each.requested)
-    return each.policy == "liveliness" and _MANUAL not in told and "BEST_AVAILABLE" not in told
+    kinds = (each.offered, each.requested)
+    return each.policy == "liveliness" and _MANUAL not in kinds and "BEST_AVAILABLE" not in kinds
 
 
 def _remedy(each: Incompatibility) -> str:

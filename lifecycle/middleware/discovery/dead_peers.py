@@ -31,7 +31,7 @@ import struct
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-from lifecycle.middleware.discovery.probe import HEADER, Door, doors_of, send
+from lifecycle.middleware.discovery.probe import HEADER, ProbeTarget, probe_targets, send
 from lifecycle.middleware.fastdds.dscp import own_udp_socket, socket_descriptors
 from lifecycle.middleware.fastdds.url_check import open_sockets
 from lifecycle.network import ConnectionUrl, Medium
@@ -179,33 +179,33 @@ def remove_participants(
         prefixes: GUID prefixes, 24 hex digits each.
         domain_id: 0–232.
         urls: of this process's observer.
-        environment: see `probe.knock_for`.
+        environment: see `probe.probes_for`.
         pids: of processes on this host that must forget them too.
     """
     messages = [disposal(each) for each in prefixes]
-    doors = {
+    targets = {
         kind: [*_asked(domain_id, urls, environment, kind), *_listening(pids, kind)]
         for kind in (Medium.UDPV4, Medium.UDPV6)
     }
     output = next((url.output_port for url in urls if url.output_port), None)
     for kind, family in ((Medium.UDPV4, socket.AF_INET), (Medium.UDPV6, socket.AF_INET6)):
-        if not doors[kind]:
+        if not targets[kind]:
             continue
         own = None if output is None else own_udp_socket(family, output)
         with contextlib.suppress(OSError), own or socket.socket(family, socket.SOCK_DGRAM) as by:
             for message in messages:
-                send(by, message, dict.fromkeys(doors[kind]))
+                send(by, message, dict.fromkeys(targets[kind]))
 
 
 def _asked(
     domain_id: int, urls: Sequence[ConnectionUrl], environment: Mapping[str, str], kind: Medium
-) -> Iterator[Door]:
-    for found, doors in doors_of(domain_id, urls, environment):
+) -> Iterator[ProbeTarget]:
+    for found, targets in probe_targets(domain_id, urls, environment):
         if found == kind:
-            yield from doors
+            yield from targets
 
 
-def _listening(pids: Iterable[int], kind: Medium) -> Iterator[Door]:
+def _listening(pids: Iterable[int], kind: Medium) -> Iterator[ProbeTarget]:
     """Yield where processes of this host receive; those that are gone receive nothing."""
     for pid in pids:
         with contextlib.suppress(OSError):
@@ -213,4 +213,4 @@ def _listening(pids: Iterable[int], kind: Medium) -> Iterator[Door]:
                 if each.kind == kind and not ipaddress.ip_address(each.address).is_multicast:
                     any_ = ipaddress.ip_address(each.address).is_unspecified
                     loopback = "::1" if kind is Medium.UDPV6 else "127.0.0.1"
-                    yield Door(address=loopback if any_ else each.address, port=each.port)
+                    yield ProbeTarget(address=loopback if any_ else each.address, port=each.port)

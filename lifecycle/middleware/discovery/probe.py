@@ -60,7 +60,7 @@ _UDPV4, _UDPV6 = 1, 2
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Door:
+class ProbeTarget:
     """Where a probe is sent: the discovery port of one participant, or a multicast group.
 
     Attributes:
@@ -74,7 +74,7 @@ class Door:
     interface: str = ""
 
 
-class Knock:
+class Probe:
     """One announcement and its answers; close it when they are not needed any more.
 
     Args:
@@ -91,7 +91,7 @@ class Knock:
 
     def __init__(
         self,
-        doors: Iterable[Door],
+        targets: Iterable[ProbeTarget],
         addresses: Iterable[str],
         receiver_ports: Iterable[int],
         *,
@@ -99,8 +99,8 @@ class Knock:
     ) -> None:
         self.counts = output_port is None
         self._answers: dict[str, str] = {}
-        self._doors, self._addresses = tuple(doors), tuple(addresses)
-        self._ipv6 = any(":" in door.address for door in self._doors)
+        self._targets, self._addresses = tuple(targets), tuple(addresses)
+        self._ipv6 = any(":" in target.address for target in self._targets)
         family = socket.AF_INET6 if self._ipv6 else socket.AF_INET
         self._socket: socket.socket | None = None
         self._receivers = tuple(receiver_ports)
@@ -134,7 +134,7 @@ class Knock:
         send(
             self._socket,
             announcement([(a, p) for p in ports for a in self._addresses]),
-            self._doors,
+            self._targets,
         )
 
     def answered(self) -> frozenset[str]:
@@ -157,16 +157,16 @@ class Knock:
             self._socket = None
 
 
-def send(sender: socket.socket, message: bytes, doors: Iterable[Door]) -> None:
+def send(sender: socket.socket, message: bytes, targets: Iterable[ProbeTarget]) -> None:
     """Send a datagram to each destination, without waiting.
 
     A full buffer or an interface without a route costs one listener, not the sender.
     """
-    for door in doors:
+    for target in targets:
         with contextlib.suppress(OSError):
-            if door.interface:
-                _send_by(sender, door.interface)
-            sender.sendto(message, socket.MSG_DONTWAIT, (door.address, door.port))
+            if target.interface:
+                _send_by(sender, target.interface)
+            sender.sendto(message, socket.MSG_DONTWAIT, (target.address, target.port))
 
 
 def _send_by(sender: socket.socket, interface: str) -> None:
@@ -240,9 +240,9 @@ _CHOICES = frozenset(
 _FAMILIES = {Medium.UDPV4: socket.AF_INET, Medium.UDPV6: socket.AF_INET6}
 
 
-def knock_for(
+def probes_for(
     domain_id: int, urls: Sequence[ConnectionUrl], environment: Mapping[str, str]
-) -> tuple[Knock, ...]:
+) -> tuple[Probe, ...]:
     """Probe every participant that an observer with these URLs could find; close the result.
 
     Args:
@@ -261,23 +261,23 @@ def knock_for(
     if not urls and chosen_otherwise(environment):
         return ()
     if urls and not leaves_discovery_open(urls):
-        return tuple(_knock_at_peers(domain_id, family) for family in found)
+        return tuple(_probe_peers(domain_id, family) for family in found)
     range_ = _range(environment)
     return tuple(
-        _knock_around(domain_id, kind, range_, environment)
+        _probe_around(domain_id, kind, range_, environment)
         for kind in (tuple(family.kind for family in found) or (Medium.UDPV4,))
     )
 
 
-def doors_of(
+def probe_targets(
     domain_id: int, urls: Sequence[ConnectionUrl], environment: Mapping[str, str]
-) -> tuple[tuple[str, tuple[Door, ...]], ...]:
+) -> tuple[tuple[str, tuple[ProbeTarget, ...]], ...]:
     """Return the UDP destinations of all participants that an observer with these URLs could find.
 
     Args:
         domain_id: 0–232.
         urls: the observer's; none for what the RMW does by itself.
-        environment: as for `knock_for`.
+        environment: as for `probes_for`.
 
     Returns:
         UDPV4 or UDPV6 and the destinations of that family; nothing where discovery allows no UDP.
@@ -287,11 +287,11 @@ def doors_of(
     found = tuple(family for family in families(urls) if family.udp)
     if urls and not leaves_discovery_open(urls):
         return tuple(
-            (family.kind, _doors_of_peers(domain_id, family, _bound(family))) for family in found
+            (family.kind, _targets_of_peers(domain_id, family, _bound(family))) for family in found
         )
     range_ = _range(environment)
     return tuple(
-        (kind, _doors_around(domain_id, kind, range_, environment))
+        (kind, _targets_around(domain_id, kind, range_, environment))
         for kind in (tuple(family.kind for family in found) or (() if urls else (Medium.UDPV4,)))
         if range_ != "OFF"
     )
@@ -367,36 +367,36 @@ def discovery_peers(
     if not hosts or chosen_otherwise(environment):
         return ()
     found = [
-        (door.address, door.port)
+        (target.address, target.port)
         for host, count in hosts.items()
-        for door in well_known_doors(domain_id, host, min(count, LOCALHOST_PEERS_RANGE))
+        for target in well_known_targets(domain_id, host, min(count, LOCALHOST_PEERS_RANGE))
     ]
     group = participant_ports(domain_id, 0).discovery_multicast
     return ((DISCOVERY_GROUP[Medium.UDPV4], group), *found)
 
 
-def _knock_around(
+def _probe_around(
     domain_id: int, kind: Medium, range_: str, environment: Mapping[str, str]
-) -> Knock:
+) -> Probe:
     if range_ == "OFF":
-        return Knock((), (), ())
-    doors = _doors_around(domain_id, kind, range_, environment)
+        return Probe((), (), ())
+    targets = _targets_around(domain_id, kind, range_, environment)
     by_interface = addresses_of(kind) if range_ == "SUBNET" else {}
     addresses = (LOOPBACK[kind], *(each for found in by_interface.values() for each in found))
-    return Knock(doors, addresses, discovery_ports(domain_id, kind))
+    return Probe(targets, addresses, discovery_ports(domain_id, kind))
 
 
-def _doors_around(
+def _targets_around(
     domain_id: int, kind: Medium, range_: str, environment: Mapping[str, str]
-) -> tuple[Door, ...]:
+) -> tuple[ProbeTarget, ...]:
     """Return this host's ports, and with the range SUBNET the group and the static peers'."""
-    doors = [*well_known_doors(domain_id, LOOPBACK[kind], PARTICIPANTS_PER_DOMAIN)]
+    targets = [*well_known_targets(domain_id, LOOPBACK[kind], PARTICIPANTS_PER_DOMAIN)]
     if range_ == "SUBNET":
-        doors += group_doors(domain_id, kind, addresses_of(kind))
+        targets += group_targets(domain_id, kind, addresses_of(kind))
         for peer in static_peers(environment):
             if (":" in peer) == (kind is Medium.UDPV6):
-                doors += well_known_doors(domain_id, peer, LOCALHOST_PEERS_RANGE)
-    return tuple(doors)
+                targets += well_known_targets(domain_id, peer, LOCALHOST_PEERS_RANGE)
+    return tuple(targets)
 
 
 def _bound(family: UrlTransport) -> dict[str, tuple[str, ...]]:
@@ -411,45 +411,47 @@ def _bound(family: UrlTransport) -> dict[str, tuple[str, ...]]:
     return here
 
 
-def _doors_of_peers(
+def _targets_of_peers(
     domain_id: int, family: UrlTransport, here: Mapping[str, tuple[str, ...]]
-) -> tuple[Door, ...]:
-    doors: list[Door] = []
+) -> tuple[ProbeTarget, ...]:
+    targets: list[ProbeTarget] = []
     for peer in dict.fromkeys(peer for url in family.urls for peer in url.peers):
         if peer.port is None:
-            doors += well_known_doors(domain_id, peer.address, LOCALHOST_PEERS_RANGE)
+            targets += well_known_targets(domain_id, peer.address, LOCALHOST_PEERS_RANGE)
         else:
-            doors.append(Door(address=peer.address, port=peer.port))
+            targets.append(ProbeTarget(address=peer.address, port=peer.port))
     if all(url.multicast for url in family.urls):
-        doors += group_doors(domain_id, family.kind, {n: each for n, each in here.items() if each})
-    return tuple(doors)
+        targets += group_targets(
+            domain_id, family.kind, {n: each for n, each in here.items() if each}
+        )
+    return tuple(targets)
 
 
-def _knock_at_peers(domain_id: int, family: UrlTransport) -> Knock:
+def _probe_peers(domain_id: int, family: UrlTransport) -> Probe:
     here = _bound(family)
-    doors = _doors_of_peers(domain_id, family, here)
+    targets = _targets_of_peers(domain_id, family, here)
     addresses = tuple(each for found in here.values() for each in found)
     fixed = [url.metatraffic_port for url in family.urls if url.metatraffic_port]
     output = next((url.output_port for url in family.urls if url.output_port), None)
-    heard_at = fixed[:1] or discovery_ports(domain_id, family.kind)
-    return Knock(doors, addresses, heard_at, output_port=output)
+    receivers = fixed[:1] or discovery_ports(domain_id, family.kind)
+    return Probe(targets, addresses, receivers, output_port=output)
 
 
-def well_known_doors(domain_id: int, address: str, participants: int) -> Iterator[Door]:
+def well_known_targets(domain_id: int, address: str, participants: int) -> Iterator[ProbeTarget]:
     """Yield the discovery ports of a host's first participants (DDSI-RTPS 9.6.2.3)."""
     for participant in range(participants):
         try:
             port = participant_ports(domain_id, participant).discovery_unicast
         except ValueError:  # the domain has no such port
             return
-        yield Door(address=address, port=port)
+        yield ProbeTarget(address=address, port=port)
 
 
-def group_doors(domain_id: int, kind: Medium, interfaces: Iterable[str]) -> Iterator[Door]:
+def group_targets(domain_id: int, kind: Medium, interfaces: Iterable[str]) -> Iterator[ProbeTarget]:
     """Yield the group of discovery by each interface."""
     port = participant_ports(domain_id, 0).discovery_multicast
     for interface in interfaces:
-        yield Door(address=DISCOVERY_GROUP[kind], port=port, interface=interface)
+        yield ProbeTarget(address=DISCOVERY_GROUP[kind], port=port, interface=interface)
 
 
 def addresses_of(kind: Medium, *, loopback: bool = False) -> dict[str, tuple[str, ...]]:

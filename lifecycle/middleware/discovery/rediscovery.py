@@ -7,7 +7,7 @@ Two participants that lost each other for longer than their lease (20 s) drop on
 each announces itself once in 3 s. `call_out` makes both sides announce themselves at once: a
 participant that receives the announcement of one that does not exist answers to where it seems to
 be (see probe.py). rmw_dds_common keeps the name of a node that was dropped out of the graph until
-its participant publishes its entities anew, which `tell_names` makes it do.
+its participant publishes its entities anew, which `republish_names` makes it do.
 
 The kernel doubles the time between TCP retransmissions each time, up to 120 s, so that after an
 outage nothing passes for about as long again (RFC 6298 §5.5).
@@ -27,14 +27,14 @@ from rclpy.qos import QoSProfile
 
 from lifecycle.middleware.discovery.probe import (
     RANGE_VARIABLE,
-    Door,
+    ProbeTarget,
     addresses_of,
     announcement,
     chosen_otherwise,
     discovery_ports,
-    group_doors,
+    group_targets,
     send,
-    well_known_doors,
+    well_known_targets,
 )
 from lifecycle.middleware.fastdds.dscp import own_udp_socket, socket_descriptors
 from lifecycle.middleware.fastdds.url_profile import (
@@ -94,11 +94,13 @@ def _call_around(domain_id: int, kind: Medium, peers: Sequence[str]) -> None:
     ours = [(a, port) for port in ports for found in interfaces.values() for a in found]
     # Two that do not exist: an answer goes to only one kind of address.
     calls = (announcement(ours), announcement([(DISCOVERY_GROUP[kind], group_port)]))
-    doors = [door for peer in peers for door in well_known_doors(domain_id, peer, _PARTICIPANTS)]
+    targets = [
+        target for peer in peers for target in well_known_targets(domain_id, peer, _PARTICIPANTS)
+    ]
     with socket.socket(_SOCKET[kind], socket.SOCK_DGRAM) as sender:
         for call in calls:
-            send(sender, call, group_doors(domain_id, kind, interfaces))
-        send(sender, calls[0], doors)
+            send(sender, call, group_targets(domain_id, kind, interfaces))
+        send(sender, calls[0], targets)
 
 
 def _call_listed(domain_id: int, family: UrlTransport) -> None:
@@ -108,15 +110,15 @@ def _call_listed(domain_id: int, family: UrlTransport) -> None:
     ours = [(url.address, url.metatraffic_port) for url in family.urls if url.address in here]
     ours += [(peer.address, peer.port) for peer in listed if peer.address in here]
     answered_at = [(address, port) for address, port in ours if port is not None]
-    doors: list[Door] = []
+    targets: list[ProbeTarget] = []
     for peer in listed:
         if peer.address in here:
             continue
         if peer.port is None:
-            doors += well_known_doors(domain_id, peer.address, _PARTICIPANTS)
+            targets += well_known_targets(domain_id, peer.address, _PARTICIPANTS)
         else:
-            doors.append(Door(address=peer.address, port=peer.port))
-    if not answered_at or not doors:
+            targets.append(ProbeTarget(address=peer.address, port=peer.port))
+    if not answered_at or not targets:
         return
     output = next((url.output_port for url in family.urls if url.output_port), None)
     kind = _SOCKET[family.kind]
@@ -125,10 +127,10 @@ def _call_listed(domain_id: int, family: UrlTransport) -> None:
     if own is None:
         return
     with own as sender:
-        send(sender, announcement(answered_at[:_ANSWERED_AT]), doors)
+        send(sender, announcement(answered_at[:_ANSWERED_AT]), targets)
 
 
-def tell_names(nodes: Iterable[Node]) -> None:
+def republish_names(nodes: Iterable[Node]) -> None:
     """Make the participants of `nodes` publish anew which nodes and endpoints they have.
 
     rmw_fastrtps does so whenever an entity is made or destroyed. Take one node of each participant.

@@ -33,7 +33,7 @@ from rclpy.validate_topic_name import validate_topic_name
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest import QosProfile
 from lifecycle.middleware.rcl import abi
-from lifecycle.middleware.rcl.hidden_node import is_guest
+from lifecycle.middleware.rcl.hidden_node import is_moved
 from lifecycle.middleware.rcl.qos import to_rclpy
 from lifecycle.network import (
     InternetProtocol,
@@ -96,7 +96,7 @@ def has_shared_memory(node: Node) -> bool:
     Raises:
         MiddlewareError: as `get_network_flow_endpoints`.
     """
-    existing = next((each for each in node.subscriptions if not is_guest(each)), None)
+    existing = next((each for each in node.subscriptions if not is_moved(each)), None)
     if existing is not None:
         return _listens_on_shared_memory(existing)
     probe = node.create_subscription(

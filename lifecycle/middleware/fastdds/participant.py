@@ -163,7 +163,7 @@ class FlowParticipant:
         self.name = name
         self.settings = settings
         self._served = served
-        self._guests: list[hidden_node.Guest] = []
+        self._moved: list[hidden_node.MovedEndpoint] = []
         self._dscp = dscp
         self._context: rclpy.Context | None
         self._nfes: tuple[NetworkFlowEndpoint, ...] = ()
@@ -332,15 +332,15 @@ class FlowParticipant:
         self._receive(action)
         return action
 
-    def destroy_endpoint(self, entity: Publisher | hidden_node.Guest) -> None:
+    def destroy_endpoint(self, entity: Publisher | hidden_node.MovedEndpoint) -> None:
         """Destroy an endpoint that was made here; again is harmless."""
         if isinstance(entity, Publisher):
             self.node.destroy_publisher(entity)
             return
         host = self._served or self.node
         hidden_node.dismiss(entity, host)
-        if entity in self._guests:
-            self._guests.remove(entity)
+        if entity in self._moved:
+            self._moved.remove(entity)
 
     def ensure_dscp(self) -> None:
         """Mark sender sockets that were opened, or lost their mark, since the participant was made.
@@ -398,7 +398,7 @@ class FlowParticipant:
         for its endpoints.
         """
         self._nfes = ()  # its ports may belong to another process from now on
-        for entity in tuple(self._guests):
+        for entity in tuple(self._moved):
             self.destroy_endpoint(entity)
         forget_hidden(self.node)
         self.node.destroy_node()
@@ -417,10 +417,10 @@ class FlowParticipant:
             return self._served.default_callback_group
         return group
 
-    def _receive(self, entity: hidden_node.Guest) -> None:
+    def _receive(self, entity: hidden_node.MovedEndpoint) -> None:
         if self._served is not None:
             hidden_node.move(entity, self.node, self._served)
-            self._guests.append(entity)
+            self._moved.append(entity)
 
     def _announced(
         self, type_: type[Any], topic: str, *, writer: bool

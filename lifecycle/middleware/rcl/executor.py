@@ -6,8 +6,8 @@ order: tasks, waitables, timers, subscriptions, guard conditions, clients, servi
 rclpy 7 makes a new wait set for each turn, asks each entity for its handle, its callback group and
 its counts, and wakes itself twice for each callback, so that every callback costs two such turns:
 6 µs for each service of a node, used or not. Here the lists are compared with those of the turn
-before, and nobody has to be woken who is awake. What an `async def` callback awaits is looked at
-again whenever a callback was called, as rclpy does by waking itself.
+before, and no thread has to be woken that is awake. What an `async def` callback awaits is looked
+at again whenever a callback was called, as rclpy does by waking itself.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ class _WaitList:
         """
         entered = 0
         try:
-            # Nobody may destroy them while rcl waits for them; afterwards anybody may.
+            # They must not be destroyed while rcl waits for them; afterwards they may.
             for enter, _ in self._entered:
                 enter()
                 entered += 1

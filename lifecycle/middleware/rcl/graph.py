@@ -27,7 +27,7 @@ from lifecycle.middleware.discovery.dead_peers import (
     is_used,
     remove_participants,
 )
-from lifecycle.middleware.discovery.probe import knock_for
+from lifecycle.middleware.discovery.probe import probes_for
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.process.process_table import programs_of
 from lifecycle.middleware.rcl.graph_changes import GraphGuard, on_graph_change
@@ -194,13 +194,13 @@ class GraphObserver:
             )
             self._guard = GraphGuard(node, self._changed)
             self._unwatch = self._guard.stop
-            self._knocks = knock_for(domain_id, settings.urls, os.environ)
+            self._probes = probes_for(domain_id, settings.urls, os.environ)
             self._limit_s = (
                 _ANNOUNCED_BY_SERVER_S if any(url.server for url in settings.urls) else _UNPROBED_S
             )
         else:
             self._unwatch = on_graph_change(node, self._changed)
-            self._knocks = ()
+            self._probes = ()
             self._limit_s = PATIENCE_S
         self.node = node
         self._name = self.node.get_fully_qualified_name()
@@ -284,19 +284,19 @@ class GraphObserver:
         then has none. Judged by the last `snapshot`. Where probing is impossible, it is a time.
         """
         age_s = time.monotonic() - self._made_s
-        if not self._knocks:
+        if not self._probes:
             return max(0.0, self._limit_s - age_s)
-        if not all(knock.counts for knock in self._knocks):
+        if not all(probe.counts for probe in self._probes):
             return max(0.0, _UNCOUNTED_S - age_s)
         if age_s < ANSWER_S:
             return ANSWER_S - age_s
-        unknown = frozenset().union(*(each.answered() for each in self._knocks)) - self._known
+        unknown = frozenset().union(*(each.answered() for each in self._probes)) - self._known
         if not unknown:
             return 0.0
         if not unknown <= self._asked_for:
             self._asked_for |= unknown
-            for knock in self._knocks:
-                knock.ask_again(to_count=False)
+            for probe in self._probes:
+                probe.ask_again(to_count=False)
         return max(0.0, PATIENCE_S - age_s)
 
     def offers(self, node: str, service: str) -> bool:
@@ -402,8 +402,8 @@ class GraphObserver:
         if self._destroyed:
             return
         self._destroyed = True
-        for knock in self._knocks:
-            knock.close()
+        for probe in self._probes:
+            probe.close()
         self._unwatch()
         if self._context is not None:
             give_up_dead_connections()
@@ -487,8 +487,8 @@ class GraphObserver:
         look has it.
         """
         known: dict[str, str] = {}
-        for knock in self._knocks:
-            known.update(knock.addresses())
+        for probe in self._probes:
+            known.update(probe.addresses())
         for endpoint in endpoints:
             prefix = endpoint.gid[:_PREFIX_DIGITS]
             if endpoint.node or not prefix:
@@ -496,8 +496,8 @@ class GraphObserver:
                 continue
             if prefix not in known and prefix not in self._asked_for:
                 self._asked_for.add(prefix)
-                for knock in self._knocks:
-                    knock.ask_again(to_count=True)
+                for probe in self._probes:
+                    probe.ask_again(to_count=True)
             yield dataclasses.replace(endpoint, address=known.get(prefix, ""))
 
     def _services(self, full_name: str) -> tuple[ObservedEndpoint, ...] | None:

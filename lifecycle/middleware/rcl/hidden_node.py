@@ -100,13 +100,13 @@ def forget_hidden(node: Node) -> None:
 Action: typing.TypeAlias = Waitable
 """An action server or client; importing their classes takes 100 ms."""
 
-Guest: typing.TypeAlias = Subscription | Service | Client | Action
+MovedEndpoint: typing.TypeAlias = Subscription | Service | Client | Action
 
 _LISTS = {Subscription: "_subscriptions", Service: "_services", Client: "_clients"}
-_guests: weakref.WeakSet[Any] = weakref.WeakSet()
+_moved: weakref.WeakSet[Any] = weakref.WeakSet()
 
 
-def move(entity: Guest, maker: Node, host: Node) -> None:
+def move(entity: MovedEndpoint, maker: Node, host: Node) -> None:
     """Have `host`'s executor run the callbacks of an endpoint that `maker` has just made.
 
     Its callback group must be one of `host`'s. `host.destroy_…` takes it away again.
@@ -122,17 +122,17 @@ def move(entity: Guest, maker: Node, host: Node) -> None:
     for handler in entity.event_handlers if isinstance(entity, Subscription) else ():
         maker.remove_waitable(handler)
         host.add_waitable(handler)
-    _guests.add(entity)
+    _moved.add(entity)
     host._wake_executor()  # noqa: SLF001 - as Node.create_… does
 
 
-def is_guest(entity: object) -> bool:
+def is_moved(entity: object) -> bool:
     """Whether an endpoint is on a node whose participant is not its own."""
-    return entity in _guests
+    return entity in _moved
 
 
-def dismiss(entity: Guest, host: Node) -> None:
-    """Destroy a guest; harmless if `host` did, or was destroyed itself."""
+def dismiss(entity: MovedEndpoint, host: Node) -> None:
+    """Destroy a moved endpoint; harmless if `host` did, or was destroyed itself."""
     if isinstance(entity, Waitable):
         entity.destroy()
         return

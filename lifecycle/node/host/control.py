@@ -55,7 +55,7 @@ class Operation(enum.Enum):
     # Of the whole process: a link is down, and retransmit soon what was not acknowledged; and
     # announce to the graph anew which nodes are here.
     SEND_AGAIN_SOON = "send_again_soon"
-    TELL_NAMES = "tell_names"
+    REPUBLISH_NAMES = "republish_names"
     # The one that is not answered: the participants of all are there, make endpoints.
     PROCEED = "proceed"
 

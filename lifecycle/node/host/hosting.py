@@ -244,7 +244,7 @@ class Host:
             self._nodes,
             {
                 Operation.SEND_AGAIN_SOON: send_again_soon,
-                Operation.TELL_NAMES: self._loop.tell_names,
+                Operation.REPUBLISH_NAMES: self._loop.republish_names,
             },
         )
 

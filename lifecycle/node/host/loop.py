@@ -40,7 +40,7 @@ from lifecycle.middleware import (
     Watching,
     hidden_nodes,
     leave_and_exit,
-    tell_names,
+    republish_names,
 )
 from lifecycle.node.author.node import LifecycleNode
 from lifecycle.node.lifecycle.execution import hint
@@ -204,10 +204,10 @@ class NodeLoop:
         if node.executor is self._own:
             self._own.remove_node(node)
 
-    def tell_names(self) -> None:
+    def republish_names(self) -> None:
         """Make every participant of this process publish anew which nodes and endpoints it has."""
         by_context = {id(node.context): node for node in self._nodes}
-        tell_names((*by_context.values(), *hidden_nodes()))
+        republish_names((*by_context.values(), *hidden_nodes()))
 
     def call_soon(self, task: Callable[..., Coroutine[Any, Any, None]], *arguments: object) -> None:
         """Run an `async def` where callbacks of nodes run; from any thread. It must not raise."""

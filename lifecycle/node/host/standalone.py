@@ -71,15 +71,15 @@ class OwnLiveliness:
         self._name = ""
         self.watchdog = Watchdog(self._sign, lambda _: self._announce(""))
 
-    def open(self, node: LifecycleNode, tell_names: Callable[[], None]) -> None:
+    def open(self, node: LifecycleNode, republish_names: Callable[[], None]) -> None:
         """Assert its liveliness from now on.
 
         Args:
             node: whose name it has.
-            tell_names: called when a subscriber is matched, which may have dropped the names.
+            republish_names: called when a subscriber is matched, which may have dropped the names.
         """
         self._name = node.lifecycle.full_name
-        self._publisher = AlivePublisher(node, node_topic(self._name), on_listener=tell_names)
+        self._publisher = AlivePublisher(node, node_topic(self._name), on_listener=republish_names)
         threading.Thread(target=self._watch, name="watchdog", daemon=True).start()
 
     def _watch(self) -> None:
@@ -166,7 +166,7 @@ def run(
         with constructing(construction), participant_settings(context, _settings(spec)):
             node: LifecycleNode = node_class(**({} if spec is None else keywords(spec, node_class)))
         loop.add(node, node.lifecycle)
-        liveliness.open(node, loop.tell_names)
+        liveliness.open(node, loop.republish_names)
         node.lifecycle.add_listener(lambda _: report(f"{_name(node)}: {_state(node)}"))
         report(f"{_name(node)}: {_state(node)}")
         if node.lifecycle.mode is Mode.AUTO:

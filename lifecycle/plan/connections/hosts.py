@@ -258,10 +258,10 @@ def _participant(
         return ParticipantDemand(
             owner=owner, index=index, discovery_port=0, user_port=0, shared_memory=True
         )
-    told = next((each for each in fixed if each.metatraffic_port or each.port), None)
-    if told is not None:
-        port = told.port or 0
-        discovery = told.metatraffic_port or port
+    placed = next((each for each in fixed if each.metatraffic_port or each.port), None)
+    if placed is not None:
+        port = placed.port or 0
+        discovery = placed.metatraffic_port or port
         return ParticipantDemand(
             owner=owner, index=index, discovery_port=discovery, user_port=port or discovery
         )
@@ -369,7 +369,7 @@ def fixed_url(
         transport: UDPV4, UDPV6 or TCPV4.
         address: own.
         ports: metatraffic, user data and source port for UDP; the listening port for TCP.
-        peers: whom it looks for.
+        peers: what it looks for.
     """
     if transport is Medium.TCPV4:
         return ConnectionUrl(

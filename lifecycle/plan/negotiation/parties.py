@@ -202,11 +202,12 @@ def _participant(
     node_name: str, connection: NegotiatedConnection, replaced: Sequence[PlannedParticipant]
 ) -> PlannedParticipant:
     sizes = [each.max_datagram_bytes for each in replaced if each.max_datagram_bytes is not None]
-    told = ", ".join(dict.fromkeys(each.reason for each in replaced))
+    reasons = ", ".join(dict.fromkeys(each.reason for each in replaced))
     return PlannedParticipant(
         name=participant_name(node_name, connection.name),
         dscp=next((each.dscp for each in replaced), None),
-        reason=f"connection {connection.name}, {connection.reason}{f'; {told}' if told else ''}",
+        reason=f"connection {connection.name}, {connection.reason}"
+        f"{f'; {reasons}' if reasons else ''}",
         max_datagram_bytes=min(sizes, default=None),
         non_blocking_send=any(each.non_blocking_send for each in replaced),
         connection=connection.name,

@@ -188,9 +188,10 @@ class NegotiatedSource:
         self._judged = seen
         parties = [self._party(node, known.get(node.full_name)) for node in self._plan.nodes]
         places = self._places(known)
-        guests = [each for name, each in known.items() if name not in self._planned]
+        unplanned = [each for name, each in known.items() if name not in self._planned]
         parties += [
-            party_of(each, places(each), negotiated=self._negotiated(each.name)) for each in guests
+            party_of(each, places(each), negotiated=self._negotiated(each.name))
+            for each in unplanned
         ]
         graph = negotiate(parties, self._wishes, self._terms, before=self.graph)
         before, self.graph = self.graph, graph
@@ -201,8 +202,8 @@ class NegotiatedSource:
             for node in self.expected.nodes
             if node.managed
         }
-        for each in guests:
-            instructions[each.name] = _guest_instructions(each, graph, before)
+        for each in unplanned:
+            instructions[each.name] = _unplanned_instructions(each, graph, before)
         self._instructions = instructions
         return instructions
 
@@ -330,7 +331,7 @@ def _with_flows(plan: Plan, graph: DataLayerGraph) -> Plan:
     return dataclasses.replace(plan, flows=(*plan.flows, *more.values()))
 
 
-def _guest_instructions(
+def _unplanned_instructions(
     configuration: NodeConfiguration, graph: DataLayerGraph, before: DataLayerGraph
 ) -> Instructions:
     """Instruct an undeclared node in what concerns the system, and leave the rest to it."""

@@ -318,14 +318,14 @@ class GateSequence:
     def _replan(self, nodes: Iterable[NodeRun]) -> None:
         """Connect nodes that come again so that those who stay find them."""
         system = self._system
-        heard = {
+        reported = {
             each.name: {report.name: report.urls for report in each.connections}
             for each in self._judge.seen.configurations
             if system.node_named(each.name) is None
         }
         keys = {each.planned.key for each in nodes}
         try:
-            plan = restarted(system.plan, keys, first=system.first, heard=heard)
+            plan = restarted(system.plan, keys, first=system.first, reported=reported)
         except PlanError as error:
             raise StepFailedError(
                 error.message, rule=START_FAILED, subject=system.plan.system

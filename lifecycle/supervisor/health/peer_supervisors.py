@@ -64,7 +64,7 @@ class AliveExchange(Protocol):
     def send_again_soon(self) -> None:
         """Have what waits for a link to come back be sent soon when it does."""
 
-    def tell_names(self) -> None:
+    def republish_names(self) -> None:
         """Announce our names to the graph again."""
 
 
@@ -223,9 +223,9 @@ class PeerSupervisors:
         if peer.lost_at_s is not None:
             lost_s = self._loop.time() - peer.lost_at_s
             self._missing.pop(peer.what, None)
-            # DDS may have forgotten the names of those whom it lost for long.
-            self._exchange.tell_names()
-            self._start(self._have_hosts(Operation.TELL_NAMES))
+            # DDS may have forgotten the node names of participants that it lost for long.
+            self._exchange.republish_names()
+            self._start(self._have_hosts(Operation.REPUBLISH_NAMES))
         peer.lost_at_s = None
         if peer.machine:
             self._system.emit(

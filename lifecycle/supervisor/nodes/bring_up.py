@@ -27,7 +27,7 @@ from lifecycle.supervisor.processes.control_channel import (
     ControlChannel,
     HostFailedError,
 )
-from lifecycle.supervisor.processes.process import ManagedProcess, Spawner, patient
+from lifecycle.supervisor.processes.process import ManagedProcess, Spawner, wait_under_load
 from lifecycle.supervisor.run.events import Notice, ProcessState, Reach
 from lifecycle.supervisor.run.failure import StepFailedError, ended
 from lifecycle.verify import (
@@ -77,7 +77,7 @@ class Wirer(Protocol):
 
 
 _GATHERED_S = 0.5
-"""For so long no further participant has come: whoever is still missing imports something big."""
+"""For so long no further participant has come: what is still missing imports something big."""
 
 
 class Gathering:
@@ -92,7 +92,8 @@ class Gathering:
         self._missing: set[ControlChannel] = set()
         self._waiting: list[ControlChannel] = []
         self._tasks: set[asyncio.Task[None]] = set()
-        self._late: list[asyncio.TimerHandle] = []
+        self._limit: asyncio.TimerHandle | None = None
+        self._quiet: asyncio.TimerHandle | None = None
 
     def expect(self, channel: ControlChannel) -> None:
         """Wait for the participant of one more host, which is started now."""
@@ -110,22 +111,23 @@ class Gathering:
             self._proceed()
             return
         loop = asyncio.get_running_loop()
-        if came and len(self._waiting) == 1:
-            self._late = [loop.call_later(self._limit_s, self._proceed)]
-        for quiet in self._late[1:]:
-            quiet.cancel()
-        self._late[1:] = [loop.call_later(_GATHERED_S, self._proceed)]
+        if self._waiting and self._limit is None:
+            self._limit = loop.call_later(self._limit_s, self._proceed)
+        if self._quiet is not None:
+            self._quiet.cancel()
+        self._quiet = loop.call_later(_GATHERED_S, self._proceed)
 
     def _proceed(self) -> None:
-        for timer in self._late:
-            timer.cancel()
-        self._late = []
+        for timer in (self._limit, self._quiet):
+            if timer is not None:
+                timer.cancel()
+        self._limit = self._quiet = None
         for channel in self._waiting:
             channel.proceed()
         self._waiting = []
 
     async def close(self) -> None:
-        """Hold nobody any more."""
+        """Have connect wait for no further host."""
         self._proceed()
         await ended(*self._tasks)
 
@@ -535,7 +537,7 @@ class BringUp:
             waits.add(node.process.ended)  # type: ignore[arg-type]
         try:
             own_s = _OWN_S if rule is TRANSITION_FAILED else 0.0
-            await patient(waits, limit_s + own_s, node.starved_s)
+            await wait_under_load(waits, limit_s + own_s, node.run_delay_s)
             if node.process is not None and node.process.ended.done() and not step.done():
                 # Its last output may still be on the way.
                 await asyncio.wait({step}, timeout=_WORDS_S)

@@ -37,7 +37,7 @@ class ObserverParticipant:
         domain_id: int,
         connections: ParticipantConnections = ParticipantConnections(),
         *,
-        guests: bool = False,
+        unplanned: bool = False,
         events: bool = False,
     ) -> ObserverParticipant:
         """Make the participant; before any process, so that each is discovered at once.
@@ -45,7 +45,7 @@ class ObserverParticipant:
         Args:
             domain_id: 0–232.
             connections: how it is connected; by default as the RMW likes.
-            guests: also read the configurations of nodes that are not planned.
+            unplanned: also read the configurations of nodes that are not planned.
             events: receive graph messages, and look again at nodes that changed.
 
         Raises:
@@ -58,7 +58,7 @@ class ObserverParticipant:
                 domain_id,
                 connections,
                 messages=events,
-                guests=guests,
+                unplanned=unplanned,
                 quiet_s=_QUIET_S,
                 burst_s=_BURST_S,
             )
@@ -173,11 +173,11 @@ class ObserverParticipant:
 
         send_again_soon()
 
-    def tell_names(self) -> None:
+    def republish_names(self) -> None:
         """Announce our node to the graph again."""
-        from lifecycle.middleware import tell_names
+        from lifecycle.middleware import republish_names
 
-        tell_names([self._node])
+        republish_names([self._node])
 
     def _watch(self, topic: str, to: Listener) -> AliveSubscription:
         from lifecycle.middleware import AliveSubscription

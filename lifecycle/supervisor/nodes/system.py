@@ -25,7 +25,7 @@ from lifecycle.supervisor.health.liveliness import SilenceMonitor
 from lifecycle.supervisor.nodes.driver import ACTIVE, INACTIVE, NodeCondition, NodeDriver
 from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.supervisor.processes.logs import LogDirectory
-from lifecycle.supervisor.processes.process import ManagedProcess, own_starved_s
+from lifecycle.supervisor.processes.process import ManagedProcess, own_run_delay_s
 from lifecycle.supervisor.run.events import (
     Emitter,
     NodeChanged,
@@ -291,9 +291,9 @@ class NodeRun:
         """Whether the gate is to activate it."""
         return self.planned.holds and self.planned.state is TargetState.ACTIVE
 
-    def starved_s(self) -> float:
-        """Return how long its process has waited for a processor, and we to hear of it."""
-        return own_starved_s() if self.process is None else self.process.starved_s()
+    def run_delay_s(self) -> float:
+        """Return the run delay of its process and ours, seconds: ready to run, but without CPU."""
+        return own_run_delay_s() if self.process is None else self.process.run_delay_s()
 
     def has_reached(self, condition: Condition) -> bool:
         """Whether the condition holds; for a node that is not managed all follow its start."""

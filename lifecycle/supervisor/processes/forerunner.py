@@ -73,7 +73,7 @@ class ForkServerProcess:
         """Have it import what the nodes of this manifest need besides, before it forks any.
 
         Args:
-            names: see node's `needed_by`; what cannot be imported is left to whom it concerns.
+            names: see node's `needed_by`; what cannot be imported is left to hosts that need it.
         """
         self._names = tuple(names)
         if self._preload and self._names:

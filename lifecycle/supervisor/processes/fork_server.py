@@ -27,7 +27,7 @@ from lifecycle.supervisor.processes.fork_server_main import (
     ForkRequest,
 )
 from lifecycle.supervisor.processes.orphans import children, descendants
-from lifecycle.supervisor.processes.process import ProcessExit, SpawnRequest, starved_s
+from lifecycle.supervisor.processes.process import ProcessExit, SpawnRequest, run_delay_s
 from lifecycle.supervisor.run.events import Emitter, Notice
 
 _STATUS_WAIT_S = 1.0
@@ -77,9 +77,9 @@ class ForkServerChild:
             with contextlib.suppress(ProcessLookupError):
                 signal.pidfd_send_signal(self._pidfd, number)
 
-    def starved_s(self) -> float:
+    def run_delay_s(self) -> float:
         """Return how long its threads, and those of its descendants, waited for a processor."""
-        return sum(map(starved_s, {self.pid, *descendants(self.pid)}))
+        return sum(map(run_delay_s, {self.pid, *descendants(self.pid)}))
 
     def _ended(self) -> None:
         """The pidfd is readable: it ended. The fork server reports how, unless it is gone."""

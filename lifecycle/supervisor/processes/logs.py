@@ -75,6 +75,64 @@ def log_directory(environment: Mapping[str, str], system: str) -> Path:
     return ros_log_root(environment) / f"{stamp}-{host}-{os.getpid()}-{system}"
 
 
+KEPT_RUNS = 50
+"""Runs of one system whose logs are kept; LIFECYCLE_KEEP_LOGS says otherwise."""
+
+LATEST = "latest"
+"""Link to the directory of the run that began last, as launch has it."""
+
+
+def _named(system: str) -> re.Pattern[str]:
+    """What the log directory of a run of a system is called; of any system if it is empty."""
+    name = re.escape(system) if system else r"[A-Za-z][A-Za-z0-9_-]*"
+    return re.compile(rf"\d{{4}}(?:-\d\d){{5}}-\d{{6}}-.+-(?P<pid>\d+)-{name}")
+
+
+def runs_of(root: Path, system: str = "") -> list[Path]:
+    """Return the log directories of runs of a system, or of all, the newest first."""
+    named = _named(system)
+    entries: list[Path] = []
+    with contextlib.suppress(OSError):
+        entries = list(root.iterdir())
+    found = (each for each in entries if named.fullmatch(each.name) and not each.is_symlink())
+    return sorted((each for each in found if each.is_dir()), reverse=True)
+
+
+def begin_logs(path: Path, system: str, environment: Mapping[str, str]) -> Path:
+    """Make and return the directory of a run, have `latest` lead to it, and forget what is too old.
+
+    What cannot be done is left: processes' logs say themselves that they cannot be written.
+    """
+    with contextlib.suppress(OSError):
+        path.mkdir(parents=True, exist_ok=True)
+        link = path.parent / LATEST
+        if link.is_symlink() or not link.exists():
+            made = path.parent / f".{LATEST}-{os.getpid()}"
+            made.symlink_to(path.name)
+            made.replace(link)
+    given = environment.get("LIFECYCLE_KEEP_LOGS", "")
+    keep = int(given) if given.isascii() and given.isdigit() and int(given) else KEPT_RUNS
+    for each in runs_of(path.parent, system)[keep:]:
+        with contextlib.suppress(OSError):
+            _remove_run(each, system)
+    return path
+
+
+def _remove_run(path: Path, system: str) -> None:
+    """Remove the logs of a run that is over, unless there is more in it."""
+    named = _named(system).fullmatch(path.name)
+    files = list(path.iterdir())
+    ours = all(
+        each.name.endswith((".log", ".log.1")) and each.is_file() and not each.is_symlink()
+        for each in files
+    )
+    if named is None or not ours or Path(f"/proc/{named['pid']}").exists():
+        return
+    for each in files:
+        each.unlink()
+    path.rmdir()
+
+
 class LineReader:
     """Turns the bytes of a pipe into lines, in the running event loop.
 

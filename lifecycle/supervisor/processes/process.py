@@ -132,7 +132,7 @@ class Child(Protocol):
     def signal(self, number: int) -> None:
         """Send a signal to the process and everything in its group; harmless once it ended."""
 
-    def starved_s(self) -> float:
+    def run_delay_s(self) -> float:
         """Return the seconds that its threads have waited for a processor, added up.
 
         Those of all its descendants count, too; 0 where the kernel does not say.
@@ -291,9 +291,9 @@ class ManagedProcess:
                 control.close()
         self.child.exited.add_done_callback(self._exited)
 
-    def starved_s(self) -> float:
-        """Return how long it has waited for a processor, and we to hear of it; see patience.py."""
-        return own_starved_s() + (0.0 if self.child is None else self.child.starved_s())
+    def run_delay_s(self) -> float:
+        """Return its run delay and ours, seconds: ready to run, but without CPU."""
+        return own_run_delay_s() + (0.0 if self.child is None else self.child.run_delay_s())
 
     def running(self) -> None:
         """Note that the process does its work: its nodes are there."""
@@ -383,21 +383,21 @@ AT_MOST = 10.0
 """However loaded the machine is, a limit lasts no longer than so many times its seconds."""
 
 
-async def patient(
-    waits: Collection[asyncio.Future[Any]], limit_s: float, starved: Callable[[], float]
+async def wait_under_load(
+    waits: Collection[asyncio.Future[Any]], limit_s: float, run_delay: Callable[[], float]
 ) -> bool:
     """Wait until one of some futures is done, or the limit is over; whether one is done.
 
     Args:
         waits: not cancelled here.
-        limit_s: seconds, > 0, in which whom it is about can run. What it waits for a processor
-            comes on top, up to `AT_MOST` times the limit in all.
-        starved: seconds waited for a processor so far, of all threads together.
+        limit_s: seconds, > 0, in which the process can run. Its run delay comes on top, up to
+            `AT_MOST` times the limit in all.
+        run_delay: seconds of run delay so far, of all threads together.
     """
     loop = asyncio.get_running_loop()
     began_s = now_s = loop.time()
     left_s = limit_s
-    waited_s = starved()
+    waited_s = run_delay()
     while left_s > 0 and now_s - began_s < AT_MOST * limit_s:
         done, _ = await asyncio.wait(
             waits, timeout=min(left_s, SLICE_S), return_when=asyncio.FIRST_COMPLETED
@@ -405,7 +405,7 @@ async def patient(
         if done:
             return True
         before_s, now_s = now_s, loop.time()
-        waited_before_s, waited_s = waited_s, starved()
+        waited_before_s, waited_s = waited_s, run_delay()
         # Threads that wait at once have waited no longer for it, and one that ends takes its own
         # along.
         passed_s = now_s - before_s
@@ -413,7 +413,7 @@ async def patient(
     return any(each.done() for each in waits)
 
 
-def starved_s(pid: int) -> float:
+def run_delay_s(pid: int) -> float:
     """Return how long the threads of a process have waited for a processor, all together.
 
     Returns:
@@ -427,7 +427,7 @@ def starved_s(pid: int) -> float:
     return total_ns / 1e9
 
 
-def own_starved_s() -> float:
+def own_run_delay_s() -> float:
     """Return how long this thread has waited for a processor, in seconds."""
     return _run_delay_ns("/proc/thread-self/schedstat") / 1e9
 

@@ -90,12 +90,12 @@ class JudgedSystem:
         """Where it was looked if nothing at all was there, else an empty text."""
         tools = self.plan.policy.tolerated_nodes
         names = (each.full_name for each in self.observation.nodes)
-        somebody = any(not tolerating_pattern(each, tools) for each in names)
-        return "" if somebody else where(self.plan, self.rmw)
+        foreign = any(not tolerating_pattern(each, tools) for each in names)
+        return "" if foreign else where(self.plan, self.rmw)
 
 
 def judge_running(
-    plan: Plan, *, timeout_s: float, strict: bool, nobody_s: float | None = None
+    plan: Plan, *, timeout_s: float, strict: bool, empty_graph_s: float | None = None
 ) -> JudgedSystem:
     """Judge what runs against the plan, as an active system.
 
@@ -103,15 +103,17 @@ def judge_running(
         plan: what should run.
         timeout_s: seconds, > 0, to wait for a verdict that is ok.
         strict: wait for what is unverifiable too.
-        nobody_s: seconds, > 0, after which a graph without any node is not waited for; None waits
-            as long for a system to be started as for anything else.
+        empty_graph_s: seconds, > 0, after which a graph without any node is not waited for; None
+            waits as long for a system to be started as for anything else.
 
     Raises:
         MiddlewareError: no participant can be made.
     """
     with _looking(plan) as observer_participant:
         return asyncio.run(
-            _judge(plan, observer_participant, timeout_s, strict=strict, nobody_s=nobody_s)
+            _judge(
+                plan, observer_participant, timeout_s, strict=strict, empty_graph_s=empty_graph_s
+            )
         )
 
 
@@ -172,7 +174,7 @@ def where(plan: Plan, rmw: str) -> str:
 
 
 def _looking(plan: Plan) -> ObserverParticipant:
-    """Observe a plan's domain; also guests, where they are negotiated with."""
+    """Observe a plan's domain; also nodes that are not planned, where they are negotiated with."""
     os.environ["ROS_DOMAIN_ID"] = str(plan.domain_id)
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = plan.discovery_range.name
     hosts = reached_hosts(plan, own_machines(plan, ""))
@@ -181,7 +183,7 @@ def _looking(plan: Plan) -> ObserverParticipant:
     return ObserverParticipant.open(
         plan.domain_id,
         onlooker_connections(plan, _reported_to_supervisors(plan)),
-        guests=is_open and is_negotiated(plan),
+        unplanned=is_open and is_negotiated(plan),
     )
 
 
@@ -216,15 +218,15 @@ async def _judge(
     timeout_s: float,
     *,
     strict: bool,
-    nobody_s: float | None,
+    empty_graph_s: float | None,
 ) -> JudgedSystem:
     loop = asyncio.get_running_loop()
     began = loop.time()
     while True:
         seen = await _see(plan, observer_participant)
         limit_s = timeout_s
-        if nobody_s is not None and seen.where:
-            limit_s = min(nobody_s, timeout_s)
+        if empty_graph_s is not None and seen.where:
+            limit_s = min(empty_graph_s, timeout_s)
         left_s = began + limit_s - loop.time()
         if left_s <= 0 or not _worth_waiting(seen.verdict, strict=strict):
             return seen

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 TIMEOUT_S = 30.0
-"""For a bring-up, where nobody asks for another; as long again at most for what is in the way at
+"""For a bring-up, where no other is asked for; as long again at most for what is in the way at
 the gate."""
 
 STARTING_S = 1.0

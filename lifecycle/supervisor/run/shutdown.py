@@ -22,7 +22,7 @@ from lifecycle.supervisor.processes.process import (
     STARTING_ESCALATION,
     STUCK_ESCALATION,
     ManagedProcess,
-    patient,
+    wait_under_load,
 )
 from lifecycle.supervisor.run.events import Emitter, Notice, ProcessState, Reach, WiringChanged
 
@@ -140,7 +140,7 @@ class TakeDown:
         request = asyncio.ensure_future(doing)
         hurry = asyncio.ensure_future(self._hurry.wait())
         try:
-            await patient({request, hurry}, limit_s, node.starved_s)
+            await wait_under_load({request, hurry}, limit_s, node.run_delay_s)
             if not request.done():
                 node.stuck = True
                 if not self._hurry.is_set():

@@ -40,7 +40,7 @@ from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.forerunner import Forerunner
 from lifecycle.supervisor.processes.fork_server import ForkServer
-from lifecycle.supervisor.processes.logs import check_log_root, log_directory
+from lifecycle.supervisor.processes.logs import begin_logs, check_log_root, log_directory
 from lifecycle.supervisor.processes.orphans import end_run
 from lifecycle.supervisor.run.events import Emitter, Event, Listener, Notice, RunStarted
 from lifecycle.supervisor.run.failure import StepFailedError, Worker, never_connected, with_failure
@@ -188,7 +188,7 @@ def _up(
         async def run(leaving: contextlib.AsyncExitStack) -> UpResult:
             nonlocal records
             leaving.callback(service.watch())
-            logs = log_directory(os.environ, plan.system)
+            logs = begin_logs(log_directory(os.environ, plan.system), plan.system, os.environ)
             system = System(
                 plan,
                 emit=emit,
@@ -321,7 +321,7 @@ def _observer_participant(plan: Plan, options: UpOptions, emit: Emitter) -> Obse
             observer_participant = ObserverParticipant.open(
                 plan.domain_id,
                 connections,
-                guests=wires and dynamic and plan.policy.undeclared_nodes is EndpointPolicy.OPEN,
+                unplanned=wires and dynamic and plan.policy.undeclared_nodes is EndpointPolicy.OPEN,
                 events=wires and (dynamic or layer.events),
             )
         if number + 1 == OBSERVER_TRIES or observer_participant.reaches_servers():

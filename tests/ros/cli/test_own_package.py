@@ -77,3 +77,21 @@ def test_a_test_that_fails_shows_the_verdict_and_the_logs(package: Path) -> None
     assert "violated graph.undeclared-publisher: /undeclared" in done.stdout
     assert "lifecycle: verdict on sound.lifecycle.yaml" in done.stdout
     assert "lifecycle: log of listener" in done.stdout
+
+
+@pytest.mark.thorough
+def test_node_code_under_up_is_counted_as_covered(package: Path) -> None:
+    pytest.importorskip("coverage")
+    coverage = [sys.executable, "-m", "coverage"]
+    tests = ["-m", "pytest", "-p", "no:cacheprovider", "-k", "verified"]
+    for words in (["run", *tests], ["combine", "-q"], ["report", "--fail-under", "100"]):
+        done = subprocess.run(
+            [*coverage, *words],
+            cwd=package,
+            env={**os.environ, "PYTHONPATH": str(package)},
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=False,
+        )
+        assert done.returncode == 0, done.stdout + done.stderr

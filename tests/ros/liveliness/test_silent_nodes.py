@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 import yaml
 
-from lifecycle.middleware.discovery.rediscovery import tell_names
+from lifecycle.middleware.discovery.rediscovery import republish_names
 from tests.ros.supervisor.running import ROOT, Event, Up, environment, up, verb
 from tests.stalls import Stalls, assert_in_time, noted_stalls
 
@@ -313,6 +313,6 @@ def test_telling_names_anew_adds_nothing_to_the_graph(
     node, other = make_node("teller"), make_node("listener")
     wait_until(lambda: ("teller", "/") in other.get_node_names_and_namespaces())
     before = sorted(node.get_topic_names_and_types())
-    tell_names([node])
+    republish_names([node])
     wait_until(lambda: sorted(other.get_topic_names_and_types()) == before)
     assert node.count_publishers("/parameter_events") == 2

@@ -277,9 +277,9 @@ def test_sends_that_must_not_wait_go_by_sockets_that_do_not(
         FlowParticipant(
             "_hasty", "/", domain_id, transports=transports, non_blocking_send=True
         ) as hasty,
-        FlowParticipant("_patient", "/", domain_id, transports=transports) as patient,
+        FlowParticipant("_patient", "/", domain_id, transports=transports) as wait_under_load,
     ):
-        assert (hasty.never_waits(), patient.never_waits()) == (True, False)
+        assert (hasty.never_waits(), wait_under_load.never_waits()) == (True, False)
         assert hasty.has_shared_memory is (not transports)
 
 

@@ -77,7 +77,7 @@ class _Run:
         _wait(lambda: self.phase() == "active", self.process)
 
     def log(self, process: str) -> str:
-        (path,) = (self.runtime / "log").glob(f"*/{process}.log")
+        (path,) = (self.runtime / "log").glob(f"20*/{process}.log")
         return path.read_text()
 
 
@@ -302,7 +302,7 @@ def test_a_full_disk_under_logs_and_run_directory_is_said_once_and_supervision_g
         assert json.loads(asked("status", "pair", "--format", "json").stdout)["phase"] == "active"
         # Room again: what is missing is said where it is missing, and to whoever follows.
         filler.unlink()
-        (log,) = (inside / "log").glob("*/talker.log")
+        (log,) = (inside / "log").glob("20*/talker.log")
         os.truncate(log, 0)
         while "log lines are missing in" not in run.until("notice")["message"]:
             pass

@@ -52,7 +52,7 @@ def write(directory: Path, domain_id: int, nodes: dict[str, Any], **keys: Any) -
 
 
 def log_of(up: Up, process: str) -> str:
-    (path,) = (up.runtime / "log").glob(f"*/{process}.log")
+    (path,) = (up.runtime / "log").glob(f"20*/{process}.log")
     return path.read_text(encoding="utf-8")
 
 

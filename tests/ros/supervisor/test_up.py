@@ -58,6 +58,7 @@ def test_a_healthy_system_is_connected_verified_activated_held_and_taken_down(
         activated = [e["node"] for e in run.of_kind("request") if e["operation"] == "activate"]
         assert sorted(activated) == ["/listener", "/talker"]
         run.assert_gate_held()
+        assert "heard hello" in verb("logs", "listener", runtime=tmp_path).stdout
         run.assert_nothing_left()
         logs = Path(run.of_kind("run")[0]["log_directory"])
         assert logs.parent == tmp_path / "log"
@@ -363,7 +364,7 @@ def test_every_import_that_fails_is_named_once_and_whoever_still_imports_is_not_
     assert "verdict: violated (3 violated)" in said
     assert "/talker (run." not in said
     for process in ("slow", "foreign"):
-        (log,) = (tmp_path / "log").glob(f"*/{process}.log")
+        (log,) = (tmp_path / "log").glob(f"latest/{process}.log")
         assert log.read_text() == "importing\n"
 
 

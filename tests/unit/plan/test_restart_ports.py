@@ -81,7 +81,7 @@ def test_a_client_of_a_discovery_server_needs_to_dial_nobody_else():
 def test_what_a_node_of_another_supervisor_says_counts_more_than_the_plan():
     first = system()
     heard = {"/near": {"": (f"{HOST}:10001?peer=127.0.0.1:8003",)}}
-    again = restarted(first, ["talker"], first=first, heard=heard)
+    again = restarted(first, ["talker"], first=first, reported=heard)
     assert [each.port for each in parse(own(again)["talker"]).peers] == [8003, 8006, 10001]
 
 

@@ -164,7 +164,7 @@ class FakeProcess:
         if number >= self._spawner.ends_at.get(self._name, 0) or number == signal.SIGKILL:
             self.end(ProcessExit(signal=number))
 
-    def starved_s(self) -> float:
+    def run_delay_s(self) -> float:
         share = self._spawner.starves.get(self._name, 0.0)
         return share * asyncio.get_running_loop().time()
 

@@ -212,7 +212,7 @@ class FakeParticipant:
     def send_again_soon(self) -> None:
         """No link is ever lost."""
 
-    def tell_names(self) -> None:
+    def republish_names(self) -> None:
         """No name is ever forgotten."""
 
     def prepare_to_leave(self) -> None:

@@ -214,8 +214,8 @@ class FakeAir:
     def send_again_soon(self) -> None:
         self.done.append("send_again_soon")
 
-    def tell_names(self) -> None:
-        self.done.append("tell_names")
+    def republish_names(self) -> None:
+        self.done.append("republish_names")
 
 
 def two_machines() -> Plan:
@@ -470,9 +470,9 @@ def test_a_loss_has_us_and_our_hosts_prepare_and_after_it_tell_our_names_anew(
         if came_back:
             listener.alive(True)
             await asyncio.sleep(1)
-            done.append("tell_names")
+            done.append("republish_names")
         assert air.done == done
-        operations = (Operation.SEND_AGAIN_SOON, Operation.TELL_NAMES)
+        operations = (Operation.SEND_AGAIN_SOON, Operation.REPUBLISH_NAMES)
         asked = [each for each in operations if f"/camera {each.value}" in world.log]
         assert [each.value for each in asked] == done
         await peer_supervisors.close()

@@ -21,7 +21,7 @@ from tests.unit.graph.test_observer import FakeClients, FakeGraph, configuration
 from tests.unit.supervisor.fakes import run
 
 
-def world(*, guests: bool) -> tuple[FakeGraph, FakeClients, Observer]:
+def world(*, unplanned: bool) -> tuple[FakeGraph, FakeClients, Observer]:
     graph, clients = FakeGraph(), FakeClients()
     graph.nodes = (
         ObservedNode(full_name="/guest", managed=True),
@@ -32,12 +32,12 @@ def world(*, guests: bool) -> tuple[FakeGraph, FakeClients, Observer]:
         "/guest": dataclasses.replace(configuration("/guest"), checksum="1"),
         "/plain": configuration("/plain"),
     }
-    return graph, clients, observing(graph, clients, guests=guests)
+    return graph, clients, observing(graph, clients, unplanned=unplanned)
 
 
 def test_a_guest_is_read_and_followed_and_nobody_else_is() -> None:
     async def main() -> None:
-        graph, clients, observer = world(guests=True)
+        graph, clients, observer = world(unplanned=True)
         seen = await observer.observe(plan())
         assert [each.name for each in seen.configurations] == ["/guest"]
         assert {each.full_name: each.state for each in seen.nodes}["/guest"] == "inactive"
@@ -53,7 +53,7 @@ def test_a_guest_is_read_and_followed_and_nobody_else_is() -> None:
 
 def test_without_guests_only_planned_nodes_are_read() -> None:
     async def main() -> None:
-        _, clients, observer = world(guests=False)
+        _, clients, observer = world(unplanned=False)
         assert (await observer.observe(plan())).configurations == ()
         assert clients.followed == {}
 
@@ -71,10 +71,10 @@ def test_a_message_is_worth_a_look_and_a_heartbeat_only_with_a_new_checksum() ->
             change.cancel()
 
     async def main() -> None:
-        graph, clients, _ = world(guests=True)
+        graph, clients, _ = world(unplanned=True)
         network = InMemoryNetwork(scheduler := ManualScheduler())
         events = GraphEvents(network.transport(), scheduler)
-        observer = Observer(graph, clients, events, guests=True)
+        observer = Observer(graph, clients, events, unplanned=True)
         sender = network.transport()
 
         def send(type_: type[GraphMessage], node: str, **fields: str) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.middleware.discovery.probe import chosen_otherwise, knock_for
+from lifecycle.middleware.discovery.probe import chosen_otherwise, probes_for
 from lifecycle.network.connection_url import parse
 
 _WAIT_S = 5.0
@@ -51,24 +51,24 @@ def locators(message: bytes, address: str) -> set[int]:
 
 def test_a_listed_peer_is_asked_to_answer_the_observer_and_is_counted(peer: socket.socket) -> None:
     url, address = url_for(peer)
-    (knock,) = knock_for(25, (parse(url),), {})
+    (probe,) = probes_for(25, (parse(url),), {})
     try:
         message, (_, asked_from, *_) = peer.recvfrom(65536)
         assert locators(message, address) == {7910, asked_from}
-        assert knock.answered() == frozenset()
+        assert probe.answered() == frozenset()
         peer.sendto(_ANSWER, (address, asked_from))
-        assert knock.answered() == {_PREFIX.hex()}
+        assert probe.answered() == {_PREFIX.hex()}
     finally:
-        knock.close()
+        probe.close()
 
 
 def test_who_is_not_listed_is_not_asked(peer: socket.socket) -> None:
     url, _ = url_for(peer)
     without = url.partition("&peer=")[0] + "&multicast=off"
-    for knock in knock_for(25, (parse(without),), {}):
-        knock.close()
-    for knock in knock_for(25, (parse(url),), {}):
-        knock.close()
+    for probe in probes_for(25, (parse(without),), {}):
+        probe.close()
+    for probe in probes_for(25, (parse(url),), {}):
+        probe.close()
     peer.recv(65536)
     peer.setblocking(False)
     with pytest.raises(BlockingIOError):
@@ -84,7 +84,7 @@ def test_who_is_not_listed_is_not_asked(peer: socket.socket) -> None:
     ],
 )
 def test_over_shared_memory_and_tcp_and_behind_a_server_nobody_can_be_asked(url: str) -> None:
-    assert knock_for(25, (parse(url),), {}) == ()
+    assert probes_for(25, (parse(url),), {}) == ()
 
 
 @pytest.mark.parametrize(
@@ -99,7 +99,7 @@ def test_where_the_user_chose_how_others_are_found_nobody_is_asked(
     environment: dict[str, str],
 ) -> None:
     assert chosen_otherwise(environment)
-    assert knock_for(25, (), environment) == ()
+    assert probes_for(25, (), environment) == ()
 
 
 @pytest.mark.parametrize(
