@@ -76,7 +76,8 @@ class ParameterReadings:
             named: names of parameters by full node name; without any, nothing is subscribed to.
         """
         with self._lock:
-            self._named = dict(named)
+            # Looks at a part of the system go on beside those at all of it.
+            self._named.update(named)
         if named:
             self._loop = asyncio.get_running_loop()
             self._clients.on_parameters(self._changed)
