@@ -168,8 +168,7 @@ def target_plan(
         UsageError: no such run, or arguments for a system that is named.
         ManifestError: the manifest cannot be loaded.
     """
-    from lifecycle.run_directory import run_name, runtime_root
-    from lifecycle.supervisor import find_run
+    from lifecycle.run_directory import find_run, run_name, runtime_root
 
     root = runtime_root(environment)
     if not os.path.isfile(target):  # noqa: PTH113 - Path.is_file() raises for a name too long
