@@ -502,6 +502,21 @@ def test_a_process_that_ends_before_a_step_of_its_nodes_has_begun_is_blamed_for_
     run(main())
 
 
+def test_a_command_that_does_not_appear_may_call_its_node_otherwise(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = _world(tmp_path, planned_node("a", kind=RunKind.COMMAND, timeouts=Timeouts()))
+        world.spawner.takes_s["a start"] = 60.0
+        with pytest.raises(StepFailedError) as caught:
+            await world.bring_up.connect(LIMIT_S)
+        assert caught.value.message == (
+            "cannot bring up '/a': it was still waiting to appear in the graph after 10 s; if its "
+            "code calls it otherwise, write 'name: a' at nodes.a"
+        )
+        await _down(world)
+
+    run(main())
+
+
 def test_every_process_that_died_by_then_is_named(tmp_path: Path) -> None:
     async def main() -> None:
         world = _world(
