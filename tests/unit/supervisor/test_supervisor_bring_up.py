@@ -633,6 +633,16 @@ def test_hosts_wait_for_one_that_imports_for_long_no_longer_than_half_a_second()
     assert _proceeding(_Host(0.1), _Host(0.3), _Host(9.0)) == [0.8, 0.8, 9.0]
 
 
+def test_a_host_that_fails_first_does_not_cut_short_what_the_others_wait_for() -> None:
+    hosts = (_Host(0.1, fails=True), _Host(0.3), _Host(0.7))
+    assert _proceeding(*hosts) == [None, 0.7, 0.7]
+
+
+def test_hosts_hold_none_beyond_the_limit_where_one_failed_first() -> None:
+    hosts = [_Host(0.1, fails=True), *(_Host(0.4 * (index + 1)) for index in range(5))]
+    assert _proceeding(*hosts, limit_s=1.0)[1:4] == [1.4, 1.4, 1.4]
+
+
 def test_hosts_that_come_one_after_the_other_hold_none_beyond_the_limit() -> None:
     hosts = [_Host(0.4 * (index + 1)) for index in range(10)]
     assert _proceeding(*hosts, limit_s=1.0)[:5] == [1.4, 1.4, 1.4, 2.6, 2.6]
