@@ -34,10 +34,14 @@ from pathlib import Path
 import psutil
 import yaml
 
+sys.path.insert(0, str(Path(__file__).parents[1]))  # as a script, only its own directory is there
+
+from benchmarks.bring_up import manifest
+
 ROOT = Path(__file__).resolve().parents[1]
 BOUND_S = 60.0
 SETTLE_S = 3.0
-"""Discovery announces each participant forty times at first."""
+"""Discovery announces each participant twenty times in its first 2 s."""
 
 MANY = 20
 MIB = 1 << 20
@@ -114,27 +118,6 @@ def fork_plain(nodes: int) -> None:
         os.kill(child, signal.SIGINT)
     for child in children:
         os.waitpid(child, 0)
-
-
-def manifest(nodes: int, domain_id: int) -> str:
-    """Our nodes, as a manifest."""
-    return yaml.safe_dump(
-        {
-            "manifest_version": 1,
-            "system": "cost",
-            "discovery": {"domain_id": domain_id, "range": "localhost"},
-            "policy": {"unheard": "ignore"},
-            "nodes": {
-                f"node_{index}": {
-                    "run": {"python": "benchmarks.bring_up_node:Ours"},
-                    "interface": {
-                        "publishers": [{"name": f"out_node_{index}", "type": "std_msgs/msg/String"}]
-                    },
-                }
-                for index in range(nodes)
-            },
-        }
-    )
 
 
 @contextlib.contextmanager
@@ -234,7 +217,9 @@ def forked_ours(nodes: int, domain_id: int) -> list[Cost]:
     with tempfile.TemporaryDirectory() as directory:
         os.environ["XDG_RUNTIME_DIR"] = directory
         file = Path(directory) / "cost.lifecycle.yaml"
-        file.write_text(manifest(nodes, domain_id), encoding="utf-8")
+        file.write_text(
+            yaml.safe_dump(manifest(nodes, "single", domain_id, "localhost")), encoding="utf-8"
+        )
         with running("-m", "lifecycle.cli", "up", str(file), "--format", "json") as process:
             pids = hosted_pids(process)
             time.sleep(SETTLE_S)

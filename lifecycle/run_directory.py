@@ -1,7 +1,8 @@
 """Run directory of one supervised system: lock, process record, control socket.
 
-Owns: where it is, that only one supervisor has it, and what it records of the processes, so that
-the next `up` can find what a killed supervisor left behind. Must not import rclpy.
+Owns: where it is, how a run is found by name, that only one supervisor has it, and what it records
+of the processes, so that the next `up` can find what a killed supervisor left behind. Must not
+import rclpy.
 """
 
 from __future__ import annotations
@@ -294,6 +295,42 @@ def is_held(path: Path) -> bool:
     finally:
         os.close(lock)
     return False
+
+
+def running(root: Path) -> tuple[str, ...]:
+    """Return the names of all runs that a supervisor holds, sorted."""
+    if not root.is_dir():
+        return ()
+    return tuple(sorted(entry.name for entry in root.iterdir() if is_held(entry)))
+
+
+def find_run(root: Path, word: str) -> Path:
+    """Return the directory of the run that `word` means.
+
+    Args:
+        root: see runtime_root.
+        word: a run's name, `teleop@7`, or its system, `teleop`, where only one such run is there.
+
+    Raises:
+        UsageError: no such run, or more than one.
+    """
+    names = running(root)
+    found = [name for name in names if word in (name, name.rpartition("@")[0])]
+    if len(found) == 1:
+        return root / found[0]
+    if found:
+        raise UsageError(f"cannot tell which {word!r} is meant; running: {', '.join(found)}")
+    left = [
+        entry.name
+        for entry in (root.iterdir() if root.is_dir() else ())
+        if word in (entry.name, entry.name.rpartition("@")[0]) and read_record(entry) is not None
+    ]
+    if left:
+        return root / left[0]
+    raise UsageError(
+        f"cannot find a running system {word!r}; running: {', '.join(names) or 'none'}",
+        hint="start it: lifecycle up MANIFEST",
+    )
 
 
 @contextlib.contextmanager

@@ -12,7 +12,6 @@ import importlib
 import os
 import signal
 import sys
-import traceback
 
 import click
 
@@ -145,6 +144,8 @@ def main(arguments: list[str] | None = None) -> int:
         click.echo(lines(str(error)), err=True)
         return error.exit_code
     except Exception:  # noqa: BLE001 - the boundary: report our bug, whatever it is
+        import traceback
+
         traceback.print_exc()
         click.echo("this is a bug in lifecycle: please report it with the trace above", err=True)
         return ExitCode.INTERNAL

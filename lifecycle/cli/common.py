@@ -159,6 +159,11 @@ def say_differences(path: Path, plan: Plan) -> None:
         )
 
 
+def is_manifest(target: str) -> bool:
+    """Return whether a target is the file of a manifest, and not the name of a running system."""
+    return os.path.isfile(target)  # noqa: PTH113 - Path.is_file() raises for a name too long
+
+
 def target_plan(
     environment: Mapping[str, str], target: str, assignments: tuple[str, ...], machine: str
 ) -> tuple[Path, Plan | None]:
@@ -168,11 +173,10 @@ def target_plan(
         UsageError: no such run, or arguments for a system that is named.
         ManifestError: the manifest cannot be loaded.
     """
-    from lifecycle.run_directory import run_name, runtime_root
-    from lifecycle.supervisor import find_run
+    from lifecycle.run_directory import find_run, run_name, runtime_root
 
     root = runtime_root(environment)
-    if not os.path.isfile(target):  # noqa: PTH113 - Path.is_file() raises for a name too long
+    if not is_manifest(target):
         if assignments:
             raise UsageError(
                 f"cannot use {' '.join(assignments)} with the running system {target!r}",

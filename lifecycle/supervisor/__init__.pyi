@@ -1,9 +1,7 @@
 from .connections.networks import token_variables as token_variables
 from .control.client import differences as differences
 from .control.client import down as down
-from .control.client import find_run as find_run
 from .control.client import order as order
-from .control.client import running as running
 from .control.client import status as status
 from .control.server import ControlRequest as ControlRequest
 from .control.server import Question as Question

@@ -24,6 +24,7 @@ from .rules import Rule as Rule
 from .rules import rule as rule
 from .rules.catalogue import About as About
 from .rules.catalogue import Heals as Heals
+from .rules.endpoints import DEFINITION_DIFFERS as DEFINITION_DIFFERS
 from .rules.matching import SERVER_OF as SERVER_OF
 from .rules.matching import MatchEnd as MatchEnd
 from .rules.matching import match as match

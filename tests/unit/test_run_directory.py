@@ -19,13 +19,14 @@ from lifecycle.run_directory import (
     AlreadyRunningError,
     ChildRecord,
     RunDirectory,
+    find_run,
     read_record,
     run_name,
+    running,
     runtime_root,
     short_path,
 )
 from lifecycle.supervisor.control import server
-from lifecycle.supervisor.control.client import find_run, running
 from lifecycle.supervisor.control.server import ControlRequest, ControlServer, Question, ask, follow
 from lifecycle.supervisor.control.status import SystemStatus
 from tests.builders import plan_of, planned_node

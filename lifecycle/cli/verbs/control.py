@@ -88,19 +88,13 @@ def status_command(
     TARGET is a manifest or the name of a system; without one, all that run are listed. Exits with
     4 if the last verdict is violated.
     """
+    if target is None:
+        return _list_running(format_)
+    path = target_run(os.environ, target, assignments, machine)
     from lifecycle.codec import to_json
-    from lifecycle.run_directory import runtime_root
-    from lifecycle.supervisor import running, status
+    from lifecycle.supervisor import status  # takes long to import, and a wrong name needs none
     from lifecycle.verify import Outcome
 
-    if target is None:
-        names = running(runtime_root(os.environ))
-        if format_ == "json":
-            click.echo(to_json(names).decode())
-        else:
-            click.echo("\n".join(names) or "no system runs")
-        return ExitCode.OK
-    path = target_run(os.environ, target, assignments, machine)
     try:
         seen = status(path)
     except TimeoutError as error:
@@ -110,6 +104,19 @@ def status_command(
     else:
         click.echo(status_text(seen))
     return ExitCode.VIOLATED if seen.verdict is Outcome.VIOLATED else ExitCode.OK
+
+
+def _list_running(format_: str) -> int:
+    from lifecycle.run_directory import running, runtime_root
+
+    names = running(runtime_root(os.environ))
+    if format_ == "json":
+        from lifecycle.codec import to_json
+
+        click.echo(to_json(names).decode())
+    else:
+        click.echo("\n".join(names) or "no system runs")
+    return ExitCode.OK
 
 
 def order_timeout(function: F) -> F:
@@ -146,8 +153,6 @@ def give_order(  # noqa: PLR0917 - in the order of the command line
         UsageError: no such run, or no manifest to reload.
         ManifestError: the manifest cannot be loaded.
     """
-    from lifecycle.supervisor import ControlRequest, Question, order
-
     path, plan = target_plan(os.environ, target, assignments, machine)
     if reload and plan is None:
         raise UsageError(
@@ -157,6 +162,8 @@ def give_order(  # noqa: PLR0917 - in the order of the command line
         say_differences(path, plan)
     if reload:
         load_manifest(target, assignments, quiet=True, machine=machine)
+    from lifecycle.supervisor import ControlRequest, Question, order
+
     question = Question(ask=ControlRequest(verb), node=node, plan=plan, reload=reload)
     try:
         answer = order(path, question, timeout)
@@ -178,9 +185,9 @@ def down_command(target: str, assignments: tuple[str, ...], machine: str, timeou
     TARGET is a manifest, or the name of a running system as `lifecycle status` shows it. Where the
     supervisor itself was killed, what it left behind is ended too.
     """
+    path = target_run(os.environ, target, assignments, machine)
     from lifecycle.supervisor import down
 
-    path = target_run(os.environ, target, assignments, machine)
     try:
         return down(path, timeout)
     except TimeoutError:

@@ -17,6 +17,7 @@ import click
 from lifecycle.cli.common import (
     NetworkCommand,
     format_option,
+    is_manifest,
     load_manifest,
     manifest_arguments,
     target_plan,
@@ -246,8 +247,7 @@ def _show(
 
 def _plan_of(target: str, assignments: tuple[str, ...]) -> Plan:
     """Return the plan of a manifest, or that of a running system of this name."""
-    # Path.is_file() raises for a name too long.
-    if os.path.isfile(target) or target.endswith((".yaml", ".yml")):  # noqa: PTH113
+    if is_manifest(target) or target.endswith((".yaml", ".yml")):
         return _plan(target, assignments)
     from lifecycle.supervisor import running_plan
 

@@ -11,7 +11,13 @@ from typing import TYPE_CHECKING
 
 import click
 
-from lifecycle.cli.common import format_option, target_arguments, target_run, timeout_option
+from lifecycle.cli.common import (
+    format_option,
+    is_manifest,
+    target_arguments,
+    target_run,
+    timeout_option,
+)
 from lifecycle.cli.standard_streams import echo_while_read
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.printable import json_text
@@ -86,7 +92,7 @@ def _found(
     target: str, assignments: tuple[str, ...], machine: str
 ) -> tuple[Path | None, Plan | None]:
     """Return the run of a supervisor, or the plan to look for without one."""
-    if not os.path.isfile(target):  # noqa: PTH113 - Path.is_file() raises for a name too long
+    if not is_manifest(target):
         return target_run(os.environ, target, assignments, machine), None
     from lifecycle.cli.common import load_manifest
     from lifecycle.plan import build_plan

@@ -408,7 +408,7 @@ class RemoteInterface:
         self._interface = interface
         self._log = log
         self._group = group
-        self._left = {
+        self._unserved = {
             "connect_to": self._connect_to,
             "map_to": self._map_to,
             "disconnect": self._disconnect,
@@ -418,8 +418,8 @@ class RemoteInterface:
 
     def serve(self, *, but: Collection[str] = ()) -> None:
         """Offer the services that are not there yet, without those named; again is harmless."""
-        for name in [each for each in self._left if each not in but]:
-            act = self._served(self._left.pop(name))
+        for name in [each for each in self._unserved if each not in but]:
+            act = self._served(self._unserved.pop(name))
             Node.create_service(
                 self._node, SetParameters, f"~/{name}", act, callback_group=self._group
             )

@@ -1,6 +1,6 @@
-"""Client of a running supervisor: finds it by name, reads its status, gives orders, ends it.
+"""Client of a running supervisor: reads its status, gives orders, ends it.
 
-Owns: `find_run`, `status`, `look`, `differences`, `order`, `down`. Must not import rclpy.
+Owns: `status`, `look`, `differences`, `order`, `down`. Must not import rclpy.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from pathlib import Path
 
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.plan import Plan
-from lifecycle.run_directory import RunDirectory, is_held, new_run_id, read_record
+from lifecycle.run_directory import RunDirectory, is_held, new_run_id
 from lifecycle.supervisor.control.server import (
     Answer,
     ControlRequest,
@@ -23,42 +23,6 @@ from lifecycle.supervisor.control.status import SystemStatus
 
 STATUS_S = 5.0
 _SOCKET = "control"
-
-
-def running(root: Path) -> tuple[str, ...]:
-    """Return the names of all runs that a supervisor holds, sorted."""
-    if not root.is_dir():
-        return ()
-    return tuple(sorted(entry.name for entry in root.iterdir() if is_held(entry)))
-
-
-def find_run(root: Path, word: str) -> Path:
-    """Return the directory of the run that `word` means.
-
-    Args:
-        root: see run_directory.runtime_root.
-        word: a run's name, `teleop@7`, or its system, `teleop`, where only one such run is there.
-
-    Raises:
-        UsageError: no such run, or more than one.
-    """
-    names = running(root)
-    found = [name for name in names if word in (name, name.rpartition("@")[0])]
-    if len(found) == 1:
-        return root / found[0]
-    if found:
-        raise UsageError(f"cannot tell which {word!r} is meant; running: {', '.join(found)}")
-    left = [
-        entry.name
-        for entry in (root.iterdir() if root.is_dir() else ())
-        if word in (entry.name, entry.name.rpartition("@")[0]) and read_record(entry) is not None
-    ]
-    if left:
-        return root / left[0]
-    raise UsageError(
-        f"cannot find a running system {word!r}; running: {', '.join(names) or 'none'}",
-        hint="start it: lifecycle up MANIFEST",
-    )
 
 
 def status(path: Path) -> SystemStatus:

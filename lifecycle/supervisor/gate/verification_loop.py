@@ -26,6 +26,7 @@ from lifecycle.supervisor.nodes.system import ObservedGraph, System
 from lifecycle.supervisor.run.events import Emitter, VerdictChanged
 from lifecycle.supervisor.run.failure import ended
 from lifecycle.verify import (
+    DEFINITION_DIFFERS,
     MISSING_REPORT,
     SERVER_OF,
     UNATTRIBUTED_ENDPOINT,
@@ -51,15 +52,15 @@ _Place = tuple[object, ...]
 class GracePeriod:
     """Knows since when something that may pass is wrong.
 
-    Two kinds of findings may: an endpoint whose node is not known (yet), and whatever concerns an
-    endpoint, a connection or a flow that must be there only since a moment ago, because the
-    authority has just decided so.
+    Two kinds of findings may: an endpoint whose node is not known (yet), with what is not known of
+    it for that reason; and whatever concerns an endpoint, a connection or a flow that must be there
+    only since a moment ago, because the authority has just decided so.
     """
 
     def __init__(self) -> None:
         self._plan: Plan | None = None
         self._demanded: dict[tuple[_Place, str], float] = {}
-        self._unattributed: dict[_Key, float] = {}
+        self._unknown: dict[_Key, float] = {}
 
     def after(
         self, last: Verdict | None, verdict: Verdict, expected: Plan, now_s: float
@@ -86,10 +87,10 @@ class GracePeriod:
         return last, min(left_s)
 
     def _note(self, verdict: Verdict, expected: Plan, now_s: float) -> None:
-        self._unattributed = {
-            key: self._unattributed.get(key, now_s)
-            for key in map(_key, verdict.findings)
-            if key[0] == UNATTRIBUTED_ENDPOINT.id
+        self._unknown = {
+            _key(each): self._unknown.get(_key(each), now_s)
+            for each in verdict.findings
+            if _is_of_unknown_node(each)
         }
         if expected is self._plan:
             return
@@ -99,8 +100,8 @@ class GracePeriod:
 
     def _since(self, finding: Finding) -> float:
         """Return since when a finding may pass; -inf if it may not."""
-        if finding.rule == UNATTRIBUTED_ENDPOINT.id:
-            return self._unattributed[_key(finding)]
+        if _is_of_unknown_node(finding):
+            return self._unknown[_key(finding)]
         places: set[_Place] = {
             (finding.subject,),
             (finding.node, finding.endpoint, finding.subject),
@@ -111,6 +112,17 @@ class GracePeriod:
             (since for (place, _), since in self._demanded.items() if place in places),
             default=float("-inf"),
         )
+
+
+def _is_of_unknown_node(finding: Finding) -> bool:
+    """Whether a finding says that an endpoint's node is not known, or no type hash of such a one.
+
+    A client and a server of a service are two DDS endpoints each, which are seen one after the
+    other as they come and as they go: until both are there, none of their hash is known.
+    """
+    if finding.rule == DEFINITION_DIFFERS.id:
+        return not finding.node and finding.outcome is Outcome.UNVERIFIABLE
+    return finding.rule == UNATTRIBUTED_ENDPOINT.id
 
 
 def _key(finding: Finding) -> _Key:

@@ -334,7 +334,7 @@ class BringUp:
         else:
             # A plain node reports nothing. Its dependents wait until it is in the graph; if it
             # never is, verification says so.
-            node.doing = "waiting to appear in the graph"
+            node.doing = _APPEARING
             if self._is_to_be_given(node) and not node.planned.may_end:
                 # What it is judged by must be there before it is.
                 limit_s = node.planned.timeouts.start_s
@@ -475,7 +475,7 @@ class BringUp:
             if node.planned.holds:
                 node.driver = ControlDriver(process.channel, node.name)
         elif node.planned.managed:
-            node.doing = "waiting to appear in the graph"
+            node.doing = _APPEARING
             await self._step(node, self._appears(node.name), limit_s, rule=START_FAILED)
             node.driver = self._services(node.planned)
 
@@ -583,7 +583,7 @@ class BringUp:
         culprit = next((node for node in missing if not node.doing.startswith("waits")), None)
         return StepFailedError(
             f"cannot bring up {self._system.plan.system!r} within {timeout_s:.3g} s: "
-            f"{self.unfinished()}",
+            f"{self.unfinished()}{next(filter(None, map(_unnamed, missing)), '')}",
             rule=DEADLINE,
             subject=culprit.name if culprit else self._system.plan.system,
             **(_process_of(culprit) if culprit else {}),
@@ -654,11 +654,26 @@ def _start_failed(error: HostFailedError, name: str, **process: str) -> StepFail
 
 def _too_late(node: NodeRun, limit_s: float) -> StepFailedError:
     return StepFailedError(
-        f"cannot bring up {node.name!r}: it was still {node.doing} after {limit_s:g} s",
+        f"cannot bring up {node.name!r}: it was still {node.doing} after {limit_s:g} s"
+        f"{_unnamed(node)}",
         rule=DEADLINE,
         subject=node.name,
         **_process_of(node),
     )
+
+
+_APPEARING = "waiting to appear in the graph"
+
+
+def _unnamed(node: NodeRun) -> str:
+    """Say how a node is named that a command may call otherwise; empty where that is not it."""
+    process, planned = node.process, node.planned
+    if process is None or process.planned.run.kind is not RunKind.COMMAND:
+        return ""
+    named = any(each.endswith(f"__node:={planned.name}") for each in process.planned.argv)
+    if named or node.doing != _APPEARING:
+        return ""
+    return f"; if its code calls it otherwise, write 'name: {planned.name}' at nodes.{planned.key}"
 
 
 def _is(doing: str) -> str:

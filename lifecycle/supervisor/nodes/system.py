@@ -139,12 +139,16 @@ class InterfaceOnDemand:
         self._offered: dict[str, ControlChannel] = {}
 
     async def follow(self) -> None:
-        """Look after each change, at most every tenth of a second, until this is cancelled."""
+        """Look once after each burst of changes, until this is cancelled."""
+        loop = asyncio.get_running_loop()
         while True:
             count = self._changes.count
             await self._look()
-            await asyncio.sleep(_DEMAND_S)
             await self._changes.beyond(count, None)
+            end_s = loop.time() + _BURST_S
+            while (left_s := end_s - loop.time()) > 0:
+                if not await self._changes.beyond(self._changes.count, min(_QUIET_S, left_s)):
+                    break
 
     async def _look(self) -> None:
         quiet = {
@@ -207,7 +211,12 @@ _CONDITIONS = {
     Condition.ACTIVE: Reach.ACTIVE,
 }
 
-_DEMAND_S = 0.1
+_QUIET_S = 0.05
+"""Without a change for so long a burst is over: a client's endpoints come together."""
+
+_BURST_S = 0.5
+"""While a system comes up the graph changes all the time: then it is looked at so often."""
+
 _OFFER_S = 5.0
 
 _REPORTING = {

@@ -55,7 +55,6 @@ class ControlChannel:
         on_hang: called with why its executor is busy for too long, with None when it came back.
 
     Attributes:
-        spec: what it hosts.
         failures: what kept its nodes from being constructed, each cause once, the first one first.
     """
 
@@ -65,7 +64,7 @@ class ControlChannel:
         on_state: Callable[[Event], None],
         on_hang: Callable[[Overdue | None], None] = lambda _: None,
     ) -> None:
-        self.spec = spec
+        self._spec = spec
         self._on_state = on_state
         self._on_hang = on_hang
         self._sign: BusySign | None = None
@@ -82,7 +81,7 @@ class ControlChannel:
     @property
     def silent_s(self) -> float:
         """Its executor may be busy for so long at a time: its nodes share it."""
-        return max(node.timeouts.silent_s for node in self.spec.nodes)
+        return max(node.timeouts.silent_s for node in self._spec.nodes)
 
     async def open(self) -> socket.socket:
         """Make the pair, send the host its spec, and return the end that the host inherits.
@@ -91,7 +90,7 @@ class ControlChannel:
         """
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
         ours.setblocking(False)
-        line = to_json(self.spec) + b"\n"
+        line = to_json(self._spec) + b"\n"
         self._sign = BusySign.make(self.silent_s)
         socket.send_fds(ours, [line[:1]], self._sign.descriptors)
         asyncio.get_running_loop().add_reader(self._sign, self._look)
@@ -186,7 +185,7 @@ class ControlChannel:
         finally:
             # A process that was killed while it was busy would be said to hang.
             self._watch_no_more()
-            self._fail(ChannelClosedError(f"cannot reach process {self.spec.process!r}: {reason}"))
+            self._fail(ChannelClosedError(f"cannot reach process {self._spec.process!r}: {reason}"))
 
     def _dispatch(self, event: Event) -> None:
         if event.kind == "reply":

@@ -18,7 +18,7 @@ from lifecycle.errors import BringUpError
 from lifecycle.run_directory import RUN_VARIABLE, new_run_id
 
 PRELOAD = "preload"
-"""Begins a message that names interface types, one a line; all others are JSON."""
+"""Begins a message that names modules and interface types, one a line; all others are JSON."""
 
 CLOSE_S = 1.0
 """A fork server whose children have ended ends within milliseconds of its socket."""

@@ -31,9 +31,9 @@ from lifecycle.graph import Look, set_within
 from lifecycle.manifest import DiscoveryRange, EndpointPolicy
 from lifecycle.middleware import peers_environment
 from lifecycle.plan import Plan, reached_hosts
-from lifecycle.run_directory import is_held, run_name, runtime_root
+from lifecycle.run_directory import is_held, run_name, running, runtime_root
 from lifecycle.supervisor.connections.negotiation import Expectation, is_negotiated
-from lifecycle.supervisor.control.client import look, running
+from lifecycle.supervisor.control.client import look
 from lifecycle.supervisor.control.server import SupervisorSnapshot, follow
 from lifecycle.supervisor.control.status import SystemStatus
 from lifecycle.supervisor.gate.gate import closes

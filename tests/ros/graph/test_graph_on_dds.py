@@ -31,6 +31,7 @@ from lifecycle.graph import (
 )
 from lifecycle.manifest import load
 from lifecycle.manifest.model import EndpointKind
+from lifecycle.middleware import segments_of, sweep
 from lifecycle.plan import build_plan
 from lifecycle.verify import Outcome
 from lifecycle.verify.observation import EndpointReport, Identity, NodeConfiguration
@@ -59,6 +60,17 @@ def spinning(*nodes: Node) -> Iterator[None]:
         thread.join()
 
 
+_killed: set[str] = set()
+
+
+@pytest.fixture(autouse=True)
+def _sweep() -> Iterator[None]:
+    """Remove what killed processes leave, once no graph of the test has their ports open."""
+    yield
+    sweep(_killed)
+    _killed.clear()
+
+
 @contextlib.contextmanager
 def process(name: str, topic: str) -> Iterator[subprocess.Popen[str]]:
     started = subprocess.Popen(
@@ -67,6 +79,7 @@ def process(name: str, topic: str) -> Iterator[subprocess.Popen[str]]:
     try:
         assert started.stdout is not None
         assert started.stdout.readline() == "reporting\n"
+        _killed.update(segments_of([started.pid]))
         yield started
     finally:
         with contextlib.suppress(ProcessLookupError):
@@ -289,3 +302,6 @@ def test_a_program_asks_whether_the_system_is_up_and_running(
             assert graph.state.observation().configurations
             with Graph.open(fresh_domain) as late:
                 wait_until(lambda: late.verdict(plan).verdict is Outcome.OK)
+            # Killed, it would leave its ports, which our own graph still has open.
+            run.signal(signal.SIGTERM)
+            run.finish()

@@ -494,6 +494,7 @@ def test_a_plain_command_is_started_verified_and_ended(tmp_path: Path, fresh_dom
     )
     edit = {
         "nodes/talker/run": {"command": [sys.executable, "-c", code]},
+        "nodes/talker/name": "talker",  # what its code calls 'x'
         "nodes/talker/managed": False,
         "nodes/talker/interface": {
             "publishers": [{"name": "/chatter", "type": "std_msgs/msg/String"}]

@@ -502,6 +502,21 @@ def test_a_process_that_ends_before_a_step_of_its_nodes_has_begun_is_blamed_for_
     run(main())
 
 
+def test_a_command_that_does_not_appear_may_call_its_node_otherwise(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = _world(tmp_path, planned_node("a", kind=RunKind.COMMAND, timeouts=Timeouts()))
+        world.spawner.takes_s["a start"] = 60.0
+        with pytest.raises(StepFailedError) as caught:
+            await world.bring_up.connect(LIMIT_S)
+        assert caught.value.message == (
+            "cannot bring up '/a': it was still waiting to appear in the graph after 10 s; if its "
+            "code calls it otherwise, write 'name: a' at nodes.a"
+        )
+        await _down(world)
+
+    run(main())
+
+
 def test_every_process_that_died_by_then_is_named(tmp_path: Path) -> None:
     async def main() -> None:
         world = _world(
@@ -616,6 +631,16 @@ def test_a_host_that_cannot_be_made_holds_no_other() -> None:
 
 def test_hosts_wait_for_one_that_imports_for_long_no_longer_than_half_a_second() -> None:
     assert _proceeding(_Host(0.1), _Host(0.3), _Host(9.0)) == [0.8, 0.8, 9.0]
+
+
+def test_a_host_that_fails_first_does_not_cut_short_what_the_others_wait_for() -> None:
+    hosts = (_Host(0.1, fails=True), _Host(0.3), _Host(0.7))
+    assert _proceeding(*hosts) == [None, 0.7, 0.7]
+
+
+def test_hosts_hold_none_beyond_the_limit_where_one_failed_first() -> None:
+    hosts = [_Host(0.1, fails=True), *(_Host(0.4 * (index + 1)) for index in range(5))]
+    assert _proceeding(*hosts, limit_s=1.0)[1:4] == [1.4, 1.4, 1.4]
 
 
 def test_hosts_that_come_one_after_the_other_hold_none_beyond_the_limit() -> None:

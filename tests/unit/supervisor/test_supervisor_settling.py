@@ -10,9 +10,17 @@ from lifecycle.manifest.model import EndpointKind, FlowTransport
 from lifecycle.plan import Plan
 from lifecycle.supervisor.connections.negotiation import NegotiatedSource
 from lifecycle.supervisor.gate.verification_loop import PASSING_S, GracePeriod
-from lifecycle.verify import Finding, Outcome, Verdict
+from lifecycle.verify import (
+    Finding,
+    Outcome,
+    Stage,
+    Verdict,
+    verify,
+)
+from tests.builders import endpoint, node, planned
 from tests.unit.supervisor.fakes import verdict_of
 from tests.unit.supervisor.test_supervisor_negotiation import LISTENER, TALKER, known, plan_of
+from tests.unit.verify.perfect import perfect
 
 PUB = EndpointKind.PUBLISHER
 OK = verdict_of(Outcome.OK)
@@ -168,3 +176,47 @@ def test_a_client_that_has_only_just_become_expected_may_be_unmatched_for_a_mome
     bad = found(("graph.unmatched-client", f"/ask: {names[0]} → {names[1]}", names[0]))
     assert grace_period.after(OK, bad, plan, 20.0) == (OK, PASSING_S)
     assert grace_period.after(OK, bad, plan, 20.0 + PASSING_S) == (bad, None)
+
+
+STATUS = "not_installed_interfaces/srv/Status"
+
+
+def with_client(plan: Plan, *hashes: str) -> Verdict:
+    """The verdict on a tool's client for each hash, seen while the name of the tool is not known.
+
+    That is so while the tool comes and while it goes.
+    """
+    seen = perfect(plan, Stage.ACTIVE)
+    server = dataclasses.replace(seen.endpoints[0], type_hash="RIHS01_a RIHS01_a")
+    client = dataclasses.replace(
+        server, kind=EndpointKind.SERVICE_CLIENT, node="", gid="010f78fd" + 24 * "0"
+    )
+    clients = (dataclasses.replace(client, type_hash=each) for each in hashes)
+    observation = dataclasses.replace(seen, endpoints=(server, *clients))
+    return verify(plan, observation, stage=Stage.ACTIVE)
+
+
+def test_a_client_of_an_unknown_node_that_is_half_seen_may_pass() -> None:
+    plan = planned(
+        node("station", endpoint(EndpointKind.SERVICE_SERVER, "/status", STATUS, qos=None))
+    )
+    fine = with_client(plan)
+    half = with_client(plan, "")
+    both = {"graph.unattributed-endpoint", "graph.type-definition-differs"}
+    assert {each.rule for each in half.findings} - {each.rule for each in fine.findings} == both
+    grace_period = GracePeriod()
+    grace_period.after(None, fine, plan, 0.0)
+    assert grace_period.after(fine, half, plan, 10.0) == (fine, PASSING_S)
+    assert grace_period.after(fine, half, plan, 10.0 + PASSING_S) == (half, None)
+
+
+def test_a_client_of_an_unknown_node_with_another_definition_is_told_at_once() -> None:
+    plan = planned(
+        node("station", endpoint(EndpointKind.SERVICE_SERVER, "/status", STATUS, qos=None))
+    )
+    fine = with_client(plan)
+    other = with_client(plan, "RIHS01_b RIHS01_b")
+    assert other.verdict is Outcome.VIOLATED
+    grace_period = GracePeriod()
+    grace_period.after(None, fine, plan, 0.0)
+    assert grace_period.after(fine, other, plan, 10.0) == (other, None)
