@@ -32,6 +32,7 @@ VERBS: dict[str, str] = {
     "flows": "show every network flow and how unique it is",
     "graph": "picture of what runs, beside what was declared",
     "export": "write a manifest as files of another system: access control of sros2",
+    "import": "write a manifest from a ROS 2 launch file, gaps marked; starts nothing",
     "capture": "write a manifest from a running system, gaps marked",
     "logs": "show what the processes of the latest run have written, or follow it",
     "run": "run one node of a manifest in this terminal, without a supervisor",
@@ -43,6 +44,7 @@ VERBS: dict[str, str] = {
 _ELSEWHERE = {
     **dict.fromkeys(("pause", "resume", "restart", "down", "status"), "control"),
     "schema": "init",
+    "import": "import_",
 }
 """Verb → module that has it, as `VERB_command`; all others have a module of their name."""
 

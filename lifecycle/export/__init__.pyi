@@ -3,8 +3,12 @@ from .captured import CapturedSystem as CapturedSystem
 from .captured import Programs as Programs
 from .captured import capture as capture
 from .manifest_yaml import SUFFIX as SUFFIX
+from .manifest_yaml import Noted as Noted
+from .manifest_yaml import Tree as Tree
+from .manifest_yaml import comment as comment
 from .manifest_yaml import to_manifest as to_manifest
 from .manifest_yaml import to_nodl as to_nodl
+from .manifest_yaml import to_yaml as to_yaml
 from .picture import WRITERS as WRITERS
 from .picture.build import Supervised as Supervised
 from .picture.build import build_picture as build_picture

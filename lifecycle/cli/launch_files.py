@@ -1,0 +1,546 @@
+"""Evaluates a launch description without starting anything, and writes its nodes as a manifest.
+
+Owns: which actions of `launch` and `launch_ros` are carried out while one is evaluated (those that
+only set something for what follows), which are read instead of run (processes, nodes, timers, event
+handlers), and how each becomes a key of the manifest or a `gap:`. Needs the `launch` package, and
+`launch_ros` where the file has nodes; both are looked for when they are needed.
+
+A launch file in Python is a program, and evaluating it runs that program; so does a `Command`
+substitution. The processes that it describes are not started.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import importlib
+import os
+import re
+import shlex
+import sys
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from lifecycle.errors import LifecycleError, UsageError
+from lifecycle.export import Noted, Tree, comment, to_yaml
+from lifecycle.manifest import ParameterValue
+
+MAX_ENTITIES = 10_000
+"""Actions of one launch description, those of files that it includes with them."""
+
+_INSTALL = (
+    "install the ros-DISTRO-{package} package of your ROS distribution and source its setup file; "
+    "PyPI has none"
+)
+_NO_INTERFACE = (
+    "a launch file says nothing of its interface: lifecycle capture shows it once it runs"
+)
+_NO_LIFECYCLE = "launch does not say whether it has a lifecycle; remove this line if it has"
+
+
+@dataclasses.dataclass(slots=True, kw_only=True)
+class LaunchedNode:
+    """What a launch file says of one node.
+
+    Attributes:
+        name: empty where the node's code chooses it.
+        run: as the manifest has it.
+        parameters: (name, value), later ones win.
+        container: full name of the component container that loads it; empty for a process.
+        gaps: what a manifest cannot say of it, or launch does not say.
+    """
+
+    name: str
+    namespace: str
+    run: dict[str, Tree]
+    managed: bool
+    parameter_files: list[str] = dataclasses.field(default_factory=list)
+    parameters: dict[str, ParameterValue] = dataclasses.field(default_factory=dict)
+    remap: dict[str, str] = dataclasses.field(default_factory=dict)
+    log_level: str = ""
+    container: str = ""
+    gaps: list[str] = dataclasses.field(default_factory=list)
+
+    @property
+    def full_name(self) -> str:
+        """`/namespace/name`; without the name where that is not known."""
+        return f"{self.namespace.rstrip('/')}/{self.name}"
+
+
+@dataclasses.dataclass(slots=True, kw_only=True)
+class Launched:
+    """What evaluating a launch file has shown.
+
+    Attributes:
+        arguments: name and value of each that the file and what it includes declare.
+        gaps: what concerns no single node.
+    """
+
+    nodes: list[LaunchedNode] = dataclasses.field(default_factory=list)
+    arguments: dict[str, str] = dataclasses.field(default_factory=dict)
+    gaps: list[str] = dataclasses.field(default_factory=list)
+
+
+def evaluate(path: Path, arguments: Mapping[str, str]) -> Launched:
+    """Evaluate a launch file, in Python, XML or YAML, without starting what it describes.
+
+    Args:
+        path: the file.
+        arguments: launch arguments by name.
+
+    Raises:
+        UsageError: `launch` is not installed, there is no such file, or it cannot be evaluated.
+    """
+    launch = _package("launch")
+    sources = importlib.import_module("launch.launch_description_sources")
+    if not path.is_file():
+        raise UsageError(f"cannot import {str(path)!r}: there is no such file")
+    before = dict(os.environ)
+    # launch_ros looks nowhere without it; wheels of ROS packages are below sys.prefix.
+    os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)
+    started = dict(os.environ)
+    try:
+        description = sources.get_launch_description_from_any_launch_file(str(path.absolute()))
+        context = launch.LaunchContext(argv=[f"{n}:={v}" for n, v in arguments.items()])
+        context.extend_locals({"current_launch_file_path": str(path.resolve())})
+        context.launch_configurations.update(arguments)
+        for name, value in (
+            ("current_launch_file_path", str(path.resolve())),
+            ("current_launch_file_directory", str(path.resolve().parent)),
+        ):
+            context.extend_globals({name: value})
+        walk = _Walk(context, started)
+        walk.visit(description)
+    except LifecycleError:
+        raise
+    except Exception as problem:
+        # Anything: a launch file is a program, and launch raises what its parsers raise.
+        said = [each.strip(" -:") for each in str(problem).splitlines()]
+        why = "; ".join(filter(None, said))[:600] or type(problem).__name__
+        raise UsageError(
+            f"cannot evaluate the launch file {str(path)!r}: {why}",
+            hint="ros2 launch --show-args FILE lists what it takes; give NAME:=VALUE here",
+        ) from problem
+    finally:
+        os.environ.clear()
+        os.environ.update(before)
+    return walk.found
+
+
+def _package(name: str) -> Any:
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as problem:
+        if problem.name is None or problem.name.partition(".")[0] not in (
+            "launch",
+            "launch_ros",
+            "launch_xml",
+            "launch_yaml",
+        ):
+            raise
+        package = problem.name.partition(".")[0]
+        raise UsageError(
+            f"cannot import a launch file: the Python package {package!r} is not installed here",
+            hint=_INSTALL.format(package=package.replace("_", "-")),
+        ) from problem
+
+
+_READ = ("ExecuteLocal", "RegisterEventHandler", "TimerAction", "LoadComposableNodes")
+"""Actions, by a class they inherit, that start something or wait: they are read, never executed."""
+
+_NEVER = (
+    "EmitEvent",
+    "Shutdown",
+    "ShutdownAction",
+    "LifecycleTransition",
+    "UnregisterEventHandler",
+)
+"""Actions that act on what runs: nothing runs."""
+
+
+class _Walk:
+    """One walk over a launch description, depth first, in the order in which launch acts."""
+
+    def __init__(self, context: Any, environment: Mapping[str, str]) -> None:
+        self.found = Launched()
+        self._context = context
+        self._environment = environment
+        self._left = MAX_ENTITIES
+
+    def visit(self, entity: Any, notes: tuple[str, ...] = ()) -> None:
+        """Carry out what sets something, read what would start something."""
+        self._left -= 1
+        if self._left < 0:
+            raise UsageError(f"cannot import more than {MAX_ENTITIES} actions of one launch file")
+        kinds = [each.__name__ for each in type(entity).__mro__]
+        if "Action" in kinds and not self._holds(entity):
+            return
+        if any(each in kinds for each in _READ):
+            self._read(entity, kinds, notes)
+        elif any(each in kinds for each in _NEVER):
+            self._gap(
+                f"{kinds[0]}: it acts on what runs; `after:` of a node says what it waits for"
+            )
+        else:
+            if "DeclareLaunchArgument" in kinds:
+                entity.execute(self._context)
+                value = self._context.launch_configurations.get(entity.name, "")
+                self.found.arguments[entity.name] = value
+                return
+            for each in entity.visit(self._context) or ():
+                self.visit(each, notes)
+
+    def _holds(self, action: Any) -> bool:
+        condition = action.condition
+        return condition is None or bool(condition.evaluate(self._context))
+
+    def _read(self, entity: Any, kinds: Sequence[str], notes: tuple[str, ...]) -> None:
+        if "TimerAction" in kinds:
+            period = self._text_or_number(entity.period)
+            note = f"launch starts it {period} s later; `after:` says what it waits for"
+            for each in entity.actions:
+                self.visit(each, (*notes, note))
+        elif "RegisterEventHandler" in kinds:
+            self._handler(entity.event_handler, notes)
+        elif "LoadComposableNodes" in kinds:
+            self._components(entity, notes)
+        elif "Node" in kinds:
+            self._node(entity, kinds, notes)
+        else:
+            words = self._command(entity)
+            self._gap(f"the process {shlex.join(words)!r} is no node: a manifest starts nodes only")
+
+    def _handler(self, handler: Any, notes: tuple[str, ...]) -> None:
+        kind = type(handler).__name__
+        entities = _private(handler, "actions_on_event", "entities") or ()
+        inside = list(entities) if isinstance(entities, Iterable) else [entities]
+        starts = [each for each in inside if _is_a(each, *_READ)]
+        if not starts:
+            self._gap(f"{kind}: what it does on an event is not in the manifest")
+        note = f"launch starts it on an event, {kind}; `after:` says what it waits for"
+        for each in starts:
+            self.visit(each, (*notes, note))
+
+    def _gap(self, text: str) -> None:
+        if text not in self.found.gaps:
+            self.found.gaps.append(text)
+
+    # -- nodes
+
+    def _node(self, action: Any, kinds: Sequence[str], notes: tuple[str, ...]) -> None:
+        node = LaunchedNode(
+            name=self._text(_private(action, "node_name")),
+            namespace=self._namespace(_private(action, "node_namespace")),
+            run=self._run(action),
+            managed="LifecycleNode" in kinds,
+            gaps=[*notes],
+        )
+        self._settings(node, _private(action, "parameters"), _private(action, "remappings"))
+        self._ros_arguments(node, action)
+        for name, what in (("respawn", "respawn"), ("shell", "shell"), ("env", "env")):
+            value = _private(action, name)
+            if value is None:
+                value = getattr(action, name, None)
+            if name == "env" and value is None:
+                value = getattr(getattr(action, "process_description", None), "env", None)
+            if value and not (isinstance(value, list) and self._text(value).lower() == "false"):
+                node.gaps.append(f"{what}: a manifest has nothing like it")
+        if _private(action, "on_exit"):
+            node.gaps.append("on_exit: what its end does to others is the supervisor's")
+        self.found.nodes.append(node)
+        described = _private(action, "composable_node_descriptions") or ()
+        for each in described:
+            self._component(each, node.full_name, notes)
+
+    def _run(self, action: Any) -> dict[str, Tree]:
+        package, executable = (
+            self._text(_private(action, name)) for name in ("package", "node_executable")
+        )
+        arguments = [self._text(each) for each in _private(action, "arguments") or ()]
+        # Words of one argument stand for several where they were parsed from XML.
+        run: dict[str, Tree]
+        if package and not arguments:
+            run = {"package": package, "executable": executable}
+        elif package:
+            path = f"$(find-pkg-share {package})/../../lib/{package}/{executable}"
+            run = {"command": [_Written(path), *map(_literal, arguments)]}
+        else:
+            run = {"command": [_literal(each) for each in (executable, *arguments)]}
+        description = getattr(action, "process_description", None)
+        prefix = self._text(_private(description, "prefix"))
+        if prefix:
+            run["prefix"] = [_literal(each) for each in shlex.split(prefix)]
+        output = self._output(action)
+        if output:
+            run["output"] = output
+        environment = self._changed()
+        for name, value in _private(description, "additional_env") or ():
+            environment[self._text(name)] = self._text(value)
+        if environment:
+            run["environment"] = {name: _literal(each) for name, each in environment.items()}
+        folder = self._text(_private(description, "cwd"))
+        if folder:
+            run["working_directory"] = _literal(folder)
+        return run
+
+    def _output(self, action: Any) -> str:
+        output = _private(action, "output")
+        text = "" if isinstance(output, dict) else self._text(output)
+        return text if text in ("screen", "both") else ""  # launch's default is log
+
+    def _changed(self) -> dict[str, str]:
+        """Return what SetEnvironmentVariable has set by now."""
+        return {
+            name: value
+            for name, value in self._context.environment.items()
+            if self._environment.get(name) != value
+        }
+
+    def _namespace(self, written: Any) -> str:
+        names = importlib.import_module("launch_ros.utilities")
+        own = None if written is None else self._text(written)
+        base = self._context.launch_configurations.get("ros_namespace")
+        return str(names.make_namespace_absolute(names.prefix_namespace(base, own)) or "/")
+
+    def _settings(self, node: LaunchedNode, parameters: Any, remappings: Any) -> None:
+        for each in self._context.launch_configurations.get("global_params") or ():
+            if isinstance(each, tuple):
+                self._parameter(node, each[0], each[1])
+            else:
+                self._file(node, str(each))
+        if parameters:
+            evaluated = importlib.import_module("launch_ros.utilities").evaluate_parameters(
+                self._context, parameters
+            )
+            for each in evaluated:
+                if isinstance(each, Mapping):
+                    for name, value in each.items():
+                        self._parameter(node, name, value)
+                elif isinstance(each, os.PathLike):
+                    self._file(node, os.fspath(each))
+                else:
+                    self._parameter(node, *each.evaluate(self._context))
+        rules = [*(self._context.launch_configurations.get("ros_remaps") or ())]
+        rules += [(self._text(source), self._text(target)) for source, target in remappings or ()]
+        for source, target in rules:
+            node.remap.setdefault(source, target)  # rcl takes the first that matches
+
+    def _parameter(self, node: LaunchedNode, name: str, value: Any) -> None:
+        if isinstance(value, (list, tuple)):
+            node.parameters[name] = tuple(value)
+        elif isinstance(value, (bool, int, float, str)):
+            node.parameters[name] = value
+        else:
+            node.gaps.append(f"parameter {name}: its value is no ROS value")
+
+    def _file(self, node: LaunchedNode, path: str) -> None:
+        if Path(path).parent == Path(tempfile.gettempdir()):
+            # launch writes a parameter file with substitutions to a temporary one.
+            node.gaps.append(f"{path}: a parameter file with substitutions; write it out, name it")
+        if node.parameters:
+            node.gaps.append(
+                f"launch lets {Path(path).name} win over parameters before it; here they win"
+            )
+        node.parameter_files.append(path)
+
+    def _ros_arguments(self, node: LaunchedNode, action: Any) -> None:
+        words = [self._text(each) for each in _private(action, "ros_arguments") or ()]
+        rest = iter(words)
+        for word in rest:
+            value = next(rest, "") if word in ("--log-level", "-r", "--remap") else ""
+            source, separator, target = value.partition(":=")
+            if word == "--log-level" and value.lower() in _LEVELS:
+                node.log_level = value.lower()
+            elif word in ("-r", "--remap") and separator:
+                node.remap.setdefault(source, target)
+            else:
+                node.gaps.append(f"ROS argument {' '.join(filter(None, (word, value)))}")
+
+    # -- components
+
+    def _components(self, action: Any, notes: tuple[str, ...]) -> None:
+        target = _private(action, "target_container")
+        if _is_a(target, "Node"):
+            namespace = self._namespace(_private(target, "node_namespace"))
+            container = f"{namespace.rstrip('/')}/{self._text(_private(target, 'node_name'))}"
+        else:
+            container = self._text(target)
+            container = container if container.startswith("/") else f"/{container}"
+        for each in _private(action, "composable_node_descriptions") or ():
+            self._component(each, container, notes)
+
+    def _component(self, described: Any, container: str, notes: tuple[str, ...]) -> None:
+        condition = described.condition()
+        if condition is not None and not condition.evaluate(self._context):
+            return
+        package, plugin = self._text(described.package), self._text(described.node_plugin)
+        node = LaunchedNode(
+            name=self._text(described.node_name),
+            namespace=self._namespace(described.node_namespace),
+            run={"component": f"{package}/{plugin}"},
+            managed=False,
+            container=container,
+            gaps=[*notes],
+        )
+        self._settings(node, described.parameters, described.remappings)
+        if described.extra_arguments:
+            node.gaps.append("extra_arguments: a manifest gives a component none")
+        self.found.nodes.append(node)
+
+    # -- values
+
+    def _text(self, value: Any) -> str:
+        """Return text of what may be text, a substitution, or a list of these."""
+        if value is None:
+            return ""
+        if isinstance(value, (str, bool, int, float)):
+            return str(value)
+        if isinstance(value, os.PathLike):
+            return str(os.fspath(value))
+        if isinstance(value, Iterable):
+            return "".join(self._text(each) for each in value)
+        return str(value.perform(self._context))
+
+    def _text_or_number(self, value: Any) -> str:
+        return f"{value:g}" if isinstance(value, (int, float)) else self._text(value)
+
+    def _command(self, action: Any) -> list[str]:
+        with contextlib.suppress(Exception):  # a word of it may depend on what runs
+            return [self._text(each) for each in action.cmd]
+        return [type(action).__name__]
+
+
+_LEVELS = ("debug", "info", "warn", "error", "fatal")
+
+
+class _Written(str):
+    """Text whose substitutions are the manifest's own."""
+
+    __slots__ = ()
+
+
+def _is_a(value: Any, *names: str) -> bool:
+    return bool({each.__name__ for each in type(value).__mro__} & {*names})
+
+
+def _private(value: Any, *names: str) -> Any:
+    """Return an attribute that launch keeps for itself, of whichever class has it.
+
+    launch offers no way to read what an action was made with: `_Node__parameters` and its like
+    are the same in Humble, Jazzy and later.
+    """
+    for name in names:
+        for each in type(value).__mro__:
+            found = getattr(value, f"_{each.__name__.lstrip('_')}__{name}", None)
+            if found is not None:
+                return found
+    return None
+
+
+def _literal(value: str) -> str:
+    return value.replace("$(", "$$(")
+
+
+def to_launched_manifest(found: Launched, *, source: str, system: str, folder: Path) -> str:
+    """Return what a launch file describes as a manifest, gaps marked.
+
+    Args:
+        found: what it says.
+        source: how the launch file is named in the first lines.
+        system: name to give the system.
+        folder: of the manifest, from which its paths start.
+    """
+    keys = _keys(found.nodes)
+    by_name = {node.full_name: key for node, key in zip(found.nodes, keys, strict=True)}
+    every = [node.parameters.get("use_sim_time") for node in found.nodes]
+    shared: dict[str, Tree] = {}
+    if isinstance(every[0], bool) and every == [every[0]] * len(every):
+        shared["use_sim_time"] = every[0]
+        for node in found.nodes:
+            del node.parameters["use_sim_time"]
+    nodes = {key: _tree(node, by_name, folder) for node, key in zip(found.nodes, keys, strict=True)}
+    head = [
+        comment(f"Imported from {source}: evaluated, and never run. `gap:` marks what is missing.")
+    ]
+    head += [comment(f"{name}:={value}") for name, value in found.arguments.items()]
+    head += [comment(f"gap: {each}") for each in found.gaps]
+    tree: dict[str, Tree] = {
+        "manifest_version": 1,
+        "system": system,
+        "policy": Noted(
+            value={"unpublished": "ignore", "unheard": "ignore"},
+            note="as long as interfaces are missing",
+        ),
+        **shared,
+        "nodes": nodes,
+    }
+    return "\n".join(head) + "\n" + to_yaml(tree)
+
+
+def _keys(nodes: Iterable[LaunchedNode]) -> list[str]:
+    keys: list[str] = []
+    for node in nodes:
+        executable = node.run.get("executable") or node.run.get("component") or ""
+        if not executable and isinstance(node.run.get("command"), list):
+            executable = node.run["command"][0]  # type: ignore[index]
+        base = node.name or Path(str(executable)).name.rpartition("::")[2] or "node"
+        base = re.sub(r"\W", "_", base, flags=re.ASCII)
+        base = base if base[0].isalpha() or base[0] == "_" else f"_{base}"
+        in_namespace = "_".join(filter(None, (*node.namespace.strip("/").split("/"), base)))
+        key = base if base not in keys else in_namespace
+        number = 2
+        while key in keys:
+            key = f"{in_namespace}_{number}"
+            number += 1
+        keys.append(key)
+    return keys
+
+
+def _tree(node: LaunchedNode, by_name: Mapping[str, str], folder: Path) -> Tree:
+    tree: dict[str, Tree] = {"run": _run_tree(node, by_name)}
+    gaps = [*node.gaps]
+    if node.name:
+        tree["name"] = node.name  # written even if it is the key: only then a command is given it
+    else:
+        gaps.insert(0, "launch leaves its name to its code; the key must be that name")
+    if node.namespace != "/":
+        tree["namespace"] = node.namespace
+    if not node.managed:
+        tree["managed"] = Noted(value=False, note=f"gap: {_NO_LIFECYCLE}")
+    files = [_literal(os.path.relpath(each, folder)) for each in node.parameter_files]
+    if files:
+        tree["parameter_files"] = files
+    if node.parameters:
+        tree["parameters"] = {
+            name: [_spelled(each) for each in value]
+            if isinstance(value, tuple)
+            else _spelled(value)
+            for name, value in node.parameters.items()
+        }
+    if node.remap:
+        tree["remap"] = {source: _literal(target) for source, target in node.remap.items()}
+    if node.log_level:
+        tree["log_level"] = node.log_level
+    tree["endpoints"] = Noted(value="open", note=f"gap: {_NO_INTERFACE}")
+    return Noted(value=tree, note="; ".join(f"gap: {each}" for each in gaps)) if gaps else tree
+
+
+def _run_tree(node: LaunchedNode, by_name: Mapping[str, str]) -> dict[str, Tree]:
+    run = dict(node.run)
+    if node.container:
+        run["container"] = by_name.get(node.container, node.container)
+    return run
+
+
+def _spelled(value: bool | float | str) -> bool | int | float | str:
+    return _literal(value) if isinstance(value, str) else value
+
+
+def gaps_of(found: Launched) -> Iterator[str]:
+    """Yield each gap, with the node that it is about."""
+    yield from found.gaps
+    for node in found.nodes:
+        for each in node.gaps:
+            yield f"{node.full_name}: {each}"
