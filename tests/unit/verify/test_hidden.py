@@ -97,3 +97,19 @@ def test_a_node_of_the_ros2_command_is_nobodys_although_a_node_is_called_so() ->
 )
 def test_a_node_is_hidden_by_the_underscore_of_its_own_name(name: str, hidden: bool) -> None:
     assert is_hidden_node(name) is hidden
+
+
+@pytest.mark.parametrize(
+    ("names", "hidden", "owner"),
+    [
+        (("a",), "/_a_net", "/a"),
+        (("camera",), "/_camera_net_low_1", "/camera"),
+        (("a", "a_b"), "/_a_b_net_low_1", "/a_b"),
+        (("b",), "/_a_net", ""),
+    ],
+)
+def test_of_the_nodes_whose_names_it_begins_with_the_longest_owns_it(
+    names: tuple[str, ...], hidden: str, owner: str
+) -> None:
+    nodes = planned(*(node(name, publisher("data")) for name in names)).nodes
+    assert Owners(nodes, ()).of(hidden) == owner

@@ -41,6 +41,7 @@ from lifecycle.verify import (
     verify,
 )
 from lifecycle.verify.rules.endpoints import differ
+from lifecycle.verify.rules.run import node_of
 from tests.builders import (
     IMAGE,
     at,
@@ -1277,3 +1278,8 @@ def test_a_link_between_nodes_that_report_nothing_is_unverifiable():
     )
     finding = the_finding(lambda seen: seen, plan=linked)
     assert (finding.rule, finding.outcome) == ("graph.unmatched-link", Outcome.UNVERIFIABLE)
+
+
+@pytest.mark.parametrize(("subject", "name"), [("/robot/camera", "/robot/camera"), ("host", "")])
+def test_a_subject_of_a_run_names_a_node_only_by_its_full_name(subject: str, name: str) -> None:
+    assert node_of(subject) == name
