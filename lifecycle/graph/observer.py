@@ -140,7 +140,6 @@ class Observer:
         unplanned: bool = False,
         follows: bool = False,
     ) -> None:
-        self.state = GraphState(events, self._read)
         self.changes = 0
         self._discovery = discovery
         self._clients = clients
@@ -160,6 +159,8 @@ class Observer:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._due: Remove | None = None
         self._closed = False
+        # The scheduler may be another thread's, and asks for the first node at once.
+        self.state = GraphState(events, self._read)
         events.on_message(self._message_received)
         self._remove = discovery.on_change(self._discovery_changed)
         if follows:

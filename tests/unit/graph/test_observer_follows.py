@@ -173,3 +173,29 @@ def test_what_was_put_of_a_node_whose_process_ended_is_judged_no_more() -> None:
         assert world.state.nodes() == ()
 
     in_world(main)
+
+
+class _Ahead(LoopScheduler):
+    """As in a thread of its own that is faster than who posts."""
+
+    def post(self, call: Callable[[], None]) -> None:
+        call()
+
+
+def test_a_node_that_is_there_at_once_may_be_read_before_the_observer_is_made_to_its_end() -> None:
+    async def main() -> None:
+        scheduler = _Ahead()
+        network = InMemoryNetwork(scheduler)
+        events = GraphEvents(network.transport(), scheduler)
+        events.report_seen("/it")
+        clients = FakeClients()
+        clients.configurations["/it"] = ITS_OWN
+        graph = FakeGraph()
+        graph.nodes = (ObservedNode(full_name="/it"),)
+        observer = Observer(graph, clients, events, follows=True)
+        await asyncio.sleep(0.5)
+        assert observer.state.node("/it") is not None
+        assert observer.state.reads >= 1
+        observer.close()
+
+    run(main())
