@@ -185,7 +185,7 @@ _NODE_PREFIX = re.compile(r"\w+:(?!//)", re.ASCII)
 
 
 def is_given_name(node: Node) -> bool:
-    """Whether the manifest writes the name of a node, so that it must be told its name."""
+    """Whether the manifest writes the name of a node, so that its process is given it."""
     return node.where("name") is not node.at
 
 

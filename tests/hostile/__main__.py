@@ -174,11 +174,11 @@ def place(seed: int) -> Iterator:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         from lifecycle.middleware import discovery_environment
+        from lifecycle.pytest_plugin import claimed_domain
         from tests.hostile.attack import Place
-        from tests.ros.conftest import _claimed_domain
 
     before = dict(os.environ)
-    with tempfile.TemporaryDirectory(prefix="hostile-") as folder, _claimed_domain() as domain:
+    with tempfile.TemporaryDirectory(prefix="hostile-") as folder, claimed_domain() as domain:
         path = Path(folder)
         (path / "profiles").mkdir()
         os.environ.pop("FASTRTPS_DEFAULT_PROFILES_FILE", None)

@@ -7,10 +7,7 @@ process. `LIFECYCLE_TEST_DOMAINS=10-19` narrows the pool.
 
 from __future__ import annotations
 
-import contextlib
-import os
 import re
-import socket
 import time
 import warnings
 from collections.abc import Callable, Collection, Iterator
@@ -30,38 +27,17 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
 from lifecycle.middleware import discovery_environment, leftovers, segments_of
+from lifecycle.pytest_plugin import claimed_domain
 from tests.second_try import SECOND_TRY
-
-# Their ports lie outside Linux's ephemeral range (32768–60999), where any socket may be in the way.
-_POOL = (*range(215, 232), *range(70, 102))
 
 BOUND_S = 30.0
 """Seconds that a wait for an event may take on a busy machine; it ends with the event."""
 
 
-def _pool() -> tuple[int, ...]:
-    first, _, last = os.environ.get("LIFECYCLE_TEST_DOMAINS", "").partition("-")
-    return tuple(range(int(first), int(last or first) + 1)) if first else _POOL
-
-
-@contextlib.contextmanager
-def _claimed_domain() -> Iterator[int]:
-    with contextlib.ExitStack() as stack:
-        claim = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
-        for domain in _pool():
-            try:
-                claim.bind(f"\0lifecycle-test-domain-{domain}")
-            except OSError:
-                continue
-            yield domain
-            return
-    pytest.fail(f"all test domains {_pool()} are taken by other test processes")
-
-
 @pytest.fixture(scope="session", autouse=True)
 def domain_id(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
     """The ROS domain of this test process; the environment is set for it and for its children."""
-    with _claimed_domain() as domain, pytest.MonkeyPatch.context() as patch:
+    with claimed_domain() as domain, pytest.MonkeyPatch.context() as patch:
         patch.setenv("ROS_DOMAIN_ID", str(domain))
         patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         patch.setenv("ROS_LOG_DIR", str(tmp_path_factory.mktemp("ros_log")))
@@ -75,7 +51,7 @@ def domain_id(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
 @pytest.fixture
 def fresh_domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
     """A domain for one test alone: nodes killed in it haunt the graph for 20 s, and nobody else."""
-    with _claimed_domain() as domain:
+    with claimed_domain() as domain:
         monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
         yield domain
 
@@ -83,7 +59,7 @@ def fresh_domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
 @pytest.fixture(scope="module")
 def shared_domain() -> Iterator[int]:
     """A domain for the tests of one module that look at one running system."""
-    with _claimed_domain() as domain:
+    with claimed_domain() as domain:
         yield domain
 
 

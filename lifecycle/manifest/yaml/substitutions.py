@@ -94,7 +94,7 @@ def parse_text(text: str) -> Text:
 
 
 def _parse(text: str, at: int, end: str, depth: int) -> tuple[Text, int]:
-    """Return what stands before one of the characters `end`, and where that is."""
+    """Return what precedes one of the characters `end`, and where that is."""
     parts: list[str | Substitution] = []
     begin = at
     while at < len(text) and text[at] not in end:
@@ -327,7 +327,7 @@ def _read(process: subprocess.Popen[bytes], name: str) -> tuple[bytes, bytes]:
                         raise LifecycleError(message)
                     del held[stream][:-4096]
         try:
-            # Ends that nobody reads are no ends: it may have closed its streams and run on.
+            # Closed streams are no end: it may run on without them.
             process.wait(max(deadline - time.monotonic(), 0.01))
         except subprocess.TimeoutExpired:
             raise late from None

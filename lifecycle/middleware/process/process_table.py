@@ -45,14 +45,14 @@ def programs_of(
     Args:
         participants: GUID prefixes, 24 hex digits each.
         own: that of a participant of this process.
-        environment: variables that differ from these are told.
+        environment: variables that differ from these are reported.
     """
     pids = tuple(int(each.name) for each in Path("/proc").iterdir() if each.name.isdecimal())
     found = {}
     for prefix in dict.fromkeys(participants):
         fits = [pid for pid in pids if is_of_process(prefix, pid, own) and _speaks_ros(pid)]
         programs = [each for pid in fits if (each := read_program(pid, environment))]
-        # Fast DDS keeps 16 bits of a pid: of two that fit nobody can say which it is.
+        # Fast DDS keeps 16 bits of a pid: of two that fit it is not known which it is.
         if len(programs) == 1:
             found[prefix] = programs[0]
     return found
@@ -63,7 +63,7 @@ def read_program(pid: int, environment: Mapping[str, str]) -> CapturedProgram | 
 
     Args:
         pid: of a process on this host.
-        environment: variables that differ from these are told.
+        environment: variables that differ from these are reported.
     """
     folder = Path(f"/proc/{pid}")
     try:
@@ -76,13 +76,17 @@ def read_program(pid: int, environment: Mapping[str, str]) -> CapturedProgram | 
         return None
     if not argv or not argv[0]:
         return None
-    told = {
+    differing = {
         name: value
         for name, value in variables.items()
         if _matters(name, value, environment.get(name))
     }
     withheld = tuple(
-        sorted(each for each in told if _SECRET.search(each) or len(told[each]) > _LONGEST_VALUE)
+        sorted(
+            each
+            for each in differing
+            if _SECRET.search(each) or len(differing[each]) > _LONGEST_VALUE
+        )
     )
     program = _program(argv[0], directory, variables.get("PATH", os.defpath), executable)
     if "/" not in argv[0] and shutil.which(argv[0], path=environment.get("PATH")) == program:
@@ -92,7 +96,7 @@ def read_program(pid: int, environment: Mapping[str, str]) -> CapturedProgram | 
         argv=(program, *argv[1:]),
         working_directory=directory,
         environment=tuple(
-            (name, value) for name, value in sorted(told.items()) if name not in withheld
+            (name, value) for name, value in sorted(differing.items()) if name not in withheld
         ),
         withheld=withheld,
     )

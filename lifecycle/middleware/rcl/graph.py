@@ -368,7 +368,7 @@ class GraphObserver:
         """Return how the processes of this host's nodes were started.
 
         Args:
-            environment: variables that differ from these are told.
+            environment: variables that differ from these are reported.
 
         Returns:
             By full node name, for each of its participants by GUID prefix (24 hex digits).

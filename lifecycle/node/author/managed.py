@@ -293,7 +293,7 @@ class Managed:
 
     @property
     def reported(self) -> HostedState:
-        """The state, as a supervisor is told of it."""
+        """The state, as it is reported to a supervisor."""
         state = self.state
         return HostedState(label=state.seen.label, connected=state.connected, steady=state.steady)
 

@@ -505,7 +505,7 @@ class ForeignNode:
         return self._let_through
 
     def state_changed(self) -> None:
-        """Tell the listeners; what leaves the data layer behind is not what was verified."""
+        """Notify the listeners; what leaves the data layer behind is not what was verified."""
         if self._supervisor and self.reported.label in ("unconfigured", "finalized"):
             self._let_through = False
             self._gate.close()

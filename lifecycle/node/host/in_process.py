@@ -309,4 +309,4 @@ class NodeInProcess:
 
 
 _LOOK_S = 0.02
-"""How often a match or an answer is looked at, which notifies nobody."""
+"""How often a match or an answer is looked at, of which no event notifies."""

@@ -195,7 +195,7 @@ class NodeLoop:
             self.spin(node)
 
     def spin(self, node: Node) -> None:
-        """Run a node's callbacks from now on, unless its own code has somebody else do it."""
+        """Run a node's callbacks from now on, unless its own code has another executor do it."""
         if node.executor is None or node.executor is self._own:
             self._own.add_node(node)
 
