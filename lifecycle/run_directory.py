@@ -123,13 +123,28 @@ def boot_id() -> str:
 
 def start_ticks(pid: int) -> int | None:
     """Return when a process started, in clock ticks since boot; None if it does not live."""
+    fields = _status(pid)
+    return None if fields is None or fields[0] in b"ZX" else int(fields[19])
+
+
+def parent_of(pid: int) -> int | None:
+    """Return the pid of a process's parent; None if there is no such process."""
+    fields = _status(pid)
+    return None if fields is None else int(fields[1])
+
+
+def _status(pid: int) -> list[bytes] | None:
+    """Return the fields of proc_pid_stat(5) that follow the command."""
     try:
-        text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
+        descriptor = os.open(f"/proc/{pid}/stat", os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            text = os.read(descriptor, 4096)
+        finally:
+            os.close(descriptor)
     except (FileNotFoundError, ProcessLookupError):
         return None
     # The command is in parentheses and may hold any character; the state follows it.
-    fields = text.rpartition(")")[2].split()
-    return None if fields[0] in "ZX" else int(fields[19])
+    return text.rpartition(b")")[2].split()
 
 
 class RunDirectory:

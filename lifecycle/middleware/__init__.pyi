@@ -33,7 +33,9 @@ from .process.shared_memory import Creations as Creations
 from .process.shared_memory import check_room as check_room
 from .process.shared_memory import holds_shared_memory as holds_shared_memory
 from .process.shared_memory import leftovers as leftovers
+from .process.shared_memory import segments_by_holder as segments_by_holder
 from .process.shared_memory import segments_of as segments_of
+from .process.shared_memory import still_there as still_there
 from .process.shared_memory import sweep as sweep
 from .process.teardown import leave_and_exit as leave_and_exit
 from .rcl.executor import NodeExecutor as NodeExecutor
