@@ -11,6 +11,7 @@ from .discovery.probe import peers_environment as peers_environment
 from .discovery.rediscovery import call_out as call_out
 from .discovery.rediscovery import republish_names as republish_names
 from .discovery.rediscovery import send_again_soon as send_again_soon
+from .fastdds.dscp import widen_discovery_buffers as widen_discovery_buffers
 from .fastdds.nfe import SHARED_MEMORY as SHARED_MEMORY
 from .fastdds.nfe import UniqueFlowNotFeasible as UniqueFlowNotFeasible
 from .fastdds.nfe import create_publisher as create_publisher
