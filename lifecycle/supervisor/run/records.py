@@ -116,11 +116,13 @@ class Records:
         return self.segments | self.unattributed
 
     def made(self, groups: frozenset[str]) -> None:
-        """Write down what was made, before anybody looks whose it is: its owner may be killed."""
+        """Note what was made, before anybody looks whose it is: its owner may be killed."""
         self._made_s = time.monotonic()
         if not groups <= self.segments | self.unattributed:
             self.unattributed |= groups
-            self.write()
+            # What cannot be written now is written with the next record.
+            with contextlib.suppress(OSError):
+                self._directory.note_made(groups)
 
     async def note_segments(self) -> None:
         """Note the shared memory of our processes: one that is killed cannot remove its own."""
@@ -128,10 +130,9 @@ class Records:
 
     def _add(self, found: frozenset[str], of_others: frozenset[str] = frozenset()) -> None:
         """Take what is owned by ours, and forget what is owned by others."""
-        known = self.segments, self.unattributed
-        self.segments |= found
         self.unattributed -= found | of_others
-        if known != (self.segments, self.unattributed):
+        if not found <= self.segments:
+            self.segments |= found
             self.write()
 
     def _owned(self) -> frozenset[str]:
