@@ -287,7 +287,7 @@ def _preloading(
 
 def _sweep(records: Records | None, emit: Emitter | None = None) -> None:
     """Remove the shared memory that processes of the run have left."""
-    swept = sweep(records.segments) if records else ()
+    swept = sweep(records.left()) if records else ()
     if swept and emit:
         emit(Notice(message=f"removed shared memory left in /dev/shm: {', '.join(swept)}"))
 
