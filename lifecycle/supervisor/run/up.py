@@ -35,7 +35,7 @@ from lifecycle.run_directory import (
 )
 from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.connections.networks import open_networks, token_variables
-from lifecycle.supervisor.control.status import SystemStatus
+from lifecycle.supervisor.control.protocol import SystemStatus
 from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.forerunner import Forerunner

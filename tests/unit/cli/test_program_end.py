@@ -51,8 +51,10 @@ def test_fast_dds_is_unloaded_where_it_still_has_shared_memory(end: Callable[...
     assert end(holds=True) is ExitCode.VIOLATED
 
 
-def test_a_process_without_ros_has_nothing_to_skip(
+def test_a_process_without_ros_ends_at_once_and_loads_none_of_it(
     end: Callable[..., int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delitem(sys.modules, "rclpy")
-    assert end(holds=False) is ExitCode.VIOLATED
+    with pytest.raises(_EndedAtOnce) as ended:
+        end(holds=True)
+    assert ended.value.args == (ExitCode.VIOLATED,)
