@@ -55,6 +55,9 @@ _ELSEWHERE = {
 _PARTICIPANTS = frozenset({"up", "verify", "flows", "graph", "capture", "run"})
 """Verbs that make participants, here or in processes that they start."""
 
+_ORDERLY = frozenset({ExitCode.OK, ExitCode.VIOLATED, ExitCode.UNVERIFIABLE})
+"""Exit codes that no exception becomes: what made participants has closed them itself."""
+
 
 class _Verbs(click.Group):
     """Loads a verb's module on first use."""
@@ -122,7 +125,8 @@ def program() -> int:
     if "rclpy" in sys.modules:
         from lifecycle.middleware import holds_shared_memory
 
-        gc.collect()  # what an error may have kept of a participant leaves the graph with it
+        if code not in _ORDERLY and not (verb == ["up"] and code == ExitCode.INTERRUPTED):
+            gc.collect()  # what an error may have kept of a participant leaves the graph with it
         if holds_shared_memory():
             return code
     # All is written, and the graph was left. Ending the interpreter takes longer than asking a
