@@ -225,7 +225,7 @@ def _spell_all(nfes: tuple[NetworkFlowEndpoint, ...]) -> str:
 
 def _spell(nfe: NetworkFlowEndpoint) -> str:
     if nfe.transport_protocol is TransportProtocol.UNKNOWN:
-        return Medium.SHM
+        return nfe.medium
     address = nfe.internet_address
     host = f"[{address}]" if ":" in address else address
     return f"{nfe.transport_protocol.value} {host}:{nfe.transport_port}"
