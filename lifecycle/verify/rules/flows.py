@@ -303,7 +303,7 @@ def _not_by_network(flow: FlowView, demanding: Actual, used: str) -> Finding:
 def _otherwise(flow: FlowView, used: str) -> Finding:
     unknown = used == UNKNOWN
     planned = _WORDS.get(flow.planned.medium, flow.planned.medium)
-    word = _WORDS.get(used, used)
+    word = _WORDS[used]
     return WRONG_MEDIUM.finding(
         Outcome.UNVERIFIABLE if unknown else Outcome.VIOLATED,
         subject=flow.subject,
