@@ -96,7 +96,7 @@ class CapturedNode:
         state: lifecycle_msgs/State label; empty if not known.
         parameters: None where it did not answer.
         run: how its process was started; None where others are to start it.
-        may_end: its process may end by itself: the node does nothing but ask others.
+        may_end: its process may end by itself: it did so, or the node only asks others.
         has_configuration: its own configuration has more than discovery does.
         gaps: what is not known of it, one phrase each.
     """
@@ -469,7 +469,9 @@ def _node(
         process_id=configuration.identity.process_id if configuration else None,
         gaps=tuple(gaps),
         run=run,
-        may_end=run is not None and not node.managed and _only_asks(taken),
+        may_end=run is not None
+        and not node.managed
+        and (run.program.has_ended or _only_asks(taken)),
     )
 
 
