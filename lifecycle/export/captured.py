@@ -26,6 +26,7 @@ from lifecycle.manifest import (
     QosProfile,
     TargetState,
     full_name_problem,
+    is_implicit,
     name_problem,
     namespace_problem,
     node_name_problem,
@@ -43,9 +44,6 @@ from lifecycle.verify import (
 )
 
 _TYPE = re.compile(r"[a-zA-Z][a-zA-Z0-9_]*/(msg|srv|action)/[a-zA-Z][a-zA-Z0-9_]*")
-_NOISE_PARAMETERS = ("use_sim_time", "start_type_description_service")
-_NOISE_PARAMETER_PREFIX = "qos_overrides."
-"""Parameters that client libraries declare for every node (rclpy, rclcpp)."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -496,9 +494,7 @@ def can_be_given(parameter: CapturedParameter) -> bool:
 def _is_own(parameter: CapturedParameter) -> bool:
     if parameter.name == "use_sim_time":
         return parameter.value is True
-    return parameter.name not in _NOISE_PARAMETERS and not parameter.name.startswith(
-        _NOISE_PARAMETER_PREFIX
-    )
+    return not is_implicit(parameter.name)
 
 
 def _endpoint(endpoint: ObservedEndpoint, reports: Iterable[EndpointReport]) -> CapturedEndpoint:

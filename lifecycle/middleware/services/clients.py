@@ -274,9 +274,9 @@ class NodeClients:
                 )
 
     async def report_parameters(
-        self, node: str, names: Collection[str], *, timeout_s: float = TIMEOUT_S
+        self, node: str, names: Collection[str] | None, *, timeout_s: float = TIMEOUT_S
     ) -> tuple[ParameterReport, ...]:
-        """Read those parameters of `node` that are named and that it has.
+        """Read those parameters of `node` that are named and that it has; None reads all.
 
         Raises:
             ServiceUnansweredError: the node serves no parameters, or did not answer.
