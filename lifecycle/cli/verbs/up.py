@@ -195,7 +195,6 @@ def _collecting_later() -> Iterator[Callable[[], None]]:
         yield collect
     finally:
         gc.enable()
-        gc.unfreeze()
 
 
 def _finished(result: UpResult, listener: RunOutput, written: ReportFile) -> ExitCode:
