@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import importlib
 from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 from lifecycle_msgs.msg import TransitionEvent
 from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
@@ -21,7 +22,6 @@ from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.export import CapturedParameter
 from lifecycle.manifest import ParameterValue as GivenValue
 from lifecycle.middleware.rcl.graph import GraphObserver
 from lifecycle.middleware.services.parameters import read_parameters, report_parameters
@@ -33,6 +33,9 @@ from lifecycle.verify import (
     ParameterReport,
     decode_configuration,
 )
+
+if TYPE_CHECKING:
+    from lifecycle.export import CapturedParameter
 
 TIMEOUT_S = 5.0
 """For services that answer at once; a transition takes as long as the node's callback does."""
