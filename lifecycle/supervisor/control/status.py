@@ -10,11 +10,12 @@ import dataclasses
 from typing import TYPE_CHECKING
 
 from lifecycle.manifest import RunKind, UniqueHow
-from lifecycle.supervisor.run.events import ProcessState, Reach
+from lifecycle.supervisor.run.events import Failed, ProcessState, Reach
 from lifecycle.verify import ConnectionReport, Outcome, Verdict
 
 if TYPE_CHECKING:
     from lifecycle.supervisor.nodes.system import NodeRun, System
+    from lifecycle.supervisor.policy.schedule import RestartSchedule
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,6 +37,11 @@ class NodeStatus:
         died: how its process ended unasked; empty while it runs. It then has no state, and no
             matches.
         connections: as it reports them, its own participant left out.
+        uptime_s: since its process was started; None while there is none of ours.
+        restarts: how often its process was started again by policy.
+        last_failure: of its process, that it was, or is to be, started again after; None if there
+            was none.
+        next_try_s: seconds until its process is started again; None if that is not planned.
     """
 
     node: str
@@ -54,6 +60,10 @@ class NodeStatus:
     silent: str = ""
     died: str = ""
     connections: tuple[ConnectionReport, ...] = ()
+    uptime_s: float | None = None
+    restarts: int = 0
+    last_failure: Failed | None = None
+    next_try_s: float | None = None
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,8 +88,18 @@ class SystemStatus:
     not_ok: str = ""
 
 
-def node_status(node: NodeRun, verdict: Verdict | None, silent: str = "") -> NodeStatus:
+def node_status(
+    node: NodeRun,
+    verdict: Verdict | None,
+    silent: str = "",
+    *,
+    elapsed_s: float = 0.0,
+    schedule: RestartSchedule | None = None,
+) -> NodeStatus:
     """Return what is known of one node."""
+    process = node.process
+    runs = process is not None and process.pid != 0 and not process.is_gone
+    known = None if process is None else schedule
     died = _died(node)
     configuration = None if died else node.configuration
     reports = () if configuration is None else configuration.endpoints
@@ -113,6 +133,10 @@ def node_status(node: NodeRun, verdict: Verdict | None, silent: str = "") -> Nod
             for each in (() if configuration is None else configuration.connections)
             if each.name
         ),
+        uptime_s=elapsed_s - process.started_s if runs and process is not None else None,
+        restarts=0 if known is None else known.restarts(node.planned.process),
+        last_failure=None if known is None else known.last_failure(node.planned.process),
+        next_try_s=None if known is None else known.next_try_s(node.planned.process),
     )
 
 
@@ -125,7 +149,13 @@ def _died(node: NodeRun) -> str:
 
 
 def system_status(
-    system: System, verdict: Verdict | None, *, phase: str, supervisor: int, elapsed_s: float
+    system: System,
+    verdict: Verdict | None,
+    *,
+    phase: str,
+    supervisor: int,
+    elapsed_s: float,
+    schedule: RestartSchedule | None = None,
 ) -> SystemStatus:
     """Return what is known of the whole system."""
     from lifecycle.verify import not_ok  # imports every rule, and clients need none
@@ -139,7 +169,10 @@ def system_status(
         supervisor=supervisor,
         elapsed_s=elapsed_s,
         nodes=tuple(
-            node_status(node, verdict, silent.get(node.name, "")) for node in system.nodes.values()
+            node_status(
+                node, verdict, silent.get(node.name, ""), elapsed_s=elapsed_s, schedule=schedule
+            )
+            for node in system.nodes.values()
         ),
         not_ok="" if verdict is None else not_ok(verdict),
     )

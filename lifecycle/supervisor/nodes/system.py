@@ -258,6 +258,7 @@ class NodeRun:
         stuck: an operation on it was given up: a polite request would wait behind it.
         connections: names of what the authority connected it to, oldest first.
         reports_changes: its host reports unasked when its configuration changes.
+        is_up: it was started and brought as far as its gate; cleared when it goes down.
     """
 
     def __init__(self, planned: PlannedNode, emit: Emitter) -> None:
@@ -273,6 +274,7 @@ class NodeRun:
         self.stuck = False
         self.connections: tuple[str, ...] = ()
         self.reports_changes = False
+        self.is_up = False
         self.changed = asyncio.Event()
         self._emit = emit
 
@@ -285,6 +287,7 @@ class NodeRun:
         self.stuck = False
         self.connections = ()
         self.reports_changes = False
+        self.is_up = False
         self.doing = ""
         self.connected = False
         self.state = ""
@@ -499,6 +502,7 @@ class System:
             old = node.process
             if old is not None and old.name not in processes:
                 processes[old.name] = self._process(old.planned)
+                processes[old.name].is_restarted = True
             node.renew(None if old is None else processes[old.name])
         self.processes.update(processes)
 
@@ -510,7 +514,7 @@ class System:
     def living(self) -> tuple[ManagedProcess, ...]:
         """Every process that was started and has not ended, the discovery server included."""
         every = (*self.processes.values(), *(() if self.server is None else (self.server,)))
-        return tuple(each for each in every if each.pid and each.state is not ProcessState.EXITED)
+        return tuple(each for each in every if each.pid and not each.is_gone)
 
     def dead(self) -> frozenset[str]:
         """Return the names of the nodes whose process has ended.
@@ -520,7 +524,7 @@ class System:
         return frozenset(
             node.name
             for node in self.nodes.values()
-            if node.process is not None and node.process.state is ProcessState.EXITED
+            if node.process is not None and node.process.is_gone
         )
 
     def on_host_event(self, event: HostEvent) -> None:

@@ -279,7 +279,7 @@ class Failure:
         subject: node or process, as in that finding.
         process: name of the process concerned; empty if there is none of ours.
         log: the file with all that its process wrote, which came as log events, too.
-        ends_run: the run ends for it; not so under --keep-going.
+        ends_run: the run ends for it; not so under --keep-going, and where it is started again.
     """
 
     kind: ClassVar[str] = "failure"
@@ -289,6 +289,83 @@ class Failure:
     process: str = ""
     log: str = ""
     ends_run: bool = True
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Failed:
+    """One failure of a process.
+
+    Attributes:
+        rule: id of the finding that it is, `run.process-died`.
+        subject: node or process, as in that finding.
+        message: a whole sentence.
+        exit_status: of the process; None if it did not end by itself, or a signal ended it.
+        signal: name of the signal that ended it, `SIGKILL`; empty if none did.
+        stderr: the last line that it wrote to standard error; empty if none.
+        elapsed_s: when, in seconds since the supervisor started.
+        at: when, UTC by ISO 8601, for people and logs.
+    """
+
+    rule: str
+    subject: str
+    message: str
+    exit_status: int | None = None
+    signal: str = ""
+    stderr: str = ""
+    elapsed_s: float = 0.0
+    at: str = ""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class RestartScheduled:
+    """A process failed that is to be started again; until then it is in backoff.
+
+    Attributes:
+        nodes: those that are started again with it; all of them are down.
+        reason: the failure, a whole sentence.
+        stderr: the last line that it wrote to standard error; empty if none.
+        restarts: how often it was started again before.
+        in_s: seconds until it is.
+    """
+
+    kind: ClassVar[str] = "backoff"
+    process: str
+    nodes: tuple[str, ...]
+    reason: str
+    stderr: str
+    restarts: int
+    in_s: float
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Restarted:
+    """A process that failed is as far again as the system is: active and verified, or paused.
+
+    Attributes:
+        nodes: those in it.
+        restarts: how often it has been started again.
+        took_s: since its failure.
+    """
+
+    kind: ClassVar[str] = "restarted"
+    process: str
+    nodes: tuple[str, ...]
+    restarts: int
+    took_s: float
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class GaveUp:
+    """A process failed too often to be started again; the run ends for it.
+
+    Attributes:
+        history: its failures, the last at the end.
+    """
+
+    kind: ClassVar[str] = "gave_up"
+    process: str
+    restarts: int
+    history: tuple[Failed, ...]
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -334,6 +411,9 @@ Event = Union[  # noqa: UP007 - a run-time alias on Python 3.10
     SystemReached,
     StageTimed,
     Failure,
+    RestartScheduled,
+    Restarted,
+    GaveUp,
     Notice,
     Stopping,
     Stopped,
