@@ -35,6 +35,9 @@ VERBS: dict[str, str] = {
     "import": "write a manifest from a ROS 2 launch file, gaps marked; starts nothing",
     "capture": "write a manifest from a running system, gaps marked",
     "logs": "show what the processes of the latest run have written, or follow it",
+    "history": "show what happened in a run, from its journal",
+    "explain": "say which fact turned a finding of a run, and when",
+    "replay": "judge what a run saw again, with today's rules",
     "run": "run one node of a manifest in this terminal, without a supervisor",
     "ports": "DDS port arithmetic and platform limits",
     "init": "make a package of one's own: nodes, manifest, tests, CI workflow",
@@ -43,6 +46,7 @@ VERBS: dict[str, str] = {
 
 _ELSEWHERE = {
     **dict.fromkeys(("pause", "resume", "restart", "down", "status"), "control"),
+    **dict.fromkeys(("explain", "replay"), "history"),
     "schema": "init",
     "import": "import_",
 }
@@ -50,6 +54,9 @@ _ELSEWHERE = {
 
 _PARTICIPANTS = frozenset({"up", "verify", "flows", "graph", "capture", "run"})
 """Verbs that make participants, here or in processes that they start."""
+
+_ORDERLY = frozenset({ExitCode.OK, ExitCode.VIOLATED, ExitCode.UNVERIFIABLE})
+"""Exit codes that no exception becomes: what made participants has closed them itself."""
 
 
 class _Verbs(click.Group):
@@ -116,15 +123,17 @@ def program() -> int:
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, signal.SIG_IGN)
     if "rclpy" in sys.modules:
-        # All is written, and the graph was left. Ending the interpreter takes 0.2 s more: it takes
-        # rclpy's objects apart, and Fast DDS sleeps when it is unloaded. But only then it removes
-        # shared memory that it still has: of the port of a peer that was killed, for one.
         from lifecycle.middleware import holds_shared_memory
 
-        gc.collect()  # what an error may have kept of a participant leaves the graph with it
-        if not holds_shared_memory():
-            os._exit(code)
-    return code
+        if code not in _ORDERLY and not (verb == ["up"] and code == ExitCode.INTERRUPTED):
+            gc.collect()  # what an error may have kept of a participant leaves the graph with it
+        if holds_shared_memory():
+            return code
+    # All is written, and the graph was left. Ending the interpreter takes longer than asking a
+    # supervisor, and 0.2 s where ROS was used: it takes rclpy's objects apart, and Fast DDS sleeps
+    # when it is unloaded. But only then it removes shared memory that it still has: of the port of
+    # a peer that was killed, for one.
+    os._exit(code)
 
 
 def main(arguments: list[str] | None = None) -> int:

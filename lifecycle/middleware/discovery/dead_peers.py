@@ -34,7 +34,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from lifecycle.middleware.discovery.probe import HEADER, ProbeTarget, probe_targets, send
 from lifecycle.middleware.fastdds.dscp import own_udp_socket, socket_descriptors
 from lifecycle.middleware.fastdds.url_check import sockets_of
-from lifecycle.network import ConnectionUrl, Medium
+from lifecycle.network import UDP_UNICAST, ConnectionUrl, Medium
 
 _UNANSWERED = 2
 """Retransmissions in a row after which a connection is dead for a leaving process: the kernel
@@ -188,9 +188,10 @@ def remove_participants(
         for kind, found in listening(pids).items()
     }
     output = next((url.output_port for url in urls if url.output_port), None)
-    for kind, family in ((Medium.UDPV4, socket.AF_INET), (Medium.UDPV6, socket.AF_INET6)):
+    for kind in UDP_UNICAST:
         if not targets[kind]:
             continue
+        family = kind.socket_family
         own = None if output is None else own_udp_socket(family, output)
         with contextlib.suppress(OSError), own or socket.socket(family, socket.SOCK_DGRAM) as by:
             for message in messages:
@@ -207,13 +208,12 @@ def _asked(
 
 def listening(pids: Iterable[int]) -> dict[Medium, dict[ProbeTarget, int]]:
     """Return where processes of this host receive UDP, by medium; the values are their pids."""
-    found: dict[Medium, dict[ProbeTarget, int]] = {Medium.UDPV4: {}, Medium.UDPV6: {}}
+    found: dict[Medium, dict[ProbeTarget, int]] = {kind: {} for kind in UDP_UNICAST}
     for pid, sockets in sockets_of(pids).items():
         for each in sockets:
             if each.kind not in found or ipaddress.ip_address(each.address).is_multicast:
                 continue
             any_ = ipaddress.ip_address(each.address).is_unspecified
-            loopback = "::1" if each.kind is Medium.UDPV6 else "127.0.0.1"
-            target = ProbeTarget(address=loopback if any_ else each.address, port=each.port)
-            found[each.kind][target] = pid
+            address = each.kind.loopback if any_ else each.address
+            found[each.kind][ProbeTarget(address=address, port=each.port)] = pid
     return found

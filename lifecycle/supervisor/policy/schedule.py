@@ -13,20 +13,16 @@ import datetime as dt
 import signal
 from collections.abc import Collection, Iterable
 
+import msgspec
+
 from lifecycle.errors import ExitCode
 from lifecycle.manifest import Restart
+from lifecycle.supervisor.control.protocol import Failed, ProcessState
 from lifecycle.supervisor.health.liveliness import Cause
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.policy.restart import RestartPolicy, group_of
 from lifecycle.supervisor.processes.process import ManagedProcess
-from lifecycle.supervisor.run.events import (
-    Emitter,
-    Failed,
-    GaveUp,
-    ProcessState,
-    Restarted,
-    RestartScheduled,
-)
+from lifecycle.supervisor.run.events import Emitter, GaveUp, Restarted, RestartScheduled
 from lifecycle.supervisor.run.failure import StepFailedError
 from lifecycle.verify import GAVE_UP, PROCESS_DIED
 
@@ -307,7 +303,7 @@ class RestartSchedule:
         if not record.history:
             return None
         stderr = "" if record.failed is None else record.failed.last_stderr
-        return dataclasses.replace(record.history[-1], stderr=stderr)
+        return msgspec.structs.replace(record.history[-1], stderr=stderr)
 
     def _gave_up(self, name: str, record: _Record, failure: StepFailedError) -> GaveUpError:
         how = record.policy.how

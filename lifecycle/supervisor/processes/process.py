@@ -21,6 +21,7 @@ from typing import Any, Protocol
 
 from lifecycle.manifest import Output
 from lifecycle.plan import PlannedProcess
+from lifecycle.supervisor.control.protocol import ProcessState
 from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.supervisor.processes.logs import (
     LineReader,
@@ -29,7 +30,7 @@ from lifecycle.supervisor.processes.logs import (
     logger_in,
     logger_of,
 )
-from lifecycle.supervisor.run.events import Emitter, LogLine, ProcessChanged, ProcessState
+from lifecycle.supervisor.run.events import Emitter, LogLine, ProcessChanged
 
 CHANGES: dict[ProcessState, frozenset[ProcessState]] = {
     ProcessState.STARTING: frozenset(
@@ -397,8 +398,14 @@ class ManagedProcess:
             self._emit(LogLine(process=self.name, stream=stream, line=line))
 
 
+PROMPT_S = 0.1
+"""What is done within this, or a tenth of its limit, is not worth looking: most steps are."""
+
 SLICE_S = 1.0
 """How often is looked whether a process could run, while it is waited for."""
+
+_LEAST_S = 0.01
+"""What is left of a limit may shrink by half each time, and never end."""
 
 AT_MOST = 10.0
 """However loaded the machine is, a limit lasts no longer than so many times its seconds."""
@@ -415,13 +422,17 @@ async def wait_under_load(
             `AT_MOST` times the limit in all.
         run_delay: seconds of run delay so far, of all threads together.
     """
+    prompt_s = min(PROMPT_S, limit_s / 10)
+    done, _ = await asyncio.wait(waits, timeout=prompt_s, return_when=asyncio.FIRST_COMPLETED)
+    if done:
+        return True
     loop = asyncio.get_running_loop()
     began_s = now_s = loop.time()
-    left_s = limit_s
+    left_s = limit_s - prompt_s
     waited_s = run_delay()
     while left_s > 0 and now_s - began_s < AT_MOST * limit_s:
         done, _ = await asyncio.wait(
-            waits, timeout=min(left_s, SLICE_S), return_when=asyncio.FIRST_COMPLETED
+            waits, timeout=min(max(left_s, _LEAST_S), SLICE_S), return_when=asyncio.FIRST_COMPLETED
         )
         if done:
             return True

@@ -7,35 +7,14 @@ order. Presentation lives in cli/. Must not import rclpy.
 from __future__ import annotations
 
 import dataclasses
-import enum
 import time
 from collections.abc import Callable
 from typing import ClassVar, Union
 
 from lifecycle.codec import to_plain
 from lifecycle.node import Operation
+from lifecycle.supervisor.control.protocol import Failed, ProcessState, Reach
 from lifecycle.verify import Stage, Verdict
-
-
-class ProcessState(enum.Enum):
-    """The life of one operating system process; BACKOFF is the wait before it is started again."""
-
-    STARTING = "starting"
-    RUNNING = "running"
-    BACKOFF = "backoff"
-    STOPPING = "stopping"
-    EXITED = "exited"
-
-
-class Reach(enum.Enum):
-    """How far one node is brought up; ordered, one value per step of bring-up."""
-
-    WAITING = "waiting"
-    STARTED = "started"
-    CONFIGURED = "configured"
-    CONNECTED = "connected"
-    ACTIVE = "active"
-    STOPPED = "stopped"
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -289,31 +268,6 @@ class Failure:
     process: str = ""
     log: str = ""
     ends_run: bool = True
-
-
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Failed:
-    """One failure of a process.
-
-    Attributes:
-        rule: id of the finding that it is, `run.process-died`.
-        subject: node or process, as in that finding.
-        message: a whole sentence.
-        exit_status: of the process; None if it did not end by itself, or a signal ended it.
-        signal: name of the signal that ended it, `SIGKILL`; empty if none did.
-        stderr: the last line that it wrote to standard error; empty if none.
-        elapsed_s: when, in seconds since the supervisor started.
-        at: when, UTC by ISO 8601, for people and logs.
-    """
-
-    rule: str
-    subject: str
-    message: str
-    exit_status: int | None = None
-    signal: str = ""
-    stderr: str = ""
-    elapsed_s: float = 0.0
-    at: str = ""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

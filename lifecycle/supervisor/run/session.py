@@ -21,13 +21,14 @@ from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.connections.authority import Reaching, authority_of
 from lifecycle.supervisor.connections.networks import Networks
 from lifecycle.supervisor.control.orders import ACTIVE, HELD, PAUSED, Revisions
+from lifecycle.supervisor.control.protocol import SystemStatus
 from lifecycle.supervisor.control.server import ControlServer, SupervisorSnapshot
-from lifecycle.supervisor.control.status import SystemStatus, system_status
+from lifecycle.supervisor.control.status import system_status
 from lifecycle.supervisor.gate.activation_guard import ActivationGuard
 from lifecycle.supervisor.gate.gate import Gate, VerificationError, closes
 from lifecycle.supervisor.gate.hold import Holding
 from lifecycle.supervisor.gate.sequence import GateSequence
-from lifecycle.supervisor.gate.verification_loop import ChangeCounter, VerificationLoop
+from lifecycle.supervisor.gate.verification_loop import ChangeCounter, Recorder, VerificationLoop
 from lifecycle.supervisor.health import agreement, peer_supervisors
 from lifecycle.supervisor.health.agreement import Agreement
 from lifecycle.supervisor.health.peer_supervisors import PeerSupervisors
@@ -151,6 +152,7 @@ class Session:
         emit: where events go.
         ending: knows of signals that came before.
         worker: for what blocks.
+        recorder: keeps what was seen and found.
     """
 
     def __init__(
@@ -166,6 +168,7 @@ class Session:
         emit: Emitter,
         ending: Ending,
         worker: Worker,
+        recorder: Recorder | None = None,
     ) -> None:
         self._worker = worker
         self._system = system
@@ -195,6 +198,7 @@ class Session:
             looker=self._authority,
             agreement=self._agreement,
             guard=self._guard,
+            recorder=recorder,
         )
         self._gate = Gate(strict=options.strict, judging=self._judge)
         sightings = Sightings(system, observer_participant, self._changes)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import dataclasses
+import gc
 import os
 import traceback
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
@@ -35,7 +36,7 @@ from lifecycle.run_directory import (
 )
 from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.connections.networks import open_networks, token_variables
-from lifecycle.supervisor.control.status import SystemStatus
+from lifecycle.supervisor.control.protocol import SystemStatus
 from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.forerunner import Forerunner
@@ -44,6 +45,7 @@ from lifecycle.supervisor.processes.logs import begin_logs, check_log_root, log_
 from lifecycle.supervisor.processes.orphans import end_run
 from lifecycle.supervisor.run.events import Emitter, Event, Listener, Notice, RunStarted
 from lifecycle.supervisor.run.failure import StepFailedError, Worker, never_connected, with_failure
+from lifecycle.supervisor.run.journal import Journal
 from lifecycle.supervisor.run.options import (
     UpOptions,
     UpResult,
@@ -165,17 +167,9 @@ def _up(
     service = ServiceManager.of(os.environ)
     emit = _emitter((*listeners, service.on_event))
     forerunner = _preloading(forerunner, plan, options, processes)
-    try:
-        directory = RunDirectory.acquire(
-            runtime_root(os.environ),
-            run_name(plan, options.machine),
-            forerunner.run_id,
-            domain_id=plan.domain_id,
-        )
-    except LifecycleError:
-        forerunner.close()
-        raise
+    directory = _acquired(plan, options, forerunner)
     records: Records | None = None
+    journal = _journal(plan, directory, emit)
     try:
         if directory.previous is not None:
             _clean_up_after(directory.previous, emit)
@@ -196,6 +190,8 @@ def _up(
                 processes=processes,
                 variables=_graph_variables(os.environ),
             )
+            leaving.enter_context(journal.writing(logs, positions=system.output_positions))
+            leaving.enter_context(journal.noting_use(system.pids))
             fork_server = ForkServer(forerunner.process, emit)
             worker = leaving.enter_context(contextlib.closing(Worker("lifecycle")))
             records = leaving.enter_context(noting(directory, system, fork_server, worker, emit))
@@ -218,6 +214,7 @@ def _up(
                     emit=emit,
                     ending=ending,
                     worker=worker,
+                    recorder=journal,
                 )
                 leaving.push_async_callback(session.leave)
                 if on_start is not None:
@@ -239,6 +236,27 @@ def _up(
         forerunner.close()
         _sweep(records)
         directory.release()
+
+
+def _acquired(plan: Plan, options: UpOptions, forerunner: Forerunner) -> RunDirectory:
+    try:
+        return RunDirectory.acquire(
+            runtime_root(os.environ),
+            run_name(plan, options.machine),
+            forerunner.run_id,
+            domain_id=plan.domain_id,
+        )
+    except LifecycleError:
+        forerunner.close()
+        raise
+
+
+def _journal(plan: Plan, directory: RunDirectory, emit: Emitter) -> Journal:
+    journal = Journal(
+        plan.system, directory.run_id, say=lambda message: emit(Notice(message=message))
+    )
+    emit.listen(journal.on_event)
+    return journal
 
 
 def _emitter(listeners: Iterable[Listener]) -> Emitter:
@@ -287,7 +305,7 @@ def _preloading(
 
 def _sweep(records: Records | None, emit: Emitter | None = None) -> None:
     """Remove the shared memory that processes of the run have left."""
-    swept = sweep(records.segments) if records else ()
+    swept = sweep(records.left()) if records else ()
     if swept and emit:
         emit(Notice(message=f"removed shared memory left in /dev/shm: {', '.join(swept)}"))
 
@@ -366,6 +384,9 @@ def _enter_graph(plan: Plan, options: UpOptions, directory: RunDirectory) -> Non
         MiddlewareError: it cannot have the threads of a participant. Fast DDS would end the process
             then, or wait for ever.
     """
+    # What was loaded stays. To look through all of it whenever garbage is collected takes 40 ms,
+    # and once more at the very end, when who asked for the end waits for nothing else.
+    gc.freeze()
     adopt_orphans()
     check_threads(THREADS)
     check_room()

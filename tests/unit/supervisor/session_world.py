@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import dataclasses
 import signal
 from collections.abc import Awaitable, Callable, Coroutine, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -17,11 +18,15 @@ from typing import Any, TypeVar
 from lifecycle.codec import from_json, to_json
 from lifecycle.manifest.model import Condition, RunKind
 from lifecycle.node.host.control import Operation
-from lifecycle.plan.model import Plan, PlannedNode
+from lifecycle.plan.model import ParticipantConnections, Plan, PlannedNode
 from lifecycle.run_directory import RunDirectory, short_path
 from lifecycle.supervisor.connections.networks import Networks
-from lifecycle.supervisor.control.server import Answer, ControlRequest, Question
-from lifecycle.supervisor.control.status import SystemStatus
+from lifecycle.supervisor.control.protocol import (
+    Answer,
+    ControlRequest,
+    Question,
+    SystemStatus,
+)
 from lifecycle.supervisor.health.peer_supervisors import Listener
 from lifecycle.supervisor.nodes.driver import NodeDriver, NodeInterfaceClient, ServiceDriver
 from lifecycle.supervisor.nodes.system import System
@@ -47,6 +52,8 @@ from lifecycle.supervisor.run.events import (
     VerdictChanged,
 )
 from lifecycle.supervisor.run.failure import StepFailedError, Worker
+from lifecycle.supervisor.run.history import journal_files, read_run, replayed
+from lifecycle.supervisor.run.journal import Journal
 from lifecycle.supervisor.run.options import UpOptions, UpResult
 from lifecycle.supervisor.run.records import Records
 from lifecycle.supervisor.run.session import Session
@@ -439,6 +446,8 @@ class SessionWorld:
         self._tmp_path = tmp_path
         self._emit = Emitter(loop.time)
         self._emit.listen(self._take)
+        self.journal = Journal("robot", "0", say=self.story.append, wall=loop.time, clock=loop.time)
+        self._emit.listen(self.journal.on_event)
         self._options = UpOptions(**options)
         (tmp_path / "logs").mkdir()
         self.system = System(
@@ -477,7 +486,8 @@ class SessionWorld:
 
     async def run(self, *scenarios: Coroutine[Any, Any, None]) -> None:
         """Run the session to its end, and beside it what happens to it."""
-        with self.ending, self._run_directory() as directory:
+        kept = self.journal.writing(self._tmp_path / "logs", positions=dict)
+        with self.ending, self._run_directory() as directory, kept:
             session = Session(
                 self.system,
                 self._options,
@@ -489,6 +499,7 @@ class SessionWorld:
                 emit=self._emit,
                 ending=self.ending,
                 worker=self.worker,
+                recorder=self.journal,
             )
             self.status = session.status
             self.result = await _beside(session.run(), scenarios)
@@ -503,12 +514,15 @@ class SessionWorld:
         finally:
             self._directory.release()
 
-    async def order(self, ask: ControlRequest, node: str = "") -> str:
+    async def order(
+        self, ask: ControlRequest, node: str = "", *, reload: Plan | None = None
+    ) -> str:
         """Order something through the control socket; return the answer, `0` or `4 cannot …`."""
         assert self._directory is not None
         with short_path(self._directory.socket_path) as path:
             reader, writer = await asyncio.open_unix_connection(path)
-        writer.write(to_json(Question(ask=ask, node=node)) + b"\n")
+        question = Question(ask=ask, node=node, plan=reload, reload=reload is not None)
+        writer.write(to_json(question) + b"\n")
         answer = from_json(await reader.readline(), Answer)
         writer.close()
         await writer.wait_closed()
@@ -545,6 +559,18 @@ class SessionWorld:
         assert self._stopping_at_s is not None
         assert self._emit.elapsed_s - self._stopping_at_s < SHUTDOWN_S
         self._check_gate()
+        self._check_journal()
+
+    def _check_journal(self) -> None:
+        """Check that the journal tells the same story, and that its verdicts can be had again."""
+        recorded = read_run(journal_files(self._tmp_path / "logs"))
+        assert recorded.unreadable == ()
+        told = [_line(each.event, 0.0) for each in recorded.moments if each.event is not None]
+        story = [line for line in self.story if line.startswith("[") and line != "[log]"]
+        assert [line.partition(" at ")[0] for line in told] == [
+            line.partition(" at ")[0] for line in story
+        ]
+        assert not any(replayed(recorded))
 
     def _check_gate(self) -> None:
         opened: set[str] = set()
@@ -567,7 +593,20 @@ class SessionWorld:
                 assert fine, f"{kind} was activated on {verdict}"
 
 
+def connected_by(*urls: str) -> ParticipantConnections:
+    """How a node's own participant is connected."""
+    return ParticipantConnections(urls=urls)
+
+
 CHAIN = plan_of(planned_node("camera"), planned_node("viewer", after={"camera": Condition.ACTIVE}))
+
+DIALLING = plan_of(
+    dataclasses.replace(CHAIN.nodes[0], connections=connected_by("tcpv4://127.0.0.1:7911")),
+    dataclasses.replace(
+        CHAIN.nodes[1], connections=connected_by("tcpv4://127.0.0.1:7912?peer=127.0.0.1:7911")
+    ),
+)
+"""The same by TCP alone: `viewer` gets another port when it is started again."""
 
 CONNECTED = [
     "camera start",

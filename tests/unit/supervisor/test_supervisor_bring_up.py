@@ -11,18 +11,20 @@ import pytest
 from lifecycle.errors import BringUpError
 from lifecycle.manifest.model import Condition, RunKind, Timeouts
 from lifecycle.node.host.control import HostSpec, Operation
+from lifecycle.supervisor.control.protocol import ProcessState, Reach
 from lifecycle.supervisor.gate.gate import Gate, Permit, VerificationError
 from lifecycle.supervisor.gate.verification_loop import ChangeCounter, VerificationLoop
 from lifecycle.supervisor.health.process_monitor import ProcessMonitor
 from lifecycle.supervisor.nodes.bring_up import ALSO_S, Gathering
 from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.supervisor.processes.process import ProcessExit
-from lifecycle.supervisor.run.events import Notice, ProcessChanged, ProcessState, Reach, RequestSent
+from lifecycle.supervisor.run.events import Notice, ProcessChanged, RequestSent
 from lifecycle.supervisor.run.failure import StepFailedError, with_failure
 from lifecycle.supervisor.run.shutdown import TakeDown
 from lifecycle.verify import rule
 from lifecycle.verify.observation import Observation, ObservedNode
-from lifecycle.verify.verdict import NOT_JUDGED, Outcome, Stage, Verdict
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.verdict import NOT_JUDGED, Stage, Verdict
 from tests.builders import plan_of, planned_node
 from tests.unit.supervisor.fakes import FakeGraph, World, run, verdict_of
 
@@ -245,6 +247,16 @@ def test_time_that_a_process_waits_for_a_processor_is_not_its_own(
         await world.bring_up.connect(LIMIT_S)
         assert world.system.nodes["a"].reach is Reach.CONNECTED
         await _down(world)
+
+    run(main())
+
+
+def test_what_is_done_promptly_is_done_without_a_look_at_any_process(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = _world(tmp_path, planned_node("a"), planned_node("b"))
+        await world.bring_up.connect(LIMIT_S)
+        await _down(world)
+        assert world.spawner.looked_at == []
 
     run(main())
 
