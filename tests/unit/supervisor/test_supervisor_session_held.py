@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from lifecycle.manifest.model import Discovery
-from lifecycle.supervisor.control.server import ControlRequest
+from lifecycle.supervisor.control.protocol import ControlRequest
 from tests.builders import plan_of
 from tests.unit.supervisor.fakes import run
 from tests.unit.supervisor.session_world import (
