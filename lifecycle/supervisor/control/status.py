@@ -24,6 +24,7 @@ class NodeStatus:
     Attributes:
         node: fully qualified name.
         process: name of its process; empty if this supervisor does not run it.
+        pid: also of an adopted node's process; 0 where it is not known.
         process_state: None if this supervisor does not run it.
         state: lifecycle_msgs/State label; empty for a node that is not managed.
         doing: what it does or waits for; empty when nothing.
@@ -93,7 +94,7 @@ def node_status(node: NodeRun, verdict: Verdict | None, silent: str = "") -> Nod
         node=node.name,
         process="" if external else node.planned.process,
         process_state=None if node.process is None else node.process.state,
-        pid=0 if node.process is None else node.process.pid,
+        pid=node.pid,
         managed=node.planned.managed,
         reach=node.reach,
         state="" if died else node.state,

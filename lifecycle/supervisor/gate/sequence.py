@@ -305,7 +305,7 @@ class GateSequence:
         self._comes_back(names)
         await self._alive(together(self._vanishes(name) for name in gone))
         self.phase = "connecting"
-        self._judge.ahead = self._active()
+        self._judge.ahead = self.active()
         await self._alive(self._bring_up.connect(timeout_s, nodes))
 
     def _reload(self, plan: Plan, nodes: tuple[NodeRun, ...]) -> tuple[NodeRun, ...]:
@@ -345,7 +345,7 @@ class GateSequence:
         """
         self._gate.close()
         self.phase = "verifying"
-        self._judge.ahead = self._active()
+        self._judge.ahead = self.active()
         await self.until_clear(timeout_s)
         assert self._judge.latest is not None
         permit = self._gate.judge(self._judge.latest)
@@ -415,7 +415,7 @@ class GateSequence:
             names = ", ".join(each.name for each in begun)
             self._emit(Notice(message=f"the gate closed again: {names} is deactivated"))
         await self._alive(self._bring_up.deactivate(begun))
-        self._judge.ahead = self._active()
+        self._judge.ahead = self.active()
 
     async def _program_flows(self, permit: Permit, deadline: float) -> None:
         """Program networks with the flows of the verdict that nodes are activated on."""
@@ -433,7 +433,8 @@ class GateSequence:
             if each.is_to_be_active and each.reach is not Reach.ACTIVE
         )
 
-    def _active(self) -> frozenset[str]:
+    def active(self) -> frozenset[str]:
+        """Return the names of the nodes that are active, let through or found so."""
         return frozenset(
             each.name
             for each in self._system.nodes.values()

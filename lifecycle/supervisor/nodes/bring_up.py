@@ -20,7 +20,7 @@ from lifecycle.manifest import Condition, RosArguments, RunKind, TargetState
 from lifecycle.node import HostSpec, Operation
 from lifecycle.plan import PlannedNode
 from lifecycle.supervisor.gate.gate import Permit
-from lifecycle.supervisor.nodes.driver import ControlDriver, NodeCondition, NodeDriver
+from lifecycle.supervisor.nodes.driver import ACTIVE, ControlDriver, NodeCondition, NodeDriver
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.processes.control_channel import (
     ChannelClosedError,
@@ -396,9 +396,19 @@ class BringUp:
 
     def _started(self, node: NodeRun, standing: NodeCondition | None = None) -> None:
         node.doing = ""
+        self._note_found(node, "running" if standing is None else standing.state)
         node.advance(Reach.STARTED, standing)
         if node.process is not None:
             node.process.running()
+
+    def _note_found(self, node: NodeRun, state: str) -> None:
+        """Note, and say, how a node was found that others started and that is adopted."""
+        if not self._system.adopts or node.process is not None or node.found:
+            return
+        node.found = state
+        where = "" if node.running is None else node.running.where
+        message = f"{node.name!r} is adopted, found {state}" + (f": {where}" if where else "")
+        self._system.emit(Notice(message=message))
 
     async def _connect(self, node: NodeRun) -> None:
         assert node.driver is not None
@@ -406,6 +416,10 @@ class BringUp:
         limit_s = node.planned.timeouts.start_s
         standing = await self._step(node, node.driver.start(), limit_s, rule=START_FAILED)
         self._started(node, standing)
+        if node.found and standing.state == ACTIVE:
+            # It is verified as it is: nothing is asked of it, and the gate has nothing to let in.
+            node.advance(Reach.ACTIVE, standing)
+            return
         await self._give(node)
         if node.planned.state is TargetState.UNCONFIGURED:
             return
@@ -456,6 +470,8 @@ class BringUp:
             node, node.perform(operation, permit), limit_s, rule=TRANSITION_FAILED
         )
         node.doing = ""
+        if standing.already and node.process is None and operation in _TO_UNDO:
+            node.undo.remove(operation)
         node.advance(reach, standing)
 
     async def _start(self, node: NodeRun) -> None:

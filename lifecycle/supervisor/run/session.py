@@ -37,6 +37,7 @@ from lifecycle.supervisor.health.process_monitor import (
     Sightings,
     StaleNodes,
 )
+from lifecycle.supervisor.nodes.adoption import SETTLE_S, AdoptedProcess, Adoption, Census
 from lifecycle.supervisor.nodes.bring_up import BringUp
 from lifecycle.supervisor.nodes.driver import NodeDriver
 from lifecycle.supervisor.nodes.system import (
@@ -102,6 +103,7 @@ class SessionParticipant(
     Reaching,
     ParticipantRegistry,
     ServiceNames,
+    Census,
     Protocol,
 ):
     """What a session needs of its participant in the graph, see nodes/observer_participant.py.
@@ -304,6 +306,8 @@ class Session:
                     result = _hurried(result)
         finally:
             await ended(offering)
+            for each in self._system.adopted:
+                each.close()
             self._stale.close()
             await self._changes.close()
             self._emit(Stopped(exit_code=result.exit_code, elapsed_s=self._emit.elapsed_s))
@@ -420,8 +424,11 @@ class Session:
         loop = asyncio.get_running_loop()
         timeout_s = self._options.bring_up_s(len(self._system.processes))
         deadline = loop.time() + timeout_s
+        if self._options.adopt:
+            await self._adopt()
         async with self._following():
             await self._process_monitor.during(self._bring_up.connect(timeout_s))
+        self._judge.ahead = self._gate_sequence.active()
         self._furthest = "connected"
         self._emit(SystemReached(reached="connected", elapsed_s=self._emit.elapsed_s))
         if self._options.until is Until.CONNECTED:
@@ -435,6 +442,28 @@ class Session:
         await self._gate_sequence.activate(permit, deadline)
         self._furthest = "active"
         return await self._hold(Stage.ACTIVE)
+
+    async def _adopt(self) -> None:
+        """Take what runs already as it is found, before anything is started.
+
+        Raises:
+            VerificationError: a node runs more than once.
+            StepFailedError: of a process with several nodes only some run.
+        """
+        running, unsettled = await self._observer_participant.running(SETTLE_S)
+        if unsettled:
+            self._emit(Notice(message=f"what runs may not be all that is adopted: {unsettled}"))
+        adoption = Adoption(self._system, running)
+        if findings := adoption.findings():
+            raise VerificationError(self._judge.refuse(findings))
+        names = adoption.adopt(self._adopted_ended)
+        if not names:
+            self._emit(Notice(message="nothing is adopted: no node of the manifest runs yet"))
+        self._replanned(names)
+
+    def _adopted_ended(self, process: AdoptedProcess) -> None:
+        self._stale.forget(process.pid, process.nodes)
+        self._system.touched.set()
 
     @contextlib.asynccontextmanager
     async def _following(self) -> AsyncIterator[None]:

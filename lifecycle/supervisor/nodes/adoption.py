@@ -1,0 +1,212 @@
+"""Nodes that ran before their supervisor: which are adopted, and whether their processes live on.
+
+Owns: `RunningNode`, what is known of a node before anything is started; `Adoption`, which decides
+on all of them at once, or refuses; and `AdoptedProcess`, a process that others started, of which a
+pidfd notifies the end (pidfd_open(2)). It is never signalled: who started it ends it. Must not
+import rclpy.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import os
+from collections.abc import Callable, Iterable
+from typing import Protocol
+
+from lifecycle.printable import one_line
+from lifecycle.supervisor.nodes.system import NodeRun, System
+from lifecycle.supervisor.run.events import Notice
+from lifecycle.supervisor.run.failure import StepFailedError
+from lifecycle.verify import DUPLICATE_NODE, PROCESS_DIED, START_FAILED, Finding, Outcome
+
+SETTLE_S = 5.0
+"""For discovery to show all that runs; usually it has settled within a second."""
+
+_LONGEST_COMMAND = 100
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class RunningNode:
+    """A node that is in the graph.
+
+    Attributes:
+        name: fully qualified.
+        count: how many nodes carry this name.
+        processes: of this host that it runs in, with their command lines, by pid; empty where that
+            is not known. More than one is several nodes.
+    """
+
+    name: str
+    count: int = 1
+    processes: dict[int, str] = dataclasses.field(default_factory=dict)
+
+    @property
+    def pid(self) -> int:
+        """Its process; 0 if it is not known."""
+        return next(iter(self.processes), 0)
+
+    @property
+    def where(self) -> str:
+        """Its process as people read it; empty if it is not known."""
+        if not self.processes:
+            return ""
+        command = one_line(self.processes[self.pid])
+        cut = "" if len(command) <= _LONGEST_COMMAND else "…"
+        return f"pid {self.pid}, {command[:_LONGEST_COMMAND]}{cut}"
+
+
+class Census(Protocol):
+    """What shows the nodes that run, see nodes/observer_participant.py."""
+
+    async def running(self, wait_s: float) -> tuple[tuple[RunningNode, ...], str]:
+        """Return the nodes in the graph once discovery has settled, and what it lacked in the end.
+
+        Args:
+            wait_s: seconds, > 0, that it may take.
+        """
+
+
+class AdoptedProcess:
+    """A process that others started; `close` it.
+
+    Args:
+        pid: of a process on this host.
+        nodes: of ours that it runs.
+        on_end: called once, when it has ended.
+
+    Attributes:
+        ended: resolves when it has ended, with all that is known of how.
+        is_over: it has ended, and all of its nodes may end by themselves.
+    """
+
+    def __init__(
+        self, pid: int, nodes: Iterable[NodeRun], on_end: Callable[[AdoptedProcess], None]
+    ) -> None:
+        self.pid = pid
+        self.nodes = tuple(nodes)
+        self.ended: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+        self._on_end = on_end
+        self._pidfd: int | None = None
+        try:
+            self._pidfd = os.pidfd_open(pid)
+        except ProcessLookupError:
+            asyncio.get_running_loop().call_soon(self._ends)
+        else:
+            asyncio.get_running_loop().add_reader(self._pidfd, self._ends)
+
+    @property
+    def name(self) -> str:
+        """What it is called among the processes of a run."""
+        return f"pid {self.pid}"
+
+    @property
+    def is_over(self) -> bool:
+        """See above."""
+        return self.ended.done() and all(each.planned.may_end for each in self.nodes)
+
+    @property
+    def died(self) -> bool:
+        """It has ended although it was to run."""
+        return self.ended.done() and not self.is_over
+
+    def failure(self) -> StepFailedError:
+        """Return the failure that its end is."""
+        names = " and ".join(repr(each.name) for each in self.nodes)
+        return StepFailedError(
+            f"cannot keep {names} running: pid {self.pid}, which was adopted, has ended; how it "
+            "ended is known to who started it",
+            rule=PROCESS_DIED,
+            subject=self.nodes[0].name,
+        )
+
+    def close(self) -> None:
+        """Watch it no more."""
+        if self._pidfd is not None:
+            asyncio.get_running_loop().remove_reader(self._pidfd)
+            os.close(self._pidfd)
+            self._pidfd = None
+
+    def _ends(self) -> None:
+        self.close()
+        if not self.ended.done():
+            self.ended.set_result("ended; it was adopted, and who started it knows how")
+            self._on_end(self)
+
+
+class Adoption:
+    """Decides which nodes of a system are adopted; nothing was started yet, and nothing asked.
+
+    Args:
+        system: nothing of which runs yet by its own supervisor.
+        running: all nodes in the graph.
+    """
+
+    def __init__(self, system: System, running: Iterable[RunningNode]) -> None:
+        self._system = system
+        there = {each.name: each for each in running}
+        self.found = {
+            key: there[node.name] for key, node in system.nodes.items() if node.name in there
+        }
+
+    def findings(self) -> tuple[Finding, ...]:
+        """Return a finding for each node that cannot be driven because it runs more than once."""
+        found = []
+        for key, each in self.found.items():
+            count = max(each.count, len(each.processes))
+            if count < 2:
+                continue
+            pids = ", ".join(str(pid) for pid in sorted(each.processes))
+            found.append(
+                DUPLICATE_NODE.on_node(
+                    Outcome.VIOLATED,
+                    self._system.nodes[key].planned,
+                    expected="1 node of this name",
+                    observed=f"{count} nodes",
+                    message=f"cannot adopt {each.name}: {count} nodes are named so"
+                    + (f", in the processes {pids}" if len(each.processes) > 1 else ""),
+                    hint="end all but one of them: nothing was started, and nothing asked of them",
+                )
+            )
+        return tuple(found)
+
+    def adopt(self, on_end: Callable[[AdoptedProcess], None]) -> frozenset[str]:
+        """Have the system adopt what was found; return the full names of the nodes.
+
+        Raises:
+            StepFailedError: a process would be started for some of its nodes while others of them
+                run already.
+        """
+        self._check_processes()
+        system = self._system
+        system.adopt(self.found)
+        nodes: dict[int, list[NodeRun]] = {}
+        for key, each in self.found.items():
+            if each.pid:
+                nodes.setdefault(each.pid, []).append(system.nodes[key])
+        system.adopted = tuple(AdoptedProcess(pid, hosted, on_end) for pid, hosted in nodes.items())
+        for process in system.adopted:
+            for node in process.nodes:
+                node.adopted = process
+        return frozenset(each.name for each in self.found.values())
+
+    def _check_processes(self) -> None:
+        for process in self._system.processes.values():
+            keys = process.planned.nodes
+            there = [key for key in keys if key in self.found]
+            missing = [self._system.nodes[key].name for key in keys if key not in self.found]
+            if there and missing:
+                one = self.found[there[0]]
+                where = f" in pid {one.pid}" if one.pid else ""
+                raise StepFailedError(
+                    f"cannot start {missing[0]!r}: the manifest has it in one process with "
+                    f"{one.name!r}, which runs already{where}; end that one, and both are started, "
+                    "or start them together, and both are adopted",
+                    rule=START_FAILED,
+                    subject=missing[0],
+                )
+            pids = {self.found[key].pid for key in there} - {0}
+            if len(pids) > 1:
+                names = " and ".join(self.found[key].name for key in there)
+                message = f"{names} run in processes of their own; the manifest has them in one"
+                self._system.emit(Notice(message=message))
