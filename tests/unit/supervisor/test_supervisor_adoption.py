@@ -169,9 +169,9 @@ def test_an_attached_node_that_is_active_is_refused_but_for_adopt(tmp_path: Path
             if adopt
             else [
                 (
-                    "cannot configure '/lidar': it is active already, and nobody verified it; have it "
-                    "adopted as it is with 'lifecycle up --adopt', or deactivate it first: ros2 "
-                    "lifecycle set /lidar deactivate"
+                    "cannot configure '/lidar': it is active already, and nobody verified it; "
+                    "have it adopted as it is with 'lifecycle up --adopt', or deactivate it first: "
+                    "ros2 lifecycle set /lidar deactivate"
                 )
             ]
         )
