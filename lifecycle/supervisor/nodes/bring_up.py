@@ -403,7 +403,8 @@ class BringUp:
 
     def _note_found(self, node: NodeRun, state: str) -> None:
         """Note, and say, how a node was found that others started and that is adopted."""
-        if not self._system.adopts or node.process is not None or node.found:
+        others = node.process is None and not node.planned.run.component
+        if not self._system.adopts or not others or node.found:
             return
         node.found = state
         where = "" if node.running is None else node.running.where

@@ -6,6 +6,7 @@ What must hold in every run is checked by `SessionWorld.run` each time.
 
 from __future__ import annotations
 
+import asyncio
 import dataclasses
 import subprocess
 from collections.abc import Iterator
@@ -140,6 +141,22 @@ def test_a_process_of_which_some_nodes_run_is_not_started_beside_them(tmp_path: 
                 "adopted"
             )
         ]
+
+    run(main())
+
+
+def test_a_node_in_a_transition_is_adopted_as_what_it_becomes(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = world_of(tmp_path, plan_of(planned_node("lidar")), stop_after_s=0.0)
+        world.graph.others["/lidar"] = "activating"
+
+        async def arrive() -> None:
+            await asyncio.sleep(1.0)
+            world.graph.others["/lidar"] = "active"
+
+        await world.run(arrive())
+        assert notices(world) == ["[notice] '/lidar' is adopted, found active"]
+        assert world.outline[-1] == "[stopped] 0"
 
     run(main())
 
