@@ -11,10 +11,11 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from typing import Protocol
 
 from lifecycle.printable import one_line
+from lifecycle.run_directory import start_ticks
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.run.events import Notice
 from lifecycle.supervisor.run.failure import StepFailedError
@@ -65,6 +66,46 @@ class Census(Protocol):
         Args:
             wait_s: seconds, > 0, that it may take.
         """
+
+    def processes(self) -> dict[str, dict[int, str]]:
+        """Return the command lines of this host's processes by full node name and pid."""
+
+
+def ran_before(node: NodeRun, census: Census, ours: Collection[int]) -> tuple[Finding, ...]:
+    """Return a finding if a node of this name runs in a process that is older than ours.
+
+    Requests to services would reach both, and both would obey.
+
+    Args:
+        node: that has a process of ours.
+        census: knows whose process each node is in.
+        ours: pids of all that this supervisor started, which may run it, too: a component is loaded.
+    """
+    assert node.process is not None
+    began = start_ticks(node.process.pid)
+    if began is None:
+        return ()
+    older = RunningNode(
+        name=node.name,
+        processes={
+            pid: command
+            for pid, command in census.processes().get(node.name, {}).items()
+            if pid not in ours and (start_ticks(pid) or began) < began
+        },
+    )
+    if not older.processes:
+        return ()
+    return (
+        DUPLICATE_NODE.on_node(
+            Outcome.VIOLATED,
+            node.planned,
+            expected="1 node of this name",
+            observed=f"one more in {older.where}",
+            message=f"cannot drive {node.name}: a node of this name ran before ({older.where}), and"
+            " would obey, too",
+            hint="have it adopted: lifecycle up MANIFEST --adopt; or end it",
+        ),
+    )
 
 
 class AdoptedProcess:

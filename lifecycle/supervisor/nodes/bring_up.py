@@ -140,6 +140,8 @@ class BringUp:
         spawner_of: the spawner for a process.
         services: makes the driver of a managed node that is not ours.
         appears: waits until a node of this name is in the graph.
+        alone: makes sure, as well as it can be known, that a node of ours which is driven by its
+            services is the only one of its name, or raises VerificationError.
         recorded: called after each spawn, to keep the record of children true.
         gives: sets the parameters of a running node that its command line does not give it.
         loads: has the container of this full name load a node.
@@ -156,9 +158,11 @@ class BringUp:
         recorded: Callable[[], None],
         wirer: Wirer | None = None,
         gives: Callable[[PlannedNode], Awaitable[None]] | None = None,
+        alone: Callable[[NodeRun], None] | None = None,
         loads: Callable[[PlannedNode, str], Awaitable[None]] | None = None,
     ) -> None:
         self._gives = gives
+        self._alone = alone
         self._loads = loads
         self._system = system
         self._spawner_of = spawner_of
@@ -337,10 +341,16 @@ class BringUp:
             node.doing = _APPEARING
             if self._is_to_be_given(node) and not node.planned.may_end:
                 # What it is judged by must be there before it is.
-                limit_s = node.planned.timeouts.start_s
-                await self._step(node, self._appears(node.name), limit_s, rule=START_FAILED)
+                await self._appear_alone(node)
                 await self._give(node)
             self._appearing.append(asyncio.ensure_future(self._appear(node)))
+
+    async def _appear_alone(self, node: NodeRun) -> None:
+        """Wait, bounded, for a node that its services are asked of: nobody else may get that."""
+        limit_s = node.planned.timeouts.start_s
+        await self._step(node, self._appears(node.name), limit_s, rule=START_FAILED)
+        if self._alone is not None and node.process is not None:
+            self._alone(node)
 
     async def _appear(self, node: NodeRun) -> None:
         appears = asyncio.ensure_future(self._appears(node.name))
@@ -486,14 +496,13 @@ class BringUp:
             if process.name not in self._starts:
                 self._starts[process.name] = asyncio.ensure_future(self._start_process(process))
             await asyncio.shield(self._starts[process.name])
-        limit_s = node.planned.timeouts.start_s
         node.doing = "starting"
         if process is not None and process.channel is not None:
             if node.planned.holds:
                 node.driver = ControlDriver(process.channel, node.name)
         elif node.planned.managed:
             node.doing = _APPEARING
-            await self._step(node, self._appears(node.name), limit_s, rule=START_FAILED)
+            await self._appear_alone(node)
             node.driver = self._services(node.planned)
 
     async def _start_process(self, process: ManagedProcess) -> None:

@@ -120,18 +120,22 @@ class ObserverParticipant:
             wait_s: seconds, > 0, that it may take.
         """
         (nodes, _), unsettled = await settled(self._graph.discovery, wait_s)
-        programs = self._graph.discovery.programs(os.environ)
+        processes = self.processes()
         return tuple(
             RunningNode(
-                name=node.full_name,
-                count=node.count,
-                processes={
-                    each.process_id: shlex.join(each.argv)
-                    for each in programs.get(node.full_name, {}).values()
-                },
+                name=each.full_name,
+                count=each.count,
+                processes=processes.get(each.full_name, {}),
             )
-            for node in nodes
+            for each in nodes
         ), unsettled
+
+    def processes(self) -> dict[str, dict[int, str]]:
+        """Return the command lines of this host's processes by full node name and pid."""
+        return {
+            name: {each.process_id: shlex.join(each.argv) for each in programs.values()}
+            for name, programs in self._graph.discovery.programs(os.environ).items()
+        }
 
     async def load(self, node: PlannedNode, container: str) -> None:
         """Have a component container load a node; raises MiddlewareError with the reason."""

@@ -37,11 +37,18 @@ from lifecycle.supervisor.health.process_monitor import (
     Sightings,
     StaleNodes,
 )
-from lifecycle.supervisor.nodes.adoption import SETTLE_S, AdoptedProcess, Adoption, Census
+from lifecycle.supervisor.nodes.adoption import (
+    SETTLE_S,
+    AdoptedProcess,
+    Adoption,
+    Census,
+    ran_before,
+)
 from lifecycle.supervisor.nodes.bring_up import BringUp
 from lifecycle.supervisor.nodes.driver import NodeDriver
 from lifecycle.supervisor.nodes.system import (
     InterfaceOnDemand,
+    NodeRun,
     ObservedGraph,
     RemoteNodes,
     ServiceNames,
@@ -212,6 +219,7 @@ class Session:
             wirer=self._authority,
             gives=observer_participant.give,
             loads=observer_participant.load,
+            alone=self._alone,
         )
         self._remote_nodes = RemoteNodes(
             system.plan, system.awaited(), observer_participant, self._changes
@@ -460,6 +468,11 @@ class Session:
         if not names:
             self._emit(Notice(message="nothing is adopted: no node of the manifest runs yet"))
         self._replanned(names)
+
+    def _alone(self, node: NodeRun) -> None:
+        ours = self._fork_server.family()
+        if findings := ran_before(node, self._observer_participant, ours):
+            raise VerificationError(self._judge.refuse(findings))
 
     def _adopted_ended(self, process: AdoptedProcess) -> None:
         self._stale.forget(process.pid, process.nodes)

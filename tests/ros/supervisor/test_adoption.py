@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from lifecycle.errors import ExitCode
-from tests.ros.supervisor.running import BOUND_S, Up, pair, up
+from tests.ros.supervisor.running import BOUND_S, Up, pair, up, verb
 
 _ELSEWHERE = str(Path(__file__).with_name("managed_elsewhere.py"))
 _LIMITS = {"start_s": 8, "configure_s": 8, "connect_s": 8, "activate_s": 8, "silent_s": 8}
@@ -52,10 +52,15 @@ def asked(run: Up) -> list[str]:
     return [each["operation"] for each in run.of_kind("request") if each["node"] == "/base"]
 
 
-def test_a_node_outlives_a_killed_supervisor_and_is_adopted_again_as_it_is(
+@pytest.mark.thorough
+def test_a_node_is_not_touched_but_adopted_and_outlives_a_supervisor_that_is_killed(
     tmp_path: Path, fresh_domain: int, base: subprocess.Popen[str]
 ) -> None:
     manifest = pair(tmp_path, fresh_domain, edit=_EDIT)
+    refused = verb("up", str(manifest), runtime=tmp_path)
+    assert refused.returncode == ExitCode.VIOLATED, refused.stdout
+    assert f"ran before (pid {base.pid}, " in refused.stdout
+    assert "lifecycle up MANIFEST --adopt" in refused.stdout
     with up(manifest, "--adopt", runtime=tmp_path) as killed:
         adopts(killed, "unconfigured", base.pid)
         assert asked(killed) == ["configure", "connect", "activate"]

@@ -172,11 +172,14 @@ class FakeParticipant:
             RunningNode(
                 name=name,
                 count=2 if name in self.twice else 1,
-                processes={self.pids[name]: "by hand"} if name in self.pids else {},
+                processes=self.processes().get(name, {}),
             )
             for name in self.others
         )
         return found, ""
+
+    def processes(self) -> dict[str, dict[int, str]]:
+        return {name: {pid: "by hand"} for name, pid in self.pids.items()}
 
     def put_configuration(self, configuration: NodeConfiguration) -> None:
         self._reports[configuration.name] = configuration
