@@ -14,9 +14,9 @@ from collections.abc import Coroutine, Iterable, Sequence
 from typing import Any, Protocol
 
 from lifecycle.supervisor.gate.verification_loop import ChangeCounter
-from lifecycle.supervisor.nodes.adoption import AdoptedProcess
 from lifecycle.supervisor.nodes.bring_up import ALSO_S, died
 from lifecycle.supervisor.nodes.system import NodeRun, ObservedGraph, System
+from lifecycle.supervisor.processes.adopted_process import AdoptedProcess
 from lifecycle.supervisor.processes.process import ManagedProcess
 from lifecycle.supervisor.run.events import Event, ProcessChanged, ProcessState
 from lifecycle.supervisor.run.failure import StepFailedError, ended

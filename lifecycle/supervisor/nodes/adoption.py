@@ -1,60 +1,24 @@
-"""Nodes that ran before their supervisor: which are adopted, and whether their processes live on.
+"""Nodes that ran before their supervisor: which are adopted, and what keeps it from adopting them.
 
-Owns: `RunningNode`, what is known of a node before anything is started; `Adoption`, which decides
-on all of them at once, or refuses; and `AdoptedProcess`, a process that others started, of which a
-pidfd notifies the end (pidfd_open(2)). It is never signalled: who started it ends it. Must not
-import rclpy.
+Owns: `Adoption`, which decides on all of them before anything is started, or refuses; and
+`ran_before`, which keeps requests from a node that ran before when none is adopted. What becomes of
+an adopted process is processes/adopted_process.py's. Must not import rclpy.
 """
 
 from __future__ import annotations
 
-import asyncio
-import dataclasses
-import os
 from collections.abc import Callable, Collection, Iterable
 from typing import Protocol
 
-from lifecycle.printable import one_line
 from lifecycle.run_directory import start_ticks
 from lifecycle.supervisor.nodes.system import NodeRun, System
+from lifecycle.supervisor.processes.adopted_process import AdoptedProcess, RunningNode
 from lifecycle.supervisor.run.events import Notice
 from lifecycle.supervisor.run.failure import StepFailedError
-from lifecycle.verify import DUPLICATE_NODE, PROCESS_DIED, START_FAILED, Finding, Outcome
+from lifecycle.verify import DUPLICATE_NODE, START_FAILED, Finding, Outcome
 
 SETTLE_S = 5.0
 """For discovery to show all that runs; usually it has settled within a second."""
-
-_LONGEST_COMMAND = 100
-
-
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class RunningNode:
-    """A node that is in the graph.
-
-    Attributes:
-        name: fully qualified.
-        count: how many nodes carry this name.
-        processes: of this host that it runs in, with their command lines, by pid; empty where that
-            is not known. More than one is several nodes.
-    """
-
-    name: str
-    count: int = 1
-    processes: dict[int, str] = dataclasses.field(default_factory=dict)
-
-    @property
-    def pid(self) -> int:
-        """Its process; 0 if it is not known."""
-        return next(iter(self.processes), 0)
-
-    @property
-    def where(self) -> str:
-        """Its process as people read it; empty if it is not known."""
-        if not self.processes:
-            return ""
-        command = one_line(self.processes[self.pid])
-        cut = "" if len(command) <= _LONGEST_COMMAND else "…"
-        return f"pid {self.pid}, {command[:_LONGEST_COMMAND]}{cut}"
 
 
 class Census(Protocol):
@@ -79,7 +43,7 @@ def ran_before(node: NodeRun, census: Census, ours: Collection[int]) -> tuple[Fi
     Args:
         node: that has a process of ours.
         census: knows whose process each node is in.
-        ours: pids of all that this supervisor started, which may run it, too: a component is loaded.
+        ours: pids of all that this supervisor started; one may run it that is older: a container.
     """
     assert node.process is not None
     began = start_ticks(node.process.pid)
@@ -106,73 +70,6 @@ def ran_before(node: NodeRun, census: Census, ours: Collection[int]) -> tuple[Fi
             hint="have it adopted: lifecycle up MANIFEST --adopt; or end it",
         ),
     )
-
-
-class AdoptedProcess:
-    """A process that others started; `close` it.
-
-    Args:
-        pid: of a process on this host.
-        nodes: of ours that it runs.
-        on_end: called once, when it has ended.
-
-    Attributes:
-        ended: resolves when it has ended, with all that is known of how.
-        is_over: it has ended, and all of its nodes may end by themselves.
-    """
-
-    def __init__(
-        self, pid: int, nodes: Iterable[NodeRun], on_end: Callable[[AdoptedProcess], None]
-    ) -> None:
-        self.pid = pid
-        self.nodes = tuple(nodes)
-        self.ended: asyncio.Future[str] = asyncio.get_running_loop().create_future()
-        self._on_end = on_end
-        self._pidfd: int | None = None
-        try:
-            self._pidfd = os.pidfd_open(pid)
-        except ProcessLookupError:
-            asyncio.get_running_loop().call_soon(self._ends)
-        else:
-            asyncio.get_running_loop().add_reader(self._pidfd, self._ends)
-
-    @property
-    def name(self) -> str:
-        """What it is called among the processes of a run."""
-        return f"pid {self.pid}"
-
-    @property
-    def is_over(self) -> bool:
-        """See above."""
-        return self.ended.done() and all(each.planned.may_end for each in self.nodes)
-
-    @property
-    def died(self) -> bool:
-        """It has ended although it was to run."""
-        return self.ended.done() and not self.is_over
-
-    def failure(self) -> StepFailedError:
-        """Return the failure that its end is."""
-        names = " and ".join(repr(each.name) for each in self.nodes)
-        return StepFailedError(
-            f"cannot keep {names} running: pid {self.pid}, which was adopted, has ended; how it "
-            "ended is known to who started it",
-            rule=PROCESS_DIED,
-            subject=self.nodes[0].name,
-        )
-
-    def close(self) -> None:
-        """Watch it no more."""
-        if self._pidfd is not None:
-            asyncio.get_running_loop().remove_reader(self._pidfd)
-            os.close(self._pidfd)
-            self._pidfd = None
-
-    def _ends(self) -> None:
-        self.close()
-        if not self.ended.done():
-            self.ended.set_result("ended; it was adopted, and who started it knows how")
-            self._on_end(self)
 
 
 class Adoption:
@@ -225,9 +122,10 @@ class Adoption:
         for key, each in self.found.items():
             if each.pid:
                 nodes.setdefault(each.pid, []).append(system.nodes[key])
-        system.adopted = tuple(AdoptedProcess(pid, hosted, on_end) for pid, hosted in nodes.items())
-        for process in system.adopted:
-            for node in process.nodes:
+        for pid, hosted in nodes.items():
+            process = AdoptedProcess(pid, [each.planned for each in hosted], on_end)
+            system.adopted = (*system.adopted, process)
+            for node in hosted:
                 node.adopted = process
         return frozenset(each.name for each in self.found.values())
 

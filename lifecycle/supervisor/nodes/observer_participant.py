@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING
 from lifecycle.graph import set_within
 from lifecycle.plan import COMMAND, DEFAULT, ParticipantConnections, Plan, PlannedNode
 from lifecycle.supervisor.health.peer_supervisors import Listener
-from lifecycle.supervisor.nodes.adoption import RunningNode
 from lifecycle.supervisor.nodes.driver import NodeDriver, NodeInterfaceClient, ServiceDriver
+from lifecycle.supervisor.processes.adopted_process import RunningNode
 from lifecycle.verify import (
     NodeConfiguration,
     Observation,

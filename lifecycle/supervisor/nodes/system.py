@@ -13,7 +13,7 @@ import contextlib
 import dataclasses
 from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 from lifecycle.errors import BringUpError
 from lifecycle.manifest import Condition, RunKind, TargetState
@@ -23,6 +23,7 @@ from lifecycle.plan import Plan, PlannedNode, PlannedProcess, attached_to
 from lifecycle.supervisor.gate.gate import Permit
 from lifecycle.supervisor.health.liveliness import SilenceMonitor
 from lifecycle.supervisor.nodes.driver import ACTIVE, INACTIVE, NodeCondition, NodeDriver
+from lifecycle.supervisor.processes.adopted_process import AdoptedProcess, RunningNode
 from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.supervisor.processes.logs import LogDirectory
 from lifecycle.supervisor.processes.process import ManagedProcess, own_run_delay_s
@@ -35,9 +36,6 @@ from lifecycle.supervisor.run.events import (
     RequestSent,
 )
 from lifecycle.verify import NodeConfiguration, Observation
-
-if TYPE_CHECKING:
-    from lifecycle.supervisor.nodes.adoption import AdoptedProcess, RunningNode
 
 ASK_AGAIN_S = 0.2
 """A remote node is asked again so long after, because the event that it connected may be missed:

@@ -37,13 +37,7 @@ from lifecycle.supervisor.health.process_monitor import (
     Sightings,
     StaleNodes,
 )
-from lifecycle.supervisor.nodes.adoption import (
-    SETTLE_S,
-    AdoptedProcess,
-    Adoption,
-    Census,
-    ran_before,
-)
+from lifecycle.supervisor.nodes.adoption import SETTLE_S, Adoption, Census, ran_before
 from lifecycle.supervisor.nodes.bring_up import BringUp
 from lifecycle.supervisor.nodes.driver import NodeDriver
 from lifecycle.supervisor.nodes.system import (
@@ -54,6 +48,7 @@ from lifecycle.supervisor.nodes.system import (
     ServiceNames,
     System,
 )
+from lifecycle.supervisor.processes.adopted_process import AdoptedProcess
 from lifecycle.supervisor.processes.orphans import ProcessFamily, end_strays, reap_adopted
 from lifecycle.supervisor.processes.process import Spawner
 from lifecycle.supervisor.run.events import (
@@ -478,7 +473,8 @@ class Session:
             raise VerificationError(self._judge.refuse(findings))
 
     def _adopted_ended(self, process: AdoptedProcess) -> None:
-        self._stale.forget(process.pid, process.nodes)
+        nodes = [each for each in self._system.nodes.values() if each.adopted is process]
+        self._stale.forget(process.pid, nodes)
         self._system.touched.set()
 
     @contextlib.asynccontextmanager

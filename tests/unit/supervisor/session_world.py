@@ -22,9 +22,9 @@ from lifecycle.run_directory import RunDirectory, short_path
 from lifecycle.supervisor.connections.networks import Networks
 from lifecycle.supervisor.control.server import Answer, ControlRequest, Question
 from lifecycle.supervisor.health.peer_supervisors import Listener
-from lifecycle.supervisor.nodes.adoption import RunningNode
 from lifecycle.supervisor.nodes.driver import NodeDriver, NodeInterfaceClient, ServiceDriver
 from lifecycle.supervisor.nodes.system import System
+from lifecycle.supervisor.processes.adopted_process import RunningNode
 from lifecycle.supervisor.processes.orphans import end_strays
 from lifecycle.supervisor.processes.process import ProcessExit
 from lifecycle.supervisor.run.events import (

@@ -27,7 +27,7 @@ ROBOT = plan_of(
     planned_node("new"),
     planned_node("arm"),
     planned_node("lidar"),
-    planned_node("logger", kind=RunKind.COMMAND, managed=False),
+    planned_node("logger", managed=False),
 )
 """Somebody runs all of it but the camera."""
 
