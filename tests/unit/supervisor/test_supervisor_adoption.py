@@ -18,8 +18,10 @@ from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import Condition, RunKind, TargetState
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.control.server import ControlRequest
+from lifecycle.supervisor.processes.adopted_process import RunningNode
+from lifecycle.supervisor.run.options import Until
 from tests.builders import plan_of, planned_node
-from tests.unit.supervisor.fakes import run
+from tests.unit.supervisor.fakes import World, run
 from tests.unit.supervisor.session_world import CAMERA_DOWN, INTRUDED, SessionWorld, over
 
 ROBOT = plan_of(
@@ -270,5 +272,58 @@ def test_a_pause_deactivates_what_was_found_active_and_a_resume_leaves_it_so(
         assert requests(world, "/lidar") == ["deactivate", "activate"]
         assert world.graph.others == {"/lidar": "active"}
         assert world.outline[-1] == "[stopped] 0"
+
+    run(main())
+
+
+def test_what_is_adopted_is_judged_also_where_nothing_is_to_be_activated(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = world_of(tmp_path, until=Until.CONNECTED)
+        await world.run()
+        assert [each for each in world.outline if each.startswith("[verdict]")] == [
+            "[verdict] connected ok"
+        ]
+        assert world.graph.others == FOUND
+
+    run(main())
+
+
+def test_nothing_is_asked_of_a_node_that_ran_before_one_of_ours(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both have the services by which ours is driven."""
+    older = "lifecycle.supervisor.nodes.adoption.start_ticks"
+    monkeypatch.setattr(older, lambda pid: 1 if pid == 7 else 2)
+
+    async def main() -> None:
+        world = SessionWorld(plan_of(planned_node("new", kind=RunKind.COMMAND)), tmp_path)
+        world.graph.others["/new"] = "unconfigured"
+        world.graph.pids["/new"] = 7
+        await world.run()
+        assert world.outline == [
+            "[verdict] connected violated graph.duplicate-node /new",
+            "[stopping] at 0.0 s: the verdict keeps the gate closed",
+            "new SIGTERM",
+            *over(4),
+        ]
+        assert world.messages == [
+            (
+                "cannot drive /new: a node of this name ran before (pid 7, by hand), and would obey,"
+                " too"
+            )
+        ]
+
+    run(main())
+
+
+def test_another_manifest_starts_nothing_beside_what_is_adopted(tmp_path: Path) -> None:
+    async def main() -> None:
+        system = World(ROBOT, tmp_path).system
+        system.adopt({"lidar": RunningNode(name="/lidar")})
+        system.reload(ROBOT, ROBOT.processes, tuple(system.nodes.values()))
+        assert sorted(system.processes) == ["arm", "camera", "logger", "new"]
+        lidar = system.nodes["lidar"]
+        assert (lidar.process, lidar.planned.run.kind) == (None, RunKind.ATTACH)
+        assert system.first == ROBOT
 
     run(main())
