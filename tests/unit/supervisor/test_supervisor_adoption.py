@@ -308,8 +308,8 @@ def test_nothing_is_asked_of_a_node_that_ran_before_one_of_ours(
         ]
         assert world.messages == [
             (
-                "cannot drive /new: a node of this name ran before (pid 7, by hand), and would obey,"
-                " too"
+                "cannot drive /new: a node of this name ran before (pid 7, by hand), and would "
+                "obey, too"
             )
         ]
 
