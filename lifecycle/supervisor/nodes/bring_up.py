@@ -145,7 +145,7 @@ class BringUp:
             services is the only one of its name, or raises VerificationError.
         recorded: called after each spawn, to keep the record of children true.
         gives: sets the parameters of a running node that its command line does not give it.
-        loads: has the container of this full name load a node.
+        loads: has the container of this full name load a node, and returns what unloads it.
         wirer: wires each node between its configure and its connect; None leaves it to the nodes.
     """
 
@@ -160,7 +160,7 @@ class BringUp:
         wirer: Wirer | None = None,
         gives: Callable[[PlannedNode], Awaitable[None]] | None = None,
         alone: Callable[[NodeRun], None] | None = None,
-        loads: Callable[[PlannedNode, str], Awaitable[None]] | None = None,
+        loads: Callable[[PlannedNode, str], Awaitable[Callable[[], Awaitable[None]]]] | None = None,
     ) -> None:
         self._gives = gives
         self._alone = alone
@@ -378,7 +378,7 @@ class BringUp:
             return
         full_name = name if container is None else container.name
         try:
-            await self._loads(node.planned, full_name)
+            node.unload = await self._loads(node.planned, full_name)
         except MiddlewareError as error:
             message = f"{error.message}; {error.hint}" if error.hint else error.message
             raise StepFailedError(message, rule=START_FAILED, subject=node.name) from error

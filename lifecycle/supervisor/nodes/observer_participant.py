@@ -10,11 +10,11 @@ import asyncio
 import contextlib
 import os
 import shlex
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Awaitable, Callable, Collection, Iterable
 from typing import TYPE_CHECKING
 
 from lifecycle.graph import set_within
-from lifecycle.plan import COMMAND, DEFAULT, ParticipantConnections, Plan, PlannedNode
+from lifecycle.plan import ParticipantConnections, Plan, PlannedNode
 from lifecycle.supervisor.health.peer_supervisors import Listener
 from lifecycle.supervisor.nodes.driver import NodeDriver, NodeInterfaceClient, ServiceDriver
 from lifecycle.supervisor.processes.adopted_process import RunningNode
@@ -106,13 +106,7 @@ class ObserverParticipant:
         Raises:
             MiddlewareError: it does not answer, or refuses.
         """
-        values = {
-            each.name: each.value
-            for each in node.expected_parameters
-            if each.value is not None and each.source not in (DEFAULT, COMMAND)
-        }
-        if values:
-            await self._graph.clients.give_parameters(node.full_name, values)
+        await self._graph.clients.give_parameters(node)
 
     async def running(self, wait_s: float) -> tuple[tuple[RunningNode, ...], str]:
         """Return the nodes in the graph once discovery has settled, and what it lacked in the end.
@@ -138,10 +132,14 @@ class ObserverParticipant:
             for name, programs in self._graph.discovery.programs(os.environ).items()
         }
 
-    async def load(self, node: PlannedNode, container: str) -> None:
-        """Have a component container load a node; raises MiddlewareError with the reason."""
+    async def load(self, node: PlannedNode, container: str) -> Callable[[], Awaitable[None]]:
+        """Have a component container load a node; return what unloads it.
+
+        Raises:
+            MiddlewareError: with the reason; so does what unloads.
+        """
         limit_s = node.timeouts.start_s
-        await self._graph.clients.load_component(node, container, timeout_s=limit_s)
+        return await self._graph.clients.load_component(node, container, timeout_s=limit_s)
 
     async def observe(self, plan: Plan) -> Observation:
         """Return what is there now."""

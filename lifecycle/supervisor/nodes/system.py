@@ -11,7 +11,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import dataclasses
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Protocol
 
@@ -257,6 +257,7 @@ class NodeRun:
         running: as it ran before this supervisor did; None if it did not.
         adopted: the process that others started it in, where that is known.
         reports_changes: its host reports unasked when its configuration changes.
+        unload: has its container unload a component; None for what is not loaded into one.
     """
 
     def __init__(self, planned: PlannedNode, emit: Emitter) -> None:
@@ -275,6 +276,7 @@ class NodeRun:
         self.running: RunningNode | None = None
         self.adopted: AdoptedProcess | None = None
         self.reports_changes = False
+        self.unload: Callable[[], Awaitable[None]] | None = None
         self.changed = asyncio.Event()
         self._emit = emit
 
@@ -287,6 +289,7 @@ class NodeRun:
         self.stuck = False
         self.connections = ()
         self.reports_changes = False
+        self.unload = None
         self.doing = ""
         self.connected = False
         self.state = ""
@@ -623,7 +626,8 @@ class System:
         return tuple(
             node
             for node in self.nodes.values()
-            if any(after.node == key for after in node.planned.after)
+            if node.planned.run.container == key
+            or any(after.node == key for after in node.planned.after)
         )
 
     async def refresh(self, observer: ObservedGraph) -> None:
