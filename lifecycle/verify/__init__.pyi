@@ -31,6 +31,7 @@ from .rules.matching import SERVER_OF as SERVER_OF
 from .rules.matching import MatchEnd as MatchEnd
 from .rules.matching import match as match
 from .rules.matching import obstacle as obstacle
+from .rules.nodes import DUPLICATE_NODE as DUPLICATE_NODE
 from .rules.nodes import MISSING_NODE as MISSING_NODE
 from .rules.nodes import UNATTRIBUTED_ENDPOINT as UNATTRIBUTED_ENDPOINT
 from .rules.run import DEADLINE as DEADLINE

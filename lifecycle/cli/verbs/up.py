@@ -77,6 +77,12 @@ if TYPE_CHECKING:
     "May be given several times.",
 )
 @click.option(
+    "--adopt",
+    is_flag=True,
+    help="Nodes that run already are verified in place and not started; found active, they stay so "
+    "in the end, too.",
+)
+@click.option(
     "--domain",
     type=click.IntRange(0, 232),
     metavar="ID",
@@ -101,6 +107,7 @@ def command(
     keep_going: bool,
     timings: bool,
     without: tuple[str, ...],
+    adopt: bool,
     domain: int | None,
     targets: tuple[str, ...],
     mapping: str,
@@ -147,6 +154,7 @@ def command(
                     strict=strict,
                     machine=machine,
                     keep_going=keep_going,
+                    adopt=adopt,
                     program=program,
                     treatment=_treatment(targets, mapping=mapping, flow_labels=flow_labels),
                 )

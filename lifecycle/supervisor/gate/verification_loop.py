@@ -28,6 +28,7 @@ from lifecycle.supervisor.run.failure import ended
 from lifecycle.verify import (
     DEFINITION_DIFFERS,
     MISSING_REPORT,
+    NOT_JUDGED,
     SERVER_OF,
     UNATTRIBUTED_ENDPOINT,
     About,
@@ -339,6 +340,12 @@ class VerificationLoop:
         )
         self._stands(stage, verdict)
         return verdict, again_s
+
+    def refuse(self, findings: tuple[Finding, ...]) -> Verdict:
+        """Judge by what was found before anything was started; return the verdict."""
+        verdict = with_findings(NOT_JUDGED, findings)
+        self._stands(Stage.CONNECTED, verdict)
+        return verdict
 
     def _stands(self, stage: Stage, verdict: Verdict) -> None:
         if verdict != self.latest:

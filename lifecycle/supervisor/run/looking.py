@@ -14,7 +14,7 @@ import contextlib
 import dataclasses
 import logging
 import os
-from collections.abc import Awaitable, Callable, Collection, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -28,7 +28,7 @@ from lifecycle.export import (
     build_picture,
     capture,
 )
-from lifecycle.graph import Look, set_within
+from lifecycle.graph import Look
 from lifecycle.manifest import DiscoveryRange, EndpointPolicy
 from lifecycle.middleware import note_ended, peers_environment
 from lifecycle.plan import Plan, reached_hosts
@@ -39,18 +39,16 @@ from lifecycle.supervisor.control.protocol import ProcessState, Reach, SystemSta
 from lifecycle.supervisor.control.server import SupervisorSnapshot, follow
 from lifecycle.supervisor.gate.gate import closes
 from lifecycle.supervisor.gate.verification_loop import GracePeriod, with_findings
-from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
+from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant, settled
 from lifecycle.supervisor.run.options import onlooker_connections, own_machines
 from lifecycle.verify import (
     Heals,
     NodeConfiguration,
     Observation,
-    ObservedEndpoint,
     ObservedNode,
     Outcome,
     Stage,
     Verdict,
-    known_node,
     rule,
     tolerating_pattern,
     verify,
@@ -58,7 +56,7 @@ from lifecycle.verify import (
 
 if TYPE_CHECKING:
     from lifecycle.graph import Graph
-    from lifecycle.middleware import GraphObserver, NodeClients
+    from lifecycle.middleware import NodeClients
 
 
 _ASK_AGAIN_S = 0.5
@@ -344,13 +342,8 @@ def _supervised(status: SystemStatus) -> dict[str, Supervised]:
 T = TypeVar("T")
 
 _logger = logging.getLogger(__name__)
-_QUIET_S = 0.5
-"""Discovery has settled once nothing changed for so long and everything has a node."""
-
 _ASK_S = 2.0
 """A node that answers at all answers within milliseconds."""
-
-Snapshot = tuple[tuple[ObservedNode, ...], tuple[ObservedEndpoint, ...]]
 
 
 def capture_running(
@@ -403,7 +396,7 @@ _Parameters = dict[str, "tuple[CapturedParameter, ...] | None"]
 async def _look(
     graph: Graph, wait_s: float, environment: Mapping[str, str] | None
 ) -> tuple[Observation, _Parameters, str, Programs]:
-    (nodes, endpoints), unsettled = await _settled(graph.discovery, wait_s)
+    (nodes, endpoints), unsettled = await settled(graph.discovery, wait_s)
     # Before anything is asked: a program may end meanwhile.
     programs = {} if environment is None else graph.discovery.programs(environment)
     serving = {
@@ -429,44 +422,6 @@ async def _look(
         name: each for name, (_, _, each) in zip(names, answers, strict=True) if name in serving
     }
     return graph.state.observation(), parameters, unsettled, note_ended(programs)
-
-
-async def _settled(graph: GraphObserver, wait_s: float) -> tuple[Snapshot, str]:
-    """Wait until the graph changes no more; return it, and what it still lacked in the end."""
-    loop = asyncio.get_running_loop()
-    deadline = loop.time() + wait_s
-    changed = asyncio.Event()
-
-    def wake() -> None:
-        with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
-            loop.call_soon_threadsafe(changed.set)
-
-    remove = graph.on_change(wake)
-    try:
-        while True:
-            changed.clear()
-            snapshot = graph.snapshot()
-            pending = _pending(snapshot, settling_s=graph.settling_s())
-            left_s = deadline - loop.time()
-            if left_s <= 0:
-                what = ", ".join(pending) or "it still changed"
-                return snapshot, f"discovery had not settled after {wait_s:g} s: {what}"
-            stirred = await set_within(changed, min(_QUIET_S, left_s))
-            if not stirred and not pending and left_s >= _QUIET_S:
-                return snapshot, ""
-    finally:
-        remove()
-
-
-def _pending(snapshot: Snapshot, *, settling_s: float) -> Collection[str]:
-    """Say what discovery still has to show."""
-    _, endpoints = snapshot
-    pending = dict.fromkeys(
-        f"nobody tells whose {each.name} is" for each in endpoints if not known_node(each.node)
-    )
-    if settling_s > 0:
-        pending["a participant answered whose node is not known"] = None
-    return tuple(pending)
 
 
 async def _ask(

@@ -225,7 +225,8 @@ cannot tell 3 nodes named /robot/camera apart
 expected: 1 node of this name
 observed: 3 nodes
 at: robot.lifecycle.yaml:3:3, on /robot/camera
-to do: stop the other one, or give each its own name or namespace
+to do: stop the other one, or give each its own name or namespace; have one that ran before
+  adopted: lifecycle up --adopt
 """,
     ),
     "one name is that of two nodes that nobody declared": (
