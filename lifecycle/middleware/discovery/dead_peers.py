@@ -33,8 +33,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from lifecycle.middleware.discovery.probe import HEADER, ProbeTarget, probe_targets, send
 from lifecycle.middleware.fastdds.dscp import own_udp_socket, socket_descriptors
-from lifecycle.middleware.fastdds.url_check import open_sockets
-from lifecycle.network import ConnectionUrl, Medium
+from lifecycle.middleware.fastdds.url_check import sockets_of
+from lifecycle.network import UDP_UNICAST, ConnectionUrl, Medium
 
 _UNANSWERED = 2
 """Retransmissions in a row after which a connection is dead for a leaving process: the kernel
@@ -184,13 +184,14 @@ def remove_participants(
     """
     messages = [disposal(each) for each in prefixes]
     targets = {
-        kind: [*_asked(domain_id, urls, environment, kind), *_listening(pids, kind)]
-        for kind in (Medium.UDPV4, Medium.UDPV6)
+        kind: [*_asked(domain_id, urls, environment, kind), *found]
+        for kind, found in listening(pids).items()
     }
     output = next((url.output_port for url in urls if url.output_port), None)
-    for kind, family in ((Medium.UDPV4, socket.AF_INET), (Medium.UDPV6, socket.AF_INET6)):
+    for kind in UDP_UNICAST:
         if not targets[kind]:
             continue
+        family = kind.socket_family
         own = None if output is None else own_udp_socket(family, output)
         with contextlib.suppress(OSError), own or socket.socket(family, socket.SOCK_DGRAM) as by:
             for message in messages:
@@ -205,12 +206,14 @@ def _asked(
             yield from targets
 
 
-def _listening(pids: Iterable[int], kind: Medium) -> Iterator[ProbeTarget]:
-    """Yield where processes of this host receive; those that are gone receive nothing."""
-    for pid in pids:
-        with contextlib.suppress(OSError):
-            for each in open_sockets(pid):
-                if each.kind == kind and not ipaddress.ip_address(each.address).is_multicast:
-                    any_ = ipaddress.ip_address(each.address).is_unspecified
-                    loopback = "::1" if kind is Medium.UDPV6 else "127.0.0.1"
-                    yield ProbeTarget(address=loopback if any_ else each.address, port=each.port)
+def listening(pids: Iterable[int]) -> dict[Medium, dict[ProbeTarget, int]]:
+    """Return where processes of this host receive UDP, by medium; the values are their pids."""
+    found: dict[Medium, dict[ProbeTarget, int]] = {kind: {} for kind in UDP_UNICAST}
+    for pid, sockets in sockets_of(pids).items():
+        for each in sockets:
+            if each.kind not in found or ipaddress.ip_address(each.address).is_multicast:
+                continue
+            any_ = ipaddress.ip_address(each.address).is_unspecified
+            address = each.kind.loopback if any_ else each.address
+            found[each.kind][ProbeTarget(address=address, port=each.port)] = pid
+    return found

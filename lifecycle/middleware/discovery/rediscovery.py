@@ -1,4 +1,4 @@
-"""Rediscovery after a link is back: announcements, node names in the graph, TCP retransmission.
+"""Rediscovery after an outage or a restart: announcements, node names, TCP retransmission.
 
 Owns: what is sent while a peer is unreachable, what makes node names complete again, and how long
 the kernel waits at most before it retransmits over TCP.
@@ -25,6 +25,7 @@ from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
+from lifecycle.middleware.discovery.dead_peers import listening
 from lifecycle.middleware.discovery.probe import (
     RANGE_VARIABLE,
     ProbeTarget,
@@ -33,6 +34,7 @@ from lifecycle.middleware.discovery.probe import (
     chosen_otherwise,
     discovery_ports,
     group_targets,
+    probe_targets,
     send,
     well_known_targets,
 )
@@ -43,15 +45,13 @@ from lifecycle.middleware.fastdds.url_profile import (
     families,
     leaves_discovery_open,
 )
-from lifecycle.network import ConnectionUrl, Medium, participant_ports
+from lifecycle.network import RMW_DISCOVERY, ConnectionUrl, Medium, participant_ports
 
 _PARTICIPANTS = 32
 """Of a host whose address is known; further participants are reached by multicast."""
 
 _ANSWERED_AT = 32
 """Participants of this host that an announcement names; each is 56 bytes of one datagram."""
-
-_SOCKET = {Medium.UDPV4: socket.AF_INET, Medium.UDPV6: socket.AF_INET6}
 
 
 def call_out(
@@ -81,9 +81,9 @@ def call_out(
         return
     if environment.get(RANGE_VARIABLE, "").upper() in ("LOCALHOST", "OFF"):
         return  # nothing is looked for on another host
-    kinds = tuple(family.kind for family in found) if urls else (Medium.UDPV4,)
+    kinds = tuple(family.kind for family in found) if urls else (RMW_DISCOVERY,)
     for kind in kinds:
-        ipv6 = kind is Medium.UDPV6
+        ipv6 = kind.ip_version == 6
         _call_around(domain_id, kind, [each for each in peers if (":" in each) == ipv6])
 
 
@@ -97,7 +97,7 @@ def _call_around(domain_id: int, kind: Medium, peers: Sequence[str]) -> None:
     targets = [
         target for peer in peers for target in well_known_targets(domain_id, peer, _PARTICIPANTS)
     ]
-    with socket.socket(_SOCKET[kind], socket.SOCK_DGRAM) as sender:
+    with socket.socket(kind.socket_family, socket.SOCK_DGRAM) as sender:
         for call in calls:
             send(sender, call, group_targets(domain_id, kind, interfaces))
         send(sender, calls[0], targets)
@@ -121,13 +121,48 @@ def _call_listed(domain_id: int, family: UrlTransport) -> None:
     if not answered_at or not targets:
         return
     output = next((url.output_port for url in family.urls if url.output_port), None)
-    kind = _SOCKET[family.kind]
+    kind = family.kind.socket_family
     # Where the plan says by which port this participant sends, nothing may come from another.
     own = own_udp_socket(kind, output) if output else socket.socket(kind, socket.SOCK_DGRAM)
     if own is None:
         return
     with own as sender:
         send(sender, announcement(answered_at[:_ANSWERED_AT]), targets)
+
+
+def introduce(
+    newcomers: Iterable[int],
+    domain_id: int,
+    urls: Sequence[ConnectionUrl],
+    environment: Mapping[str, str],
+    pids: Iterable[int],
+) -> None:
+    """Make participants that have been there for long announce themselves to new ones at once.
+
+    They answered the first announcement of a new one before it listened, and else announce
+    themselves once in 3 s (see probe.py). Nothing is sent where a plan fixes the port that this
+    process sends by, nor over shared memory and TCP.
+
+    Args:
+        newcomers: pids of the new processes of this host, whose participants listen by now.
+        domain_id: 0–232.
+        urls: of this process's observer.
+        environment: see `probe.probe_targets`.
+        pids: of this host's processes whose participants are to answer, besides all that the
+            observer could find.
+    """
+    if any(url.output_port for url in urls):
+        return
+    new = frozenset(newcomers)
+    asked = dict(probe_targets(domain_id, urls, environment))
+    for kind, found in listening((*new, *pids)).items():
+        family = kind.socket_family
+        answered_at = [(each.address, each.port) for each, pid in found.items() if pid in new]
+        targets = dict.fromkeys((*asked.get(kind, ()), *found))
+        if not answered_at or not targets:
+            continue
+        with contextlib.suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as sender:
+            send(sender, announcement(answered_at[:_ANSWERED_AT]), targets)
 
 
 def republish_names(nodes: Iterable[Node]) -> None:

@@ -17,10 +17,10 @@ from collections.abc import Collection, Iterable, Iterator
 from lifecycle.codec import to_plain
 from lifecycle.errors import BringUpError, ExitCode, UsageError
 from lifecycle.manifest import DataLayerSource
-from lifecycle.network import Medium
+from lifecycle.network import parse
 from lifecycle.plan import Plan, PlanDifference, PlannedNode, changes, with_files_of_now
+from lifecycle.supervisor.control.protocol import ProcessState
 from lifecycle.supervisor.nodes.system import NodeRun, System
-from lifecycle.supervisor.run.events import ProcessState
 from lifecycle.supervisor.run.options import UpOptions, local_processes
 
 ACTIVE = "active"
@@ -45,10 +45,12 @@ class Order:
         node: for RESTART, manifest key or fully qualified name; empty for the whole system.
         plan: the plan of the manifest that the order names, as it is now; None if it names none.
         reload: for RESTART, `plan` is to run from now on.
+        keys: for RESTART by policy, of the nodes, which are down already; empty for one by hand.
     """
 
     kind: OrderKind
     node: str = ""
+    keys: tuple[str, ...] = ()
     plan: Plan | None = None
     reload: bool = False
 
@@ -111,11 +113,11 @@ def node_of(order: Order, system: System) -> NodeRun:
     """
     for node in system.nodes.values():
         if order.node in (node.planned.key, node.name):
-            if node.process is None:
+            if node.process is None and node.unload is None:
                 raise UsageError(f"cannot restart {node.name!r}: somebody else runs it")
             return node
     known = ", ".join(
-        sorted(node.name for node in system.nodes.values() if node.process is not None)
+        sorted(node.name for node in system.nodes.values() if node.process or node.unload)
     )
     raise UsageError(
         f"cannot restart {order.node!r}: this supervisor runs no such node; it runs: {known}"
@@ -141,6 +143,7 @@ class Mailbox:
     def __init__(self) -> None:
         self._queue: asyncio.Queue[Pending] = asyncio.Queue()
         self._open: set[Pending] = set()
+        self._placed = asyncio.Event()
 
     async def place(self, order: Order) -> Done:
         """Give an order and wait for what comes of it."""
@@ -148,6 +151,8 @@ class Mailbox:
         self._open.add(pending)
         try:
             await self._queue.put(pending)
+            self._placed.set()
+            self._placed = asyncio.Event()
             return await asyncio.shield(pending.done)
         finally:
             self._open.discard(pending)
@@ -155,6 +160,11 @@ class Mailbox:
     async def next(self) -> Pending:
         """Wait for the next order."""
         return await self._queue.get()
+
+    async def arrives(self) -> None:
+        """Return once an order waits; it stays where it is."""
+        while self._queue.empty():
+            await self._placed.wait()
 
     def close(self, reason: str) -> None:
         """Refuse what is still open."""
@@ -247,8 +257,7 @@ class Revisions:
             raise refuse("its data layer is negotiated by the manifest that runs")
         if self._options.program:
             raise refuse("networks are programmed by the manifest that runs")
-        tcp = f"{Medium.TCPV4}:"
-        if any(url.startswith(tcp) for each in (running, plan) for url in _urls(each)):
+        if any(parse(url).transport.is_tcp for each in (running, plan) for url in _urls(each)):
             raise refuse("a TCP port that was used is not connected to again by who used it")
         if order.node:
             self._check_node(order, plan, found)

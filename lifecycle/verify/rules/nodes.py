@@ -12,9 +12,10 @@ from collections.abc import Iterator
 
 from lifecycle.manifest import EndpointPolicy, RunKind
 from lifecycle.verify.observation import ObservedEndpoint
+from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.rules.endpoints import UNDECLARED
-from lifecycle.verify.verdict import Finding, Outcome, Stage
+from lifecycle.verify.verdict import Finding, Stage
 from lifecycle.verify.view import View
 
 MISSING_NODE = Rule(
@@ -69,8 +70,10 @@ def _missing(view: View) -> Iterator[Finding]:
                 Outcome.UNVERIFIABLE,
                 node,
                 expected="node in the graph, or ended by itself",
-                observed=view.over[name],
-                message=f"cannot verify node {name}: it has ended by itself, as it may",
+                observed=view.over[name] or "no such node",
+                message=f"cannot verify node {name}: it has ended by itself, as it may"
+                if view.over[name]
+                else f"cannot verify node {name}: it may have ended by itself, or not have started",
             )
             continue
         hint = ""

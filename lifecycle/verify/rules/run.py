@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
-from lifecycle.verify.verdict import Finding, Outcome
+from lifecycle.verify.verdict import Finding
 from lifecycle.verify.view import View
 
 PROCESS_DIED = Rule(
@@ -17,6 +18,13 @@ PROCESS_DIED = Rule(
     meaning="a process of the system ended although nobody asked it to",
     outcomes=(Outcome.VIOLATED,),
     fix="look at the last lines of its log",
+    names_log=True,
+)
+GAVE_UP = Rule(
+    id="run.gave-up",
+    meaning="a process failed too often to be started again",
+    outcomes=(Outcome.VIOLATED,),
+    fix="see what it failed of each time, in the message and in its log",
     names_log=True,
 )
 START_FAILED = Rule(
@@ -74,6 +82,7 @@ PLAN_UNKNOWN = Rule(
 )
 RULES = (
     PROCESS_DIED,
+    GAVE_UP,
     START_FAILED,
     TRANSITION_FAILED,
     DEADLINE,

@@ -17,13 +17,13 @@ from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan import build_plan
 from lifecycle.verify import Outcome, Stage, verify
 from lifecycle.verify.observation import (
-    ConnectionReport,
     NodeParameters,
     Observation,
     ObservedEndpoint,
     ObservedNode,
     ParameterReport,
 )
+from lifecycle.verify.outcome import ConnectionReport
 from tests.builders import configuration, reported
 
 PUBLISHER, SUBSCRIPTION = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
@@ -220,7 +220,10 @@ def test_nodl_documents_stand_in_for_interfaces(tmp_path: Path) -> None:
 
     assert interfaces(by_reference) == interfaces(inline)
     verdict = verify(build_plan(by_reference, environment={}), ASKED, stage=Stage.ACTIVE)
-    assert verdict.findings == ()
+    # A document cannot say that parameters are not known: without any, there are to be none.
+    assert [(each.rule, each.subject) for each in verdict.findings] == [
+        ("param.unverifiable", "/right/scanner")
+    ]
 
 
 @pytest.mark.parametrize(

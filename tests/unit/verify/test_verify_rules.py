@@ -551,6 +551,10 @@ def test_a_node_that_has_ended_as_it_may_is_unverifiable_and_not_missing():
     (finding,) = (each for each in verdict.findings if each.node == "/viewer")
     assert (finding.rule, finding.outcome) == ("graph.ended-node", Outcome.UNVERIFIABLE)
     assert finding.message == "cannot verify node /viewer: it has ended by itself, as it may"
+    from_outside = verify(PLAN, seen, stage=Stage.CONNECTED, over={"/viewer": ""})
+    assert [each.message for each in from_outside.findings if each.node == "/viewer"] == [
+        "cannot verify node /viewer: it may have ended by itself, or not have started"
+    ]
 
 
 # --- policies
@@ -1078,6 +1082,12 @@ def test_a_missing_endpoint_is_told_whole():
         endpoint=PUB,
         hint="compare the declared name, remaps and namespace with what the node creates",
     )
+
+
+def test_a_client_without_a_server_names_both_as_who_may_be_undiscovered():
+    edit = change_report(CLIENT, "/robot/camera/calibrate", server_matched=False)
+    (finding,) = verify(PLAN, edit(perfect(PLAN)), stage=Stage.CONNECTED).findings
+    assert finding.ends == ("/viewer", "/robot/camera")
 
 
 def test_an_incompatible_pair_names_the_policy_and_both_ends():
