@@ -19,8 +19,8 @@ from lifecycle.errors import BringUpError, ExitCode, UsageError
 from lifecycle.manifest import DataLayerSource
 from lifecycle.network import Medium
 from lifecycle.plan import Plan, PlanDifference, PlannedNode, changes, with_files_of_now
+from lifecycle.supervisor.control.protocol import ProcessState
 from lifecycle.supervisor.nodes.system import NodeRun, System
-from lifecycle.supervisor.run.events import ProcessState
 from lifecycle.supervisor.run.options import UpOptions, local_processes
 
 ACTIVE = "active"

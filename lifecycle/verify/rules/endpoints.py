@@ -12,9 +12,10 @@ from collections.abc import Iterator, Mapping
 
 from lifecycle.manifest import EndpointKind, EndpointPolicy, Position
 from lifecycle.verify.observation import ObservedEndpoint
+from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.tool_filter import OFFERS
-from lifecycle.verify.verdict import Finding, Outcome
+from lifecycle.verify.verdict import Finding
 from lifecycle.verify.view import Actual, SeenEndpoint, View
 
 MISSING_ENDPOINT = Rule(

@@ -27,6 +27,7 @@ from lifecycle.network import (
     describe,
     meets,
 )
+from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import Heals, Rule
 from lifecycle.verify.rules.state import MISSING_REPORT
 from lifecycle.verify.transport import (
@@ -35,7 +36,7 @@ from lifecycle.verify.transport import (
     effective_transport,
 )
 from lifecycle.verify.uniqueness import Uniqueness
-from lifecycle.verify.verdict import Finding, Outcome
+from lifecycle.verify.verdict import Finding
 from lifecycle.verify.view import Actual, FlowView, View, connection_of
 
 NOT_UNIQUE = Rule(

@@ -21,8 +21,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from lifecycle.manifest import Certainty, EndpointKind, QosProfile, incompatibilities
 from lifecycle.verify.observation import EndpointReport, ObservedEndpoint
+from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
-from lifecycle.verify.verdict import Finding, Outcome
+from lifecycle.verify.verdict import Finding
 from lifecycle.verify.view import UNKNOWN_QOS, Actual, FlowView, SeenEndpoint, View, actual_qos
 
 UNMATCHED_LINK = Rule(

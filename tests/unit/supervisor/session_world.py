@@ -20,7 +20,7 @@ from lifecycle.node.host.control import Operation
 from lifecycle.plan.model import Plan, PlannedNode
 from lifecycle.run_directory import RunDirectory, short_path
 from lifecycle.supervisor.connections.networks import Networks
-from lifecycle.supervisor.control.server import Answer, ControlRequest, Question
+from lifecycle.supervisor.control.protocol import Answer, ControlRequest, Question
 from lifecycle.supervisor.health.peer_supervisors import Listener
 from lifecycle.supervisor.nodes.driver import NodeDriver, NodeInterfaceClient, ServiceDriver
 from lifecycle.supervisor.nodes.system import System

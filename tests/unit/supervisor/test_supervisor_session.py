@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from lifecycle.manifest.model import Condition, Timeouts
-from lifecycle.supervisor.control.server import ControlRequest
+from lifecycle.supervisor.control.protocol import ControlRequest
 from lifecycle.supervisor.run.options import Until
 from tests.builders import plan_of, planned_node
 from tests.unit.supervisor.fakes import run

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.supervisor.control.server import ControlRequest
+from lifecycle.supervisor.control.protocol import ControlRequest
 from tests.unit.supervisor.fakes import run
 from tests.unit.supervisor.session_world import (
     ACTIVATED,

@@ -7,7 +7,8 @@ import dataclasses
 import pytest
 
 from lifecycle.plan.model import PlannedParticipant
-from lifecycle.verify.observation import ConnectionReport, NodeConfiguration
+from lifecycle.verify.observation import NodeConfiguration
+from lifecycle.verify.outcome import ConnectionReport
 from lifecycle.verify.tool_filter import Owners, is_hidden_node
 from tests.builders import configuration, node, planned, publisher
 

@@ -16,7 +16,7 @@ from lifecycle.network.nfe import (
 from lifecycle.plan import Plan
 from lifecycle.plan.model import ParticipantConnections, PlannedParticipant
 from lifecycle.verify import Finding, Identity, Outcome, Stage, verify
-from lifecycle.verify.observation import ConnectionReport
+from lifecycle.verify.outcome import ConnectionReport
 from lifecycle.verify.transport import carrier
 from tests.builders import at, link, need, node, planned, publisher, subscription
 from tests.unit.verify.edits import (
