@@ -226,7 +226,7 @@ def _spell_all(nfes: tuple[NetworkFlowEndpoint, ...]) -> str:
 
 def _spell(nfe: NetworkFlowEndpoint) -> str:
     if nfe.transport_protocol is TransportProtocol.UNKNOWN:
-        return Medium.SHM
+        return nfe.medium
     address = nfe.internet_address
     host = f"[{address}]" if ":" in address else address
     return f"{nfe.transport_protocol.value} {host}:{nfe.transport_port}"
@@ -304,7 +304,7 @@ def _not_by_network(flow: FlowView, demanding: Actual, used: str) -> Finding:
 def _otherwise(flow: FlowView, used: str) -> Finding:
     unknown = used == UNKNOWN
     planned = _WORDS.get(flow.planned.medium, flow.planned.medium)
-    word = _WORDS.get(used, used)
+    word = _WORDS[used]
     return WRONG_MEDIUM.finding(
         Outcome.UNVERIFIABLE if unknown else Outcome.VIOLATED,
         subject=flow.subject,

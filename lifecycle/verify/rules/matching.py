@@ -72,9 +72,9 @@ class MatchEnd:
     kind: EndpointKind
     type: str
     qos: QosProfile
-    gid: str
-    report: EndpointReport | None
-    expected: bool
+    gid: str = ""
+    report: EndpointReport | None = None
+    expected: bool = True
 
 
 def obstacle(publisher: MatchEnd, subscription: MatchEnd) -> str:
@@ -237,17 +237,15 @@ def _end(actual: Actual) -> MatchEnd:
         qos=actual_qos(shown.qos if shown else None, report.qos if report else None) or UNKNOWN_QOS,
         gid=(shown.gid if shown else "") or (report.gid if report else ""),
         report=report,
-        expected=True,
     )
 
 
 def _end_of_graph(seen: SeenEndpoint) -> MatchEnd:
+    """Return an end as one of all that others can match: it is not asked whom it matches."""
     return MatchEnd(
         kind=seen.kind,
         type=seen.type,
         qos=seen.qos or UNKNOWN_QOS,
-        gid="",
-        report=seen.report,
         expected=seen.planned is not None,
     )
 

@@ -105,6 +105,7 @@ def test_a_node_is_hidden_by_the_underscore_of_its_own_name(name: str, hidden: b
     [
         (("a",), "/_a_net", "/a"),
         (("camera",), "/_camera_net_low_1", "/camera"),
+        (("a",), "/_a_net_low_1", "/a"),
         (("a", "a_b"), "/_a_b_net_low_1", "/a_b"),
         (("b",), "/_a_net", ""),
     ],
