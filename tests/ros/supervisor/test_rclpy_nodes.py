@@ -305,7 +305,12 @@ def test_nodes_of_rclpy_run_in_a_test_as_ours_do(lifecycle_node: Any, tmp_path: 
         tmp_path,
         0,
         {
-            "managed": node("Managed", name="other", interface={"publishers": says}),
+            "managed": node(
+                "Managed",
+                name="other",
+                remap={"words": "other_words"},
+                interface={"publishers": says},
+            ),
             "talker": node("pair", interface=TALKS, **shared),
             "ears": node("pair", interface=HEARS, **shared),
             "loud": node(
@@ -317,15 +322,15 @@ def test_nodes_of_rclpy_run_in_a_test_as_ours_do(lifecycle_node: Any, tmp_path: 
             ),
         },
     )
-    managed = lifecycle_node(manifest, "managed", to="inactive")
-    assert (managed.state, managed.node.get_name()) == ("inactive", "other")
-    managed.change("activate")
-    assert managed.received("words").data == "managed"
-
     ears = lifecycle_node(manifest, "ears")
     ears.publish("words", rclpy_nodes.String(data="from the test"))
     assert ears.wait_for_log("heard from the test")
     ears.wait_for_log("heard pair")  # by the talker, which the same function makes
+
+    managed = lifecycle_node(manifest, "managed", to="inactive")
+    assert (managed.state, managed.node.get_name()) == ("inactive", "other")
+    managed.change("activate")
+    assert managed.received("words").data == "managed"
 
     loud = lifecycle_node(manifest, "loud")
     assert "HELLO" in {loud.received("words").data for _ in range(2)}
