@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import importlib
 from collections.abc import Awaitable, Callable, Collection, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lifecycle_msgs.msg import TransitionEvent
 from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
@@ -22,7 +22,6 @@ from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.export import CapturedParameter
 from lifecycle.middleware.rcl.graph import GraphObserver
 from lifecycle.middleware.services.parameters import read_parameters, report_parameters
 from lifecycle.middleware.services.service_calls import ServiceCalls, ServiceUnansweredError
@@ -33,6 +32,9 @@ from lifecycle.verify import (
     ParameterReport,
     decode_configuration,
 )
+
+if TYPE_CHECKING:
+    from lifecycle.export import CapturedParameter
 
 TIMEOUT_S = 5.0
 """For services that answer at once; a transition takes as long as the node's callback does."""

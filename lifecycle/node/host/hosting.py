@@ -267,7 +267,9 @@ class Host:
                     maker = self._import(planned)
                     with contextlib.ExitStack() as stack:
                         if first:
-                            stack.enter_context(once_participant_is_made(self._gather))
+                            stack.enter_context(
+                                once_participant_is_made(self._context, self._gather)
+                            )
                         self._construct(planned, maker)
                 except Exception as error:  # noqa: BLE001 - reported to the supervisor
                     failure = error
