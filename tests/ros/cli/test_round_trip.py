@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import psutil
+import pytest
 
 from lifecycle.errors import ExitCode
 from lifecycle.manifest import load
@@ -95,11 +96,13 @@ def test_programs_started_by_hand_come_up_again_from_what_was_captured(
     }
 
 
+@pytest.mark.thorough
 def test_a_program_that_ends_while_it_is_captured_may_end(tmp_path: Path, domain_id: int) -> None:
     manifest = tmp_path / "found.lifecycle.yaml"
     deadline = time.monotonic() + BOUND_S
-    while not manifest.exists():
-        assert time.monotonic() < deadline
+    node = None
+    while node is None or not node.may_end:  # where it takes long to end, it has not yet
+        assert time.monotonic() < deadline, node
         brief = subprocess.Popen(
             [sys.executable, str(PROGRAM), "brief"],
             env={**os.environ, "ROS_DOMAIN_ID": str(domain_id)},
@@ -109,8 +112,9 @@ def test_a_program_that_ends_while_it_is_captured_may_end(tmp_path: Path, domain
         finally:
             brief.terminate()
             brief.wait(BOUND_S)
-    (node,) = load(str(manifest), {}).manifest.nodes
-    assert (node.may_end, node.run.command[1:]) == (True, (str(PROGRAM), "brief"))
+        if manifest.exists():
+            (node,) = load(str(manifest), {}).manifest.nodes
+    assert node.run.command[1:] == (str(PROGRAM), "brief")
     judged = verb(
         *("verify", str(manifest), "--timeout", "0.2", "--format", "json"), runtime=tmp_path
     )

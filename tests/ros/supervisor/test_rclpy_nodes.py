@@ -217,6 +217,7 @@ def test_callbacks_run_in_several_threads_where_the_executor_has_them(
 _SERVICES = ("inner", "outer")
 
 
+@pytest.mark.thorough
 def test_a_hung_callback_is_noticed_whatever_the_executor_unless_others_go_on_beside_it(
     fresh_domain: int, tmp_path: Path, wait_until: Any
 ) -> None:
