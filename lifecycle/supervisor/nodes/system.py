@@ -253,6 +253,7 @@ class NodeRun:
         connections: names of what the authority connected it to, oldest first.
         reports_changes: its host reports unasked when its configuration changes.
         unload: has its container unload a component; None for what is not loaded into one.
+        is_up: it was started and brought as far as its gate; cleared when it goes down.
     """
 
     def __init__(self, planned: PlannedNode, emit: Emitter) -> None:
@@ -269,6 +270,7 @@ class NodeRun:
         self.connections: tuple[str, ...] = ()
         self.reports_changes = False
         self.unload: Callable[[], Awaitable[None]] | None = None
+        self.is_up = False
         self.changed = asyncio.Event()
         self._emit = emit
 
@@ -282,6 +284,7 @@ class NodeRun:
         self.connections = ()
         self.reports_changes = False
         self.unload = None
+        self.is_up = False
         self.doing = ""
         self.connected = False
         self.state = ""
@@ -496,6 +499,7 @@ class System:
             old = node.process
             if old is not None and old.name not in processes:
                 processes[old.name] = self._process(old.planned)
+                processes[old.name].is_restarted = True
             node.renew(None if old is None else processes[old.name])
         self.processes.update(processes)
 
@@ -507,7 +511,7 @@ class System:
     def living(self) -> tuple[ManagedProcess, ...]:
         """Every process that was started and has not ended, the discovery server included."""
         every = (*self.processes.values(), *(() if self.server is None else (self.server,)))
-        return tuple(each for each in every if each.pid and each.state is not ProcessState.EXITED)
+        return tuple(each for each in every if each.pid and not each.is_gone)
 
     def output_positions(self) -> dict[str, int]:
         """Return how many bytes the log file of each process has."""
@@ -525,7 +529,7 @@ class System:
         return frozenset(
             node.name
             for node in self.nodes.values()
-            if node.process is not None and node.process.state is ProcessState.EXITED
+            if node.process is not None and node.process.is_gone
         )
 
     def on_host_event(self, event: HostEvent) -> None:

@@ -208,4 +208,4 @@ def _applies(operation: Operation, node: NodeRun) -> bool:
 
 
 def _gone(node: NodeRun) -> bool:
-    return node.process is not None and node.process.state is ProcessState.EXITED
+    return node.process is not None and node.process.is_gone
