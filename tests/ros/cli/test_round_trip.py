@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import psutil
+import pytest
 
 from lifecycle.errors import ExitCode
 from lifecycle.manifest import load
@@ -127,11 +128,13 @@ def test_programs_started_by_hand_are_adopted_and_come_up_again_from_what_was_ca
     }
 
 
+@pytest.mark.thorough
 def test_a_program_that_ends_while_it_is_captured_may_end(tmp_path: Path, domain_id: int) -> None:
     manifest = tmp_path / "found.lifecycle.yaml"
     deadline = time.monotonic() + BOUND_S
-    while not manifest.exists():
-        assert time.monotonic() < deadline
+    node = None
+    while node is None or not node.may_end:  # where it takes long to end, it has not yet
+        assert time.monotonic() < deadline, node
         brief = subprocess.Popen(
             [sys.executable, str(PROGRAM), "brief"],
             env={**os.environ, "ROS_DOMAIN_ID": str(domain_id)},
@@ -141,8 +144,9 @@ def test_a_program_that_ends_while_it_is_captured_may_end(tmp_path: Path, domain
         finally:
             brief.terminate()
             brief.wait(BOUND_S)
-    (node,) = load(str(manifest), {}).manifest.nodes
-    assert (node.may_end, node.run.command[1:]) == (True, (str(PROGRAM), "brief"))
+        if manifest.exists():
+            (node,) = load(str(manifest), {}).manifest.nodes
+    assert node.run.command[1:] == (str(PROGRAM), "brief")
     judged = verb(
         *("verify", str(manifest), "--timeout", "0.2", "--format", "json"), runtime=tmp_path
     )
