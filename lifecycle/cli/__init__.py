@@ -52,6 +52,41 @@ _PARTICIPANTS = frozenset({"up", "verify", "flows", "graph", "capture", "run"})
 """Verbs that make participants, here or in processes that they start."""
 
 
+_LINUX = _PARTICIPANTS | {"pause", "resume", "restart", "down", "status", "logs"}
+"""Verbs that run nodes, or are about what runs."""
+
+_NEEDS_ROS = (
+    "pip install 'ros-lifecycle-manifests[ros]', or source /opt/ros/jazzy/setup.bash for its Python"
+)
+
+
+def _check_platform(verb: str) -> None:
+    """Refuse what only Linux has; raises UsageError."""
+    if verb in _LINUX and sys.platform != "linux":
+        raise UsageError(
+            f"cannot run 'lifecycle {verb}' on {sys.platform}: nodes are run and watched on Linux",
+            hint="what is about manifests works here: check, plan, export, import, init, schema",
+        )
+
+
+def _check_ros(verb: str) -> None:
+    """Refuse a verb that needs ROS 2, before anything is imported for it.
+
+    Raises:
+        UsageError: there is no ROS 2 here, or not the RMW that the environment names.
+    """
+    from importlib.util import find_spec
+
+    if find_spec("rclpy") is None:
+        raise UsageError(
+            f"cannot run 'lifecycle {verb}': it needs ROS 2, and this Python has no rclpy",
+            hint=_NEEDS_ROS,
+        )
+    from lifecycle.middleware import check_rmw
+
+    check_rmw(os.environ)
+
+
 class _Verbs(click.Group):
     """Loads a verb's module on first use."""
 
@@ -65,10 +100,10 @@ class _Verbs(click.Group):
             close = get_close_matches(args[0], VERBS, n=1)
             hint = f"did you mean {close[0]!r}?" if close else "lifecycle --help lists the verbs"
             raise UsageError(f"cannot find the verb {args[0]!r}", hint=hint)
+        if args:
+            _check_platform(args[0])
         if args and args[0] in _PARTICIPANTS and not {"-h", "--help"} & {*args}:
-            from lifecycle.middleware import check_rmw
-
-            check_rmw(os.environ)
+            _check_ros(args[0])
         return super().resolve_command(ctx, args)
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 - click's signature
@@ -143,7 +178,13 @@ def main(arguments: list[str] | None = None) -> int:
     except LifecycleError as error:
         click.echo(lines(str(error)), err=True)
         return error.exit_code
-    except Exception:  # noqa: BLE001 - the boundary: report our bug, whatever it is
+    except Exception as error:  # noqa: BLE001 - the boundary: report our bug, whatever it is
+        if isinstance(error, ImportError) and "rclpy" in f"{error.name} {error}":
+            # Of another Python, most often: ROS 2 has its C extensions for one version only.
+            version = sys.version.split()[0]
+            message = f"cannot import rclpy with Python {version}: {error}; {_NEEDS_ROS}"
+            click.echo(lines(" ".join(message.split())), err=True)
+            return ExitCode.USAGE
         import traceback
 
         traceback.print_exc()

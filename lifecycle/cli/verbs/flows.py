@@ -236,8 +236,8 @@ def _show(
     waits = asked is not click.core.ParameterSource.DEFAULT or supervisor_of(os.environ, plan, "")
     empty_graph_s = None if waits else _EMPTY_GRAPH_S
     seen = judge_running(plan, timeout_s=timeout, strict=False, empty_graph_s=empty_graph_s)
-    if seen.where:
-        click.echo(lines(seen.where), err=True)
+    for each in seen.notices:
+        click.echo(lines(each), err=True)
     if exporter is not None:
         exporter.write(seen.plan, seen.verdict.flows)
     else:
@@ -396,8 +396,8 @@ def _judged(manifest: str, assignments: tuple[str, ...], timeout_s: float) -> tu
     from lifecycle.supervisor import judge_running
 
     seen = judge_running(_plan(manifest, assignments), timeout_s=timeout_s, strict=False)
-    if seen.where:
-        click.echo(lines(seen.where), err=True)
+    for each in seen.notices:
+        click.echo(lines(each), err=True)
     return seen.plan, seen.verdict
 
 

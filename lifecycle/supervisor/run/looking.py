@@ -78,12 +78,14 @@ class JudgedSystem:
         observation: what was there.
         verdict: of an active system.
         rmw: name of the RMW implementation it was looked at with.
+        limits: which installed libraries are not known, and what that costs; empty if all are.
     """
 
     plan: Plan
     observation: Observation
     verdict: Verdict
     rmw: str = ""
+    limits: str = ""
 
     @property
     def where(self) -> str:
@@ -92,6 +94,11 @@ class JudgedSystem:
         names = (each.full_name for each in self.observation.nodes)
         foreign = any(not tolerating_pattern(each, tools) for each in names)
         return "" if foreign else where(self.plan, self.rmw)
+
+    @property
+    def notices(self) -> tuple[str, ...]:
+        """What has to be known beside the verdict."""
+        return tuple(each for each in (self.limits, self.where) if each)
 
 
 def judge_running(
@@ -209,6 +216,7 @@ async def _see(plan: Plan, observer_participant: ObserverParticipant) -> JudgedS
         observation=observation,
         verdict=with_findings(verdict, expected.findings),
         rmw=observer_participant.rmw,
+        limits=observer_participant.unknown_versions,
     )
 
 
