@@ -14,6 +14,7 @@ import signal
 import sys
 
 import click
+from click.shell_completion import CompletionItem
 
 from lifecycle.cli.standard_streams import own_streams
 from lifecycle.errors import ExitCode, LifecycleError, UsageError
@@ -39,6 +40,7 @@ VERBS: dict[str, str] = {
     "ports": "DDS port arithmetic and platform limits",
     "init": "make a package of one's own: nodes, manifest, tests, CI workflow",
     "schema": "print the manifest's JSON Schema, or install it for editors",
+    "completion": "print what switches on completion in bash, zsh or fish",
 }
 
 _ELSEWHERE = {
@@ -87,6 +89,10 @@ def _check_ros(verb: str) -> None:
     check_rmw(os.environ)
 
 
+COMPLETE = "_LIFECYCLE_COMPLETE"
+"""Variable by which a shell asks what can come next, see verbs/completion.py."""
+
+
 class _Verbs(click.Group):
     """Loads a verb's module on first use."""
 
@@ -94,6 +100,8 @@ class _Verbs(click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Look first whether there is such a verb, and one that needs the RMW can have it."""
+        if ctx.resilient_parsing:  # for shell completion
+            return super().resolve_command(ctx, args)
         if args and args[0] not in VERBS and not args[0].startswith("-"):
             from difflib import get_close_matches
 
@@ -109,6 +117,16 @@ class _Verbs(click.Group):
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 - click's signature
         """Verbs in the order of the pipeline."""
         return list(VERBS)
+
+    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem[str]]:
+        """Complete verbs without importing them."""
+        if incomplete.startswith("-"):
+            return click.Command.shell_complete(self, ctx, incomplete)
+        return [
+            CompletionItem(verb, help=about)
+            for verb, about in VERBS.items()
+            if verb.startswith(incomplete)
+        ]
 
     def get_command(
         self,
@@ -142,6 +160,10 @@ def cli() -> None:
 
 def program() -> int:
     """Run `lifecycle` as a process of its own."""
+    if COMPLETE in os.environ:
+        from lifecycle.cli.verbs.completion import answer
+
+        return answer(cli, os.environ)
     verb = sys.argv[1:2]
     if verb == ["run"]:  # whose streams are the user's node's
         return main()

@@ -12,9 +12,13 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from lifecycle.cli.common import (
+    assignments_argument,
+    completing,
     format_option,
     load_manifest,
+    machine_option,
     say_differences,
+    target_argument,
     target_arguments,
     target_plan,
     target_run,
@@ -76,9 +80,14 @@ def _row(node: NodeStatus) -> tuple[str, ...]:
 
 
 @click.command("status")
-@click.argument("target", required=False, metavar="[TARGET]")
-@click.argument("assignments", nargs=-1, metavar="[NAME:=VALUE]...")
-@click.option("--machine", default="", metavar="NAME", help="As it was given to `lifecycle up`.")
+@click.argument(
+    "target",
+    required=False,
+    metavar="[TARGET]",
+    shell_complete=completing("manifests systems"),
+)
+@assignments_argument
+@machine_option("As it was given to `lifecycle up`.")
 @format_option("text", "json")
 def status_command(
     target: str | None, assignments: tuple[str, ...], machine: str, format_: str
@@ -222,9 +231,14 @@ def resume_command(target: str, assignments: tuple[str, ...], machine: str, time
 
 
 @click.command("restart")
-@click.argument("target", metavar="TARGET")
-@click.argument("words", nargs=-1, metavar="[NODE] [NAME:=VALUE]...")
-@click.option("--machine", default="", metavar="NAME", help="As it was given to `lifecycle up`.")
+@target_argument
+@click.argument(
+    "words",
+    nargs=-1,
+    metavar="[NODE] [NAME:=VALUE]...",
+    shell_complete=completing("nodes arguments"),
+)
+@machine_option("As it was given to `lifecycle up`.")
 @click.option(
     "--reload", is_flag=True, help="Take the manifest as it is now, where it has changed."
 )

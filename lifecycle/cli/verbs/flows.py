@@ -16,10 +16,12 @@ import click
 
 from lifecycle.cli.common import (
     NetworkCommand,
+    assignments_argument,
     format_option,
     is_manifest,
     load_manifest,
     manifest_arguments,
+    target_argument,
     target_plan,
     targets_option,
     timeout_option,
@@ -185,8 +187,8 @@ _EMPTY_GRAPH_S = 1.5
 
 
 @click.command("flows", cls=NetworkCommand)
-@click.argument("target", metavar="TARGET")
-@click.argument("assignments", nargs=-1, metavar="[NAME:=VALUE]...")
+@target_argument
+@assignments_argument
 @format_option("text", "json", "csv")
 @click.option("--watch", is_flag=True, help="Show them again whenever they change; Ctrl-C ends.")
 @timeout_option(5.0, "How long flows that are not complete may still become so.")

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import click
 
+from lifecycle.cli.common import completing
 from lifecycle.cli.standard_streams import echo_while_read
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.printable import log_line
@@ -22,9 +23,15 @@ _HEAD = re.compile(r"==> (.*) <==\n")
 
 
 @click.command("logs")
-@click.argument("node", required=False, metavar="[NODE]")
+@click.argument("node", required=False, metavar="[NODE]", shell_complete=completing("logged"))
 @click.option("-f", "--follow", is_flag=True, help="Go on with what is written, until Ctrl-C.")
-@click.option("--system", default="", metavar="NAME", help="Of this system; default: of any.")
+@click.option(
+    "--system",
+    default="",
+    metavar="NAME",
+    shell_complete=completing("logged_systems"),
+    help="Of this system; default: of any.",
+)
 @click.option(
     "-n",
     "--lines",

@@ -11,7 +11,7 @@ from typing import NoReturn
 
 import click
 
-from lifecycle.cli.common import load_manifest
+from lifecycle.cli.common import completing, load_manifest
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest import DiscoveryRange, RunKind
 from lifecycle.middleware import peers_environment
@@ -21,12 +21,13 @@ _ROS_ARGUMENTS = "--ros-args"
 
 
 @click.command("run", context_settings={"ignore_unknown_options": True})
-@click.argument("manifest", metavar="MANIFEST")
-@click.argument("node", metavar="NODE")
+@click.argument("manifest", metavar="MANIFEST", shell_complete=completing("manifests"))
+@click.argument("node", metavar="NODE", shell_complete=completing("nodes"))
 @click.argument(
     "words",
     nargs=-1,
     type=click.UNPROCESSED,
+    shell_complete=completing("arguments"),
     metavar=f"[NAME:=VALUE]... [{_ROS_ARGUMENTS} ...]",
 )
 @click.option(
