@@ -6,8 +6,9 @@ Owns: `MANIFEST [name:=value …]`, `TARGET [name:=value …]` of the verbs abou
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -183,6 +184,20 @@ def target_run(
     if plan is not None:
         say_differences(path, plan)
     return path
+
+
+@contextlib.contextmanager
+def asking(path: Path) -> Iterator[None]:
+    """Say which supervisor, that of a run directory, does not answer or is gone."""
+    try:
+        yield
+    except TimeoutError as error:
+        raise UsageError(f"cannot ask {path.name!r}: its supervisor does not answer") from error
+    except (FileNotFoundError, ConnectionRefusedError) as error:
+        raise UsageError(
+            f"cannot ask {path.name!r}: its supervisor was killed",
+            hint=f"clean up after it: lifecycle down {path.name}",
+        ) from error
 
 
 def say_differences(path: Path, plan: Plan) -> None:

@@ -5,6 +5,7 @@ from .control.client import order as order
 from .control.client import status as status
 from .control.server import ControlRequest as ControlRequest
 from .control.server import Question as Question
+from .control.server import follow as follow
 from .control.status import NodeStatus as NodeStatus
 from .control.status import SystemStatus as SystemStatus
 from .gate.gate import closes as closes

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from lifecycle.cli.common import (
+    asking,
     assignments_argument,
     completing,
     format_option,
@@ -28,6 +29,8 @@ from lifecycle.errors import ExitCode, UsageError
 from lifecycle.printable import json_text, lines, one_line
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from lifecycle.supervisor import NodeStatus, SystemStatus
     from lifecycle.verify import ConnectionReport
 
@@ -89,8 +92,14 @@ def _row(node: NodeStatus) -> tuple[str, ...]:
 @assignments_argument
 @machine_option("As it was given to `lifecycle up`.")
 @format_option("text", "json")
+@click.option("--watch", is_flag=True, help="Show it again at every change; Ctrl-C ends.")
 def status_command(
-    target: str | None, assignments: tuple[str, ...], machine: str, format_: str
+    *,
+    target: str | None,
+    assignments: tuple[str, ...],
+    machine: str,
+    format_: str,
+    watch: bool,
 ) -> int:
     """Show a running system: its nodes, their processes and states, and the last verdict.
 
@@ -98,21 +107,43 @@ def status_command(
     4 if the last verdict is violated.
     """
     if target is None:
+        if watch:
+            raise UsageError("cannot watch without a TARGET", hint="lifecycle status lists them")
         return _list_running(format_)
     path = target_run(os.environ, target, assignments, machine)
+    if watch:
+        return _watch(path, format_)
     from lifecycle.codec import to_json
     from lifecycle.supervisor import status  # takes long to import, and a wrong name needs none
     from lifecycle.verify import Outcome
 
-    try:
+    with asking(path):
         seen = status(path)
-    except TimeoutError as error:
-        raise UsageError(f"cannot ask {path.name!r}: its supervisor does not answer") from error
     if format_ == "json":
         click.echo(json_text(to_json(seen).decode()))
     else:
         click.echo(status_text(seen))
     return ExitCode.VIOLATED if seen.verdict is Outcome.VIOLATED else ExitCode.OK
+
+
+def _watch(path: Path, format_: str) -> int:
+    from lifecycle.cli.screen import Screen
+    from lifecycle.codec import to_json
+    from lifecycle.supervisor import follow
+    from lifecycle.verify import Outcome
+
+    verdict = None
+    last = ""
+    with Screen(whole=format_ == "text") as screen, asking(path):
+        for seen in follow(path / "control"):
+            verdict, is_json = seen.status.verdict, format_ == "json"
+            text = json_text(to_json(seen.status).decode()) if is_json else ""
+            text = text or status_text(seen.status)
+            if text != last:
+                screen.show(last := text)
+    if not screen.quit:
+        click.echo(f"{path.name}: its supervisor has ended", err=True)
+    return ExitCode.VIOLATED if verdict is Outcome.VIOLATED else ExitCode.OK
 
 
 def _list_running(format_: str) -> int:

@@ -27,7 +27,7 @@ from lifecycle.cli.common import (
     timeout_option,
     treatment_options,
 )
-from lifecycle.cli.standard_streams import echo_while_read
+from lifecycle.cli.screen import Screen
 from lifecycle.cli.verbs.verify import exit_code
 from lifecycle.codec import to_json
 from lifecycle.errors import ExitCode, UsageError
@@ -233,7 +233,9 @@ def _show(
         click.echo(render_flows(verdict.flows, format_))
 
     if watch:
-        follow_running(plan, lambda seen: echo_while_read(render_flows(seen.flows, format_)))
+        with Screen(whole=format_ == "text") as screen:
+            follow_running(plan, lambda seen: screen.show(render_flows(seen.flows, format_)))
+        return ExitCode.OK  # `q`: only a key ends it
     asked = click.get_current_context().get_parameter_source("timeout")
     waits = asked is not click.core.ParameterSource.DEFAULT or supervisor_of(os.environ, plan, "")
     empty_graph_s = None if waits else _EMPTY_GRAPH_S
