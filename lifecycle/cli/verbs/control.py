@@ -93,6 +93,12 @@ def _row(node: NodeStatus) -> tuple[str, ...]:
 @machine_option("As it was given to `lifecycle up`.")
 @format_option("text", "json")
 @click.option("--watch", is_flag=True, help="Show it again at every change; Ctrl-C ends.")
+@click.option(
+    "--probe",
+    type=click.Choice(["live", "ready"]),
+    help="For health checks: print nothing, exit with 0 while the supervisor answers (live), or "
+    "while the system is active and not violated (ready), else with 6.",
+)
 def status_command(
     *,
     target: str | None,
@@ -100,12 +106,15 @@ def status_command(
     machine: str,
     format_: str,
     watch: bool,
+    probe: str | None,
 ) -> int:
     """Show a running system: its nodes, their processes and states, and the last verdict.
 
     TARGET is a manifest or the name of a system; without one, all that run are listed. Exits with
     4 if the last verdict is violated.
     """
+    if watch and probe is not None:
+        raise UsageError("cannot probe and watch at once; a probe prints nothing")
     if target is None:
         if watch:
             raise UsageError("cannot watch without a TARGET", hint="lifecycle status lists them")
@@ -119,6 +128,9 @@ def status_command(
 
     with asking(path):
         seen = status(path)
+    if probe is not None:
+        ready = seen.phase == "active" and seen.verdict is not Outcome.VIOLATED
+        return ExitCode.OK if ready or probe == "live" else ExitCode.BRING_UP_FAILED
     if format_ == "json":
         click.echo(json_text(to_json(seen).decode()))
     else:

@@ -21,8 +21,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from lifecycle.manifest import Certainty, EndpointKind, QosProfile, incompatibilities
 from lifecycle.verify.observation import EndpointReport, ObservedEndpoint
+from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
-from lifecycle.verify.verdict import Finding, Outcome
+from lifecycle.verify.verdict import Finding
 from lifecycle.verify.view import UNKNOWN_QOS, Actual, FlowView, SeenEndpoint, View, actual_qos
 
 UNMATCHED_LINK = Rule(
@@ -71,9 +72,9 @@ class MatchEnd:
     kind: EndpointKind
     type: str
     qos: QosProfile
-    gid: str
-    report: EndpointReport | None
-    expected: bool
+    gid: str = ""
+    report: EndpointReport | None = None
+    expected: bool = True
 
 
 def obstacle(publisher: MatchEnd, subscription: MatchEnd) -> str:
@@ -236,17 +237,15 @@ def _end(actual: Actual) -> MatchEnd:
         qos=actual_qos(shown.qos if shown else None, report.qos if report else None) or UNKNOWN_QOS,
         gid=(shown.gid if shown else "") or (report.gid if report else ""),
         report=report,
-        expected=True,
     )
 
 
 def _end_of_graph(seen: SeenEndpoint) -> MatchEnd:
+    """Return an end as one of all that others can match: it is not asked whom it matches."""
     return MatchEnd(
         kind=seen.kind,
         type=seen.type,
         qos=seen.qos or UNKNOWN_QOS,
-        gid="",
-        report=seen.report,
         expected=seen.planned is not None,
     )
 

@@ -76,7 +76,7 @@ def _asked(line: str, place: Path, shell: str = "bash") -> list[str]:
 @pytest.mark.parametrize(
     ("line", "offered"),
     [
-        ("lifecycle re", ["plain resume", "plain restart"]),
+        ("lifecycle resu", ["plain resume"]),
         ("lifecycle nonsense x", []),
         ("lifecycle check --for", ["plain --format"]),
         ("lifecycle check --format=te", ["plain text"]),

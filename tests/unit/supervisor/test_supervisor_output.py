@@ -8,6 +8,7 @@ import io
 import json
 import re
 
+import msgspec
 import pytest
 from rich.console import Console
 
@@ -24,7 +25,7 @@ from lifecycle.network.nfe import (
     UniqueRequirement,
 )
 from lifecycle.node.host.control import Operation
-from lifecycle.supervisor.control.status import NodeStatus, SystemStatus
+from lifecycle.supervisor.control.protocol import NodeStatus, ProcessState, Reach, SystemStatus
 from lifecycle.supervisor.run.events import (
     Event,
     Failure,
@@ -32,8 +33,6 @@ from lifecycle.supervisor.run.events import (
     LogLine,
     NodeChanged,
     ProcessChanged,
-    ProcessState,
-    Reach,
     RequestSent,
     RunStarted,
     Stopping,
@@ -45,7 +44,7 @@ from lifecycle.supervisor.run.events import (
 )
 from lifecycle.supervisor.run.options import UpResult
 from lifecycle.verify import FlowReport, Outcome, Stage, to_json
-from lifecycle.verify.observation import ConnectionReport
+from lifecycle.verify.outcome import ConnectionReport
 from tests.unit.supervisor.fakes import verdict_of
 
 EVENTS: tuple[Event, ...] = (
@@ -356,9 +355,9 @@ def test_the_live_table_shows_each_node_and_scrolls_what_it_prints() -> None:
 @pytest.mark.parametrize("count", [3, 60])
 def test_the_live_table_fits_the_terminal(count: int) -> None:
     (node,) = STATUS.nodes
-    nodes = [dataclasses.replace(node, node=f"/{'n' * 90}_{number}") for number in range(count)]
-    nodes[-1] = dataclasses.replace(node, node="/late", state="inactive")
-    status = dataclasses.replace(STATUS, nodes=tuple(nodes))
+    nodes = [msgspec.structs.replace(node, node=f"/{'n' * 90}_{number}") for number in range(count)]
+    nodes[-1] = msgspec.structs.replace(node, node="/late", state="inactive")
+    status = msgspec.structs.replace(STATUS, nodes=tuple(nodes))
     stream = io.StringIO()
     console = Console(file=stream, force_terminal=True, width=80, height=24, color_system=None)
     with Live(console) as live:
@@ -381,7 +380,9 @@ def test_a_status_is_a_head_and_a_line_for_each_node() -> None:
 
 
 def test_a_status_says_what_keeps_the_verdict_from_being_ok() -> None:
-    wrong = dataclasses.replace(STATUS, verdict=Outcome.VIOLATED, not_ok="missing: /camera (node)")
+    wrong = msgspec.structs.replace(
+        STATUS, verdict=Outcome.VIOLATED, not_ok="missing: /camera (node)"
+    )
     assert status_text(wrong).splitlines()[0] == (
         "robot: active, verdict violated (missing: /camera (node)), domain 30, supervisor 1, "
         "up for 1.5 s"
@@ -547,7 +548,7 @@ def test_a_step_of_wiring_is_one_line(event: Event, line: str) -> None:
 
 
 def test_a_status_lists_connections_below_their_node() -> None:
-    node = dataclasses.replace(
+    node = msgspec.structs.replace(
         STATUS.nodes[0],
         connections=(
             ConnectionReport(
@@ -560,7 +561,7 @@ def test_a_status_lists_connections_below_their_node() -> None:
             ConnectionReport(name="idle", urls=("shm://",)),
         ),
     )
-    lines = status_text(dataclasses.replace(STATUS, nodes=(node,))).splitlines()
+    lines = status_text(msgspec.structs.replace(STATUS, nodes=(node,))).splitlines()
     assert lines[3:] == [
         "  connection net established; udpv4://10.77.0.1:7911; carries publishers/video",
         "  connection far failed: no route; tcpv4://10.77.0.1:5100; carries nothing",
@@ -569,14 +570,14 @@ def test_a_status_lists_connections_below_their_node() -> None:
 
 
 def test_a_dead_node_is_shown_as_dead_with_how_it_ended() -> None:
-    dead = dataclasses.replace(
+    dead = msgspec.structs.replace(
         STATUS.nodes[0],
         process_state=ProcessState.EXITED,
         state="",
         matched=0,
         died="pid 7 died: killed by SIGKILL",
     )
-    lines = status_text(dataclasses.replace(STATUS, nodes=(dead, *STATUS.nodes))).splitlines()
+    lines = status_text(msgspec.structs.replace(STATUS, nodes=(dead, *STATUS.nodes))).splitlines()
     assert lines[0].startswith("robot: active 1/2, verdict ok, ")
     assert lines[2].split(maxsplit=6) == [
         "/camera",
