@@ -94,6 +94,12 @@ def _check_ros(verb: str) -> None:
     from lifecycle.middleware import check_rmw
 
     check_rmw(os.environ)
+    if not os.environ.get("HOME"):
+        from lifecycle.run_directory import home_directory
+
+        # rcl asks the variable alone, and makes no node with logs without it.
+        if home := home_directory(os.environ):
+            os.environ["HOME"] = home
 
 
 COMPLETE = "_LIFECYCLE_COMPLETE"

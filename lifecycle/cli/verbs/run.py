@@ -52,7 +52,7 @@ def command(manifest: str, node: str, words: tuple[str, ...], *, auto: bool) -> 
     os.environ.update({**environment, **dict(planned.run.environment)})
     if planned.run.kind is RunKind.ATTACH:
         raise UsageError(
-            f"cannot run {planned.full_name}: the manifest attaches to it, somebody else starts it"
+            f"cannot run {planned.full_name}: it is attached, and started outside of the manifest"
         )
     if planned.run.kind is RunKind.COMMAND:
         _replace_process(plan, planned, words[split:])
@@ -75,6 +75,9 @@ def find_node(plan: Plan, name: str) -> PlannedNode:
 def _run_class(plan: Plan, planned: PlannedNode, arguments: list[str], *, lifecycle: str) -> int:
     # Late: everything before this works without ROS, and says what is wrong without it.
     from lifecycle.node import load_nodes, run
+    from lifecycle.supervisor import check_log_root
+
+    check_log_root(os.environ)
 
     beside = str(Path(planned.at.file).absolute().parent)
     if planned.run.working_directory:
