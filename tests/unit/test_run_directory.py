@@ -359,7 +359,7 @@ def test_a_full_disk_is_said_before_anything_is_started(
     with pytest.raises(UsageError) as refused:
         RunDirectory.acquire(tmp_path / "lifecycle", "arm@7", "id")
     assert str(refused.value) == (
-        f"cannot write in run directory '{tmp_path}/lifecycle/arm@7': No space left on device; make "
-        "room there, or set XDG_RUNTIME_DIR to another directory"
+        f"cannot write in run directory '{tmp_path}/lifecycle/arm@7': No space left on device; "
+        "make room there, or set XDG_RUNTIME_DIR to another directory"
     )
     assert not (tmp_path / "lifecycle/arm@7").exists()
