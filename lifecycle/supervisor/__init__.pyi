@@ -13,6 +13,7 @@ from .control.server import follow as follow
 from .gate.gate import closes as closes
 from .processes.forerunner import Forerunner as Forerunner
 from .processes.logs import check_log_root as check_log_root
+from .processes.logs import is_running as is_running
 from .processes.logs import ros_log_root as ros_log_root
 from .processes.logs import runs_of as runs_of
 from .run.events import Emitter as Emitter

@@ -113,6 +113,12 @@ def runs_of(root: Path, system: str = "") -> list[Path]:
     return sorted((each for each in found if each.is_dir()), reverse=True)
 
 
+def is_running(run: Path) -> bool:
+    """Return whether the supervisor lives whose run a log directory is of."""
+    named = _named("").fullmatch(run.name)
+    return named is not None and Path(f"/proc/{named['pid']}").exists()
+
+
 def begin_logs(path: Path, system: str, environment: Mapping[str, str]) -> Path:
     """Make and return the directory of a run, have `latest` lead to it, and forget what is too old.
 
