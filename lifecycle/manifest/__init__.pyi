@@ -1,4 +1,5 @@
 from .checks.parameters import Section as Section
+from .checks.parameters import is_implicit as is_implicit
 from .checks.parameters import misfit as misfit
 from .checks.parameters import read_scalar as read_scalar
 from .checks.parameters import read_sections as read_sections

@@ -217,7 +217,11 @@ def _inline(cursor: Cursor, found: Findings) -> Interface:
                 hint = f"the first stands at {other.at.file}:{other.at.line}:{other.at.column}"
                 found.append(error("manifest.duplicate-name", at, message, hint))
     parameters = [_declaration(name, each, found) for name, each in cursor.entries("parameters")]
-    return Interface(endpoints=tuple(endpoints), parameters=tuple(parameters))
+    return Interface(
+        endpoints=tuple(endpoints),
+        parameters=tuple(parameters),
+        has_all_parameters="parameters" in cursor,
+    )
 
 
 def _endpoint(kind: EndpointKind, cursor: Cursor, found: Findings) -> Endpoint:

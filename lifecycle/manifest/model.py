@@ -269,11 +269,14 @@ class Interface:
 
     Attributes:
         source: empty when inline, else the reference it was read from.
+        has_all_parameters: `parameters` are all that the node has: it is written down, or a NoDL
+            document, which describes a node as a whole.
     """
 
     endpoints: tuple[Endpoint, ...] = ()
     parameters: tuple[ParameterDeclaration, ...] = ()
     source: str = ""
+    has_all_parameters: bool = False
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

@@ -31,6 +31,7 @@ from .process.control import check_threads as check_threads
 from .process.control import exit_after as exit_after
 from .process.control import machine_id as machine_id
 from .process.control import no_room_for_threads as no_room_for_threads
+from .process.process_table import note_ended as note_ended
 from .process.shared_memory import Creations as Creations
 from .process.shared_memory import check_room as check_room
 from .process.shared_memory import holds_shared_memory as holds_shared_memory

@@ -32,6 +32,7 @@ _DECLARED = {
     "endpoint_policy": "endpoints",
     "enforce_dscp": "enforce",
     "unverifiable_blocks": "unverifiable",
+    "has_all_parameters": "interface.parameters",
     "default": "default_value",
 }
 """Fields that the manifest calls otherwise."""

@@ -3,6 +3,7 @@ from .judge import not_ok as not_ok
 from .judge import taken_on_trust as taken_on_trust
 from .judge import verify as verify
 from .matcher import lay_out as lay_out
+from .observation import SERVES_NONE as SERVES_NONE
 from .observation import ConfigurationError as ConfigurationError
 from .observation import EndpointReport as EndpointReport
 from .observation import Identity as Identity

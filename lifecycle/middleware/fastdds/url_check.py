@@ -15,8 +15,6 @@ import struct
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import psutil
-
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds.url_profile import UrlTransport, families
 from lifecycle.network import CONNECTABLE, ConnectionUrl, Medium
@@ -48,6 +46,8 @@ def check_host(urls: Sequence[ConnectionUrl]) -> None:
     Raises:
         MiddlewareError: names the URL and what there is.
     """
+    import psutil
+
     addresses, names = set(), set()
     for name, entries in psutil.net_if_addrs().items():
         names.add(name)

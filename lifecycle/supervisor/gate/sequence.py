@@ -272,7 +272,15 @@ class GateSequence:
         )
 
     def _with_process_of(self, node: NodeRun) -> tuple[NodeRun, ...]:
-        return tuple(each for each in self._system.nodes.values() if each.process is node.process)
+        """Return all that comes and goes with a node: a container's components with it."""
+        if node.process is None:
+            return (node,)
+        found = [each for each in self._system.nodes.values() if each.process is node.process]
+        loaded = {each.planned.key for each in found}
+        components = (
+            each for each in self._system.nodes.values() if each.planned.run.container in loaded
+        )
+        return (*found, *components)
 
     async def _again(
         self, nodes: tuple[NodeRun, ...], timeout_s: float, plan: Plan | None = None
@@ -288,7 +296,7 @@ class GateSequence:
         self._leaves(names)
         await TakeDown(self._system, self._emit, self._hurry, nodes=nodes).run()
         # A participant that was killed haunts the graph; who comes back would be taken for two.
-        gone = [each.name for each in nodes if each.process is not None]
+        gone = [each.name for each in nodes if each.process or each.planned.run.component]
         for node in nodes:
             self._forget(node.name)
         if plan is not None:

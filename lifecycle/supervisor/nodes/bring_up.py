@@ -143,7 +143,7 @@ class BringUp:
         appears: waits until a node of this name is in the graph.
         recorded: called after each spawn, to keep the record of children true.
         gives: sets the parameters of a running node that its command line does not give it.
-        loads: has the container of this full name load a node.
+        loads: has the container of this full name load a node, and returns what unloads it.
         wirer: wires each node between its configure and its connect; None leaves it to the nodes.
     """
 
@@ -157,7 +157,7 @@ class BringUp:
         recorded: Callable[[], None],
         wirer: Wirer | None = None,
         gives: Callable[[PlannedNode], Awaitable[None]] | None = None,
-        loads: Callable[[PlannedNode, str], Awaitable[None]] | None = None,
+        loads: Callable[[PlannedNode, str], Awaitable[Callable[[], Awaitable[None]]]] | None = None,
     ) -> None:
         self._gives = gives
         self._loads = loads
@@ -368,7 +368,7 @@ class BringUp:
             return
         full_name = name if container is None else container.name
         try:
-            await self._loads(node.planned, full_name)
+            node.unload = await self._loads(node.planned, full_name)
         except MiddlewareError as error:
             message = f"{error.message}; {error.hint}" if error.hint else error.message
             raise StepFailedError(message, rule=START_FAILED, subject=node.name) from error

@@ -11,7 +11,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import dataclasses
-from collections.abc import Collection, Iterable
+from collections.abc import Awaitable, Callable, Collection, Iterable
 from pathlib import Path
 from typing import Protocol
 
@@ -252,6 +252,7 @@ class NodeRun:
         stuck: an operation on it was given up: a polite request would wait behind it.
         connections: names of what the authority connected it to, oldest first.
         reports_changes: its host reports unasked when its configuration changes.
+        unload: has its container unload a component; None for what is not loaded into one.
     """
 
     def __init__(self, planned: PlannedNode, emit: Emitter) -> None:
@@ -267,6 +268,7 @@ class NodeRun:
         self.stuck = False
         self.connections: tuple[str, ...] = ()
         self.reports_changes = False
+        self.unload: Callable[[], Awaitable[None]] | None = None
         self.changed = asyncio.Event()
         self._emit = emit
 
@@ -279,6 +281,7 @@ class NodeRun:
         self.stuck = False
         self.connections = ()
         self.reports_changes = False
+        self.unload = None
         self.doing = ""
         self.connected = False
         self.state = ""
@@ -567,7 +570,8 @@ class System:
         return tuple(
             node
             for node in self.nodes.values()
-            if any(after.node == key for after in node.planned.after)
+            if node.planned.run.container == key
+            or any(after.node == key for after in node.planned.after)
         )
 
     async def refresh(self, observer: ObservedGraph) -> None:

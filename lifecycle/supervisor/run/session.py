@@ -11,7 +11,7 @@ import contextlib
 import dataclasses
 import os
 import signal
-from collections.abc import AsyncIterator, Coroutine, Iterable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterable, Iterator
 from typing import Any, Protocol
 
 from lifecycle.errors import ExitCode
@@ -110,8 +110,12 @@ class SessionParticipant(
     The parts are the Protocols of those who use them; here is what the session itself asks.
     """
 
-    async def load(self, node: PlannedNode, container: str) -> None:
-        """Have a component container load a node; raises MiddlewareError with the reason."""
+    async def load(self, node: PlannedNode, container: str) -> Callable[[], Awaitable[None]]:
+        """Have a component container load a node; return what unloads it.
+
+        Raises:
+            MiddlewareError: with the reason; so does what unloads.
+        """
 
     async def give(self, node: PlannedNode) -> None:
         """Set the parameters that a running node has with other values than its plan gives it."""
