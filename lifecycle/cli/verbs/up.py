@@ -10,8 +10,10 @@ import click
 
 from lifecycle.cli.common import (
     NetworkCommand,
+    completing,
     format_option,
     load_manifest,
+    machine_option,
     manifest_arguments,
     targets_option,
     timeout_option,
@@ -52,12 +54,7 @@ if TYPE_CHECKING:
 )
 @report_option
 @click.option("--strict", is_flag=True, help="What cannot be verified keeps the gate closed.")
-@click.option(
-    "--machine",
-    default="",
-    metavar="NAME",
-    help="Run only this machine's nodes; default: all whose address is this host's.",
-)
+@machine_option("Run only this machine's nodes; default: all whose address is this host's.")
 @click.option(
     "--keep-going",
     is_flag=True,
@@ -73,6 +70,7 @@ if TYPE_CHECKING:
     "without",
     multiple=True,
     metavar="NODE",
+    shell_complete=completing("nodes"),
     help="Do not start it, but wait for it: `lifecycle run MANIFEST NODE --manual`, in a debugger. "
     "May be given several times.",
 )

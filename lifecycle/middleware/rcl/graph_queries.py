@@ -6,17 +6,22 @@ UTF-8 (UnicodeDecodeError, for all names together), a node name that rcl cannot 
 an empty one (RCLError of rcl_get_node_names, for all nodes together). Any participant of the domain
 can announce such names, so none may hide what else is there.
 
-Bytes that are no UTF-8 are written as `\xff`; everything else is left as it is announced.
+Bytes that are no UTF-8 are written as `\xff`; everything else is left as it is announced. With an
+rcl that is not known (`abi.is_known`) rclpy's own queries are all there is: what they raise at is
+left out then.
 """
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from rclpy.exceptions import NameValidationException
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, LivelinessPolicy, ReliabilityPolicy
 
@@ -30,6 +35,7 @@ from lifecycle.manifest import (
     Reliability,
 )
 from lifecycle.middleware.rcl import abi
+from lifecycle.middleware.rcl.qos import from_rclpy
 
 _UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"
 """How rmw_dds_common names the node of an endpoint that it does not know (yet)."""
@@ -113,6 +119,9 @@ def node_names(node: Node) -> list[str]:
     Raises:
         MiddlewareError: the graph cannot be read; all functions here.
     """
+    if not abi.is_known():
+        with _read("nodes"):
+            return [full_name(*each) for each in node.get_node_names_and_namespaces()]
     library = _library()
     names, spaces = _Strings(), _Strings()
     with node.handle:
@@ -132,19 +141,29 @@ def node_names(node: Node) -> list[str]:
 
 def topic_endpoints(node: Node) -> Iterator[tuple[EndpointKind, str, EndpointInfo]]:
     """Yield kind, topic and endpoint of all publishers and subscriptions that `node` sees."""
-    library = _library()
-
-    def query(handle: int, result: object) -> int:
-        return int(library.topics(handle, library.allocator, False, result))
-
-    for topic, _ in _names_and_types(node, query, "topics") or ():
+    for topic in _topics(node):
         for kind in (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION):
             for info in _endpoints(node, kind, topic, no_mangle=False):
                 yield kind, _text(topic), info
 
 
+def _topics(node: Node) -> list[bytes]:
+    if not abi.is_known():
+        with _read("topics"):
+            return [name.encode() for name, _ in node.get_topic_names_and_types()]
+    library = _library()
+
+    def query(handle: int, result: object) -> int:
+        return int(library.topics(handle, library.allocator, False, result))
+
+    return [topic for topic, _ in _names_and_types(node, query, "topics") or ()]
+
+
 def service_names(node: Node) -> frozenset[str]:
     """Return the fully qualified names of all services that have a server or a client."""
+    if not abi.is_known():
+        with _read("services"):
+            return frozenset(name for name, _ in node.get_service_names_and_types())
     library = _library()
 
     def query(handle: int, result: object) -> int:
@@ -175,8 +194,10 @@ def endpoints_of_node(
     Returns:
         None where rcl shows no such node: it has left, or has a name that no rcl would give it.
     """
-    library = _library()
     namespace, _, name = full_name.rpartition("/")
+    if not abi.is_known():
+        return _shown_of_node(node, kind, name, namespace or "/")
+    library = _library()
     arguments = (name.encode(errors="replace"), (namespace or "/").encode(errors="replace"))
     function = library.by_node[kind]
 
@@ -196,9 +217,23 @@ def full_name(name: str, namespace: str) -> str:
     return f"{namespace.rstrip('/')}/{name}"
 
 
+def fingerprint(node: Node) -> object:
+    """Return what differs whenever the graph that `node` sees has changed; None if unreadable."""
+    try:
+        return (
+            sorted(node_names(node)),
+            sorted((kind.value, topic, info.gid) for kind, topic, info in topic_endpoints(node)),
+            service_names(node),
+        )
+    except MiddlewareError:
+        return None
+
+
 def _endpoints(
     node: Node, kind: EndpointKind, topic: bytes, *, no_mangle: bool
 ) -> list[EndpointInfo]:
+    if not abi.is_known():
+        return _shown(node, kind, _text(topic), no_mangle=no_mangle)
     library = _library()
     infos = _Infos()
     with node.handle:
@@ -234,6 +269,62 @@ def _endpoint(info: Any) -> EndpointInfo:
         ),
         type_hash=f"RIHS{version:02}_{bytes(info.hash_value).hex()}" if version else "",
     )
+
+
+_REFUSED = (ValueError, rclpy_implementation.RCLError, NameValidationException)
+"""What rclpy's graph queries raise at names that are not ROS's; UnicodeDecodeError is one."""
+
+
+@contextlib.contextmanager
+def _read(what: str) -> Iterator[None]:
+    try:
+        yield
+    except _REFUSED as error:
+        raise MiddlewareError(f"cannot read the {what} of the graph: {error}") from error
+
+
+def _shown(node: Node, kind: EndpointKind, topic: str, *, no_mangle: bool) -> list[EndpointInfo]:
+    """As `endpoints_of`, by rclpy's own query; nothing for a topic that it refuses."""
+    is_publisher = kind is EndpointKind.PUBLISHER
+    ask = (
+        node.get_publishers_info_by_topic if is_publisher else node.get_subscriptions_info_by_topic
+    )
+    try:
+        infos = ask(topic, no_mangle)
+    except _REFUSED:
+        return []
+    return [
+        EndpointInfo(
+            node=""
+            if info.node_name == _UNKNOWN_NODE
+            else full_name(info.node_name, info.node_namespace),
+            type=info.topic_type,
+            gid=bytes(info.endpoint_gid[:_GID_BYTES]).hex(),
+            qos=from_rclpy(info.qos_profile),
+            type_hash=_spelled(getattr(info, "topic_type_hash", None)),
+        )
+        for info in infos
+    ]
+
+
+def _spelled(type_hash: Any) -> str:
+    return str(type_hash) if type_hash is not None and type_hash.version > 0 else ""
+
+
+def _shown_of_node(
+    node: Node, kind: EndpointKind, name: str, namespace: str
+) -> list[tuple[str, str]] | None:
+    """As `endpoints_of_node`, by rclpy's own queries."""
+    ask = {
+        EndpointKind.PUBLISHER: node.get_publisher_names_and_types_by_node,
+        EndpointKind.SUBSCRIPTION: node.get_subscriber_names_and_types_by_node,
+        EndpointKind.SERVICE_SERVER: node.get_service_names_and_types_by_node,
+        EndpointKind.SERVICE_CLIENT: node.get_client_names_and_types_by_node,
+    }[kind]
+    try:
+        return [(each, type_) for each, types in ask(name, namespace) for type_ in types]
+    except (*_REFUSED, rclpy_implementation.NodeNameNonExistentError):
+        return None
 
 
 def _nanoseconds(duration: Any) -> int | None:

@@ -88,6 +88,13 @@ class ObserverParticipant:
 
         return str(rclpy.get_rmw_implementation_identifier())
 
+    @property
+    def unknown_versions(self) -> str:
+        """Which installed libraries are not known, and what that costs; empty if all are."""
+        from lifecycle.middleware import unknown_versions
+
+        return unknown_versions()
+
     def reaches_servers(self) -> bool:
         """Wait, bounded, until a TCP discovery server can be asked; False if it never will be."""
         return self._graph.discovery.reaches_servers()

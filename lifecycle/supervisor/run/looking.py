@@ -76,12 +76,14 @@ class JudgedSystem:
         observation: what was there.
         verdict: of an active system.
         rmw: name of the RMW implementation it was looked at with.
+        limits: which installed libraries are not known, and what that costs; empty if all are.
     """
 
     plan: Plan
     observation: Observation
     verdict: Verdict
     rmw: str = ""
+    limits: str = ""
 
     @property
     def where(self) -> str:
@@ -90,6 +92,11 @@ class JudgedSystem:
         names = (each.full_name for each in self.observation.nodes)
         foreign = any(not tolerating_pattern(each, tools) for each in names)
         return "" if foreign else where(self.plan, self.rmw)
+
+    @property
+    def notices(self) -> tuple[str, ...]:
+        """What has to be known beside the verdict."""
+        return tuple(each for each in (self.limits, self.where) if each)
 
 
 def judge_running(
@@ -200,11 +207,15 @@ def _reported_to_supervisors(plan: Plan) -> tuple[NodeConfiguration, ...]:
 
 async def _see(plan: Plan, observer_participant: ObserverParticipant) -> JudgedSystem:
     observation = await observer_participant.observe(plan)
-    return _judged(plan, observation, observer_participant.rmw)
+    return _judged(plan, observation, observer_participant)
 
 
 def _judged(
-    plan: Plan, observation: Observation, rmw: str, *, may_be_over: bool = True
+    plan: Plan,
+    observation: Observation,
+    observer_participant: ObserverParticipant,
+    *,
+    may_be_over: bool = True,
 ) -> JudgedSystem:
     """Judge what was seen; of a node that may end by itself and is not there, it may have ended."""
     expected = Expectation.of(plan, observation)
@@ -214,7 +225,8 @@ def _judged(
         plan=expected.plan,
         observation=observation,
         verdict=with_findings(verdict, expected.findings),
-        rmw=rmw,
+        rmw=observer_participant.rmw,
+        limits=observer_participant.unknown_versions,
     )
 
 
@@ -231,13 +243,13 @@ async def _judge(
     while True:
         observation = await observer_participant.observe(plan)
         # One that is not there may be yet to come.
-        seen = _judged(plan, observation, observer_participant.rmw, may_be_over=False)
+        seen = _judged(plan, observation, observer_participant, may_be_over=False)
         limit_s = timeout_s
         if empty_graph_s is not None and seen.where:
             limit_s = min(empty_graph_s, timeout_s)
         left_s = began + limit_s - loop.time()
         if left_s <= 0 or not _worth_waiting(seen.verdict, strict=strict):
-            return _judged(plan, observation, observer_participant.rmw)
+            return _judged(plan, observation, observer_participant)
         await _change(observer_participant, min(left_s, _ASK_AGAIN_S))
 
 

@@ -140,8 +140,8 @@ def _remapped(actual: Actual) -> str:
     if report is None or report.resolved == planned.resolved:
         return ""
     return (
-        f"{report.kind.value}/{report.name} is {report.resolved} now: is a remap wrong, or did "
-        f"somebody call {actual.node.full_name}/remap? the name '' gives back the declared one"
+        f"{report.kind.value}/{report.name} is {report.resolved} now: is a remap wrong, or was "
+        f"{actual.node.full_name}/remap called? the name '' gives back the declared one"
     )
 
 
@@ -218,8 +218,8 @@ def _given_name(view: View, endpoint: ObservedEndpoint) -> str:
             return f"it is an alias of {declared}: see who called {endpoint.node}/alias"
         if endpoint.name == report.resolved != actual.planned.resolved:
             return (
-                f"it is {declared} under another name: is a remap wrong, or did somebody call "
-                f"{endpoint.node}/remap?"
+                f"it is {declared} under another name: is a remap wrong, or was "
+                f"{endpoint.node}/remap called?"
             )
     return ""
 

@@ -32,7 +32,7 @@ STATE_UNVERIFIABLE = Rule(
 )
 ACTIVATED_AT_CLOSED_GATE = Rule(
     id="state.activated-at-closed-gate",
-    meaning="somebody else activated a managed node while the gate is closed",
+    meaning="another client activated a managed node while the gate is closed",
     outcomes=(Outcome.VIOLATED,),
     fix="find out who drives the node beside the supervisor, and let the gate activate it",
     about=About.PROGRESS,
