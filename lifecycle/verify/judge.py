@@ -36,7 +36,7 @@ _HOW = (UniqueHow.NOT, UniqueHow.WEAKLY, UniqueHow.STRONGLY)
 def flow_reports(view: View, findings: Sequence[Finding]) -> tuple[FlowReport, ...]:
     """Report every planned flow, in plan order."""
     spoiled = _spoiled(findings)
-    return tuple(_report(view, flow, view.uniqueness, spoiled) for flow in view.flows)
+    return tuple(_report(flow, view.uniqueness, spoiled) for flow in view.flows)
 
 
 _Place = tuple[str, str, EndpointKind | None]
@@ -61,12 +61,18 @@ def _spoiled(findings: Iterable[Finding]) -> dict[_Place, Outcome]:
     return worst
 
 
-def _report(
-    view: View, flow: FlowView, uniqueness: Uniqueness, spoiled: dict[_Place, Outcome]
-) -> FlowReport:
-    source = uniqueness.nfes(flow.publishers)
-    destination = uniqueness.nfes(flow.subscriptions)
-    ends = (uniqueness.all_unique(flow.publishers), uniqueness.all_unique(flow.subscriptions))
+def _report(flow: FlowView, uniqueness: Uniqueness, spoiled: dict[_Place, Outcome]) -> FlowReport:
+    """Report a flow; again only if it, what spoils it or what is unique has changed."""
+    outcome = _outcome(flow, spoiled) if spoiled else Outcome.OK
+    known: tuple[object, Outcome, FlowReport] | None = flow.found.get(_report)
+    if known is not None and known[0] is uniqueness.judged and known[1] is outcome:
+        return known[2]
+    report = _reported(flow, uniqueness, outcome)
+    flow.found[_report] = uniqueness.judged, outcome, report
+    return report
+
+
+def _outcome(flow: FlowView, spoiled: dict[_Place, Outcome]) -> Outcome:
     topic = flow.planned.topic
     places: tuple[_Place, ...] = (
         (flow.subject, "", None),
@@ -75,10 +81,16 @@ def _report(
         (topic, flow.publisher, EndpointKind.PUBLISHER),
         (topic, flow.subscription, EndpointKind.SUBSCRIPTION),
     )
-    outcomes = (spoiled[place] for place in places if place in spoiled)
-    carrier = effective_transport(view, flow)
+    return Outcome.worst(spoiled[place] for place in places if place in spoiled)
+
+
+def _reported(flow: FlowView, uniqueness: Uniqueness, outcome: Outcome) -> FlowReport:
+    ends = (uniqueness.all_unique(flow.publishers), uniqueness.all_unique(flow.subscriptions))
+    source = uniqueness.nfes(flow.publishers)
+    destination = uniqueness.nfes(flow.subscriptions)
+    carrier = effective_transport(flow)
     return FlowReport(
-        topic=topic,
+        topic=flow.planned.topic,
         publisher=flow.publisher,
         subscription=flow.subscription,
         source=_used(source, carrier),
@@ -88,8 +100,8 @@ def _report(
         reader_dscp=_dscp(flow.subscriptions, carrier),
         requirement=flow.requirement,
         demanded=flow.planned.unique,
-        transport=_transport(view, flow, source, destination),
-        outcome=Outcome.worst(outcomes),
+        transport=_transport(flow, source, destination),
+        outcome=outcome,
         max_delay_ms=flow.planned.max_delay_ms,
         five_qi=flow.five_qi,
         five_qi_reason="; ".join(
@@ -121,7 +133,6 @@ def _dscp(ends: Sequence[Actual], carrier: str) -> int | None:
 
 
 def _transport(
-    view: View,
     flow: FlowView,
     source: Sequence[NetworkFlowEndpoint],
     destination: Sequence[NetworkFlowEndpoint],
@@ -132,11 +143,7 @@ def _transport(
     """
     if not source or not destination:
         return "unknown"
-    machines = {
-        view.configurations[name].identity.machine_id
-        for name in (flow.publisher, flow.subscription)
-        if name in view.configurations
-    }
+    machines = {each.configuration.identity.machine_id for each in flow.nodes if each.configuration}
     common: list[str] = []
     if len(machines) == 1 and not all(map(is_ip, source)) and not all(map(is_ip, destination)):
         common.append(Medium.SHM)
@@ -172,11 +179,43 @@ def verify(
             although this one has not opened yet.
         over: how the process ended of nodes that may end by themselves, by fully qualified name.
     """
-    view = lay_out(plan, observation, stage, machines=machines, ahead=ahead, over=over or {})
+    return _verdict(lay_out(plan, observation, stage, machines=machines, ahead=ahead, over=over))
+
+
+class Verifier:
+    """Judges one system again and again: what has not changed since the last time is not redone.
+
+    `verify` gives what the function of that name gives for the same arguments, whatever it was
+    asked before. It recognises what has not changed by the identity of the parts of the observation
+    (`ObservedNode`, `ObservedEndpoint`, `NodeConfiguration`, `NodeParameters`): who observes keeps
+    those. It holds what it was asked last, and no more.
+    """
+
+    def __init__(self) -> None:
+        self._last: View | None = None
+
+    def verify(
+        self,
+        plan: Plan,
+        observation: Observation,
+        *,
+        stage: Stage,
+        machines: frozenset[str] | None = None,
+        ahead: frozenset[str] = frozenset(),
+        over: Mapping[str, str] | None = None,
+    ) -> Verdict:
+        """Judge what was seen of a system; see the function of this name."""
+        self._last = view = lay_out(
+            plan, observation, stage, machines=machines, ahead=ahead, over=over, last=self._last
+        )
+        return _verdict(view)
+
+
+def _verdict(view: View) -> Verdict:
     findings = tuple(finding for check in CHECKS for finding in check(view))
     return Verdict(
         verdict=Outcome.worst(each.outcome for each in findings),
-        blocking=_blocks(findings, unverifiable_blocks=plan.policy.unverifiable_blocks),
+        blocking=_blocks(findings, unverifiable_blocks=view.plan.policy.unverifiable_blocks),
         findings=findings,
         flows=flow_reports(view, findings),
         open_endpoints=tuple(

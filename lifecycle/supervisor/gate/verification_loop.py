@@ -1,6 +1,6 @@
 """Verifies the running system at every change: level-triggered, debounced, with a grace period.
 
-Owns: when `verify` is called again, how long a verdict that closes the gate is waited out, and
+Owns: when the system is judged again, how long a verdict that closes the gate is waited out, and
 `GracePeriod`: which findings may pass by themselves while a system is watched, because the facts of
 one change arrive one by one, and for how long a verdict that is worse by these alone is kept back.
 The gate itself has no grace period. Nothing is polled: the graph, or a node over its control
@@ -37,6 +37,7 @@ from lifecycle.verify import (
     Outcome,
     Stage,
     Verdict,
+    Verifier,
     rule,
     verify,
 )
@@ -257,7 +258,7 @@ class VerificationLoop:
         emit: Emitter,
         *,
         strict: bool,
-        verify_: Callable[..., Verdict] = verify,
+        verify_: Callable[..., Verdict] | None = None,
         looker: Looker | None = None,
         agreement: Agreement | None = None,
         guard: ActivationGuard | None = None,
@@ -267,7 +268,8 @@ class VerificationLoop:
         self._changes = changes
         self._emit = emit
         self._strict = strict
-        self._verify = verify_
+        self._verify = verify_ or verify
+        self._watch = verify_ or Verifier().verify
         self._looker = looker
         self._agreement = agreement
         self._guard = guard
@@ -276,6 +278,7 @@ class VerificationLoop:
         self.seen = Observation()
         self._presence = NodeArrivals(emit)
         self._grace_period = GracePeriod()
+        self._asked_of: tuple[Plan, frozenset[str], Plan] | None = None
         self.ahead: frozenset[str] = frozenset()
 
     async def once(self, stage: Stage) -> Verdict:
@@ -326,7 +329,7 @@ class VerificationLoop:
 
     async def _look(self, stage: Stage) -> Verdict:
         await self._system.refresh(self._observer)
-        asked = without_nodes(self._system.plan, self._system.liveliness.silent)
+        asked = self._asked()
         observation = without(await self._observer.observe(asked), self._system.dead())
         self.seen = observation
         self._presence.see(observation)
@@ -335,7 +338,9 @@ class VerificationLoop:
             self._looker.look(observation)
         if self._guard is not None:
             self._guard.look(observation)
-        verdict = self._verify(
+        # What opens the gate is judged from scratch; what is watched, where it has changed.
+        judge = self._watch if stage is Stage.ACTIVE else self._verify
+        verdict = judge(
             self._system.expected,
             observation,
             stage=stage,
@@ -352,6 +357,13 @@ class VerificationLoop:
             verdict = self._agreement.explained(verdict)
             verdict = with_findings(verdict, self._agreement.findings(observation))
         return with_findings(verdict, discovery_server.findings(self._system))
+
+    def _asked(self) -> Plan:
+        """Return the plan without silent nodes; the same object while that is the same."""
+        of = self._system.plan, frozenset(self._system.liveliness.silent)
+        if self._asked_of is None or self._asked_of[0] is not of[0] or self._asked_of[1] != of[1]:
+            self._asked_of = (*of, without_nodes(*of))
+        return self._asked_of[2]
 
     async def until_clear(
         self, stage: Stage, timeout_s: float, *, unchanged_s: float | None = None

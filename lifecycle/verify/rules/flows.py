@@ -36,7 +36,7 @@ from lifecycle.verify.transport import (
 )
 from lifecycle.verify.uniqueness import Uniqueness
 from lifecycle.verify.verdict import Finding, Outcome
-from lifecycle.verify.view import Actual, FlowView, View, connection_of
+from lifecycle.verify.view import Actual, FlowView, NodeFacts, View, connection_of, once
 
 NOT_UNIQUE = Rule(
     id="flow.not-unique",
@@ -79,10 +79,14 @@ RULES = (NOT_UNIQUE, UNVERIFIABLE, BROKEN_ENDPOINT, NOT_MEASURED)
 def check(view: View) -> Iterator[Finding]:
     """Judge every strict endpoint, then every link's demand, then name what is not measured."""
     uniqueness = view.uniqueness
-    for actual in view.actual:
-        yield from _broken(actual)
-        if actual.planned.unique is UniqueRequirement.STRICTLY_REQUIRED:
-            yield from _strict(actual, uniqueness)
+    for facts in view.nodes.values():
+        if not once(facts, _strict_ends):
+            yield from once(facts, _all_broken)
+            continue
+        for actual in facts.actual:
+            yield from _broken(actual)
+            if _is_strict(actual):
+                yield from _strict(actual, uniqueness)
     for flow in view.flows:
         if flow.planned.unique is not UniqueHow.NOT:
             yield from _demanded(flow, uniqueness)
@@ -91,8 +95,22 @@ def check(view: View) -> Iterator[Finding]:
 
 def _not_measured(view: View) -> Iterator[Finding]:
     """One finding per declared number: it reports that the number was not compared."""
-    for actual in view.actual:
-        planned, node = actual.planned, actual.node.full_name
+    for facts in view.nodes.values():
+        yield from once(facts, _not_measured_of)
+    for flow in view.flows:
+        if not flow.planned.quantities:
+            continue
+        ends = (*flow.publishers, *flow.subscriptions)
+        if any(end.observed is None and end.report is None for end in ends):
+            continue
+        for each in flow.planned.quantities:
+            where = f"the flow {flow.publisher} → {flow.subscription} on {flow.planned.topic}"
+            yield _unmeasured(each, where, subject=flow.subject, ends=flow.ends)
+
+
+def _not_measured_of(facts: NodeFacts) -> Iterator[Finding]:
+    for actual in facts.actual:
+        planned, node = actual.planned, facts.name
         if actual.observed is None and actual.report is None:
             continue  # it is missing, and that is said
         for each in planned.quantities:
@@ -100,13 +118,6 @@ def _not_measured(view: View) -> Iterator[Finding]:
             yield _unmeasured(
                 each, where, subject=planned.resolved, node=node, endpoint=planned.kind
             )
-    for flow in view.flows:
-        ends = (*flow.publishers, *flow.subscriptions)
-        if any(end.observed is None and end.report is None for end in ends):
-            continue
-        for each in flow.planned.quantities:
-            where = f"the flow {flow.publisher} → {flow.subscription} on {flow.planned.topic}"
-            yield _unmeasured(each, where, subject=flow.subject, ends=flow.ends)
 
 
 def _unmeasured(
@@ -129,6 +140,19 @@ def _unmeasured(
         endpoint=endpoint,
         ends=ends,
     )
+
+
+def _is_strict(actual: Actual) -> bool:
+    return actual.planned.unique is UniqueRequirement.STRICTLY_REQUIRED
+
+
+def _strict_ends(facts: NodeFacts) -> Iterator[Actual]:
+    return filter(_is_strict, facts.actual)
+
+
+def _all_broken(facts: NodeFacts) -> Iterator[Finding]:
+    for actual in facts.actual:
+        yield from _broken(actual)
 
 
 def _broken(actual: Actual) -> Iterator[Finding]:
@@ -260,22 +284,26 @@ _WORDS = {
 def check_transport(view: View) -> Iterator[Finding]:
     """Judge every flow that must be carried by something."""
     for flow in view.flows:
-        ends = (*flow.publishers, *flow.subscriptions)
-        if not flow.publishers or not flow.subscriptions:
-            continue
-        if any(end.observed is None and end.report is None for end in ends):
-            continue  # it is missing, and that is said
-        used = effective_transport(view, flow)
-        demanding = [end for end in ends if end.planned.transport is FlowTransport.NETWORK]
-        if demanding and used not in NETWORK_MEDIA:
-            yield _not_by_network(flow, demanding[0], used)
-        elif flow.planned.medium not in ("", used) and _is_decided(view, flow):
-            yield _otherwise(flow, used)
+        yield from once(flow, _judge_transport)
 
 
-def _is_decided(view: View, flow: FlowView) -> bool:
+def _judge_transport(flow: FlowView) -> Iterator[Finding]:
+    ends = (*flow.publishers, *flow.subscriptions)
+    if not flow.publishers or not flow.subscriptions:
+        return
+    if any(end.observed is None and end.report is None for end in ends):
+        return  # it is missing, and that is said
+    used = effective_transport(flow)
+    demanding = [end for end in ends if end.planned.transport is FlowTransport.NETWORK]
+    if demanding and used not in NETWORK_MEDIA:
+        yield _not_by_network(flow, demanding[0], used)
+    elif flow.planned.medium not in ("", used) and _is_decided(flow):
+        yield _otherwise(flow, used)
+
+
+def _is_decided(flow: FlowView) -> bool:
     """Return whether the medium was asked for; else the plan only has what is expected."""
-    if view.plan.data_layer.at is not None:
+    if flow.nodes[0].frame.plan.data_layer.at is not None:
         return True
     return any(
         end.planned.transport not in (FlowTransport.ANY, FlowTransport.NETWORK)
@@ -340,7 +368,12 @@ def check_dscp(view: View) -> Iterator[Finding]:
 
     A subscription's is that of its acknowledgements.
     """
-    for actual in view.actual:
+    for facts in view.nodes.values():
+        yield from once(facts, _judge_dscp)
+
+
+def _judge_dscp(facts: NodeFacts) -> Iterator[Finding]:
+    for actual in facts.actual:
         planned, node, report = actual.planned, actual.node, actual.report
         wanted = planned.dscp
         if wanted is None:

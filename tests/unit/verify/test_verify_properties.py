@@ -13,7 +13,16 @@ from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import PRESETS
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan import Plan
-from lifecycle.verify import Observation, Outcome, Stage, verify
+from lifecycle.verify import (
+    Identity,
+    Observation,
+    ObservedEndpoint,
+    ObservedNode,
+    Outcome,
+    Stage,
+    Verifier,
+    verify,
+)
 from tests.builders import endpoint, need, node, planned
 from tests.unit.verify.perfect import perfect
 
@@ -154,3 +163,118 @@ def test_the_verdict_does_not_depend_on_the_order_of_what_was_seen(
         configurations=shuffled(seen.configurations),
     )
     assert verify(plan, other, stage=Stage.CONNECTED) == verify(plan, seen, stage=Stage.CONNECTED)
+
+
+STRANGERS = (
+    "",
+    "/_ros2cli_1",
+    "/stranger",
+    "/n0",
+    "/robot/n1",
+    "/_n0_flow_0",
+    "_NODE_NAME_UNKNOWN_",
+)
+PORTS = (0, 7411, 7413, 40000)
+
+
+def _changed(part: object, data: st.DataObject) -> object:
+    """Something of the same kind that discovery or a node may show a moment later."""
+    if isinstance(part, ObservedNode):
+        fields = {
+            "count": data.draw(st.integers(1, 2)),
+            "state": data.draw(st.sampled_from([None, "inactive", "active", "unconfigured"])),
+        }
+        return dataclasses.replace(part, **fields)
+    if isinstance(part, ObservedEndpoint):
+        types = [*TYPES.values(), part.type]
+        fields = {
+            "type": data.draw(st.sampled_from(types)),
+            "type_hash": data.draw(st.sampled_from([None, "", "RIHS01_a", "RIHS01_b"])),
+            "node": data.draw(st.sampled_from([part.node, *STRANGERS])),
+        }
+        name = data.draw(st.sampled_from(sorted(fields)))
+        return dataclasses.replace(part, **{name: fields[name]})
+    if not part.endpoints or data.draw(st.booleans()):
+        identity = Identity(machine_id="other", process_id=1, node_id="x")
+        return dataclasses.replace(
+            part,
+            identity=data.draw(st.sampled_from([part.identity, identity])),
+            state=data.draw(st.sampled_from(["inactive", "active"])),
+        )
+    index = data.draw(st.integers(0, len(part.endpoints) - 1))
+    report = part.endpoints[index]
+    port = data.draw(st.sampled_from(PORTS))
+    reports = (
+        dataclasses.replace(report, matched=0, peers=()),
+        dataclasses.replace(report, matched=1, peers=None, server_matched=False),
+        dataclasses.replace(report, error="refused", mapped=False),
+        dataclasses.replace(report, resolved="/elsewhere"),
+        dataclasses.replace(
+            report,
+            nfes=None
+            if not port
+            else tuple(
+                dataclasses.replace(each, transport_port=port) for each in report.nfes or ()
+            ),
+        ),
+    )
+    endpoints = list(part.endpoints)
+    endpoints[index] = data.draw(st.sampled_from(reports))
+    return dataclasses.replace(part, endpoints=tuple(endpoints))
+
+
+def _step(seen: Observation, first: Observation, data: st.DataObject) -> Observation:
+    """What is seen a moment later: some part of it is gone, back, new, another, or equal."""
+    field = data.draw(st.sampled_from(["nodes", "endpoints", "configurations"]))
+    parts = list(getattr(seen, field))
+    index = data.draw(st.integers(0, len(parts) - 1)) if parts else 0
+    how = data.draw(st.sampled_from(["gone", "back", "new", "other", "equal", "order"]))
+    if how == "new":
+        name = data.draw(st.sampled_from(STRANGERS))
+        if field == "nodes":
+            parts.append(ObservedNode(full_name=name or "/stranger"))
+        else:
+            field, parts = "endpoints", list(seen.endpoints)
+            kind = data.draw(st.sampled_from(EndpointKind))
+            topics = sorted({each.name for each in first.endpoints} | {"/another"})
+            parts.append(
+                ObservedEndpoint(
+                    kind=kind,
+                    node=name,
+                    name=data.draw(st.sampled_from(topics)),
+                    type=TYPES[kind],
+                    gid=f"{len(parts):032x}" if kind.is_topic or not name else "",
+                )
+            )
+    elif how == "back" or not parts:
+        parts = list(getattr(first, field))
+    elif how == "gone":
+        del parts[index]
+    elif how == "other":
+        parts[index] = _changed(parts[index], data)
+    elif how == "equal":
+        parts = [dataclasses.replace(each) for each in parts]
+    else:
+        parts.reverse()
+    return dataclasses.replace(seen, **{field: tuple(parts)})
+
+
+@settings(max_examples=150, deadline=None)
+@given(systems(), st.data())
+def test_what_is_judged_again_and_again_is_judged_as_at_first_sight(
+    plan: Plan, data: st.DataObject
+):
+    verifier = Verifier()
+    seen = first = perfect(plan)
+    moments = st.tuples(
+        st.sampled_from(Stage),
+        st.sampled_from([None, None, frozenset({"robot"})]),
+        st.sampled_from([frozenset(), frozenset(), frozenset({"/n0"})]),
+    )
+    stage, machines, ahead = data.draw(moments)
+    for _ in range(data.draw(st.integers(2, 8))):
+        rest = {"stage": stage, "machines": machines, "ahead": ahead}
+        assert verifier.verify(plan, seen, **rest) == verify(plan, seen, **rest)
+        seen = _step(seen, first, data)
+        if not data.draw(st.integers(0, 5)):
+            stage, machines, ahead = data.draw(moments)
