@@ -392,7 +392,7 @@ def _match_node(
             elif observed is not None:
                 used.add(place)  # found by name only: it represents any number of them
             elif unseen and report is not None and _is_there(report, planned.resolved):
-                observed = _as_observed(node, report, report.resolved)
+                observed = _as_observed(node, report, planned.resolved)
             reports.take(picked)
             matched[index] = Actual(
                 node=node,

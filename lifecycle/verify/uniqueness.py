@@ -171,21 +171,24 @@ class Uniqueness:
             judged: stays the same object while every answer does.
         """
         configurations = tuple(configurations)
-        self.read: dict[int, _Reported] = {}
+        self.read: list[_Reported] = []
         self._entries: dict[int, _Entry] = {}
-        before = last.read if last is not None else {}
+        before = {id(each.configuration): each for each in last.read} if last is not None else {}
         staying = set(map(id, configurations))
         replaced = {
             each.configuration.name: each for key, each in before.items() if key not in staying
         }
         for configuration in configurations:
-            name = configuration.name
-            read = before.get(id(configuration)) or _Reported.of(
-                configuration, addresses.get(name, ""), replaced.pop(name, None)
-            )
-            self.read[id(configuration)] = read
+            # Taken once: what is reported twice, be it by one object, has two owners.
+            read = before.pop(id(configuration), None)
+            if read is None:
+                name = configuration.name
+                read = _Reported.of(
+                    configuration, addresses.get(name, ""), replaced.pop(name, None)
+                )
+            self.read.append(read)
             self._entries.update(read.by_report)
-        entries = [each.entries for each in self.read.values()]
+        entries = [each.entries for each in self.read]
         same = last is not None and last.judged.is_of(entries)
         self.judged: _Judged = last.judged if last is not None and same else _Judged(entries)
 
