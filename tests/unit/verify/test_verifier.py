@@ -29,6 +29,7 @@ from lifecycle.verify import (
     verify,
 )
 from lifecycle.verify.observation import ConnectionReport, NodeParameters, ParameterReport
+from lifecycle.verify.tool_filter import NODE_SERVICES, OUR_SERVICES
 from tests.unit.verify.perfect import perfect
 from tests.unit.verify.test_verify_properties import TYPES, systems
 
@@ -52,6 +53,14 @@ _MANIFESTS = (
 """Connections, shared memory alone, static discovery, links, parameters, machines, open nodes."""
 
 _NOBODY = ("", "_NODE_NAME_UNKNOWN_", "/_ros2cli_1", "/rviz", "/stranger", "/_stranger_flow_0")
+_BESIDE = "_radio"
+"""A hidden node that a node may report as its own."""
+_MADE = (
+    (EndpointKind.SERVICE_SERVER, "get_configuration", OUR_SERVICES["get_configuration"]),
+    (EndpointKind.SERVICE_SERVER, "get_parameters", NODE_SERVICES["get_parameters"]),
+    (EndpointKind.SERVICE_SERVER, "get_parameters", "robot/srv/Other"),
+    (EndpointKind.PUBLISHER, "transition_event", "lifecycle_msgs/msg/TransitionEvent"),
+)
 _HASHES = (None, "", "RIHS01_a", "RIHS01_b")
 _STATES = (None, "", "unconfigured", "inactive", "activating", "active", "finalized")
 
@@ -93,6 +102,8 @@ class Moments:
         self.names = [each.full_name for each in plan.nodes]
         self.chance = chance
         self.first = perfect(plan, chance.choice(tuple(Stage)))
+        if chance.random() < 0.5:
+            self.first = _counting(self.first)
         self.reports = [one for each in self.first.configurations for one in each.endpoints]
         if chance.random() < 0.3:
             self.first = _asked_for_parameters(self.first)
@@ -105,6 +116,7 @@ class Moments:
             (
                 *(part(self._part, field) for field in (*_PARTS, "endpoints", "configurations")),
                 *(self._process, self._outsider, self._outsider, self._shared_socket),
+                *(self._made, self._beside),
                 *(self._order, self._same_again),
             )
         )()
@@ -154,6 +166,19 @@ class Moments:
                 lambda each: each.resolved == known.name and each.kind is not known.kind,
                 lambda each: {"matched": (each.matched or 0) + 1, "peers": None},
             )
+
+    def _made(self) -> None:
+        """A node has an endpoint that client libraries make, or ours."""
+        name = self.chance.choice(self.names)
+        kind, base, type_ = self.chance.choice(_MADE)
+        made = ObservedEndpoint(kind=kind, node=name, name=f"{name}/{base}", type=type_)
+        self._put("endpoints", (*self.seen.endpoints, made))
+
+    def _beside(self) -> None:
+        """A participant that a node connected, or is said to have connected, has an endpoint."""
+        space = self.chance.choice(self.names).rpartition("/")[0]
+        other = dataclasses.replace(self.new_endpoint(), node=f"{space}/{_BESIDE}")
+        self._put("endpoints", (*self.seen.endpoints, other))
 
     def _shared_socket(self) -> None:
         """An endpoint has the sockets of another one, maybe in another process."""
@@ -300,8 +325,8 @@ class Moments:
         }
 
     def _connections(self, part: NodeConfiguration) -> tuple[ConnectionReport, ...]:
-        another = ConnectionReport(name="radio", node_name="/_stranger_flow_0", established=True)
-        known = (another,) if self.chance.random() < 0.3 else ()
+        another = ConnectionReport(name="radio", node_name=_BESIDE, established=True)
+        known = (another,) if self.chance.random() < 0.5 else ()
         return known + tuple(
             dataclasses.replace(
                 each,
@@ -356,6 +381,20 @@ class Moments:
 def _parameters_of(seen: Observation) -> Iterator[ParameterReport]:
     for one in (*seen.configurations, *seen.parameters):
         yield from one.parameters or ()
+
+
+def _counting(seen: Observation) -> Observation:
+    """Return what is seen of nodes that say how many they are matched with, and not with whom."""
+    return dataclasses.replace(
+        seen,
+        configurations=tuple(
+            dataclasses.replace(
+                one,
+                endpoints=tuple(dataclasses.replace(each, peers=None) for each in one.endpoints),
+            )
+            for one in seen.configurations
+        ),
+    )
 
 
 def _asked_for_parameters(seen: Observation) -> Observation:
