@@ -8,7 +8,8 @@ its arguments. Pure.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import dataclasses
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from lifecycle.manifest import EndpointKind, EndpointPolicy, UniqueHow
 from lifecycle.network import Medium, NetworkFlowEndpoint, TransportProtocol, is_ip
@@ -28,15 +29,27 @@ from lifecycle.verify.verdict import (
     ToleratedNode,
     Verdict,
 )
-from lifecycle.verify.view import Actual, FlowView, View
+from lifecycle.verify.view import Actual, FlowView, Frame, View, once, subject_of
 
 _HOW = (UniqueHow.NOT, UniqueHow.WEAKLY, UniqueHow.STRONGLY)
 
 
 def flow_reports(view: View, findings: Sequence[Finding]) -> tuple[FlowReport, ...]:
     """Report every planned flow, in plan order."""
+    uniqueness = view.uniqueness
+
+    def unspoiled(flow: FlowView) -> Iterator[FlowReport]:
+        yield _reported(flow, uniqueness, Outcome.OK)
+
+    reports = list(view.by_flow.each(unspoiled, name=_reported, terms=uniqueness.judged))
     spoiled = _spoiled(findings)
-    return tuple(_report(flow, view.uniqueness, spoiled) for flow in view.flows)
+    if spoiled:
+        (places,) = once(view.frame, _flows_by_place)
+        for index in {index for place in spoiled for index in places.get(place, ())}:
+            reports[index] = dataclasses.replace(
+                reports[index], outcome=_outcome(view.frame, index, spoiled)
+            )
+    return tuple(reports)
 
 
 _Place = tuple[str, str, EndpointKind | None]
@@ -61,27 +74,29 @@ def _spoiled(findings: Iterable[Finding]) -> dict[_Place, Outcome]:
     return worst
 
 
-def _report(flow: FlowView, uniqueness: Uniqueness, spoiled: dict[_Place, Outcome]) -> FlowReport:
-    """Report a flow; again only if it, what spoils it or what is unique has changed."""
-    outcome = _outcome(flow, spoiled) if spoiled else Outcome.OK
-    known: tuple[object, Outcome, FlowReport] | None = flow.found.get(_report)
-    if known is not None and known[0] is uniqueness.judged and known[1] is outcome:
-        return known[2]
-    report = _reported(flow, uniqueness, outcome)
-    flow.found[_report] = uniqueness.judged, outcome, report
-    return report
+def _flows_by_place(frame: Frame) -> Iterator[dict[_Place, list[int]]]:
+    """Yield the indices of the flows that a finding at a place spoils."""
+    found: dict[_Place, list[int]] = {}
+    for index in range(len(frame.plan.flows)):
+        for place in _places(frame, index):
+            found.setdefault(place, []).append(index)
+    yield found
 
 
-def _outcome(flow: FlowView, spoiled: dict[_Place, Outcome]) -> Outcome:
-    topic = flow.planned.topic
-    places: tuple[_Place, ...] = (
-        (flow.subject, "", None),
-        (flow.publisher, flow.publisher, None),
-        (flow.subscription, flow.subscription, None),
-        (topic, flow.publisher, EndpointKind.PUBLISHER),
-        (topic, flow.subscription, EndpointKind.SUBSCRIPTION),
+def _places(frame: Frame, index: int) -> tuple[_Place, ...]:
+    flow = frame.plan.flows[index]
+    publisher, subscription = frame.by_key[flow.publisher], frame.by_key[flow.subscription]
+    return (
+        (subject_of(flow.topic, publisher, subscription), "", None),
+        (publisher, publisher, None),
+        (subscription, subscription, None),
+        (flow.topic, publisher, EndpointKind.PUBLISHER),
+        (flow.topic, subscription, EndpointKind.SUBSCRIPTION),
     )
-    return Outcome.worst(spoiled[place] for place in places if place in spoiled)
+
+
+def _outcome(frame: Frame, index: int, spoiled: dict[_Place, Outcome]) -> Outcome:
+    return Outcome.worst(spoiled[place] for place in _places(frame, index) if place in spoiled)
 
 
 def _reported(flow: FlowView, uniqueness: Uniqueness, outcome: Outcome) -> FlowReport:

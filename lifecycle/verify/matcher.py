@@ -38,11 +38,13 @@ from lifecycle.verify.view import (
     Frame,
     NodeEndpoints,
     NodeFacts,
+    Parts,
     SeenEndpoint,
     TopicFacts,
     View,
     actual_qos,
     may_hide,
+    once,
 )
 
 _Pools = dict[tuple[EndpointKind, str], list[ObservedEndpoint]]
@@ -109,13 +111,17 @@ def lay_out(
         )
         # A second node of the same name has the same endpoints again; that is one finding.
         left_over += () if name in duplicated else facts.rest
-    actual = tuple(each for facts in nodes.values() for each in facts.actual)
+    by_node = Parts(
+        nodes, order=frame.order.__getitem__, last=last.by_node if last is not None else None
+    )
+    actual = tuple(itertools.chain.from_iterable(facts.actual for facts in nodes.values()))
     strangers = [name for name in groups if name and name not in planned and name not in tools]
     of_tools = tuple(
         each for name, group in groups.items() if name in tools for each in group.endpoints
     )
     seen = _seen(groups, nodes, tools)
-    topics = _topics(frame, seen, of_tools, last)
+    topics, retold = _topics(frame, seen, of_tools, last)
+    flows, moved = _flows(frame, nodes, topics, last, changed=(*by_node.changed, *retold))
     return View(
         frame=frame,
         observed=observed,
@@ -130,12 +136,25 @@ def lay_out(
         tools=tools,
         of_tools=of_tools,
         seen=seen,
-        flows=_flows(frame, nodes, topics, last),
-        uniqueness=Uniqueness(
-            reported, declared_addresses(plan), last.uniqueness if last is not None else None
+        flows=flows,
+        uniqueness=Uniqueness.of(
+            reported, frame.addresses, last.uniqueness if last is not None else None
         ),
         nodes=nodes,
         topics=topics,
+        by_node=by_node,
+        by_topic=Parts(
+            topics,
+            order=str,
+            last=last.by_topic if last is not None else None,
+            changed=retold,
+        ),
+        by_flow=Parts(
+            dict(enumerate(flows)),
+            order=int,
+            last=last.by_flow if last is not None else None,
+            changed=moved,
+        ),
         attributed=attributed,
         groups=groups,
     )
@@ -144,14 +163,6 @@ def lay_out(
 def _same(one: Sequence[object], other: Sequence[object]) -> bool:
     """Return whether two sequences hold the same objects: equal ones may have other identities."""
     return one is other or (len(one) == len(other) and all(map(operator.is_, one, other)))
-
-
-def declared_addresses(plan: Plan) -> dict[str, str]:
-    """Return the declared address of each node's machine, by full node name, where there is one."""
-    machines = {each.name: each.address for each in plan.machines if each.address}
-    return {
-        node.full_name: machines[node.machine] for node in plan.nodes if node.machine in machines
-    }
 
 
 def _by_identity(observation: Observation) -> tuple[NodeConfiguration, ...]:
@@ -179,8 +190,8 @@ def _attributed(
         name of the node whose they are, sorted by it.
     """
     shown: dict[str, list[ObservedEndpoint]] = {}
-    for endpoint in observation.endpoints:
-        shown.setdefault(endpoint.node, []).append(endpoint)
+    for name, of_node in itertools.groupby(observation.endpoints, operator.attrgetter("node")):
+        shown.setdefault(name, []).extend(of_node)
     attributed: dict[str, Attributed] = {}
     by_node: dict[str, list[Sequence[ObservedEndpoint]]] = {}
     for name, endpoints in shown.items():
@@ -588,22 +599,38 @@ def _topics(
     seen: Iterable[SeenEndpoint],
     of_tools: Iterable[ObservedEndpoint],
     last: View | None,
-) -> dict[str, TopicFacts]:
-    ends: dict[str, list[SeenEndpoint]] = {}
-    for each in seen:
-        ends.setdefault(each.name, []).append(each)
+) -> tuple[dict[str, TopicFacts], Collection[str]]:
+    """Return what is seen of every topic, and of which of them another thing than last."""
     tools: dict[str, list[SeenEndpoint]] = {}
     for endpoint in _topical(of_tools):
         tools.setdefault(endpoint.name, []).append(_seen_endpoint(endpoint, None))
-    found: dict[str, TopicFacts] = {}
-    before = last.topics if last is not None else {}
-    for name in (*ends, *(name for name in tools if name not in ends)):
-        here, beside = ends.get(name, ()), tools.get(name, ())
-        known = before.get(name)
-        if known is None or not _same(known.ends, here) or known.of_tools != tuple(beside):
-            known = TopicFacts(frame=frame, ends=tuple(here), of_tools=tuple(beside))
-        found[name] = known
-    return found
+    ends: dict[str, list[SeenEndpoint]] = {}
+    if last is None:
+        for each in seen:
+            ends.setdefault(each.name, []).append(each)
+        found: dict[str, TopicFacts] = {}
+        touched: Collection[str] = ends.keys() | tools.keys()
+    else:
+        # Ends that are there in both moments are in the same order: nodes have theirs.
+        now, before = set(map(id, seen)), set(map(id, last.seen))
+        touched = {each.name for each in seen if id(each) not in before}
+        touched |= {each.name for each in last.seen if id(each) not in now}
+        touched |= tools.keys() | {each.name for each in last.of_tools}
+        for each in seen:
+            if each.name in touched:
+                ends.setdefault(each.name, []).append(each)
+        found = dict(last.topics)
+    changed: set[str] = set()
+    for name in touched:
+        here, beside = tuple(ends.get(name, ())), tuple(tools.get(name, ()))
+        known = found.get(name)
+        if not here and not beside:
+            if found.pop(name, None) is not None:
+                changed.add(name)
+        elif known is None or not _same(known.ends, here) or known.of_tools != beside:
+            found[name] = TopicFacts(frame=frame, ends=here, of_tools=beside)
+            changed.add(name)
+    return found, changed
 
 
 def _type_hash(endpoint: ObservedEndpoint, report: EndpointReport | None) -> str | None:
@@ -618,27 +645,35 @@ def _flows(
     nodes: Mapping[str, NodeFacts],
     topics: Mapping[str, TopicFacts],
     last: View | None,
-) -> tuple[FlowView, ...]:
-    names = {node.key: node.full_name for node in reversed(frame.plan.nodes)}
-    before = last.flows if last is not None else itertools.repeat(None)
-    found: list[FlowView] = []
-    for planned, known in zip(frame.plan.flows, before, strict=False):
-        topic = topics.get(planned.topic)
-        if known is not None:
-            publisher, subscription = known.nodes
-            if (
-                nodes[known.publisher] is publisher
-                and nodes[known.subscription] is subscription
-                and known.ends_of_topic is topic
-            ):
-                found.append(known)
-                continue
-        found.append(
-            _flow(
-                planned, nodes[names[planned.publisher]], nodes[names[planned.subscription]], topic
-            )
+    changed: Iterable[str],
+) -> tuple[tuple[FlowView, ...], Collection[int]]:
+    """Return every flow, and the indices of those that have another node or topic than last."""
+
+    def flow(planned: PlannedFlow) -> FlowView:
+        return _flow(
+            planned,
+            nodes[frame.by_key[planned.publisher]],
+            nodes[frame.by_key[planned.subscription]],
+            topics.get(planned.topic),
         )
-    return tuple(found)
+
+    if last is None:
+        return tuple(map(flow, frame.plan.flows)), ()
+    (concerned,) = once(frame, _flows_by_name)
+    moved = {index for name in changed for index in concerned.get(name, ())}
+    found = list(last.flows)
+    for index in moved:
+        found[index] = flow(frame.plan.flows[index])
+    return tuple(found), moved
+
+
+def _flows_by_name(frame: Frame) -> Iterator[dict[str, list[int]]]:
+    """Yield the indices of the flows that a node or a topic is of; names may be of both."""
+    found: dict[str, list[int]] = {}
+    for index, each in enumerate(frame.plan.flows):
+        for name in {frame.by_key[each.publisher], frame.by_key[each.subscription], each.topic}:
+            found.setdefault(name, []).append(index)
+    yield found
 
 
 def _flow(

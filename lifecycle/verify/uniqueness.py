@@ -192,6 +192,20 @@ class Uniqueness:
         same = last is not None and last.judged.is_of(entries)
         self.judged: _Judged = last.judged if last is not None and same else _Judged(entries)
 
+    @classmethod
+    def of(
+        cls,
+        configurations: tuple[NodeConfiguration, ...],
+        addresses: Mapping[str, str],
+        last: Uniqueness | None,
+    ) -> Uniqueness:
+        """Return what is to be said of configurations: `last` if they are the same objects."""
+        if last is not None and len(last.read) == len(configurations):
+            read = (each.configuration for each in last.read)
+            if all(map(operator.is_, read, configurations)):
+                return last
+        return cls(configurations, addresses, last)
+
     def nfes(self, ends: Sequence[ReportedEnd]) -> tuple[NetworkFlowEndpoint, ...]:
         """Return the NFEs of endpoints, each once, with the DSCP that was read back."""
         entries = (self._entries.get(id(end.report)) for end in ends)

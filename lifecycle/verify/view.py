@@ -2,15 +2,15 @@
 
 Owns: the types of the view and the one way to combine announced and reported QoS. `matcher.lay_out`
 fills it. Its parts, `NodeFacts`, `TopicFacts` and `FlowView`, stay the same objects from one
-judgement to the next while all that they are made of does, and keep what was found of them: `once`.
-So a change costs work in proportion to what changed. Pure.
+judgement to the next while all that they are made of does, and what was found of them is taken over
+(`Parts`). So a change costs work in proportion to what changed. Pure.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any, TypeVar
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping
+from typing import Any, Generic, TypeVar
 
 from lifecycle.manifest import (
     Durability,
@@ -103,6 +103,9 @@ class Frame:
         ahead: full names of the nodes that an earlier gate let through.
         over: how they ended, of the nodes whose process has ended as it may, by full name.
         planned: nodes of the plan by full name, in plan order.
+        order: their places in it.
+        by_key: full names of nodes by their keys.
+        addresses: see `declared_addresses`.
         names: what the plan declares, by name.
         declared: node, kind and name of every declared endpoint.
         found: see `once`.
@@ -114,6 +117,9 @@ class Frame:
     ahead: frozenset[str]
     over: Mapping[str, str]
     planned: dict[str, PlannedNode]
+    order: dict[str, int]
+    by_key: dict[str, str]
+    addresses: dict[str, str]
     names: DeclaredNames
     declared: frozenset[tuple[str, EndpointKind, str]]
     found: dict[Any, Any] = dataclasses.field(default_factory=dict)
@@ -136,6 +142,9 @@ class Frame:
             ahead=ahead,
             over=dict(over),
             planned=planned,
+            order={name: place for place, name in enumerate(planned)},
+            by_key={node.key: node.full_name for node in reversed(plan.nodes)},
+            addresses=declared_addresses(plan),
             names=DeclaredNames.of(plan),
             declared=frozenset(
                 (name, each.kind, each.resolved)
@@ -192,7 +201,6 @@ class NodeFacts:
         unseen: those that only its report shows.
         absent: nothing at all is seen of it: then one finding says it all.
         may_hide: some of its declared endpoints need not be shown by discovery, and are not.
-        found: see `once`.
     """
 
     frame: Frame
@@ -209,7 +217,6 @@ class NodeFacts:
     unseen: tuple[SeenEndpoint, ...]
     absent: bool
     may_hide: bool
-    found: dict[Any, Any] = dataclasses.field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -233,7 +240,7 @@ class TopicFacts:
     found: dict[Any, Any] = dataclasses.field(default_factory=dict)
 
 
-_Part = TypeVar("_Part", Frame, NodeFacts, TopicFacts, "FlowView")
+_Part = TypeVar("_Part", Frame, TopicFacts, "FlowView")
 _Found = TypeVar("_Found")
 
 
@@ -248,6 +255,95 @@ def once(part: _Part, work: Callable[[_Part], Iterable[_Found]]) -> tuple[_Found
     if found is None:
         found = part.found[work] = tuple(work(part))
     return found
+
+
+_Key = TypeVar("_Key", bound=Hashable)
+_Of = TypeVar("_Of")
+
+
+class Parts(Generic[_Key, _Of]):
+    """The parts of a view of one kind by key, and what was found of each.
+
+    Args:
+        parts: all of them.
+        order: of a key, by which they come.
+        last: those of the last view in the same frame, from which is taken over what was found.
+        changed: keys of those that are not the same object there, and of those that were there
+            and are not here, if not more; without it they are compared.
+    """
+
+    def __init__(
+        self,
+        parts: Mapping[_Key, _Of],
+        *,
+        order: Callable[[_Key], Any],
+        last: Parts[_Key, _Of] | None = None,
+        changed: Collection[_Key] | None = None,
+    ) -> None:
+        self.parts = parts
+        self.results: dict[object, tuple[object, dict[_Key, tuple[Any, ...]]]] = {}
+        self.changed: frozenset[_Key] = frozenset()
+        self._order = order
+        self._before = last.results if last is not None else {}
+        if last is not None and changed is None:
+            before = last.parts
+            keys = parts.keys() | before.keys()
+            changed = [each for each in keys if parts.get(each) is not before.get(each)]
+        if last is not None and changed is not None:
+            self.changed = frozenset(changed)
+
+    def found(
+        self,
+        work: Callable[[_Of], Iterable[_Found]],
+        *,
+        name: object = None,
+        terms: object = None,
+    ) -> Mapping[_Key, tuple[_Found, ...]]:
+        """Return what `work` yields of each part, without those of which it yields nothing.
+
+        Args:
+            work: looks at nothing but the part and its frame, and `terms`.
+            name: of the work, where it is not always the same function.
+            terms: what else it looks at; what was found on the same object is taken over.
+        """
+        name = name or work
+        if name not in self.results:
+            asked, before = self._before.get(name, (None, None))
+            keys: Iterable[_Key] = self.parts
+            found: dict[_Key, tuple[_Found, ...]] = {}
+            if before is not None and asked is terms:
+                keys, changed = self.changed, self.changed
+                found = {key: each for key, each in before.items() if key not in changed}
+            for key in keys:
+                part = self.parts.get(key)
+                yielded = () if part is None else tuple(work(part))
+                if yielded:
+                    found[key] = yielded
+            self.results[name] = terms, found
+        return self.results[name][1]
+
+    def each(
+        self,
+        work: Callable[[_Of], Iterable[_Found]],
+        *,
+        name: object = None,
+        terms: object = None,
+    ) -> Iterator[_Found]:
+        """Yield what `work` yields of each part in turn; see `found`."""
+        for _, yielded in self.items(work, name=name, terms=terms):
+            yield from yielded
+
+    def items(
+        self,
+        work: Callable[[_Of], Iterable[_Found]],
+        *,
+        name: object = None,
+        terms: object = None,
+    ) -> Iterator[tuple[_Key, tuple[_Found, ...]]]:
+        """Yield with its key what `work` yields of each part in turn; see `found`."""
+        found = self.found(work, name=name, terms=terms)
+        for key in sorted(found, key=self._order):
+            yield key, found[key]
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -278,7 +374,7 @@ class FlowView:
     @property
     def subject(self) -> str:
         """What findings call this flow."""
-        return f"{self.planned.topic}: {self.publisher} → {self.subscription}"
+        return subject_of(self.planned.topic, self.publisher, self.subscription)
 
     @property
     def ends(self) -> tuple[str, str]:
@@ -295,6 +391,11 @@ class FlowView:
         """The planned 5QI; None if none is, or several publishers differ."""
         declared = {end.planned.five_qi for end in self.publishers}
         return declared.pop() if len(declared) == 1 else None
+
+
+def subject_of(topic: str, publisher: str, subscription: str) -> str:
+    """Return what findings call a flow."""
+    return f"{topic}: {publisher} → {subscription}"
 
 
 def _strongest(ends: Iterable[Actual]) -> UniqueRequirement:
@@ -354,7 +455,8 @@ class View:
         flows: every planned flow, in plan order.
         uniqueness: which of the reported endpoints have a flow of their own.
         nodes: what is known of every declared node, by full name, in plan order.
-        topics: what is seen of every topic, in the order of `seen`, then those of tools alone.
+        topics: what is seen of every topic.
+        by_node: `nodes` with what was found of them, and `by_topic`; `by_flow`, by their index.
         attributed: the endpoints by the name of the node that discovery shows, as they are judged.
         groups: all endpoints that are judged by full node name, sorted by it.
     """
@@ -376,6 +478,9 @@ class View:
     uniqueness: Uniqueness
     nodes: dict[str, NodeFacts]
     topics: dict[str, TopicFacts]
+    by_node: Parts[str, NodeFacts]
+    by_topic: Parts[str, TopicFacts]
+    by_flow: Parts[int, FlowView]
     attributed: dict[str, Attributed]
     groups: dict[str, NodeEndpoints]
 
@@ -451,6 +556,14 @@ class View:
         """Return the identity that a node reports; None if it reports none."""
         configuration = self.configurations.get(full_name)
         return configuration.identity if configuration else None
+
+
+def declared_addresses(plan: Plan) -> dict[str, str]:
+    """Return the declared address of each node's machine, by full node name, where there is one."""
+    machines = {each.name: each.address for each in plan.machines if each.address}
+    return {
+        node.full_name: machines[node.machine] for node in plan.nodes if node.machine in machines
+    }
 
 
 def only_shared_memory(connections: ParticipantConnections) -> bool:

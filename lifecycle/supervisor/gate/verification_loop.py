@@ -61,6 +61,7 @@ class GracePeriod:
     def __init__(self) -> None:
         self._plan: Plan | None = None
         self._demanded: dict[tuple[_Place, str], float] = {}
+        self._latest: dict[_Place, float] = {}
         self._unknown: dict[_Key, float] = {}
 
     def after(
@@ -98,6 +99,9 @@ class GracePeriod:
         since = float("-inf") if self._plan is None else now_s
         self._plan = expected
         self._demanded = {each: self._demanded.get(each, since) for each in _demands(expected)}
+        self._latest = {}
+        for (place, _), since in self._demanded.items():
+            self._latest[place] = max(since, self._latest.get(place, since))
 
     def _since(self, finding: Finding) -> float:
         """Return since when a finding may pass; -inf if it may not."""
@@ -109,10 +113,7 @@ class GracePeriod:
         }
         if rule(finding.rule).about is About.CONNECTION:
             places.add(("connection", finding.node))
-        return max(
-            (since for (place, _), since in self._demanded.items() if place in places),
-            default=float("-inf"),
-        )
+        return max(self._latest.get(place, float("-inf")) for place in places)
 
 
 def _is_of_unknown_node(finding: Finding) -> bool:

@@ -13,7 +13,7 @@ from lifecycle.plan import ParticipantConnections, is_restarted_url
 from lifecycle.verify.observation import ConnectionReport
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.verdict import Finding, Outcome
-from lifecycle.verify.view import Actual, NodeFacts, View, connection_of, once
+from lifecycle.verify.view import Actual, NodeFacts, View, connection_of
 
 MISSING = Rule(
     id="connection.missing",
@@ -56,8 +56,7 @@ RULES = (MISSING, FAILED, DIFFERS, WRONG_MAPPING)
 
 def check(view: View) -> Iterator[Finding]:
     """Judge every planned connection and mapping."""
-    for facts in view.nodes.values():
-        yield from once(facts, _judge)
+    yield from view.by_node.each(_judge)
 
 
 def _judge(facts: NodeFacts) -> Iterator[Finding]:

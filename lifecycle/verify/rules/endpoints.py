@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 
 from lifecycle.manifest import EndpointKind, EndpointPolicy, Position
 from lifecycle.verify.observation import ObservedEndpoint
@@ -96,11 +96,13 @@ RULES = (
 def check(view: View) -> Iterator[Finding]:
     """Judge the existence and the type of endpoints."""
     known: Counter[tuple[str, EndpointKind | None]] = Counter()
-    if any(facts.may_hide for facts in view.nodes.values()):
+    hiding = view.by_node.found(_hiding)
+    if hiding:
         known.update((seen.name, seen.kind) for seen in (*view.seen, *view.seen_of_tools))
-    for facts in view.nodes.values():
-        if not facts.may_hide or facts.absent:
-            yield from once(facts, _all_declared)
+    declared = view.by_node.found(_all_declared)
+    for name, facts in view.nodes.items():
+        if name not in hiding or facts.absent:
+            yield from declared.get(name, ())
             continue
         for actual in facts.actual:
             yield from _declared(actual, absent=False)
@@ -108,6 +110,11 @@ def check(view: View) -> Iterator[Finding]:
                 yield from _unseen(view, actual, known)
     yield from _undeclared(view)
     yield from _conflicts(view)
+
+
+def _hiding(facts: NodeFacts) -> Iterator[NodeFacts]:
+    if facts.may_hide:
+        yield facts
 
 
 def _all_declared(facts: NodeFacts) -> Iterator[Finding]:
@@ -240,7 +247,7 @@ def _given_name(view: View, endpoint: ObservedEndpoint) -> str:
 
 def _conflicts(view: View) -> Iterator[Finding]:
     """A topic, service or action of ours that an undeclared node uses with another type."""
-    types = dict(once(view.frame, _declared_types))
+    (types,) = once(view.frame, _declared_types)
     others = (*view.undeclared, *view.foreign, *view.unattributed)
     undeclared: tuple[SeenEndpoint | ObservedEndpoint, ...] = (
         *(each for each in view.seen if each.planned is None),
@@ -266,13 +273,13 @@ def _conflicts(view: View) -> Iterator[Finding]:
         )
 
 
-def _declared_types(frame: Frame) -> Iterable[tuple[tuple[str, str], dict[str, None]]]:
-    """Return the types of every declared topic, service and action, in plan order."""
+def _declared_types(frame: Frame) -> Iterator[dict[tuple[str, str], dict[str, None]]]:
+    """Yield the types of every declared topic, service and action, in plan order."""
     types: dict[tuple[str, str], dict[str, None]] = {}
     for node in frame.planned.values():
         for each in node.endpoints:
             types.setdefault((MEETS[each.kind], each.resolved), {})[each.type] = None
-    return types.items()
+    yield types
 
 
 DEFINITION_DIFFERS = Rule(
@@ -326,7 +333,7 @@ class _JudgedPlace:
 
 def _judged_places(view: View) -> Iterator[_JudgedPlace]:
     """Yield the places of which there is something to report, in the order of what is seen."""
-    found = [each for topic in view.topics.values() for each in once(topic, _of_topic)]
+    found = list(view.by_topic.each(_of_topic))
     if len(found) > 1:
         order: dict[_Place, int] = {}
         for seen in view.seen:
@@ -395,9 +402,8 @@ def differ(one: str, other: str) -> bool:
 def _other_ends(view: View) -> dict[_Place, list[_TypedEnd]]:
     """Return the ends of services and actions."""
     found: dict[_Place, list[_TypedEnd]] = {}
-    for facts in view.nodes.values():
-        for place, end in once(facts, _declared_ends):
-            found.setdefault(place, []).append(end)
+    for place, end in view.by_node.each(_declared_ends):
+        found.setdefault(place, []).append(end)
     for each in (*view.undeclared, *view.foreign, *view.of_tools, *view.unattributed):
         if not each.kind.is_topic:
             end = _TypedEnd(kind=each.kind, node=each.node, type_hash=each.type_hash, at=None)

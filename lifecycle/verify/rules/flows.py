@@ -36,7 +36,7 @@ from lifecycle.verify.transport import (
 )
 from lifecycle.verify.uniqueness import Uniqueness
 from lifecycle.verify.verdict import Finding, Outcome
-from lifecycle.verify.view import Actual, FlowView, NodeFacts, View, connection_of, once
+from lifecycle.verify.view import Actual, FlowView, Frame, NodeFacts, View, connection_of, once
 
 NOT_UNIQUE = Rule(
     id="flow.not-unique",
@@ -79,33 +79,46 @@ RULES = (NOT_UNIQUE, UNVERIFIABLE, BROKEN_ENDPOINT, NOT_MEASURED)
 def check(view: View) -> Iterator[Finding]:
     """Judge every strict endpoint, then every link's demand, then name what is not measured."""
     uniqueness = view.uniqueness
-    for facts in view.nodes.values():
-        if not once(facts, _strict_ends):
-            yield from once(facts, _all_broken)
+    strict = view.by_node.found(_strict_ends)
+    broken = view.by_node.found(_all_broken)
+    for name, facts in view.nodes.items():
+        if name not in strict:
+            yield from broken.get(name, ())
             continue
         for actual in facts.actual:
             yield from _broken(actual)
             if _is_strict(actual):
                 yield from _strict(actual, uniqueness)
-    for flow in view.flows:
-        if flow.planned.unique is not UniqueHow.NOT:
-            yield from _demanded(flow, uniqueness)
+    for index in once(view.frame, _demanding):
+        yield from _demanded(view.flows[index], uniqueness)
     yield from _not_measured(view)
 
 
 def _not_measured(view: View) -> Iterator[Finding]:
     """One finding per declared number: it reports that the number was not compared."""
-    for facts in view.nodes.values():
-        yield from once(facts, _not_measured_of)
-    for flow in view.flows:
-        if not flow.planned.quantities:
-            continue
+    yield from view.by_node.each(_not_measured_of)
+    for index in once(view.frame, _numbered):
+        flow = view.flows[index]
         ends = (*flow.publishers, *flow.subscriptions)
         if any(end.observed is None and end.report is None for end in ends):
             continue
         for each in flow.planned.quantities:
             where = f"the flow {flow.publisher} → {flow.subscription} on {flow.planned.topic}"
             yield _unmeasured(each, where, subject=flow.subject, ends=flow.ends)
+
+
+def _demanding(frame: Frame) -> Iterator[int]:
+    """Yield the index of each flow whose link demands that it be unique."""
+    for index, each in enumerate(frame.plan.flows):
+        if each.unique is not UniqueHow.NOT:
+            yield index
+
+
+def _numbered(frame: Frame) -> Iterator[int]:
+    """Yield the index of each flow of which numbers are declared."""
+    for index, each in enumerate(frame.plan.flows):
+        if each.quantities:
+            yield index
 
 
 def _not_measured_of(facts: NodeFacts) -> Iterator[Finding]:
@@ -283,8 +296,7 @@ _WORDS = {
 
 def check_transport(view: View) -> Iterator[Finding]:
     """Judge every flow that must be carried by something."""
-    for flow in view.flows:
-        yield from once(flow, _judge_transport)
+    yield from view.by_flow.each(_judge_transport)
 
 
 def _judge_transport(flow: FlowView) -> Iterator[Finding]:
@@ -368,8 +380,7 @@ def check_dscp(view: View) -> Iterator[Finding]:
 
     A subscription's is that of its acknowledgements.
     """
-    for facts in view.nodes.values():
-        yield from once(facts, _judge_dscp)
+    yield from view.by_node.each(_judge_dscp)
 
 
 def _judge_dscp(facts: NodeFacts) -> Iterator[Finding]:

@@ -125,8 +125,7 @@ def match(
 
 def check(view: View) -> Iterator[Finding]:
     """Judge every planned flow."""
-    for flow in view.flows:
-        yield from once(flow, _judge_flow)
+    yield from view.by_flow.each(_judge_flow)
 
 
 def _judge_flow(flow: FlowView) -> Iterator[Finding]:
@@ -293,19 +292,18 @@ _SERVERS = frozenset(SERVER_OF.values())
 def check_clients(view: View) -> Iterator[Finding]:
     """Judge every declared client that reports and of which declared servers are there."""
     servers: dict[_Place, list[str]] = {}
-    for facts in view.nodes.values():
-        for place in once(facts, _servers):
-            servers.setdefault(place, []).append(facts.name)
+    for name, places in view.by_node.items(_servers):
+        for place in places:
+            servers.setdefault(place, []).append(name)
     if not servers:
         return
     others = Counter(
         map(_place, (*view.undeclared, *view.foreign, *view.of_tools, *view.unattributed))
     )
-    for facts in view.nodes.values():
-        for client, place in once(facts, _clients):
-            found = servers.get(place, ())
-            for server in dict.fromkeys(found):
-                yield from _judge_client(client, server, count=len(found) + others[place])
+    for client, place in view.by_node.each(_clients):
+        found = servers.get(place, ())
+        for server in dict.fromkeys(found):
+            yield from _judge_client(client, server, count=len(found) + others[place])
 
 
 def _servers(facts: NodeFacts) -> Iterator[_Place]:

@@ -9,7 +9,7 @@ from lifecycle.plan import COMMAND, DEFAULT, GIVEN, NOT_FINITE, ExpectedParamete
 from lifecycle.verify.observation import ParameterReport, digest_of
 from lifecycle.verify.rules.catalogue import Heals, Rule
 from lifecycle.verify.verdict import Finding, Outcome
-from lifecycle.verify.view import NodeFacts, View, once
+from lifecycle.verify.view import NodeFacts, View
 
 MISSING = Rule(
     id="param.missing",
@@ -51,8 +51,7 @@ _SHOWN_TEXT = 60
 
 def check(view: View) -> Iterator[Finding]:
     """Judge the parameters of every node that is there."""
-    for facts in view.nodes.values():
-        yield from once(facts, _judge_node)
+    yield from view.by_node.each(_judge_node)
 
 
 def _judge_node(facts: NodeFacts) -> Iterator[Finding]:

@@ -27,7 +27,6 @@ from lifecycle.verify.view import (
     TopicFacts,
     View,
     actual_qos,
-    once,
 )
 
 QOS_DIFFERS = Rule(
@@ -62,10 +61,8 @@ _Unknown = list[tuple[Actual, list[tuple[str, str]]]]
 
 def check(view: View) -> Iterator[Finding]:
     """Judge the QoS of every declared endpoint as far as it is written, then of every pair."""
-    for facts in view.nodes.values():
-        yield from once(facts, _of_node)
-    for topic in sorted(view.topics):
-        yield from once(view.topics[topic], _pairs)
+    yield from view.by_node.each(_of_node)
+    yield from view.by_topic.each(_pairs)
 
 
 def _of_node(facts: NodeFacts) -> Iterator[Finding]:

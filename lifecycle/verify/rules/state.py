@@ -8,7 +8,7 @@ from lifecycle.manifest import TargetState
 from lifecycle.plan import PlannedNode
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.verdict import Finding, Outcome, Stage
-from lifecycle.verify.view import NodeFacts, View, once
+from lifecycle.verify.view import NodeFacts, View
 
 WRONG_STATE = Rule(
     id="state.wrong-state",
@@ -51,8 +51,7 @@ def _wanted(stage: Stage, node: PlannedNode) -> str:
 
 def check(view: View) -> Iterator[Finding]:
     """Judge the state of every managed node that is there."""
-    for facts in view.nodes.values():
-        yield from once(facts, _judge)
+    yield from view.by_node.each(_judge)
 
 
 def _judge(facts: NodeFacts) -> Iterator[Finding]:
@@ -144,8 +143,7 @@ REPORT_RULES = (MISSING_REPORT, INCOMPLETE_REPORT)
 
 def check_reports(view: View) -> Iterator[Finding]:
     """Judge that our own nodes report all that only they can report."""
-    for facts in view.nodes.values():
-        yield from once(facts, _judge_report)
+    yield from view.by_node.each(_judge_report)
 
 
 def _judge_report(facts: NodeFacts) -> Iterator[Finding]:
