@@ -35,6 +35,11 @@ _OURS = os.O_CLOEXEC | os.O_NOFOLLOW
 _LONGEST_RECORD = 16 * 2**20
 """Bytes; a record names processes and shared memory, a few kB."""
 
+_RECORD_NAME = "record.json"
+_PART_NAME = ".record.json"
+_MADE_NAME = "made"
+"""Names of shared memory made since the record was written, one a line."""
+
 LEDGER_NAME = "programmed.json"
 """File in a run directory that lists what is ours in networks, see programming/apply/ledger.py."""
 
@@ -123,13 +128,28 @@ def boot_id() -> str:
 
 def start_ticks(pid: int) -> int | None:
     """Return when a process started, in clock ticks since boot; None if it does not live."""
+    fields = _status(pid)
+    return None if fields is None or fields[0] in b"ZX" else int(fields[19])
+
+
+def parent_of(pid: int) -> int | None:
+    """Return the pid of a process's parent; None if there is no such process."""
+    fields = _status(pid)
+    return None if fields is None else int(fields[1])
+
+
+def _status(pid: int) -> list[bytes] | None:
+    """Return the fields of proc_pid_stat(5) that follow the command."""
     try:
-        text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
+        descriptor = os.open(f"/proc/{pid}/stat", os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            text = os.read(descriptor, 4096)
+        finally:
+            os.close(descriptor)
     except (FileNotFoundError, ProcessLookupError):
         return None
     # The command is in parentheses and may hold any character; the state follows it.
-    fields = text.rpartition(")")[2].split()
-    return None if fields[0] in "ZX" else int(fields[19])
+    return text.rpartition(b")")[2].split()
 
 
 class RunDirectory:
@@ -223,6 +243,20 @@ class RunDirectory:
         """Where `lifecycle down` and `status` reach the supervisor."""
         return self.path / "control"
 
+    def note_made(self, segments: Iterable[str]) -> None:
+        """Add shared memory to the record, until the next `record`; takes microseconds.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        made = os.open(
+            self.path / _MADE_NAME, os.O_WRONLY | os.O_CREAT | os.O_APPEND | _OURS, 0o600
+        )
+        try:
+            os.write(made, "".join(f"{each}\n" for each in segments).encode())
+        finally:
+            os.close(made)
+
     def record(self, children: tuple[ChildRecord, ...], segments: Iterable[str] = ()) -> None:
         """Write down what runs, in one piece."""
         from lifecycle import codec
@@ -238,12 +272,17 @@ class RunDirectory:
             segments=tuple(sorted(segments)),
             domain_id=self.domain_id,
         )
-        part = self.path / ".record.json"
+        part = self.path / _PART_NAME
         part.unlink(missing_ok=True)
         new = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _OURS, 0o600)
         with os.fdopen(new, "wb") as file:
             file.write(codec.to_json(record))
-        part.replace(self.path / "record.json")
+        # Replacing a file has some file systems write the new one to the disk first (ext4(5),
+        # auto_da_alloc), which takes long on a busy one; who reads meanwhile finds the other name.
+        (self.path / _RECORD_NAME).unlink(missing_ok=True)
+        part.rename(self.path / _RECORD_NAME)
+        with contextlib.suppress(FileNotFoundError):
+            os.truncate(self.path / _MADE_NAME, 0)
 
     def release(self) -> None:
         """Remove the directory and give up the lock; nothing of ours may run.
@@ -269,17 +308,30 @@ def read_record(path: Path) -> RunRecord | None:
     """Return the record in a run directory; None if there is none that can be read."""
     from lifecycle import codec
 
-    try:
-        # Not blocking: a pipe in its place might have no writer.
-        record = os.open(path / "record.json", os.O_RDONLY | os.O_NONBLOCK | _OURS)
-        with os.fdopen(record, "rb") as file:
-            if not stat.S_ISREG(os.fstat(record).st_mode):
-                return None
-            return codec.from_json(
-                file.read(_LONGEST_RECORD + 1), RunRecord, longest=_LONGEST_RECORD
-            )
-    except (OSError, ValueError):
-        return None
+    # It may just take the place of the one before it.
+    for name in (_RECORD_NAME, _PART_NAME, _RECORD_NAME):
+        with contextlib.suppress(OSError, ValueError):
+            record = codec.from_json(_regular(path / name), RunRecord, longest=_LONGEST_RECORD)
+            with contextlib.suppress(OSError):
+                made = _regular(path / _MADE_NAME).decode("ascii", "ignore").split()
+                segments = tuple(sorted({*record.segments, *made}))
+                record = dataclasses.replace(record, segments=segments)
+            return record
+    return None
+
+
+def _regular(path: Path) -> bytes:
+    """Read a file, and no more than a record holds.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    # Not blocking: a pipe in its place might have no writer.
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | _OURS)
+    with os.fdopen(descriptor, "rb") as file:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise OSError(errno.EINVAL, os.strerror(errno.EINVAL), str(path))
+        return file.read(_LONGEST_RECORD + 1)
 
 
 def is_held(path: Path) -> bool:

@@ -20,6 +20,7 @@ import msgspec
 from lifecycle.cli.verbs.check import CheckReport
 from lifecycle.export.picture.model import Picture
 from lifecycle.plan.model import Plan
+from lifecycle.supervisor.run.journal import JournalLine
 from lifecycle.verify.observation import NodeConfiguration
 from lifecycle.verify.verdict import Verdict
 
@@ -69,6 +70,10 @@ RESULTS = {
         type_=Picture,
         title="Picture of a system (lifecycle graph --format json)",
         always={"PicturedArrow": ("notes",)},
+    ),
+    "journal": Result(
+        type_=JournalLine,
+        title="Line of a run's journal (journal.jsonl beside its logs)",
     ),
     "node_configuration": Result(
         type_=NodeConfiguration, title="Configuration of one node (~/get_configuration)"

@@ -35,6 +35,9 @@ VERBS: dict[str, str] = {
     "import": "write a manifest from a ROS 2 launch file, gaps marked; starts nothing",
     "capture": "write a manifest from a running system, gaps marked",
     "logs": "show what the processes of the latest run have written, or follow it",
+    "history": "show what happened in a run, from its journal",
+    "explain": "say which fact turned a finding of a run, and when",
+    "replay": "judge what a run saw again, with today's rules",
     "run": "run one node of a manifest in this terminal, without a supervisor",
     "ports": "DDS port arithmetic and platform limits",
     "init": "make a package of one's own: nodes, manifest, tests, CI workflow",
@@ -43,6 +46,7 @@ VERBS: dict[str, str] = {
 
 _ELSEWHERE = {
     **dict.fromkeys(("pause", "resume", "restart", "down", "status"), "control"),
+    **dict.fromkeys(("explain", "replay"), "history"),
     "schema": "init",
     "import": "import_",
 }

@@ -11,6 +11,7 @@ from .discovery.probe import peers_environment as peers_environment
 from .discovery.rediscovery import call_out as call_out
 from .discovery.rediscovery import republish_names as republish_names
 from .discovery.rediscovery import send_again_soon as send_again_soon
+from .fastdds.dscp import widen_discovery_buffers as widen_discovery_buffers
 from .fastdds.nfe import SHARED_MEMORY as SHARED_MEMORY
 from .fastdds.nfe import UniqueFlowNotFeasible as UniqueFlowNotFeasible
 from .fastdds.nfe import create_publisher as create_publisher
@@ -33,7 +34,9 @@ from .process.shared_memory import Creations as Creations
 from .process.shared_memory import check_room as check_room
 from .process.shared_memory import holds_shared_memory as holds_shared_memory
 from .process.shared_memory import leftovers as leftovers
+from .process.shared_memory import segments_by_holder as segments_by_holder
 from .process.shared_memory import segments_of as segments_of
+from .process.shared_memory import still_there as still_there
 from .process.shared_memory import sweep as sweep
 from .process.teardown import leave_and_exit as leave_and_exit
 from .rcl.executor import NodeExecutor as NodeExecutor

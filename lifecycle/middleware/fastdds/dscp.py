@@ -2,7 +2,8 @@
 
 Owns: these options (ip(7), ipv6(7), RFC 2474) on the sockets that a participant sends from: data,
 and what its readers acknowledge; finding the sockets of this process by a network flow endpoint's
-protocol, address and port among its descriptors (proc(5)), and reading them.
+protocol, address and port among its descriptors (proc(5)), and reading them; and the receive
+buffers of those on which it receives discovery.
 
 Fast DDS 2.14 has no DSCP setting, always lists 0 in its NFEs and exposes no socket; the socket
 option is what the kernel puts into packets. It needs no privilege.
@@ -23,7 +24,13 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.network import InternetProtocol, NetworkFlowEndpoint, TransportProtocol
+from lifecycle.network import (
+    DG,
+    InternetProtocol,
+    NetworkFlowEndpoint,
+    TransportProtocol,
+    participant_ports,
+)
 
 _FAMILY = {InternetProtocol.IPV4: socket.AF_INET, InternetProtocol.IPV6: socket.AF_INET6}
 _TYPE = {TransportProtocol.UDP: socket.SOCK_DGRAM, TransportProtocol.TCP: socket.SOCK_STREAM}
@@ -104,6 +111,38 @@ def socket_descriptors() -> list[int]:
             if str(entry.readlink()).startswith("socket:"):
                 numbers.append(int(entry.name))
     return numbers
+
+
+_DISCOVERY_BYTES = 1 << 22
+
+
+def widen_discovery_buffers(domain_id: int) -> int:
+    """Give the sockets on which this process receives discovery room for many participants.
+
+    Fast DDS 2.14 leaves them the system's default, which holds some 160 small datagrams: twenty
+    participants that announce their endpoints send four times as many, and what is lost is sent
+    again. Data keep their buffers: what waits in a large one is late. The kernel gives twice what
+    is asked for, and no more than twice net.core.rmem_max (socket(7)).
+
+    Args:
+        domain_id: 0–232; other ports than discovery's own of this domain stay as they are.
+
+    Returns:
+        How many sockets have more room than before.
+    """
+    first = participant_ports(domain_id, 0).discovery_multicast
+    ports = range(first, first + DG, 2)
+    count = 0
+    for number in socket_descriptors():
+        # Closed since, or no socket any more.
+        with contextlib.suppress(OSError), socket.socket(fileno=os.dup(number)) as each:
+            if each.type != socket.SOCK_DGRAM or each.family not in _FAMILY.values():
+                continue
+            before = each.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
+            if before < _DISCOVERY_BYTES and each.getsockname()[1] in ports:
+                each.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _DISCOVERY_BYTES)
+                count += each.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) > before
+    return count
 
 
 def _key(each: socket.socket) -> tuple[int, int, str, int]:

@@ -41,6 +41,9 @@ _IN_CREATE = 0x100
 _EVENT = struct.Struct("iIII")
 _EVENT_BYTES = 65536
 
+_LOCK_FIELDS = 8
+"""Of a held lock in /proc/locks: number, FLOCK, ADVISORY, WRITE, pid, file, start, end."""
+
 _Inode = tuple[int, int]
 """(device, inode number)."""
 
@@ -93,11 +96,43 @@ def segments_of(pids: Iterable[int]) -> frozenset[str]:
     return frozenset(file.path.name for file in files if file.group in owned)
 
 
+def segments_by_holder() -> dict[int, frozenset[str]]:
+    """Return the names of the Fast DDS files that processes own, by the pids of the owners.
+
+    One reading for all processes, but nothing of one that has opened a lock file and not locked it
+    yet, nor of processes of other PID namespaces; `segments_of` is sure.
+
+    Raises:
+        OSError: /proc/locks cannot be read, see proc_locks(5).
+    """
+    files = _files()
+    locks = {file.inode: file.group for file in files if file.is_lock}
+    held: dict[int, set[str]] = {}
+    if locks:
+        for line in Path("/proc/locks").read_text(encoding="ascii").splitlines():
+            fields = line.split()
+            if len(fields) < _LOCK_FIELDS or fields[1] != "FLOCK":
+                continue
+            major, minor, inode = fields[5].split(":")
+            device = os.makedev(int(major, 16), int(minor, 16))
+            if group := locks.get((device, int(inode))):
+                held.setdefault(int(fields[4]), set()).add(group)
+    return {
+        pid: frozenset(file.path.name for file in files if file.group in groups)
+        for pid, groups in held.items()
+    }
+
+
+def still_there(groups: Collection[str]) -> frozenset[str]:
+    """Return those of some groups, see `Creations.take`, that still have a file."""
+    return frozenset(groups) & {file.group for file in _files()} if groups else frozenset()
+
+
 class Creations:
-    """Notices that a process, ours or not, begins to own a segment or a port (inotify(7)).
+    """Notices that a process, ours or not, makes files of a segment or of a port (inotify(7)).
 
     Attributes:
-        descriptor: readable as soon as a lock file was created.
+        descriptor: readable as soon as one was created.
     """
 
     def __init__(self) -> None:
@@ -115,13 +150,13 @@ class Creations:
             os.close(self.descriptor)
             raise error
 
-    def take(self) -> bool:
-        """Take what came; return whether a lock file was created."""
+    def take(self) -> frozenset[str]:
+        """Take what came; return the groups of which a file was created, for `sweep`."""
         try:
             data = os.read(self.descriptor, _EVENT_BYTES)
         except BlockingIOError:
-            return False
-        return any(_group(name) and name.endswith(("_el", "_sl")) for name in _created(data))
+            return frozenset()
+        return frozenset(map(_group, _created(data))) - {""}
 
     def close(self) -> None:
         """End it."""

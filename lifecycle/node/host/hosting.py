@@ -33,6 +33,7 @@ from lifecycle.middleware import (
     once_participant_is_made,
     participant_settings,
     send_again_soon,
+    widen_discovery_buffers,
 )
 from lifecycle.node.author.spec import load_nodes
 from lifecycle.node.connections.data_layer import NodeInterface
@@ -283,6 +284,7 @@ class Host:
         peer. To those found later all of it is sent again, and each such message has a heartbeat
         sent to all others (Fast DDS 2.14; 20 nodes: 33,000 of 80,000 datagrams).
         """
+        widen_discovery_buffers(self._spec.domain_id)
         self._channel.write(Event(kind="participant"))
         self._proceed.wait(_GATHER_S)
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Protocol
 
 from lifecycle.graph import set_within
@@ -242,6 +242,23 @@ class Looker(Protocol):
         """Return what the observation alone does not show."""
 
 
+class Recorder(Protocol):
+    """What keeps what was seen and found, see run/journal.py."""
+
+    def looked(
+        self,
+        plan: Plan,
+        observation: Observation,
+        verdict: Verdict,
+        *,
+        stage: Stage,
+        machines: frozenset[str] | None,
+        ahead: frozenset[str],
+        over: Mapping[str, str],
+    ) -> None:
+        """Take what `verify` was given, and what it found."""
+
+
 class VerificationLoop:
     """Judges one system.
 
@@ -263,8 +280,10 @@ class VerificationLoop:
         looker: Looker | None = None,
         agreement: Agreement | None = None,
         guard: ActivationGuard | None = None,
+        recorder: Recorder | None = None,
     ) -> None:
         self._system = system
+        self._recorder = recorder
         self._observer = observer
         self._changes = changes
         self._emit = emit
@@ -339,16 +358,23 @@ class VerificationLoop:
             self._looker.look(observation)
         if self._guard is not None:
             self._guard.look(observation)
+        expected, machines = self._system.expected, self._system.machines
+        ahead, over = self.ahead, self._system.over()
         # What opens the gate is judged from scratch; what is watched, where it has changed.
         judge = self._watch if stage is Stage.ACTIVE else self._verify
         verdict = judge(
-            self._system.expected,
-            observation,
-            stage=stage,
-            machines=self._system.machines,
-            ahead=self.ahead,
-            over=self._system.over(),
+            expected, observation, stage=stage, machines=machines, ahead=ahead, over=over
         )
+        if self._recorder is not None:
+            self._recorder.looked(
+                expected,
+                observation,
+                verdict,
+                stage=stage,
+                machines=machines,
+                ahead=ahead,
+                over=over,
+            )
         if self._looker is not None:
             verdict = with_findings(verdict, self._looker.findings())
         if self._guard is not None:

@@ -52,17 +52,18 @@ class ObserverParticipant:
             MiddlewareError: it cannot be made.
         """
         from lifecycle.graph import Graph
+        from lifecycle.middleware import widen_discovery_buffers
 
-        return cls(
-            Graph.in_loop(
-                domain_id,
-                connections,
-                messages=events,
-                unplanned=unplanned,
-                quiet_s=_QUIET_S,
-                burst_s=_BURST_S,
-            )
+        graph = Graph.in_loop(
+            domain_id,
+            connections,
+            messages=events,
+            unplanned=unplanned,
+            quiet_s=_QUIET_S,
+            burst_s=_BURST_S,
         )
+        widen_discovery_buffers(domain_id)
+        return cls(graph)
 
     @property
     def rmw(self) -> str:

@@ -512,6 +512,14 @@ class System:
         every = (*self.processes.values(), *(() if self.server is None else (self.server,)))
         return tuple(each for each in every if each.pid and each.state is not ProcessState.EXITED)
 
+    def output_positions(self) -> dict[str, int]:
+        """Return how many bytes the log file of each process has."""
+        return {each.name: each.log.position for each in self.processes.values()}
+
+    def pids(self) -> dict[str, int]:
+        """Return the pids of the living processes, by name."""
+        return {each.name: each.pid for each in self.living}
+
     def dead(self) -> frozenset[str]:
         """Return the names of the nodes whose process has ended.
 

@@ -26,7 +26,7 @@ from lifecycle.supervisor.processes.fork_server_main import (
     ChildReport,
     ForkRequest,
 )
-from lifecycle.supervisor.processes.orphans import children, descendants
+from lifecycle.supervisor.processes.orphans import Lineage, children, descendants
 from lifecycle.supervisor.processes.process import ProcessExit, SpawnRequest, run_delay_s
 from lifecycle.supervisor.run.events import Emitter, Notice
 
@@ -54,10 +54,14 @@ class ForkServerChild:
 
     Args:
         on_stop: see SpawnRequest.
+        lineage: which processes descend from it.
     """
 
-    def __init__(self, pid: int, pidfd: int, on_stop: Callable[[bool], None]) -> None:
+    def __init__(
+        self, pid: int, pidfd: int, on_stop: Callable[[bool], None], lineage: Lineage
+    ) -> None:
         self.pid = pid
+        self._lineage = lineage
         self.exited: asyncio.Future[ProcessExit] = asyncio.get_running_loop().create_future()
         self.on_stop = on_stop
         self._pidfd: int | None = pidfd
@@ -79,7 +83,7 @@ class ForkServerChild:
 
     def run_delay_s(self) -> float:
         """Return how long its threads, and those of its descendants, waited for a processor."""
-        return sum(map(run_delay_s, {self.pid, *descendants(self.pid)}))
+        return sum(map(run_delay_s, self._lineage.of(self.pid)))
 
     def _ended(self) -> None:
         """The pidfd is readable: it ended. The fork server reports how, unless it is gone."""
@@ -144,6 +148,7 @@ class ForkServer:
         self._loop = asyncio.get_running_loop()
         # Of a shell that became this process by exec: no part of the run.
         self._foreign = children()
+        self._lineage = Lineage()
         self._has_died = False
         self._closed = False
         self._begin(process)
@@ -285,7 +290,7 @@ class ForkServer:
             if not born.done():
                 born.set_exception(BringUpError(report.error))
             return
-        child = ForkServerChild(report.pid, descriptors[0], request.on_stop)
+        child = ForkServerChild(report.pid, descriptors[0], request.on_stop, self._lineage)
         self._children[report.id] = child
         child.exited.add_done_callback(lambda _: self._children.pop(report.id, None))
         if born.cancelled():

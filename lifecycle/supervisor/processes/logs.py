@@ -78,6 +78,9 @@ def log_directory(environment: Mapping[str, str], system: str) -> Path:
 KEPT_RUNS = 50
 """Runs of one system whose logs are kept; LIFECYCLE_KEEP_LOGS says otherwise."""
 
+JOURNAL_NAME = "journal.jsonl"
+"""What happened in the run, in the directory of its logs, see run/journal.py."""
+
 LATEST = "latest"
 """Link to the directory of the run that began last, as launch has it."""
 
@@ -123,7 +126,9 @@ def _remove_run(path: Path, system: str) -> None:
     named = _named(system).fullmatch(path.name)
     files = list(path.iterdir())
     ours = all(
-        each.name.endswith((".log", ".log.1")) and each.is_file() and not each.is_symlink()
+        each.name.endswith((".log", ".log.1", JOURNAL_NAME, f"{JOURNAL_NAME}.1"))
+        and each.is_file()
+        and not each.is_symlink()
         for each in files
     )
     if named is None or not ours or Path(f"/proc/{named['pid']}").exists():
@@ -329,6 +334,11 @@ class ProcessLog:
             self._file = os.open(self.path, flags, 0o666)
             self._bytes = os.fstat(self._file).st_size
         return self._file
+
+    @property
+    def position(self) -> int:
+        """Bytes in the file; 0 before the first line."""
+        return self._bytes
 
     @property
     def shown(self) -> str:

@@ -21,7 +21,14 @@ from typing import Protocol
 import psutil
 
 from lifecycle.middleware import segments_of
-from lifecycle.run_directory import OWN_CHILD, RUN_VARIABLE, RunRecord, boot_id, start_ticks
+from lifecycle.run_directory import (
+    OWN_CHILD,
+    RUN_VARIABLE,
+    RunRecord,
+    boot_id,
+    parent_of,
+    start_ticks,
+)
 
 GRACE_S = 3.0
 """Between asking an orphan to end and killing it."""
@@ -139,6 +146,33 @@ def descendants(pid: int) -> tuple[int, ...]:
         return tuple(each.pid for each in psutil.Process(pid).children(recursive=True))
     except psutil.NoSuchProcess:
         return ()
+
+
+class Lineage:
+    """Which processes descend from which, as it was at most `FRESH_S` ago: reading all costs ms."""
+
+    FRESH_S = 0.5
+
+    def __init__(self) -> None:
+        self._read_s = float("-inf")
+        self._children: dict[int, list[int]] = {}
+
+    def of(self, pid: int) -> set[int]:
+        """Return a process and all that descends from it."""
+        if time.monotonic() - self._read_s > self.FRESH_S:
+            self._children = {}
+            for entry in os.listdir("/proc"):  # noqa: PTH208 - hot loop
+                if entry.isdigit() and (parent := parent_of(int(entry))) is not None:
+                    self._children.setdefault(parent, []).append(int(entry))
+            self._read_s = time.monotonic()
+        found: set[int] = set()
+        left = [pid]
+        while left:
+            each = left.pop()
+            if each not in found:
+                found.add(each)
+                left += self._children.get(each, ())
+        return found
 
 
 def _carrying(run_id: str) -> set[int]:

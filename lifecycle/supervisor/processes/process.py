@@ -376,8 +376,14 @@ class ManagedProcess:
             self._emit(LogLine(process=self.name, stream=stream, line=line))
 
 
+PROMPT_S = 0.1
+"""What is done within this, or a tenth of its limit, is not worth looking: most steps are."""
+
 SLICE_S = 1.0
 """How often is looked whether a process could run, while it is waited for."""
+
+_LEAST_S = 0.01
+"""What is left of a limit may shrink by half each time, and never end."""
 
 AT_MOST = 10.0
 """However loaded the machine is, a limit lasts no longer than so many times its seconds."""
@@ -394,13 +400,17 @@ async def wait_under_load(
             `AT_MOST` times the limit in all.
         run_delay: seconds of run delay so far, of all threads together.
     """
+    prompt_s = min(PROMPT_S, limit_s / 10)
+    done, _ = await asyncio.wait(waits, timeout=prompt_s, return_when=asyncio.FIRST_COMPLETED)
+    if done:
+        return True
     loop = asyncio.get_running_loop()
     began_s = now_s = loop.time()
-    left_s = limit_s
+    left_s = limit_s - prompt_s
     waited_s = run_delay()
     while left_s > 0 and now_s - began_s < AT_MOST * limit_s:
         done, _ = await asyncio.wait(
-            waits, timeout=min(left_s, SLICE_S), return_when=asyncio.FIRST_COMPLETED
+            waits, timeout=min(max(left_s, _LEAST_S), SLICE_S), return_when=asyncio.FIRST_COMPLETED
         )
         if done:
             return True

@@ -44,6 +44,7 @@ from lifecycle.supervisor.processes.logs import begin_logs, check_log_root, log_
 from lifecycle.supervisor.processes.orphans import end_run
 from lifecycle.supervisor.run.events import Emitter, Event, Listener, Notice, RunStarted
 from lifecycle.supervisor.run.failure import StepFailedError, Worker, never_connected, with_failure
+from lifecycle.supervisor.run.journal import Journal
 from lifecycle.supervisor.run.options import (
     UpOptions,
     UpResult,
@@ -165,17 +166,9 @@ def _up(
     service = ServiceManager.of(os.environ)
     emit = _emitter((*listeners, service.on_event))
     forerunner = _preloading(forerunner, plan, options, processes)
-    try:
-        directory = RunDirectory.acquire(
-            runtime_root(os.environ),
-            run_name(plan, options.machine),
-            forerunner.run_id,
-            domain_id=plan.domain_id,
-        )
-    except LifecycleError:
-        forerunner.close()
-        raise
+    directory = _acquired(plan, options, forerunner)
     records: Records | None = None
+    journal = _journal(plan, directory, emit)
     try:
         if directory.previous is not None:
             _clean_up_after(directory.previous, emit)
@@ -196,6 +189,8 @@ def _up(
                 processes=processes,
                 variables=_graph_variables(os.environ),
             )
+            leaving.enter_context(journal.writing(logs, positions=system.output_positions))
+            leaving.enter_context(journal.noting_use(system.pids))
             fork_server = ForkServer(forerunner.process, emit)
             worker = leaving.enter_context(contextlib.closing(Worker("lifecycle")))
             records = leaving.enter_context(noting(directory, system, fork_server, worker, emit))
@@ -218,6 +213,7 @@ def _up(
                     emit=emit,
                     ending=ending,
                     worker=worker,
+                    recorder=journal,
                 )
                 leaving.push_async_callback(session.leave)
                 if on_start is not None:
@@ -239,6 +235,27 @@ def _up(
         forerunner.close()
         _sweep(records)
         directory.release()
+
+
+def _acquired(plan: Plan, options: UpOptions, forerunner: Forerunner) -> RunDirectory:
+    try:
+        return RunDirectory.acquire(
+            runtime_root(os.environ),
+            run_name(plan, options.machine),
+            forerunner.run_id,
+            domain_id=plan.domain_id,
+        )
+    except LifecycleError:
+        forerunner.close()
+        raise
+
+
+def _journal(plan: Plan, directory: RunDirectory, emit: Emitter) -> Journal:
+    journal = Journal(
+        plan.system, directory.run_id, say=lambda message: emit(Notice(message=message))
+    )
+    emit.listen(journal.on_event)
+    return journal
 
 
 def _emitter(listeners: Iterable[Listener]) -> Emitter:
@@ -287,7 +304,7 @@ def _preloading(
 
 def _sweep(records: Records | None, emit: Emitter | None = None) -> None:
     """Remove the shared memory that processes of the run have left."""
-    swept = sweep(records.segments) if records else ()
+    swept = sweep(records.left()) if records else ()
     if swept and emit:
         emit(Notice(message=f"removed shared memory left in /dev/shm: {', '.join(swept)}"))
 

@@ -15,6 +15,7 @@ import threading
 import time
 from pathlib import Path
 
+import rclpy
 from rclpy.node import Node
 from std_msgs.msg import String
 
@@ -28,6 +29,11 @@ def misbehave(step: str) -> None:
         return
     print(f"about to {way} in {step}", flush=True)
     if way == "kill":
+        os.kill(os.getpid(), signal.SIGKILL)
+    if way == "kill-with-participant":
+        context = rclpy.Context()
+        context.init(args=[])
+        rclpy.create_node("short_lived", context=context)
         os.kill(os.getpid(), signal.SIGKILL)
     if way == "exit":
         os._exit(9)

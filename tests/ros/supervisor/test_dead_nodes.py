@@ -16,7 +16,7 @@ import rclpy
 from rclpy.node import Node
 
 from lifecycle.errors import ExitCode
-from lifecycle.middleware import sweep
+from lifecycle.middleware import leftovers, sweep
 from tests.ros.middleware.free_ports import free_ports
 from tests.ros.supervisor.running import ENOUGH, Up, pair, up, verb
 
@@ -148,6 +148,18 @@ def test_a_killed_process_is_gone_for_everybody_at_once_and_comes_back_at_once(
         open_ports |= {each for each in run.segments if "_port" in each}
         run.segments -= open_ports
         run.assert_nothing_left()
+
+
+def test_shared_memory_of_a_process_killed_as_soon_as_it_has_made_it_is_removed(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    """Nobody has looked whose it is by then, and afterwards nobody can tell."""
+    before = set(leftovers())
+    manifest = pair(tmp_path, fresh_domain, misbehave="configure:kill-with-participant")
+    with up(manifest, runtime=tmp_path) as killed:
+        assert killed.finish() == ExitCode.BRING_UP_FAILED
+        assert "fastrtps_" in str(killed.of_kind("notice"))
+    assert set(leftovers()) <= before
 
 
 @pytest.mark.parametrize("mode", ["static", "server"])

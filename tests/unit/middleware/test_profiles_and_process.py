@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import subprocess
 import sys
 import time
@@ -11,8 +12,9 @@ from pathlib import Path
 import pytest
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware import exit_after
+from lifecycle.middleware import exit_after, widen_discovery_buffers
 from lifecycle.middleware.fastdds.profiles import discovery_environment, discovery_profile
+from lifecycle.network import participant_ports
 
 VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 
@@ -118,3 +120,21 @@ def test_an_orphan_is_adopted_by_the_subreaper() -> None:
     )
     orphan, adopted = done.stdout.split()
     assert orphan == adopted
+
+
+def test_only_sockets_that_receive_discovery_of_the_domain_get_more_room() -> None:
+    ports = participant_ports(231, 50)
+
+    def room(port: int) -> tuple[int, int]:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as bound:
+            bound.bind(("127.0.0.1", port))
+            before = bound.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
+            counted = widen_discovery_buffers(231)
+            after = bound.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
+            assert counted == (after > before)
+            return before, after
+
+    before, after = room(ports.discovery_unicast)
+    assert after > before
+    before, after = room(ports.user_unicast)
+    assert after == before

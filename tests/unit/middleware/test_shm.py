@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.middleware import leftovers, segments_of, sweep
+from lifecycle.middleware import leftovers, segments_by_holder, segments_of, still_there, sweep
 from lifecycle.middleware.process import shared_memory
 from lifecycle.middleware.process.shared_memory import Creations
 
@@ -187,15 +187,16 @@ def test_a_port_cannot_be_opened_while_it_is_being_removed(
     assert removed == tuple(sorted(seen)) == tuple(sorted(GROUP))
 
 
-def test_the_creation_of_a_lock_file_is_noticed_and_of_nothing_else(directory: Path) -> None:
+def test_the_creation_of_fast_ddss_files_is_noticed_and_of_nothing_else(directory: Path) -> None:
     creations = Creations()
     try:
-        make(directory, "other_el", PORT, SEGMENT, f"sem.{PORT}_mutex")
-        assert not creations.take()
-        make(directory, f"{PORT}_sl")
+        make(directory, "other_el")
+        assert creations.take() == frozenset()
+        make(directory, f"{PORT}_sl", SEGMENT, f"sem.{PORT}_mutex")
         assert select.select([creations.descriptor], [], [], 5)[0]
-        assert creations.take()
-        assert not creations.take()
+        assert creations.take() == {PORT, SEGMENT}
+        assert creations.take() == frozenset()
+        assert still_there((PORT, "fastrtps_port1")) == {PORT}
     finally:
         creations.close()
 
@@ -205,6 +206,14 @@ def test_a_process_owns_the_groups_whose_lock_file_it_has_open(directory: Path) 
     with (directory / f"{PORT}_el").open("rb"), (directory / SEGMENT).open("rb"):
         assert segments_of([os.getpid()]) == frozenset(GROUP)
     assert segments_of([os.getpid()]) == frozenset()
+
+
+def test_the_kernels_list_of_locks_names_the_owner_of_a_group(directory: Path) -> None:
+    make(directory, *GROUP, SEGMENT, f"{SEGMENT}_el")
+    with (directory / f"{PORT}_el").open("rb") as lock, (directory / f"{SEGMENT}_el").open("rb"):
+        assert segments_by_holder() == {}
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        assert segments_by_holder() == {os.getpid(): frozenset(GROUP)}
 
 
 def test_a_process_that_has_ended_owns_nothing() -> None:

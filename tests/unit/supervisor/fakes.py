@@ -165,6 +165,7 @@ class FakeProcess:
             self.end(ProcessExit(signal=number))
 
     def run_delay_s(self) -> float:
+        self._spawner.looked_at.append(self._name)
         share = self._spawner.starves.get(self._name, 0.0)
         return share * asyncio.get_running_loop().time()
 
@@ -273,6 +274,7 @@ class FakeSpawner:
         takes_s: how long such a line takes.
         unhosted: by process, nodes that cannot be constructed and why, reported 0.1 s apart.
         starves: by process, for how much of the time its threads wait for a processor, added up.
+        looked_at: processes of which it was read how long they waited for a processor.
         ends_at: processes that do not end by themselves, and the signal that ends them.
         processes: by name.
         interfaces: what a node reports, by full name; steps of wiring change it.
@@ -287,6 +289,7 @@ class FakeSpawner:
         self.takes_s: dict[str, float] = {}
         self.unhosted: dict[str, dict[str, str]] = {}
         self.starves: dict[str, float] = {}
+        self.looked_at: list[str] = []
         self.ends_at: dict[str, int] = {}
         self.processes: dict[str, FakeProcess] = {}
         self.interfaces: dict[str, NodeConfiguration] = {}

@@ -43,6 +43,8 @@ from lifecycle.supervisor.run.events import (
     VerdictChanged,
 )
 from lifecycle.supervisor.run.failure import StepFailedError, Worker
+from lifecycle.supervisor.run.history import journal_files, read_run, replayed
+from lifecycle.supervisor.run.journal import Journal
 from lifecycle.supervisor.run.options import UpOptions, UpResult
 from lifecycle.supervisor.run.records import Records
 from lifecycle.supervisor.run.session import Session
@@ -424,6 +426,8 @@ class SessionWorld:
         self._tmp_path = tmp_path
         self._emit = Emitter(loop.time)
         self._emit.listen(self._take)
+        self.journal = Journal("robot", "0", say=self.story.append, wall=loop.time, clock=loop.time)
+        self._emit.listen(self.journal.on_event)
         self._options = UpOptions(**options)
         (tmp_path / "logs").mkdir()
         self.system = System(
@@ -462,7 +466,8 @@ class SessionWorld:
 
     async def run(self, *scenarios: Coroutine[Any, Any, None]) -> None:
         """Run the session to its end, and beside it what happens to it."""
-        with self.ending, self._run_directory() as directory:
+        kept = self.journal.writing(self._tmp_path / "logs", positions=dict)
+        with self.ending, self._run_directory() as directory, kept:
             session = Session(
                 self.system,
                 self._options,
@@ -474,6 +479,7 @@ class SessionWorld:
                 emit=self._emit,
                 ending=self.ending,
                 worker=self.worker,
+                recorder=self.journal,
             )
             self.result = await _beside(session.run(), scenarios)
             await session.leave()
@@ -529,6 +535,18 @@ class SessionWorld:
         assert self._stopping_at_s is not None
         assert self._emit.elapsed_s - self._stopping_at_s < SHUTDOWN_S
         self._check_gate()
+        self._check_journal()
+
+    def _check_journal(self) -> None:
+        """Check that the journal tells the same story, and that its verdicts can be had again."""
+        recorded = read_run(journal_files(self._tmp_path / "logs"))
+        assert recorded.unreadable == ()
+        told = [_line(each.event, 0.0) for each in recorded.moments if each.event is not None]
+        story = [line for line in self.story if line.startswith("[") and line != "[log]"]
+        assert [line.partition(" at ")[0] for line in told] == [
+            line.partition(" at ")[0] for line in story
+        ]
+        assert not any(replayed(recorded))
 
     def _check_gate(self) -> None:
         opened: set[str] = set()

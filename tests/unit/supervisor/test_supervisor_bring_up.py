@@ -249,6 +249,16 @@ def test_time_that_a_process_waits_for_a_processor_is_not_its_own(
     run(main())
 
 
+def test_what_is_done_promptly_is_done_without_a_look_at_any_process(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = _world(tmp_path, planned_node("a"), planned_node("b"))
+        await world.bring_up.connect(LIMIT_S)
+        await _down(world)
+        assert world.spawner.looked_at == []
+
+    run(main())
+
+
 @pytest.mark.parametrize(("starves", "after_s"), [(0.0, 2.0), (0.5, 4.0), (3.0, 20.0)])
 def test_a_start_that_hangs_is_noticed_on_a_loaded_machine_too(
     tmp_path: Path, starves: float, after_s: float

@@ -33,7 +33,7 @@ from lifecycle.supervisor.processes.logs import (
     ProcessLog,
     ros_log_root,
 )
-from lifecycle.supervisor.processes.orphans import end_run
+from lifecycle.supervisor.processes.orphans import Lineage, descendants, end_run
 from lifecycle.supervisor.processes.process import (
     COMMAND_ESCALATION,
     ManagedProcess,
@@ -113,6 +113,21 @@ def test_a_command_gets_its_arguments_environment_and_session_and_its_end_is_not
             await process.end(COMMAND_ESCALATION, asyncio.Event())
             assert bench.lines == ["red True"]
             assert process.log.path.read_text() == "red True\n"
+
+    _run(test())
+
+
+def test_a_process_is_read_together_with_what_it_started(tmp_path: Path) -> None:
+    async def test() -> None:
+        started = "import subprocess; subprocess.run(['sleep', '60'])"
+        async with _bench(tmp_path) as bench:
+            process = await bench.start(PYTHON, "-c", started)
+            for _ in range(500):
+                if len(found := Lineage().of(process.pid)) > 1:
+                    break
+                await asyncio.sleep(0.02)
+            assert found == {process.pid, *descendants(process.pid)}
+            assert len(found) == 2
 
     _run(test())
 

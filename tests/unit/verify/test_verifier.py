@@ -73,7 +73,8 @@ def _loaded(path: str) -> Plan:
 @st.composite
 def plans(draw: st.DrawFn) -> Plan:
     """A system made up or one of the manifests, with a policy of its own and installed types."""
-    plan = draw(st.sampled_from(_MANIFESTS).map(_loaded) | systems())
+    made = st.sampled_from(_MANIFESTS).map(_loaded)
+    plan = draw(made | made | systems())
     policies = st.sampled_from(EndpointPolicy)
     hashes = st.sampled_from(["", "RIHS01_a"])
     policy = Policy(
