@@ -2,6 +2,8 @@ from .captured import CapturedParameter as CapturedParameter
 from .captured import CapturedSystem as CapturedSystem
 from .captured import Programs as Programs
 from .captured import capture as capture
+from .engines import ENGINES as ENGINES
+from .engines import Deployment as Deployment
 from .manifest_yaml import SUFFIX as SUFFIX
 from .manifest_yaml import Noted as Noted
 from .manifest_yaml import Tree as Tree

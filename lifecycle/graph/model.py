@@ -462,7 +462,6 @@ def _match_end(end: End) -> MatchEnd:
         qos=endpoint.qos or UNKNOWN_QOS,
         gid=endpoint.gid,
         report=endpoint,
-        expected=True,
     )
 
 

@@ -44,6 +44,7 @@ from lifecycle.network import (
     map_priority,
     max_unfragmented,
     propose,
+    udp_to,
 )
 
 _OPERATOR_SPECIFIC = range(128, 255)  # TS 24.501 §9.11.4.12
@@ -415,7 +416,7 @@ class FlowNeeds:
         )
 
     def _transports(self, node: Node) -> tuple[Medium, ...]:
-        return (Medium.UDPV6 if ":" in self._addresses.get(node.machine, "") else Medium.UDPV4,)
+        return (udp_to(self._addresses.get(node.machine, "")),)
 
     def _with_datagrams(self, node_key: str, each: ResolvedNeed) -> ResolvedNeed:
         """Return how small datagrams must be; only a flow that a network knows can be harmed."""

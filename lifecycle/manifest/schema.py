@@ -3,8 +3,8 @@
 Owns: loading the shipped schemas; turning each violation into one `Diagnostic`, for the branch that
 was meant where a choice failed; the wording: what is allowed, derived from a schema's keywords, and
 the nearest spelling. Every message starts with "cannot" and quotes the value. Also the adapter
-around jsonschema's `ValidationError`, whose fields are untyped and optional. Pure but for reading
-the shipped schemas.
+around jsonschema's `ValidationError`, whose fields are untyped and optional; and the quick look by
+which a document that fits needs no jsonschema. Pure but for reading the shipped schemas.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import difflib
 import functools
 import itertools
 import json
+import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from importlib import resources
 from typing import TYPE_CHECKING, Any
@@ -284,7 +285,10 @@ def validate(
     """
     found: list[tuple[Place, Diagnostic]] = []
     seen: set[tuple[Place, str]] = set()
-    errors = _validator(definition, is_resolved).iter_errors(document.root.plain())
+    plain = document.root.plain()
+    if _is_sound(plain, definition, is_resolved=is_resolved):
+        return ()
+    errors = _validator(definition, is_resolved).iter_errors(plain)
     broken = list(violations(errors))
     enums = {each.place for each in broken if each.keyword == "enum"}
     # The allowed values are more precise than that they are strings.
@@ -307,14 +311,19 @@ def validate(
 
 @functools.cache
 def _validator(definition: str, is_resolved: bool) -> Draft202012Validator:
+    from jsonschema import Draft202012Validator
+
+    return Draft202012Validator(_schema(definition, is_resolved))
+
+
+@functools.cache
+def _schema(definition: str, is_resolved: bool) -> Mapping[str, Any]:
     whole = read_schema(MANIFEST)
     schema = _resolved_only(whole) if is_resolved else whole
     assert isinstance(schema, dict)
     if definition:
         schema = {"$defs": schema["$defs"], "$ref": f"#/$defs/{definition}"}
-    from jsonschema import Draft202012Validator
-
-    return Draft202012Validator(schema)
+    return schema
 
 
 def _resolved_only(schema: object) -> object:
@@ -388,3 +397,142 @@ def _misspelt(each: Violation) -> set[str]:
     """Return the known keys that unknown ones probably mean: the unknown key is finding enough."""
     known = each.schema.get("properties", {})
     return {nearest(key, known) for key in each.value if key not in known}
+
+
+class _UndecidedError(Exception):
+    """What holds for a value is left to jsonschema."""
+
+
+def _is_sound(value: object, definition: str, *, is_resolved: bool) -> bool:
+    """Return whether a document surely fits; if not, jsonschema decides, and says why.
+
+    Most documents fit, and loading jsonschema takes longer than all the rest of loading one.
+    """
+    schema = _schema(definition, is_resolved)
+    try:
+        return _holds(schema, value, schema["$defs"])
+    except _UndecidedError:
+        return False
+
+
+def _holds(schema: Any, value: Any, definitions: Mapping[str, Any]) -> bool:
+    if isinstance(schema, bool):
+        return schema
+    for keyword, operand in schema.items():
+        if keyword in _ANNOTATIONS:
+            continue
+        if keyword == "type":
+            fits = any(_is_type(value, each) for each in _listed(operand))
+        elif keyword == "$ref":
+            fits = _holds(definitions[operand.removeprefix("#/$defs/")], value, definitions)
+        elif keyword == "anyOf":
+            fits = any(_holds(each, value, definitions) for each in operand)
+        elif keyword == "oneOf":
+            fits = sum(_holds(each, value, definitions) for each in operand) == 1
+        elif keyword in {"enum", "const"}:
+            fits = _is_one_of(value, operand if keyword == "enum" else [operand])
+        elif isinstance(value, dict):
+            fits = _mapping_holds(keyword, schema, value, definitions)
+        elif isinstance(value, list):
+            fits = _list_holds(keyword, operand, value, definitions)
+        else:
+            fits = _scalar_holds(keyword, operand, value)
+        if not fits:
+            return False
+    return True
+
+
+_ANNOTATIONS = frozenset(
+    ("$schema", "$id", "$defs", "title", "description", "default", "examples")
+) | {"patternErrorMessage"}
+_OF_MAPPINGS = frozenset(
+    ("properties", "additionalProperties", "propertyNames", "required", "minProperties")
+)
+_OF_LISTS = frozenset(("items", "minItems", "uniqueItems"))
+_OF_SCALARS = frozenset(("pattern", "minLength", "minimum", "maximum", "exclusiveMinimum"))
+_KNOWN = _OF_MAPPINGS | _OF_LISTS | _OF_SCALARS
+
+
+def _ignored(keyword: str) -> bool:
+    """Return that a keyword is for values of another type; of an unknown one nobody knows."""
+    if keyword not in _KNOWN:
+        raise _UndecidedError
+    return True
+
+
+def _is_type(value: object, name: str) -> bool:
+    if isinstance(value, bool):
+        return name == "boolean"
+    if name == "integer":
+        return isinstance(value, int) or (isinstance(value, float) and value.is_integer())
+    return isinstance(value, _PYTHON_TYPES[name])
+
+
+_PYTHON_TYPES: dict[str, type | tuple[type, ...]] = {
+    "string": str,
+    "number": (int, float),
+    "boolean": bool,
+    "array": list,
+    "object": dict,
+    "null": type(None),
+}
+
+
+def _is_one_of(value: object, allowed: list[Any]) -> bool:
+    """Return whether a value equals one, as JSON Schema has it: 1 is 1.0, and not true."""
+    if any(isinstance(each, dict | list) for each in allowed):
+        raise _UndecidedError
+    return any(
+        each == value and isinstance(each, bool) is isinstance(value, bool) for each in allowed
+    )
+
+
+def _mapping_holds(
+    keyword: str,
+    schema: Mapping[str, Any],
+    value: Mapping[str, Any],
+    definitions: Mapping[str, Any],
+) -> bool:
+    operand = schema[keyword]
+    if keyword == "properties":
+        return all(
+            _holds(operand[key], each, definitions) for key, each in value.items() if key in operand
+        )
+    if keyword == "additionalProperties":
+        known = schema.get("properties", {})
+        return all(_holds(operand, value[key], definitions) for key in value if key not in known)
+    if keyword == "propertyNames":
+        return all(_holds(operand, key, definitions) for key in value)
+    if keyword == "required":
+        return all(key in value for key in operand)
+    return len(value) >= operand if keyword == "minProperties" else _ignored(keyword)
+
+
+def _list_holds(
+    keyword: str, operand: Any, value: list[Any], definitions: Mapping[str, Any]
+) -> bool:
+    if keyword == "items":
+        return all(_holds(operand, each, definitions) for each in value)
+    if keyword == "minItems":
+        return len(value) >= int(operand)
+    if keyword == "uniqueItems" and operand:
+        if not all(isinstance(each, str) for each in value):
+            raise _UndecidedError
+        return len({*value}) == len(value)
+    return _ignored(keyword)
+
+
+def _scalar_holds(keyword: str, operand: Any, value: Any) -> bool:
+    if isinstance(value, str):
+        if keyword == "pattern":
+            return re.search(operand, value) is not None
+        if keyword == "minLength":
+            return len(value) >= int(operand)
+    elif isinstance(value, int | float) and not isinstance(value, bool):
+        if keyword == "minimum":
+            return not value < operand
+        if keyword == "maximum":
+            return not value > operand
+        if keyword == "exclusiveMinimum":
+            return not value <= operand
+    return _ignored(keyword)

@@ -270,9 +270,9 @@ def _has_host(text: str) -> bool:
 
 
 def _check(url: ConnectionUrl) -> None:
-    if url.transport is Medium.SHM:
+    if not url.transport.is_network:
         if url.address or url.port is not None:
-            raise ConnectionUrlError("shm has no address and no port")
+            raise ConnectionUrlError(f"{url.transport} has no address and no port")
         return
     if url.port == 0:
         raise ConnectionUrlError("port 0 is none: leave it out to let the middleware choose")
@@ -284,14 +284,14 @@ def _check(url: ConnectionUrl) -> None:
             raise ConnectionUrlError(f"{url.address!r} is no IP address") from None
         if version and address.version != version:
             raise ConnectionUrlError(f"{url.address!r} is no IPv{version} address")
-        group = url.transport is Medium.UDPM
+        group = url.transport.is_group
         if group and not address.is_multicast:
             raise ConnectionUrlError(f"{url.address!r} is no multicast group")
         if not group and address.is_multicast:
             raise ConnectionUrlError(f"{url.address!r} is a multicast group: use udpm://")
-    elif url.transport is Medium.UDPM:
+    elif url.transport.is_group:
         raise ConnectionUrlError("udpm needs a group, udpm://239.255.1.9:7901")
-    if url.transport is Medium.UDPM and url.port is None:
+    if url.transport.is_group and url.port is None:
         raise ConnectionUrlError("udpm needs a port, udpm://239.255.1.9:7901")
 
 

@@ -1,8 +1,10 @@
 """Transports between participants: UDP, TCP, shared memory, multicast; size of a UDP datagram.
 
-Owns: the one enum of media, with what plan, checks and verification need to know of each, and
-`FlowTransport`, the values of a manifest's `transport:`; MTU, and what of a datagram IP fragments.
-What Fast DDS calls a transport in a profile is in `middleware.fastdds.url_profile`. Pure.
+Owns: the one enum of media, with what plan, checks, adapter and verification ask of each; they ask
+a member and compare it with none, so that a new medium is one entry here. `FlowTransport`, the
+values of a manifest's `transport:`; MTU, and what of a datagram IP fragments. What Fast DDS calls a
+transport in a profile is in `middleware.fastdds.url_profile`; which medium two ends get, and why,
+in `plan.negotiation.media`. Pure.
 
 A UDP datagram that does not fit the path's MTU is split by IP. Only the first fragment carries the
 ports, so that a rule on ports treats the others as something else, and one lost fragment loses them
@@ -12,7 +14,26 @@ datagram of its own, with ports.
 
 from __future__ import annotations
 
+import dataclasses
 import enum
+import socket
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class _Traits:
+    """What a medium is besides UDP or TCP over the version of IP that its value ends with.
+
+    Attributes:
+        meaning: see `Medium.meaning`; empty for its value.
+        stays_in: see `Medium.stays_in`.
+        is_group: see `Medium.is_group`.
+        connects: connection URLs have it as their scheme.
+    """
+
+    meaning: str = ""
+    stays_in: str = ""
+    is_group: bool = False
+    connects: bool = True
 
 
 class Medium(str, enum.Enum):
@@ -21,13 +42,26 @@ class Medium(str, enum.Enum):
     In the order in which a connection is named after several.
     """
 
-    SHM = "shm"
-    UDPM = "udpm"  # a multicast group, over IPv4 or IPv6 by its address
+    traits: _Traits
+
+    def __new__(cls, value: str, traits: _Traits | None = None) -> Medium:  # noqa: PYI034 - 3.10
+        """Make a member."""
+        member = str.__new__(cls, value)
+        member._value_ = value
+        member.traits = traits or _Traits()
+        return member
+
+    SHM = "shm", _Traits(meaning="shared memory", stays_in="shared memory")
+    # A multicast group, over IPv4 or IPv6 by its address.
+    UDPM = "udpm", _Traits(meaning="UDP multicast", is_group=True)
     UDPV4 = "udpv4"
     UDPV6 = "udpv6"
     TCPV4 = "tcpv4"
-    TCPV6 = "tcpv6"  # seen at others; nothing of ours is connected by it
-    INTRAPROCESS = "intraprocess"  # passed on inside a process
+    TCPV6 = "tcpv6", _Traits(connects=False)  # seen at others; nothing of ours is connected by it
+    INTRAPROCESS = (
+        "intraprocess",
+        _Traits(meaning="handed over inside their process", stays_in="one process", connects=False),
+    )
 
     def __str__(self) -> str:
         """Return the value; as StrEnum does, which Python 3.10 has not."""
@@ -40,17 +74,37 @@ class Medium(str, enum.Enum):
     @property
     def is_udp(self) -> bool:
         """Whether it is UDP, to one or to a group."""
-        return self in (Medium.UDPM, Medium.UDPV4, Medium.UDPV6)
+        return self.startswith("udp")
 
     @property
     def is_tcp(self) -> bool:
-        """Whether it is TCP."""
-        return self in (Medium.TCPV4, Medium.TCPV6)
+        """Whether it is TCP: found by being dialled, on the one port of a participant."""
+        return self.startswith("tcp")
 
     @property
     def is_network(self) -> bool:
-        """Whether its packets are what a network sees."""
+        """Whether its packets are what a network sees; only these have addresses and ports."""
         return self.is_udp or self.is_tcp
+
+    @property
+    def is_group(self) -> bool:
+        """Whether it is multicast: its address and port belong to all that listen there."""
+        return self.traits.is_group
+
+    @property
+    def stays_on_host(self) -> bool:
+        """Whether it carries nothing to another host; a group's datagrams have TTL 0."""
+        return self.is_group or not self.is_network
+
+    @property
+    def stays_in(self) -> str:
+        """Where its data stay, if no network sees them, as people read it; empty of others."""
+        return self.traits.stays_in
+
+    @property
+    def connects(self) -> bool:
+        """Whether connections are made of it."""
+        return self.traits.connects
 
     @property
     def ip_version(self) -> int | None:
@@ -58,33 +112,76 @@ class Medium(str, enum.Enum):
         return {"v4": 4, "v6": 6}.get(self.value[-2:])
 
     @property
+    def socket_family(self) -> socket.AddressFamily:
+        """Of its sockets: IPv6's where it says so."""
+        return socket.AF_INET6 if self.ip_version == 6 else socket.AF_INET
+
+    @property
+    def loopback(self) -> str:
+        """The address by which it reaches its own host."""
+        return LOOPBACK6 if self.ip_version == 6 else LOOPBACK
+
+    @property
+    def any_address(self) -> str:
+        """The address of a socket that listens on all interfaces."""
+        return "::" if self.ip_version == 6 else "0.0.0.0"  # noqa: S104 - it is only spelled here
+
+    @property
+    def ports(self) -> int:
+        """How many ports a participant has of it, where each is fixed.
+
+        Of UDP those for discovery, for data, and to send from.
+        """
+        return 3 if self.is_udp else int(self.is_tcp)
+
+    @property
     def unicast(self) -> Medium:
         """What its participants are found by: of a group's, UDP over IPv4."""
-        return Medium.UDPV4 if self is Medium.UDPM else self
+        return Medium.UDPV4 if self.is_group else self
 
     @property
     def meaning(self) -> str:
         """What people read; of an IP transport its value."""
-        return _MEANINGS.get(self, self.value)
+        return self.traits.meaning or self.value
 
 
-_MEANINGS = {
-    Medium.INTRAPROCESS: "handed over inside their process",
-    Medium.UDPM: "UDP multicast",
-    Medium.SHM: "shared memory",
-}
+def udp_to(address: str) -> Medium:
+    """Return UDP over the version of IP of an address; over IPv4 if that is empty."""
+    return Medium.UDPV6 if ":" in address else Medium.UDPV4
+
+
+def medium_of(transport: str) -> Medium:
+    """Return the medium of a transport as participants have it: a group is `udpm@ADDRESS:PORT`."""
+    return Medium(transport.partition("@")[0])
+
+
+LOOPBACK = "127.0.0.1"
+LOOPBACK6 = "::1"
 
 NETWORK_MEDIA = frozenset(each for each in Medium if each.is_network)
 """Media whose packets a network sees."""
 
-SCHEMES = (Medium.UDPV4, Medium.UDPV6, Medium.UDPM, Medium.TCPV4, Medium.SHM)
-"""Media that connections are made of, the schemes of their URLs."""
+CONNECTABLE = tuple(
+    sorted(
+        (each for each in Medium if each.connects), key=lambda each: (each.is_tcp, each.is_group)
+    )
+)
+"""Media that connections are made of, in the order in which a node reports them."""
 
-CONNECTABLE = (Medium.SHM, Medium.UDPV4, Medium.UDPV6, Medium.UDPM, Medium.TCPV4)
-"""The same, in the order in which a node reports what it can be connected by."""
+SCHEMES = tuple(sorted(CONNECTABLE, key=lambda each: not each.is_network))
+"""The same, in the order in which the schemes of connection URLs are listed."""
+
+UDP_UNICAST = tuple(each for each in CONNECTABLE if each.is_udp and not each.is_group)
+"""By what participants are probed, and found without a discovery server."""
 
 RMW_DEFAULT = (Medium.SHM, Medium.UDPV4)
 """What a participant has by default (Fast DDS 2.14)."""
+
+RMW_DISCOVERY = next(each for each in RMW_DEFAULT if each.is_network)
+"""By what such a participant is discovered."""
+
+DEFAULT_TCP = Medium.TCPV4
+"""By what a discovery server is reached, and an observer by TCP, where a manifest says no more."""
 
 TRANSPORTS_VARIABLE = "FASTDDS_BUILTIN_TRANSPORTS"
 
@@ -123,6 +220,16 @@ class FlowTransport(enum.Enum):
     def medium(self) -> Medium | None:
         """The one medium that is asked for; None for ANY and NETWORK."""
         return self.media[0] if len(self.media) == 1 else None
+
+    @property
+    def in_memory(self) -> bool:
+        """Whether it asks for what no network sees, and no other host."""
+        return self.medium is not None and not self.medium.is_network
+
+    @property
+    def by_udp(self) -> bool:
+        """Whether a participant with no more than it is found by UDP, as it is by default."""
+        return self is FlowTransport.ANY or self.medium in UDP_UNICAST
 
     @property
     def builtin(self) -> str | None:

@@ -125,6 +125,9 @@ class InternetProtocol(enum.Enum):
     IPV6 = "ipv6"
 
 
+_VERSIONS = {InternetProtocol.IPV4: "v4", InternetProtocol.IPV6: "v6"}
+
+
 class UniqueRequirement(enum.Enum):
     """`require_unique_network_flow_endpoints`: a creation-time option of every endpoint.
 
@@ -189,8 +192,15 @@ class NetworkFlowEndpoint:
     def describe(self) -> str:
         """Return it for people: `10.0.0.1:7411`, `[fd00::1]:7411`, or `shm`."""
         if self.transport_protocol is TransportProtocol.UNKNOWN:
-            return Medium.SHM
+            return self.medium
         return socket_text(self.internet_address, self.transport_port)
+
+    @property
+    def medium(self) -> str:
+        """What it is of, as `Medium` spells it; `shm` where there is no protocol (rmw_fastrtps)."""
+        if self.transport_protocol is TransportProtocol.UNKNOWN:
+            return Medium.SHM
+        return f"{self.transport_protocol.value}{_VERSIONS.get(self.internet_protocol, '')}"
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

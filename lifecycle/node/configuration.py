@@ -40,7 +40,11 @@ from lifecycle.middleware import (
     machine_id,
     matched_with,
 )
-from lifecycle.network import InternetProtocol, Medium, NetworkFlowEndpoint, TransportProtocol
+from lifecycle.network import (
+    CONNECTABLE,
+    Medium,
+    NetworkFlowEndpoint,
+)
 from lifecycle.node.author import parameters
 from lifecycle.node.author.declaring import interface_name
 from lifecycle.node.connections.connections import Connection, Connections
@@ -73,15 +77,19 @@ def transports() -> tuple[str, ...]:
     """
     if get_rmw_implementation_identifier() != _CONFIGURABLE_RMW:
         return ()
-    found = [Medium.TCPV4, Medium.UDPM, Medium.UDPV4]
-    if os.access(_SHARED_MEMORY, os.W_OK):
-        found.append(Medium.SHM)
+    return tuple(sorted(each for each in CONNECTABLE if _is_here(each)))
+
+
+def _is_here(medium: Medium) -> bool:
+    """Whether this host has what a medium needs."""
+    if not medium.is_network:
+        return os.access(_SHARED_MEMORY, os.W_OK)
+    if medium.ip_version != 6:
+        return True
     try:
-        if _IPV6_ADDRESSES.read_text(encoding="ascii").strip():
-            found.append(Medium.UDPV6)
-    except OSError:
-        pass  # a kernel without IPv6
-    return tuple(sorted(found))
+        return bool(_IPV6_ADDRESSES.read_text(encoding="ascii").strip())
+    except OSError:  # a kernel without IPv6
+        return False
 
 
 _DIGITS = 16
@@ -415,15 +423,7 @@ def _actual_qos(entity: Any, info: EndpointInfo | None) -> QosProfile:
 
 def _transports(endpoints: tuple[EndpointReport, ...]) -> tuple[str, ...]:
     """Return what the node can be reached by, as far as its endpoints' NFEs show."""
-    found = {_transport(nfe) for endpoint in endpoints for nfe in endpoint.nfes or ()}
-    return tuple(sorted(found))
-
-
-def _transport(nfe: NetworkFlowEndpoint) -> str:
-    if nfe.transport_protocol is TransportProtocol.UNKNOWN:
-        return Medium.SHM
-    version = {InternetProtocol.IPV4: "v4", InternetProtocol.IPV6: "v6"}
-    return f"{nfe.transport_protocol.value}{version.get(nfe.internet_protocol, '')}"
+    return tuple(sorted({nfe.medium for each in endpoints for nfe in each.nfes or ()}))
 
 
 Listener = Callable[["NodeConfiguration"], None]

@@ -262,7 +262,7 @@ def build_plan(
             domain_id=domain_id,
             discovery_range=discovery_range,
             environment=variables,
-            shared_memory=manifest.discovery.transport is FlowTransport.SHM,
+            shared_memory=manifest.discovery.transport.in_memory,
         ),
         nodes=wired.nodes,
         flows=wired.flows,

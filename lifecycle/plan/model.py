@@ -32,9 +32,9 @@ from lifecycle.manifest import (
     SystemDeclaration,
     UniqueHow,
 )
-from lifecycle.network import Medium
+from lifecycle.network import UDP_UNICAST, Medium
 
-_UdpUnicast = Annotated[Medium, says(enum=[Medium.UDPV4.value, Medium.UDPV6.value])]
+_UdpUnicast = Annotated[Medium, says(enum=[each.value for each in UDP_UNICAST])]
 
 
 def declared(as_: type, by: object) -> dict[str, Any]:

@@ -15,7 +15,7 @@ import dataclasses
 from collections.abc import Collection, Iterator, Mapping
 from types import MappingProxyType
 
-from lifecycle.network import ConnectionUrl, Medium, Peer, parse
+from lifecycle.network import ConnectionUrl, Peer, parse
 from lifecycle.plan.connections.hosts import PortPool, contacts_of
 from lifecycle.plan.model import ParticipantConnections, Plan, PlanError, PlannedNode
 from lifecycle.plan.negotiation.parties import hosts_of, terms_of
@@ -112,7 +112,7 @@ def moved_observer(
         )
     urls = tuple(
         str(dataclasses.replace(url, port=port))
-        if url.transport is Medium.TCPV4 and url.port is not None
+        if url.transport.is_tcp and url.port is not None
         else str(url)
         for url in map(parse, connections.urls)
     )
@@ -145,7 +145,7 @@ def is_restarted_url(planned: str, reported: str, *, first_port: int) -> bool:
         ConnectionUrlError: one of them is none.
     """
     was, now = parse(planned), parse(reported)
-    if was.transport is not Medium.TCPV4 or not (was.peers or was.server):
+    if not was.transport.is_tcp or not (was.peers or was.server):
         return False
     if was.port is None or now.port is None or now.port < first_port + RESTART_PORTS_FROM:
         return False
@@ -174,7 +174,7 @@ def _with_port(urls: Collection[str]) -> Iterator[ConnectionUrl]:
     """Yield the URL with the TCP port; a participant has at most one (url_families)."""
     for text in urls:
         url = parse(text)
-        if url.transport is Medium.TCPV4 and url.port is not None:
+        if url.transport.is_tcp and url.port is not None:
             yield url
 
 

@@ -3,10 +3,12 @@ from .control.client import differences as differences
 from .control.client import down as down
 from .control.client import order as order
 from .control.client import status as status
-from .control.server import ControlRequest as ControlRequest
-from .control.server import Question as Question
-from .control.status import NodeStatus as NodeStatus
-from .control.status import SystemStatus as SystemStatus
+from .control.protocol import ControlRequest as ControlRequest
+from .control.protocol import NodeStatus as NodeStatus
+from .control.protocol import ProcessState as ProcessState
+from .control.protocol import Question as Question
+from .control.protocol import Reach as Reach
+from .control.protocol import SystemStatus as SystemStatus
 from .gate.gate import closes as closes
 from .processes.forerunner import Forerunner as Forerunner
 from .processes.logs import ros_log_root as ros_log_root
@@ -23,8 +25,6 @@ from .run.events import NodeChanged as NodeChanged
 from .run.events import NodeSilent as NodeSilent
 from .run.events import Notice as Notice
 from .run.events import ProcessChanged as ProcessChanged
-from .run.events import ProcessState as ProcessState
-from .run.events import Reach as Reach
 from .run.events import RunStarted as RunStarted
 from .run.events import StageTimed as StageTimed
 from .run.events import Stopped as Stopped

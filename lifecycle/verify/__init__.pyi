@@ -5,7 +5,6 @@ from .judge import taken_on_trust as taken_on_trust
 from .judge import verify as verify
 from .matcher import lay_out as lay_out
 from .observation import ConfigurationError as ConfigurationError
-from .observation import ConnectionReport as ConnectionReport
 from .observation import EndpointReport as EndpointReport
 from .observation import Identity as Identity
 from .observation import NodeConfiguration as NodeConfiguration
@@ -15,6 +14,8 @@ from .observation import ObservedEndpoint as ObservedEndpoint
 from .observation import ObservedNode as ObservedNode
 from .observation import ParameterReport as ParameterReport
 from .observation import decode_configuration as decode_configuration
+from .outcome import ConnectionReport as ConnectionReport
+from .outcome import Outcome as Outcome
 from .report import plain_findings as plain_findings
 from .report import render_text as render_text
 from .report import to_json as to_json
@@ -62,7 +63,6 @@ from .transport import carrier as carrier
 from .verdict import NOT_JUDGED as NOT_JUDGED
 from .verdict import Finding as Finding
 from .verdict import FlowReport as FlowReport
-from .verdict import Outcome as Outcome
 from .verdict import RunEnd as RunEnd
 from .verdict import Stage as Stage
 from .verdict import Verdict as Verdict

@@ -16,6 +16,7 @@ from lifecycle.network import Medium, NetworkFlowEndpoint, TransportProtocol, is
 from lifecycle.plan import Plan
 from lifecycle.verify.matcher import lay_out
 from lifecycle.verify.observation import Observation
+from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import CHECKS, rule
 from lifecycle.verify.tool_filter import OUR_NODES
 from lifecycle.verify.transport import effective_transport
@@ -24,7 +25,6 @@ from lifecycle.verify.verdict import (
     Finding,
     FlowReport,
     OpenEndpoint,
-    Outcome,
     Stage,
     ToleratedNode,
     Verdict,

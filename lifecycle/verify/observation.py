@@ -17,6 +17,7 @@ from lifecycle.codec import Count, DscpValue
 from lifecycle.manifest import EndpointKind, ParameterValue, QosProfile
 from lifecycle.network import NetworkFlowEndpoint, UniqueRequirement
 from lifecycle.plan import portable
+from lifecycle.verify.outcome import ConnectionReport
 
 LONGEST_CONFIGURATION = 1 << 22
 """Characters of a node configuration as JSON; one of 1,000 endpoints takes about 600,000."""
@@ -41,27 +42,6 @@ class Identity:
     machine_id: str
     process_id: Count
     node_id: str
-
-
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class ConnectionReport:
-    """What a node reports of one of its connections.
-
-    Attributes:
-        name: as `connect_to` named it; empty for the node's own participant.
-        urls: what it was given, as text; empty if the RMW chose.
-        node_name: base name of the hidden node that carries it; empty for the node's own.
-        established: it exists and, where it has mappings, all of them have a matched peer.
-        mappings: declared names of what is mapped onto it, `publishers/video`.
-        error: why it could not be made; empty if it was.
-    """
-
-    name: str
-    urls: tuple[str, ...] = ()
-    node_name: str = ""
-    established: bool = False
-    mappings: tuple[str, ...] = ()
-    error: str = ""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

@@ -29,9 +29,10 @@ from lifecycle.manifest import UniqueHow
 from lifecycle.network import NETWORK_MEDIA, describe
 from lifecycle.plan import Plan
 from lifecycle.printable import json_text, lines, one_line
+from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import RULES
 from lifecycle.verify.rules.catalogue import Rule
-from lifecycle.verify.verdict import Finding, FlowReport, Outcome, RunEnd, Verdict
+from lifecycle.verify.verdict import Finding, FlowReport, RunEnd, Verdict
 
 _COLOURS = {Outcome.OK: "\x1b[32m", Outcome.VIOLATED: "\x1b[31m", Outcome.UNVERIFIABLE: "\x1b[33m"}
 _RESET = "\x1b[0m"

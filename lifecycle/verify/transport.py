@@ -34,8 +34,6 @@ UNKNOWN = "unknown"
 _ANY_PORT = 0
 """Of the NFE made from a URL: no port distinguishes one transport from another."""
 
-_FAMILIES = {InternetProtocol.IPV4: "v4", InternetProtocol.IPV6: "v6"}
-
 
 def effective_transport(flow: FlowView) -> str:
     """Return what carries a planned flow, as `carrier` says."""
@@ -91,7 +89,7 @@ def _as_nfe(text: str) -> NetworkFlowEndpoint | None:
         url = parse(text)
     except ConnectionUrlError:
         return None
-    if url.transport is Medium.SHM:
+    if not url.transport.is_network:
         return NetworkFlowEndpoint(
             transport_protocol=TransportProtocol.UNKNOWN,
             internet_protocol=InternetProtocol.UNKNOWN,
@@ -102,7 +100,7 @@ def _as_nfe(text: str) -> NetworkFlowEndpoint | None:
         transport_protocol=TransportProtocol.TCP if url.transport.is_tcp else TransportProtocol.UDP,
         internet_protocol=InternetProtocol.IPV6 if ipv6 else InternetProtocol.IPV4,
         transport_port=_ANY_PORT,
-        internet_address=url.address or ("::" if ipv6 else "0.0.0.0"),  # noqa: S104 - any address
+        internet_address=url.address or url.transport.any_address,
     )
 
 
@@ -134,18 +132,13 @@ def carrier(
         return UNKNOWN
     if same_host and _has_shared_memory(source) and _has_shared_memory(destination):
         return Medium.SHM
-    leaving = {spell_transport(each) for each in source if is_ip(each)}
+    leaving = {each.medium for each in source if is_ip(each)}
     groups = [each for each in destination if is_ip(each) and _is_group(each)]
     # A group has no router between here and another host: it is sent with a TTL of 0.
-    if same_host and any(spell_transport(each) in leaving for each in groups):
+    if same_host and any(each.medium in leaving for each in groups):
         return Medium.UDPM
-    arriving = (spell_transport(each) for each in destination if is_ip(each) and each not in groups)
+    arriving = (each.medium for each in destination if is_ip(each) and each not in groups)
     return next((each for each in arriving if each in leaving), NONE)
-
-
-def spell_transport(nfe: NetworkFlowEndpoint) -> str:
-    """Return the name of an IP NFE's transport, `udpv4`."""
-    return nfe.transport_protocol.value + _FAMILIES[nfe.internet_protocol]
 
 
 def _is_group(nfe: NetworkFlowEndpoint) -> bool:

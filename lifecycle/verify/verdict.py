@@ -7,28 +7,14 @@ from __future__ import annotations
 
 import dataclasses
 import enum
-from collections.abc import Iterable
 from typing import Annotated
 
 from lifecycle.codec import DscpValue, Octet, says
 from lifecycle.manifest import EndpointKind, UniqueHow
 from lifecycle.network import FlowTuple, Medium, NetworkFlowEndpoint, UniqueRequirement, flow_tuples
+from lifecycle.verify.outcome import Outcome
 
 _Carrier = Annotated[str, says(enum=[*map(str, Medium), "none", "unknown"])]
-
-
-class Outcome(enum.Enum):
-    """The three outcomes; nothing unknown is silently OK."""
-
-    OK = "ok"
-    VIOLATED = "violated"
-    UNVERIFIABLE = "unverifiable"
-
-    @classmethod
-    def worst(cls, found: Iterable[Outcome]) -> Outcome:
-        """Return VIOLATED if any is; else UNVERIFIABLE if any is; else OK."""
-        outcomes = set(found)
-        return next((each for each in (cls.VIOLATED, cls.UNVERIFIABLE) if each in outcomes), cls.OK)
 
 
 class Stage(enum.Enum):

@@ -16,7 +16,7 @@ from lifecycle.codec import to_json, to_plain
 from lifecycle.manifest import load
 from lifecycle.plan import build_plan
 from lifecycle.run_directory import connect
-from lifecycle.supervisor.control.server import ControlRequest, Question, ask
+from lifecycle.supervisor.control.protocol import Answer, ControlRequest, Question, ask
 from tests.hostile.attack import (
     Attack,
     HostileClass,
@@ -50,7 +50,7 @@ class Running:
 
     def check(self) -> None:
         """Whoever asks properly is answered at once, whatever others sent before."""
-        answer = ask(self.run / "control", Question(ask=ControlRequest.STATUS), WAIT_S)
+        answer = ask(self.run / "control", Question(ask=ControlRequest.STATUS), WAIT_S, Answer)
         if answer is None or answer.status is None:
             raise Unhandled(f"no status any more: {answer}; {self.up.events[-2:]}")
 

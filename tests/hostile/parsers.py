@@ -36,7 +36,7 @@ from lifecycle.programming.apply.targets.registry import settings_types
 from lifecycle.programming.apply.tool import HostTool, ToolOutput
 from lifecycle.programming.rules.nftables import parse_managed_comment
 from lifecycle.run_directory import read_record
-from lifecycle.supervisor.control.server import Answer, Question
+from lifecycle.supervisor.control.server import LookAnswer, QuestionWithPlan
 from lifecycle.verify import Stage
 from lifecycle.verify.observation import ConfigurationError, decode_configuration
 from tests.hostile.attack import Attack, HostileClass, Place, mutated
@@ -157,12 +157,12 @@ READERS: dict[str, Reader] = {
     ),
     "control question": Reader(
         good=b'{"ask":"restart","node":"talker","plan":null,"reload":false}',
-        read=lambda data, _: from_json(data, Question),
+        read=lambda data, _: from_json(data, QuestionWithPlan),
         errors=(ValueError,),
     ),
     "control answer": Reader(
-        good=to_json(Answer(exit_code=0, error="x", differences=("a",))),
-        read=lambda data, _: from_json(data, Answer),
+        good=to_json(LookAnswer(exit_code=0, error="x", differences=("a",))),
+        read=lambda data, _: from_json(data, LookAnswer),
         errors=(ValueError,),
     ),
     "host event": Reader(

@@ -26,9 +26,15 @@ from lifecycle.run_directory import (
     runtime_root,
     short_path,
 )
-from lifecycle.supervisor.control import server
-from lifecycle.supervisor.control.server import ControlRequest, ControlServer, Question, ask, follow
-from lifecycle.supervisor.control.status import SystemStatus
+from lifecycle.supervisor.control import protocol
+from lifecycle.supervisor.control.protocol import (
+    Answer,
+    ControlRequest,
+    Question,
+    SystemStatus,
+    ask,
+)
+from lifecycle.supervisor.control.server import ControlServer, follow
 from tests.builders import plan_of, planned_node
 
 STATUS = SystemStatus(
@@ -222,12 +228,12 @@ def test_the_control_socket_answers_and_tells_of_the_end_however_deep_it_lies(
         await server.open()
         loop = asyncio.get_running_loop()
         answer = await loop.run_in_executor(
-            None, ask, deep / "control", Question(ask=ControlRequest.STATUS), 5.0
+            None, ask, deep / "control", Question(ask=ControlRequest.STATUS), 5.0, Answer
         )
         assert answer is not None
         assert answer.status == STATUS
         down = loop.run_in_executor(
-            None, ask, deep / "control", Question(ask=ControlRequest.DOWN), 5.0
+            None, ask, deep / "control", Question(ask=ControlRequest.DOWN), 5.0, Answer
         )
         await asyncio.wait_for(asked.wait(), 5.0)
         await server.close(0)
@@ -300,7 +306,7 @@ def test_a_strange_answer_on_the_control_socket_is_one_clear_error(
     verb: str,
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    monkeypatch.setattr(server, "_LARGEST_ANSWER", 1 << 20)
+    monkeypatch.setattr(protocol, "_LARGEST_ANSWER", 1 << 20)
     answer, pause_s, why = _STRANGE[which]
     with _Stranger(tmp_path / "lifecycle", answer, pause_s):
         assert main([verb, "pair"]) == ExitCode.USAGE
@@ -316,11 +322,11 @@ def test_a_strange_answer_on_the_control_socket_is_one_clear_error(
 def test_an_answer_that_never_ends_is_not_waited_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(server, "_ANSWER_S", 0.3)
+    monkeypatch.setattr(protocol, "ANSWER_S", 0.3)
     with _Stranger(tmp_path, b"[", 0.02):
         path = tmp_path / "pair@7" / "control"
         with pytest.raises(TimeoutError):
-            ask(path, Question(ask=ControlRequest.STATUS), 0.3)
+            ask(path, Question(ask=ControlRequest.STATUS), 0.3, Answer)
         with pytest.raises(TimeoutError):
             next(follow(path))
 

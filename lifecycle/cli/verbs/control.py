@@ -80,8 +80,14 @@ def _row(node: NodeStatus) -> tuple[str, ...]:
 @click.argument("assignments", nargs=-1, metavar="[NAME:=VALUE]...")
 @click.option("--machine", default="", metavar="NAME", help="As it was given to `lifecycle up`.")
 @format_option("text", "json")
+@click.option(
+    "--probe",
+    type=click.Choice(["live", "ready"]),
+    help="For health checks: print nothing, exit with 0 while the supervisor answers (live), or "
+    "while the system is active and not violated (ready), else with 6.",
+)
 def status_command(
-    target: str | None, assignments: tuple[str, ...], machine: str, format_: str
+    target: str | None, assignments: tuple[str, ...], machine: str, format_: str, probe: str | None
 ) -> int:
     """Show a running system: its nodes, their processes and states, and the last verdict.
 
@@ -99,6 +105,9 @@ def status_command(
         seen = status(path)
     except TimeoutError as error:
         raise UsageError(f"cannot ask {path.name!r}: its supervisor does not answer") from error
+    if probe is not None:
+        ready = seen.phase == "active" and seen.verdict is not Outcome.VIOLATED
+        return ExitCode.OK if ready or probe == "live" else ExitCode.BRING_UP_FAILED
     if format_ == "json":
         click.echo(json_text(to_json(seen).decode()))
     else:

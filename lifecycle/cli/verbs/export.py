@@ -1,4 +1,7 @@
-"""`lifecycle export`: a manifest as files of another system. Needs no ROS and starts nothing."""
+"""`lifecycle export`: a manifest as files of another system. Needs no ROS and starts nothing.
+
+Owns: access control for SROS 2, and units or manifests of the engines that start programs.
+"""
 
 from __future__ import annotations
 
@@ -70,6 +73,122 @@ def sros2(manifest: str, assignments: tuple[str, ...], output: Path, days: int) 
             )
     click.echo(lines(_next_commands(enclaves, output, plan.domain_id)))
     return ExitCode.OK
+
+
+_WRITTEN_FOR = {
+    "systemd": (
+        "Write a systemd unit for each machine.\n\n"
+        "Type=notify, ready once active and verified; the watchdog is the supervisor's event loop. "
+        "Check the file with `systemd-analyze verify`, copy it to /etc/systemd/system."
+    ),
+    "quadlet": (
+        "Write a .container file for each machine, of which podman makes a systemd unit.\n\n"
+        "As `systemd`, in a container of --image. Copy it to /etc/containers/systemd."
+    ),
+    "compose": (
+        "Write a Compose file for each machine.\n\n"
+        "Healthy once active and verified. `docker compose -f FILE config` checks it."
+    ),
+    "kubernetes": (
+        "Write the Kubernetes object of each machine's part, on the node of the machine's name.\n\n"
+        "Ready once active and verified, live while the supervisor answers. "
+        "`kubectl apply -f FILE` takes it."
+    ),
+}
+_CONTAINERS = frozenset(_WRITTEN_FOR) - {"systemd"}
+
+
+def _engine_command(engine: str) -> click.Command:
+    @manifest_arguments
+    @click.option(
+        "-o",
+        "--output",
+        type=click.Path(path_type=Path),
+        required=True,
+        metavar="DIR",
+        help="Write a file for each machine there; one of its name is replaced.",
+    )
+    @click.option(
+        "--at",
+        default="",
+        metavar="PATH",
+        help="Where the manifest is when it is started; default: "
+        + ("in the image, /system/NAME." if engine in _CONTAINERS else "where it is here."),
+    )
+    @click.option(
+        "--up",
+        "more",
+        default="",
+        metavar="OPTIONS",
+        help="Further options of `lifecycle up`, in one word: '--strict --program nft'.",
+    )
+    def write(
+        manifest: str,
+        assignments: tuple[str, ...],
+        output: Path,
+        at: str,
+        more: str,
+        **rest: str,
+    ) -> int:
+        from lifecycle.export import ENGINES, Deployment
+        from lifecycle.plan import build_plan
+
+        words = _up_options(more, container=engine in _CONTAINERS)
+        loaded = load_manifest(manifest, assignments, machine=None)
+        here = str(Path(manifest).resolve())
+        inside = f"/system/{Path(manifest).name}" if engine in _CONTAINERS else here
+        deployment = Deployment(
+            plan=build_plan(loaded.manifest),
+            manifest=at or inside,
+            words=(*assignments, *words),
+            image=rest.get("image", ""),
+            program=rest.get("program", ""),
+            programs_networks="--program" in " ".join(words),
+        )
+        for name, text in ENGINES[engine](deployment).items():
+            _write(output / name, text)
+            click.echo(str(output / name))
+        return ExitCode.OK
+
+    if engine in _CONTAINERS:
+        write = click.option(
+            "--image",
+            required=True,
+            metavar="IMAGE",
+            help="Has `lifecycle`, ROS 2 and the programs of all nodes; see examples/deploy.",
+        )(write)
+    else:
+        write = click.option(
+            "--program",
+            default="/opt/lifecycle/bin/lifecycle",
+            show_default=True,
+            metavar="PATH",
+            help="Where `lifecycle` is on the machines.",
+        )(write)
+    return click.command(engine, help=_WRITTEN_FOR[engine])(write)
+
+
+for _engine in _WRITTEN_FOR:
+    command.add_command(_engine_command(_engine))
+
+
+def _up_options(more: str, *, container: bool) -> tuple[str, ...]:
+    """Return further words of `lifecycle up`.
+
+    Raises:
+        UsageError: they cannot be read, or what they ask for cannot be had in a container.
+    """
+    try:
+        words = tuple(shlex.split(more))
+    except ValueError as error:
+        raise UsageError(f"cannot read --up {more!r}: {error}") from error
+    if container and any(each.partition("=")[0] == "--program" for each in words):
+        raise UsageError(
+            "cannot program networks from a container without root: engines give capabilities to "
+            "root alone there",
+            hint="program them on the machine: lifecycle export systemd … --up '--program …'",
+        )
+    return words
 
 
 def _check_paths(enclaves: tuple[Enclave, ...]) -> None:

@@ -16,15 +16,14 @@ from lifecycle.manifest.model import (
     ConnectionDeclaration,
     DiscoveryMode,
     EndpointKind,
-    FlowTransport,
     Node,
 )
 from lifecycle.manifest.yaml.document import error, warning
 from lifecycle.network import (
     DG,
     MAX_DOMAIN_ID,
+    UDP_UNICAST,
     ConnectionUrl,
-    Medium,
     Peer,
     domain_base,
     is_loopback,
@@ -100,10 +99,10 @@ def _uses(
         port = getattr(url, attribute)
         if port is None:
             continue
-        group = url.transport is Medium.UDPM
+        group = url.transport.is_group
         yield _Use(
             host=_host(system, node),
-            tcp=url.transport is Medium.TCPV4,
+            tcp=url.transport.is_tcp,
             group=group and attribute == "port",
             address="" if group or attribute == "output_port" else url.address,
             port=port,
@@ -114,11 +113,11 @@ def _uses(
 
 def _contacts(system: DeclaredSystem, node: Node, url: ConnectionUrl) -> set[tuple[str, int]]:
     """Return where a connection's discovery is reached, by every address of its host."""
-    tcp = url.transport is Medium.TCPV4
+    tcp = url.transport.is_tcp
     port = url.port if tcp else url.metatraffic_port
     if port is None:
         return set()
-    own = "" if url.transport is Medium.UDPM else url.address
+    own = "" if url.transport.is_group else url.address
     addresses = (
         {own}
         if own and not ipaddress.ip_address(own).is_unspecified
@@ -136,7 +135,7 @@ def _own_address(
     system: DeclaredSystem, node: Node, url: ConnectionUrl, at: Position
 ) -> Iterator[Diagnostic]:
     host = _host(system, node)
-    if not host or not url.address or url.transport is Medium.UDPM:
+    if not host or not url.address or url.transport.is_group:
         return
     own = ipaddress.ip_address(url.address)
     if own.is_loopback or own.is_unspecified or own == ipaddress.ip_address(host):
@@ -175,7 +174,7 @@ def _well_known(system: DeclaredSystem, uses: list[_Use]) -> Iterator[Diagnostic
     domain = discovery.domain_id or 0
     if (
         discovery.mode is not DiscoveryMode.DYNAMIC
-        or discovery.transport in (FlowTransport.SHM, FlowTransport.TCPV4)
+        or not discovery.transport.by_udp
         or not 0 <= domain <= MAX_DOMAIN_ID
     ):
         return
@@ -202,9 +201,7 @@ def _peers(
 ) -> Iterator[Diagnostic]:
     """Warn of peers that match no participant of the system."""
     discovery = system.manifest.discovery
-    planned = discovery.mode is not DiscoveryMode.DYNAMIC and (
-        discovery.transport is not FlowTransport.SHM
-    )
+    planned = discovery.mode is not DiscoveryMode.DYNAMIC and not discovery.transport.in_memory
     domain = domain_base(min(max(discovery.domain_id or 0, 0), MAX_DOMAIN_ID))
     for peer in url.peers:
         if peer.port is None or planned or domain <= peer.port < domain + DG:
@@ -230,7 +227,7 @@ def _loopback(
     at: Position,
 ) -> Iterator[Diagnostic]:
     """Judge loopback addresses where what is carried has an end elsewhere."""
-    if url.transport is Medium.UDPM:
+    if url.transport.is_group:
         return
     local = [str(each) for each in url.peers if is_loopback(each.address)]
     if is_loopback(url.address):
@@ -270,9 +267,9 @@ def _remote_nodes(
 def _together(node: Node, connection: ConnectionDeclaration) -> Iterator[Diagnostic]:
     """Judge URLs that one participant cannot have together (Fast DDS 2.14)."""
     at = node.where(f"connections.{connection.name}")
-    udp = [url for url in connection.urls if url.transport in (Medium.UDPV4, Medium.UDPV6)]
+    udp = [url for url in connection.urls if url.transport in UDP_UNICAST]
     fixed = [url for url in udp if url.port]
-    shm = [url for url in connection.urls if url.transport is Medium.SHM]
+    shm = [url for url in connection.urls if not url.transport.is_network]
     rule, name = "check.connection-urls", connection.name
     if shm and fixed:
         message = (
@@ -288,7 +285,7 @@ def _together(node: Node, connection: ConnectionDeclaration) -> Iterator[Diagnos
             "server: a client finds nobody else"
         )
         yield error(rule, at, message, "leave peer= or server= out")
-    tcp = [url for url in connection.urls if url.transport is Medium.TCPV4 and url.port]
+    tcp = [url for url in connection.urls if url.transport.is_tcp and url.port]
     if len(tcp) > 1:
         message = (
             f"cannot listen on {str(tcp[0])!r} and {str(tcp[1])!r} in {name!r}: one participant "

@@ -235,7 +235,7 @@ def _carrier(
         )
         hint = "add a URL of that transport to it, or remove 'transport'"
         yield error(rule, each.need.at, message, hint)
-    if each.need.lossy is False and transports == {Medium.UDPM}:
+    if each.need.lossy is False and all(one.is_group for one in transports):
         message = (
             f"cannot carry {what}, whose data are declared not lossy, by multicast alone, as "
             f"connection {connection.name!r} does"

@@ -23,7 +23,6 @@ from lifecycle.manifest.model import (
     DiscoveryRange,
     EndpointKind,
     Executor,
-    FlowTransport,
     Machine,
     Node,
     RosArguments,
@@ -277,7 +276,7 @@ def _beyond_localhost(
     participant, and those of processes that it starts.
     """
     discovery = system.manifest.discovery
-    if discovery.mode is not DiscoveryMode.DYNAMIC or discovery.transport not in _BY_UDP:
+    if discovery.mode is not DiscoveryMode.DYNAMIC or not discovery.transport.by_udp:
         return
     said = "'range: localhost'"
     if discovery.range is DiscoveryRange.SYSTEM_DEFAULT:
@@ -305,10 +304,6 @@ def _beyond_localhost(
     )
     hint = "use 'range: subnet', or give several nodes one 'process:'"
     yield error("check.localhost", discovery.at or nodes[0].at, message, hint)
-
-
-_BY_UDP = (FlowTransport.ANY, FlowTransport.UDPV4, FlowTransport.UDPV6)
-"""Transports of own participants that are looked for at the ports of the DDS formula."""
 
 
 def _participants(nodes: list[Node], needs: FlowNeeds) -> int:

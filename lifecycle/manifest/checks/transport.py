@@ -31,12 +31,13 @@ from lifecycle.manifest.model import (
 from lifecycle.manifest.schema import did_you_mean
 from lifecycle.manifest.yaml.document import error, warning
 from lifecycle.network import (
+    DEFAULT_TCP,
+    RMW_DISCOVERY,
     RTPS_OVERHEAD_BYTES,
     TRANSPORTS_VARIABLE,
     Capability,
     Feasibility,
     FlowSide,
-    Medium,
     UniqueRequirement,
     capabilities,
     datagram_bytes,
@@ -127,24 +128,24 @@ def _transport(system: DeclaredSystem, section: Position) -> Iterator[Diagnostic
     discovery = system.manifest.discovery
     at = system.manifest.where("discovery.transport", section)
     transport, found = discovery.transport, hosts(system)
+    medium = transport.medium
     rule, what = "check.discovery-transport", f"cannot let discovery use {transport.value} alone"
-    if transport is FlowTransport.SHM and len(found) > 1:
+    if transport.in_memory and len(found) > 1:
         names = ", ".join(repr(machine.name) for each in found.values() for machine in each)
         message = f"{what} between machines {names}: shared memory does not leave a host"
         hint = "use 'transport: udpv4', and connections for the data"
         yield error(rule, at, message, hint)
-    if transport is FlowTransport.SHM and discovery.mode is DiscoveryMode.SERVER:
+    if transport.in_memory and discovery.mode is DiscoveryMode.SERVER:
         message = f"{what} with a discovery server: it is reached by TCP or UDP"
         yield error(rule, at, message, "use 'transport: tcpv4', or remove it")
-    if transport is FlowTransport.UDPV6 and discovery.mode is DiscoveryMode.SERVER:
+    if medium and medium.ip_version == 6 and discovery.mode is DiscoveryMode.SERVER:
         message = f"{what} with a discovery server: it is reached by IPv4"
         yield error(rule, at, message, "use 'transport: tcpv4' or 'udpv4'")
-    if transport is FlowTransport.TCPV4 and discovery.mode is DiscoveryMode.DYNAMIC:
+    if medium and medium.is_tcp and discovery.mode is DiscoveryMode.DYNAMIC:
         message = f"{what} in mode dynamic: TCP has no multicast to find anybody by"
         yield error(rule, at, message, "use 'mode: static' or 'mode: server'")
-    medium = transport.medium
     if discovery.mode is DiscoveryMode.SERVER and transport is FlowTransport.ANY:
-        medium = Medium.TCPV4
+        medium = DEFAULT_TCP
     version = medium.ip_version if medium else None
     for address, machines in found.items():
         if version and address and ipaddress.ip_address(address).version != version:
@@ -219,8 +220,7 @@ def _foreign_rmws(discovery: Discovery, node: Node) -> Iterator[Diagnostic]:
     ):
         return
     by_variable = (
-        discovery.mode in (DiscoveryMode.DYNAMIC, DiscoveryMode.SERVER)
-        or transport is FlowTransport.SHM
+        discovery.mode in (DiscoveryMode.DYNAMIC, DiscoveryMode.SERVER) or transport.in_memory
     ) and discovery.mode is not DiscoveryMode.STATIC_ENDPOINTS
     if node.run.kind is RunKind.COMMAND and by_variable:
         return
@@ -250,13 +250,13 @@ def _unfound(
     if (
         node.run.kind is not RunKind.COMMAND
         or discovery.mode is not DiscoveryMode.DYNAMIC
-        or discovery.transport is not FlowTransport.UDPV6
+        or (discovery.transport.medium or RMW_DISCOVERY).ip_version != 6
         or reach != DiscoveryRange.LOCALHOST.name
     ):
         return
     message = (
-        f"cannot find {node.key!r} by udpv6 in range localhost: its RMW looks for others at "
-        "127.0.0.1 only"
+        f"cannot find {node.key!r} by {discovery.transport.value} in range localhost: its RMW "
+        "looks for others at 127.0.0.1 only"
     )
     hint = "use 'range: subnet', or 'transport: udpv4'"
     yield error("check.discovery-foreign", node.where("run"), message, hint)
@@ -426,7 +426,7 @@ def _pair(
     node, end = ends
     one, two = _address(system, node), _address(system, end)
     if one == two and _process(end) == _process(node):
-        if transport in (FlowTransport.SHM, FlowTransport.MULTICAST):
+        if transport.medium and transport.medium.stays_on_host:
             return
         by = "the network" if transport is FlowTransport.NETWORK else transport.value
         both = "it" if node is end else f"{node.key!r} and {end.key!r}"
@@ -441,7 +441,7 @@ def _pair(
         return
     here = "this host"
     between = f"between {node.key!r} at {one or here} and {end.key!r} at {two or here}"
-    if transport is FlowTransport.SHM:
+    if transport.in_memory:
         message = f"cannot send {topic!r} by shm {between}: shared memory does not leave a host"
         yield error(_RULE, at, message, "use 'transport: udpv4' or 'tcpv4'")
     elif one and two and (":" in one) != (":" in two):

@@ -34,7 +34,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from lifecycle.middleware.discovery.probe import HEADER, ProbeTarget, probe_targets, send
 from lifecycle.middleware.fastdds.dscp import own_udp_socket, socket_descriptors
 from lifecycle.middleware.fastdds.url_check import open_sockets
-from lifecycle.network import ConnectionUrl, Medium
+from lifecycle.network import UDP_UNICAST, ConnectionUrl, Medium
 
 _UNANSWERED = 2
 """Retransmissions in a row after which a connection is dead for a leaving process: the kernel
@@ -185,12 +185,13 @@ def remove_participants(
     messages = [disposal(each) for each in prefixes]
     targets = {
         kind: [*_asked(domain_id, urls, environment, kind), *_listening(pids, kind)]
-        for kind in (Medium.UDPV4, Medium.UDPV6)
+        for kind in UDP_UNICAST
     }
     output = next((url.output_port for url in urls if url.output_port), None)
-    for kind, family in ((Medium.UDPV4, socket.AF_INET), (Medium.UDPV6, socket.AF_INET6)):
+    for kind in UDP_UNICAST:
         if not targets[kind]:
             continue
+        family = kind.socket_family
         own = None if output is None else own_udp_socket(family, output)
         with contextlib.suppress(OSError), own or socket.socket(family, socket.SOCK_DGRAM) as by:
             for message in messages:
@@ -212,5 +213,5 @@ def _listening(pids: Iterable[int], kind: Medium) -> Iterator[ProbeTarget]:
             for each in open_sockets(pid):
                 if each.kind == kind and not ipaddress.ip_address(each.address).is_multicast:
                     any_ = ipaddress.ip_address(each.address).is_unspecified
-                    loopback = "::1" if kind is Medium.UDPV6 else "127.0.0.1"
-                    yield ProbeTarget(address=loopback if any_ else each.address, port=each.port)
+                    address = kind.loopback if any_ else each.address
+                    yield ProbeTarget(address=address, port=each.port)

@@ -34,7 +34,6 @@ from lifecycle.middleware.fastdds.url_check import open_sockets
 from lifecycle.middleware.fastdds.url_profile import (
     DISCOVERY_GROUP,
     LOCALHOST_PEERS_RANGE,
-    LOOPBACK,
     UrlTransport,
     families,
     leaves_discovery_open,
@@ -42,6 +41,7 @@ from lifecycle.middleware.fastdds.url_profile import (
 from lifecycle.network import (
     DG,
     PARTICIPANTS_PER_DOMAIN,
+    RMW_DISCOVERY,
     TRANSPORTS_VARIABLE,
     ConnectionUrl,
     Medium,
@@ -207,7 +207,7 @@ def announcement(locators: Iterable[tuple[str, int]]) -> bytes:
     return HEADER + prefix + info_timestamp + struct.pack("<BBH", 0x15, 0x05, len(body)) + body
 
 
-def discovery_ports(domain_id: int, kind: Medium = Medium.UDPV4) -> tuple[int, ...]:
+def discovery_ports(domain_id: int, kind: Medium = RMW_DISCOVERY) -> tuple[int, ...]:
     """Return the UDP ports of this process on which participants receive discovery.
 
     Read from the kernel, never inferred: a taken port moves a participant to another one.
@@ -237,8 +237,6 @@ _CHOICES = frozenset(
 )
 """Elements of a participant profile that say where others are looked for, or by what."""
 
-_FAMILIES = {Medium.UDPV4: socket.AF_INET, Medium.UDPV6: socket.AF_INET6}
-
 
 def probes_for(
     domain_id: int, urls: Sequence[ConnectionUrl], environment: Mapping[str, str]
@@ -265,7 +263,7 @@ def probes_for(
     range_ = _range(environment)
     return tuple(
         _probe_around(domain_id, kind, range_, environment)
-        for kind in (tuple(family.kind for family in found) or (Medium.UDPV4,))
+        for kind in (tuple(family.kind for family in found) or (RMW_DISCOVERY,))
     )
 
 
@@ -292,7 +290,7 @@ def probe_targets(
     range_ = _range(environment)
     return tuple(
         (kind, _targets_around(domain_id, kind, range_, environment))
-        for kind in (tuple(family.kind for family in found) or (() if urls else (Medium.UDPV4,)))
+        for kind in (tuple(family.kind for family in found) or (() if urls else (RMW_DISCOVERY,)))
         if range_ != "OFF"
     )
 
@@ -372,7 +370,7 @@ def discovery_peers(
         for target in well_known_targets(domain_id, host, min(count, LOCALHOST_PEERS_RANGE))
     ]
     group = participant_ports(domain_id, 0).discovery_multicast
-    return ((DISCOVERY_GROUP[Medium.UDPV4], group), *found)
+    return ((DISCOVERY_GROUP[RMW_DISCOVERY], group), *found)
 
 
 def _probe_around(
@@ -382,7 +380,7 @@ def _probe_around(
         return Probe((), (), ())
     targets = _targets_around(domain_id, kind, range_, environment)
     by_interface = addresses_of(kind) if range_ == "SUBNET" else {}
-    addresses = (LOOPBACK[kind], *(each for found in by_interface.values() for each in found))
+    addresses = (kind.loopback, *(each for found in by_interface.values() for each in found))
     return Probe(targets, addresses, discovery_ports(domain_id, kind))
 
 
@@ -390,11 +388,11 @@ def _targets_around(
     domain_id: int, kind: Medium, range_: str, environment: Mapping[str, str]
 ) -> tuple[ProbeTarget, ...]:
     """Return this host's ports, and with the range SUBNET the group and the static peers'."""
-    targets = [*well_known_targets(domain_id, LOOPBACK[kind], PARTICIPANTS_PER_DOMAIN)]
+    targets = [*well_known_targets(domain_id, kind.loopback, PARTICIPANTS_PER_DOMAIN)]
     if range_ == "SUBNET":
         targets += group_targets(domain_id, kind, addresses_of(kind))
         for peer in static_peers(environment):
-            if (":" in peer) == (kind is Medium.UDPV6):
+            if (":" in peer) == (kind.ip_version == 6):
                 targets += well_known_targets(domain_id, peer, LOCALHOST_PEERS_RANGE)
     return tuple(targets)
 
@@ -461,7 +459,7 @@ def addresses_of(kind: Medium, *, loopback: bool = False) -> dict[str, tuple[str
     """
     found = {}
     for name, entries in sorted(psutil.net_if_addrs().items()):
-        texts = [each.address for each in entries if each.family is _FAMILIES[kind]]
+        texts = [each.address for each in entries if each.family is kind.socket_family]
         addresses = [ipaddress.ip_address(text.partition("%")[0]) for text in texts]
         kept = [
             str(each)

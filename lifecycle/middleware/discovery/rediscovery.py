@@ -43,15 +43,13 @@ from lifecycle.middleware.fastdds.url_profile import (
     families,
     leaves_discovery_open,
 )
-from lifecycle.network import ConnectionUrl, Medium, participant_ports
+from lifecycle.network import RMW_DISCOVERY, ConnectionUrl, Medium, participant_ports
 
 _PARTICIPANTS = 32
 """Of a host whose address is known; further participants are reached by multicast."""
 
 _ANSWERED_AT = 32
 """Participants of this host that an announcement names; each is 56 bytes of one datagram."""
-
-_SOCKET = {Medium.UDPV4: socket.AF_INET, Medium.UDPV6: socket.AF_INET6}
 
 
 def call_out(
@@ -81,9 +79,9 @@ def call_out(
         return
     if environment.get(RANGE_VARIABLE, "").upper() in ("LOCALHOST", "OFF"):
         return  # nothing is looked for on another host
-    kinds = tuple(family.kind for family in found) if urls else (Medium.UDPV4,)
+    kinds = tuple(family.kind for family in found) if urls else (RMW_DISCOVERY,)
     for kind in kinds:
-        ipv6 = kind is Medium.UDPV6
+        ipv6 = kind.ip_version == 6
         _call_around(domain_id, kind, [each for each in peers if (":" in each) == ipv6])
 
 
@@ -97,7 +95,7 @@ def _call_around(domain_id: int, kind: Medium, peers: Sequence[str]) -> None:
     targets = [
         target for peer in peers for target in well_known_targets(domain_id, peer, _PARTICIPANTS)
     ]
-    with socket.socket(_SOCKET[kind], socket.SOCK_DGRAM) as sender:
+    with socket.socket(kind.socket_family, socket.SOCK_DGRAM) as sender:
         for call in calls:
             send(sender, call, group_targets(domain_id, kind, interfaces))
         send(sender, calls[0], targets)
@@ -121,7 +119,7 @@ def _call_listed(domain_id: int, family: UrlTransport) -> None:
     if not answered_at or not targets:
         return
     output = next((url.output_port for url in family.urls if url.output_port), None)
-    kind = _SOCKET[family.kind]
+    kind = family.kind.socket_family
     # Where the plan says by which port this participant sends, nothing may come from another.
     own = own_udp_socket(kind, output) if output else socket.socket(kind, socket.SOCK_DGRAM)
     if own is None:

@@ -41,7 +41,6 @@ from lifecycle.middleware.fastdds.participant_profile import (
 )
 from lifecycle.middleware.fastdds.settings import with_endpoint_profiles
 from lifecycle.middleware.fastdds.url_check import open_sockets
-from lifecycle.middleware.fastdds.url_profile import LOOPBACK, transport_of
 from lifecycle.middleware.rcl import hidden_node
 from lifecycle.middleware.rcl.hidden_node import forget_hidden, hidden_nodes, quiet_node
 from lifecycle.middleware.rcl.qos import to_rclpy
@@ -91,12 +90,12 @@ def fixed_sockets(settings: ParticipantSettings) -> set[int]:
 def uses_shared_memory(node: Node, settings: ParticipantSettings) -> bool:
     """Return if it has the transport, without a probe that static discovery would not allow."""
     if settings.urls:
-        return any(url.transport is Medium.SHM for url in settings.urls)
+        return not all(url.transport.is_network for url in settings.urls)
     return has_shared_memory(node)
 
 
 def _is_udp(url: ConnectionUrl) -> bool:
-    return transport_of(url) in LOOPBACK
+    return url.transport.is_udp
 
 
 __all__ = ["FlowParticipant", "hidden_nodes", "quiet_node"]

@@ -27,7 +27,7 @@ from lifecycle.middleware.fastdds import url_profile
 from lifecycle.middleware.fastdds.profiles import DEFAULT_FILE, PROFILES_FILE_VARIABLE
 from lifecycle.middleware.fastdds.profiles import child as _child
 from lifecycle.middleware.fastdds.profiles import text as _text
-from lifecycle.network import RMW_DEFAULT, TRANSPORTS_VARIABLE, ConnectionUrl, Medium
+from lifecycle.network import RMW_DEFAULT, TRANSPORTS_VARIABLE, UDP_UNICAST, ConnectionUrl, Medium
 from lifecycle.network import parse as parse_url
 from lifecycle.plan import (
     GRAPH_TOPIC,
@@ -141,7 +141,6 @@ def _check(endpoint: StaticEndpoint, participant: StaticParticipant, seen: dict[
 
 _SKIP_DEFAULT_FILE_VARIABLE = "SKIP_DEFAULT_XML"
 _TRANSPORT_CHOICES = ("userTransports", "useBuiltinTransports", "builtinTransports")
-_LOOPBACK = url_profile.LOOPBACK
 _LOCALHOST_PEERS_RANGE = url_profile.LOCALHOST_PEERS_RANGE
 _MIN_DATAGRAM_BYTES = 500
 _MAX_DATAGRAM_BYTES = 65500
@@ -223,11 +222,11 @@ class ParticipantSettings:
             )
         if self.static_participants:
             own_endpoints(self.static_name, self.static_participants)
-        unknown = [each for each in self.transports if each not in _LOOPBACK]
+        unknown = [each for each in self.transports if each not in UDP_UNICAST]
         if unknown or len(set(self.transports)) != len(self.transports):
             raise MiddlewareError(
                 f"cannot use transports {', '.join(map(repr, self.transports))}: allowed are "
-                f"{' and '.join(map(repr, _LOOPBACK))}, each once"
+                f"{' and '.join(map(repr, UDP_UNICAST))}, each once"
             )
         size = self.max_datagram_bytes
         if size is not None and not _MIN_DATAGRAM_BYTES <= size <= _MAX_DATAGRAM_BYTES:
@@ -349,12 +348,12 @@ def profile(
             _text(config, "static_edp_xml_config", f"data://{table}")
     elif settings.chooses_transports:
         # Fast DDS's own default where none is asked for: shared memory and UDP over IPv4.
-        kinds = settings.transports or RMW_DEFAULT
+        kinds = tuple(map(Medium, settings.transports)) or RMW_DEFAULT
         descriptors = ET.SubElement(profiles, "transport_descriptors")
         chosen = ET.SubElement(rtps, "userTransports")
         for kind in kinds:
             descriptor = _descriptor(f"{name}_{kind}", kind, settings)
-            if localhost_peers is not None and kind in _LOOPBACK:
+            if localhost_peers is not None and kind.is_udp:
                 _text(descriptor, "maxInitialPeersRange", str(_LOCALHOST_PEERS_RANGE))
             descriptors.append(descriptor)
             _text(chosen, "transport_id", f"{name}_{kind}")
@@ -393,7 +392,7 @@ def _descriptor(name: str, kind: Medium, settings: ParticipantSettings) -> ET.El
     descriptor = ET.Element("transport_descriptor")
     _text(descriptor, "transport_id", name)
     _text(descriptor, "type", url_profile.TYPES[kind])
-    if settings.non_blocking_send and kind in _LOOPBACK:
+    if settings.non_blocking_send and kind.is_udp:
         _text(descriptor, "non_blocking_send", "true")
     # Not maxMessageSize: it is the receive buffer's size as well, and would cut what others send.
     return descriptor
@@ -403,7 +402,7 @@ def _discover_as_localhost(
     builtin: ET.Element, kinds: tuple[Medium, ...], peers: tuple[str, ...]
 ) -> None:
     """Do what rmw_fastrtps's create_participant does for LOCALHOST, per transport."""
-    families = [kind for kind in kinds if kind in _LOOPBACK]
+    families = [kind for kind in kinds if kind.is_udp]
     for multicast in builtin.findall("metatrafficMulticastLocatorList"):
         builtin.remove(multicast)
     # A unicast locator without address and port means "any" and keeps multicast from being added.
@@ -416,7 +415,7 @@ def _discover_as_localhost(
             _text(ET.SubElement(ET.SubElement(searched, "locator"), family), "address", peer)
     for family in families:
         locator = ET.SubElement(ET.SubElement(searched, "locator"), family)
-        _text(locator, "address", _LOOPBACK[family])
+        _text(locator, "address", family.loopback)
 
 
 def _families_of(peer: str, families: list[Medium]) -> list[Medium]:

@@ -18,7 +18,7 @@ from pathlib import Path
 from xml.etree import ElementTree as ET
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.network import Medium
+from lifecycle.network import Medium, udp_to
 
 PROFILES_FILE_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 DEFAULT_FILE = "DEFAULT_FASTRTPS_PROFILES.xml"
@@ -51,7 +51,7 @@ def discovery_profile(
     locators = "".join(
         f"<locator><{kind}><address>{address}</address><port>{port}</port></{kind}></locator>"
         for address, port in peers
-        for kind in (Medium.UDPV6 if ":" in address else Medium.UDPV4,)
+        for kind in (udp_to(address),)
     )
     searched = f"<initialPeersList>{locators}</initialPeersList>" if locators else ""
     return f"""<?xml version="1.0" encoding="UTF-8"?>
@@ -131,18 +131,19 @@ def locator(parent: ET.Element, kind: Medium, address: str, port: int | None) ->
 
 
 def tcp_locator(
-    parent: ET.Element, address: str, physical: int | None, logical: int | None
+    parent: ET.Element, kind: Medium, address: str, physical: int | None, logical: int | None
 ) -> None:
-    """Add a TCP locator over IPv4 to a list.
+    """Add a TCP locator to a list.
 
     Args:
         parent: the list.
+        kind: TCPV4.
         address: empty for any.
         physical: the port that is listened on; None for the transport's.
         logical: the port inside the connection, which Fast DDS separates traffic by; None for
             the well-known ones.
     """
-    element = ET.SubElement(ET.SubElement(parent, "locator"), Medium.TCPV4.value)
+    element = ET.SubElement(ET.SubElement(parent, "locator"), kind.value)
     if address:
         text(element, "address", address)
     if physical is not None:

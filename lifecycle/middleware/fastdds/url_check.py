@@ -19,14 +19,9 @@ import psutil
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds.url_profile import UrlTransport, families
-from lifecycle.network import ConnectionUrl, Medium
+from lifecycle.network import CONNECTABLE, ConnectionUrl, Medium
 
-_TABLES = (
-    ("udp", Medium.UDPV4, socket.AF_INET),
-    ("udp6", Medium.UDPV6, socket.AF_INET6),
-    ("tcp", Medium.TCPV4, socket.AF_INET),
-)
-_FAMILIES = {kind: family for _, kind, family in _TABLES}
+_KINDS = tuple(each for each in CONNECTABLE if each.is_network and not each.is_group)
 _LISTEN = "0A"  # TCP_LISTEN of linux/tcp_states.h
 
 
@@ -61,7 +56,7 @@ def check_host(urls: Sequence[ConnectionUrl]) -> None:
                 addresses.add(entry.address.partition("%")[0])
     for url in urls:
         wanted = [each for each in url.interfaces if each not in names]
-        group = url.transport is Medium.UDPM
+        group = url.transport.is_group
         if url.address and not group and not ipaddress.ip_address(url.address).is_unspecified:
             wanted.append(url.address)
         for each in wanted:
@@ -84,10 +79,10 @@ def check_free(urls: Sequence[ConnectionUrl]) -> None:
         MiddlewareError: names the URL and the port.
     """
     for family in families(urls):
-        if family.kind not in _FAMILIES:
+        if family.kind not in _KINDS:
             continue
         for url, what, port in _ports(family):
-            group = url.transport is Medium.UDPM
+            group = url.transport.is_group
             if group and port == url.port:
                 continue  # a group's port is shared
             address = "" if group else url.address
@@ -132,16 +127,15 @@ def open_sockets(pid: int | None = None) -> tuple[OpenSocket, ...]:
 
 def _is_free(kind: Medium, address: str, port: int) -> bool:
     stream = kind.is_tcp
-    any_ = "::" if kind is Medium.UDPV6 else "0.0.0.0"  # noqa: S104 - only to see whether it is free
     with socket.socket(
-        _FAMILIES[kind], socket.SOCK_STREAM if stream else socket.SOCK_DGRAM
+        kind.socket_family, socket.SOCK_STREAM if stream else socket.SOCK_DGRAM
     ) as probe:
         if stream:  # as Fast DDS does: connections that are over are not in the way
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        if kind is Medium.UDPV6:
+        if kind.ip_version == 6:
             probe.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
         try:
-            probe.bind((address or any_, port))
+            probe.bind((address or kind.any_address, port))
             if stream:
                 probe.listen()
         except OSError:
@@ -169,7 +163,8 @@ def _ports(family: UrlTransport) -> Iterator[tuple[ConnectionUrl, str, int]]:
 
 
 def _bound_sockets() -> Iterator[OpenSocket]:
-    for table, kind, family in _TABLES:
+    for kind in _KINDS:
+        table = f"{'tcp' if kind.is_tcp else 'udp'}{'6' if kind.ip_version == 6 else ''}"
         path = Path("/proc/thread-self/net") / table
         with contextlib.suppress(FileNotFoundError):  # a kernel without IPv6
             for line in path.read_text(encoding="ascii").splitlines()[1:]:
@@ -181,7 +176,7 @@ def _bound_sockets() -> Iterator[OpenSocket]:
                     yield OpenSocket(
                         inode=int(fields[9]),
                         kind=kind,
-                        address=_address(family, address),
+                        address=_address(kind.socket_family, address),
                         port=int(port, 16),
                     )
 

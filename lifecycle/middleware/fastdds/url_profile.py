@@ -22,10 +22,14 @@ from lifecycle.middleware.fastdds.profiles import child as _child
 from lifecycle.middleware.fastdds.profiles import locator as _locator
 from lifecycle.middleware.fastdds.profiles import tcp_locator as _tcp_locator
 from lifecycle.middleware.fastdds.profiles import text as _text
-from lifecycle.network import LOCALHOST_PEERS_RANGE, ConnectionUrl, Medium, Peer, participant_ports
-
-LOOPBACK = {Medium.UDPV4: "127.0.0.1", Medium.UDPV6: "::1"}
-"""The transports that carry UDP, and where each finds this host."""
+from lifecycle.network import (
+    LOCALHOST_PEERS_RANGE,
+    ConnectionUrl,
+    Medium,
+    Peer,
+    participant_ports,
+    udp_to,
+)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,17 +49,17 @@ class UrlTransport:
     @property
     def udp(self) -> bool:
         """Whether it carries UDP, and so may use multicast."""
-        return self.kind in LOOPBACK
+        return self.kind.is_udp
 
     @property
     def unicast(self) -> tuple[ConnectionUrl, ...]:
         """Its URLs that are no groups."""
-        return tuple(url for url in self.urls if url.transport is not Medium.UDPM)
+        return tuple(url for url in self.urls if not url.transport.is_group)
 
     @property
     def groups(self) -> tuple[ConnectionUrl, ...]:
         """Its URLs that are groups."""
-        return tuple(url for url in self.urls if url.transport is Medium.UDPM)
+        return tuple(url for url in self.urls if url.transport.is_group)
 
 
 def families(urls: Sequence[ConnectionUrl]) -> tuple[UrlTransport, ...]:
@@ -80,23 +84,21 @@ def leaves_discovery_open(urls: Iterable[ConnectionUrl]) -> bool:
 
     Then what the environment says of that still holds (ROS_AUTOMATIC_DISCOVERY_RANGE).
     """
-    udp = [url for url in urls if transport_of(url) in LOOPBACK]
+    udp = [url for url in urls if url.transport.is_udp]
     return bool(udp) and not any(
         url.peers
         or url.server
         or not url.multicast
         or url.metatraffic_port
         or url.interfaces
-        or (url.address and url.transport is not Medium.UDPM)
+        or (url.address and not url.transport.is_group)
         for url in udp
     )
 
 
 def transport_of(url: ConnectionUrl) -> Medium:
     """Return the kind of transport that a URL is served by; a group's is that of its address."""
-    if url.transport is Medium.UDPM:
-        return Medium.UDPV4 if ipaddress.ip_address(url.address).version == 4 else Medium.UDPV6
-    return url.transport
+    return udp_to(url.address) if url.transport.is_group else url.transport
 
 
 def _interfaces(urls: Sequence[ConnectionUrl]) -> tuple[str, ...]:
@@ -104,7 +106,7 @@ def _interfaces(urls: Sequence[ConnectionUrl]) -> tuple[str, ...]:
     found: dict[str, None] = {}
     free = [url for url in urls if not _bound_to(url)]
     bound = [url for url in urls if _bound_to(url)]
-    if free and bound and not all(url.transport is Medium.UDPM for url in free):
+    if free and bound and not all(url.transport.is_group for url in free):
         raise MiddlewareError(
             f"cannot use {str(free[0])!r} on all interfaces and {str(bound[0])!r} on some: one "
             "participant has one transport for both",
@@ -118,7 +120,7 @@ def _interfaces(urls: Sequence[ConnectionUrl]) -> tuple[str, ...]:
 def _bound_to(url: ConnectionUrl) -> tuple[str, ...]:
     if url.interfaces:
         return url.interfaces
-    group = url.transport is Medium.UDPM
+    group = url.transport.is_group
     if group or not url.address or ipaddress.ip_address(url.address).is_unspecified:
         return ()
     return (url.address,)
@@ -135,16 +137,15 @@ def _check(found: Sequence[UrlTransport], urls: Sequence[ConnectionUrl]) -> None
                     f"cannot use {spelt} together: one participant has one {option}",
                     hint="give them to different connections",
                 )
-        listening = [url for url in family.urls if url.port] if family.kind is Medium.TCPV4 else []
+        listening = [url for url in family.urls if url.port] if family.kind.is_tcp else []
         if len(listening) > 1:
             raise MiddlewareError(
                 f"cannot listen on {str(listening[0])!r} and {str(listening[1])!r}: one "
                 "participant has one TCP port",
                 hint="give them to different connections",
             )
-    kinds = {family.kind for family in found}
-    fixed = [url for url in urls if transport_of(url) in LOOPBACK and url.port]
-    if Medium.SHM in kinds and fixed:
+    fixed = [url for url in urls if url.transport.is_udp and url.port]
+    if fixed and not all(family.kind.is_network for family in found):
         raise MiddlewareError(
             f"cannot use 'shm://' beside {str(fixed[0])!r}: a profile with fixed ports cannot say "
             "where shared memory listens, so it would not",
@@ -231,7 +232,7 @@ def _add_metatraffic(
 ) -> None:
     """Say where discovery arrives, if Fast DDS would not do as asked by itself."""
     fixed = any(url.metatraffic_port for family in found for url in family.urls)
-    tcp_alone = all(family.kind is Medium.TCPV4 for family in found)
+    tcp_alone = all(family.kind.is_tcp for family in found)
     udp = any(family.udp for family in found)
     if not (fixed or tcp_alone or (udp and not multicast)):
         return
@@ -242,10 +243,10 @@ def _add_metatraffic(
             addresses = dict.fromkeys(url.address for url in family.unicast) or {"": None}
             for address in addresses:
                 _locator(unicast, family.kind, address, port)
-        elif family.kind is Medium.TCPV4:
+        elif family.kind.is_tcp:
             logical = participant_ports(domain_id, 0).discovery_unicast
             for url in family.urls:
-                _tcp_locator(unicast, url.address, url.port, logical)
+                _tcp_locator(unicast, family.kind, url.address, url.port, logical)
     if multicast and udp:  # an empty list would be refused
         groups = ET.SubElement(builtin, "metatrafficMulticastLocatorList")
         for family in found:
@@ -264,8 +265,8 @@ def _add_peers(
     searched = ET.Element("initialPeersList")
     for family in found:
         for peer in dict.fromkeys(peer for url in family.urls for peer in url.peers):
-            if family.kind is Medium.TCPV4:
-                _tcp_locator(searched, peer.address, peer.port, None)
+            if family.kind.is_tcp:
+                _tcp_locator(searched, family.kind, peer.address, peer.port, None)
             else:
                 _locator(searched, family.kind, peer.address, peer.port)
         if family.udp:
@@ -273,7 +274,7 @@ def _add_peers(
                 if _may_be(peer.address, family.kind):
                     _locator(searched, family.kind, peer.address, None)
             if loopback:
-                _locator(searched, family.kind, LOOPBACK[family.kind], None)
+                _locator(searched, family.kind, family.kind.loopback, None)
     if len(searched):
         if announce:
             # Named peers replace the groups by which Fast DDS otherwise announces.
@@ -295,9 +296,9 @@ def _add_servers(builtin: ET.Element, urls: Sequence[ConnectionUrl], *, super_cl
             prefix = _counted(url.server_prefix, index)
             remote = ET.SubElement(servers, "RemoteServer", prefix=prefix)
             listened = ET.SubElement(remote, "metatrafficUnicastLocatorList")
-            if url.transport is Medium.TCPV4:
+            if url.transport.is_tcp:
                 # A server's logical port is its physical one.
-                _tcp_locator(listened, server.address, server.port, server.port)
+                _tcp_locator(listened, url.transport, server.address, server.port, server.port)
             else:
                 _locator(listened, transport_of(url), server.address, server.port)
 
@@ -338,7 +339,6 @@ def _may_be(address: str, kind: Medium) -> bool:
 __all__ = [
     "DISCOVERY_GROUP",
     "LOCALHOST_PEERS_RANGE",
-    "LOOPBACK",
     "TYPES",
     "UrlTransport",
     "add_urls",
@@ -420,7 +420,7 @@ def _descriptor(
             _text(descriptor, "output_port", str(output))
         if non_blocking:
             _text(descriptor, "non_blocking_send", "true")
-    if family.kind is not Medium.SHM:
+    if family.kind.is_network:
         peers = [peer for url in family.urls for peer in url.peers]
         wide = open_peers or any(peer.port is None for peer in peers)
         range_ = LOCALHOST_PEERS_RANGE if wide and family.udp else 1
@@ -430,7 +430,7 @@ def _descriptor(
         for each in family.interfaces:
             is_name = _is_name(each)
             _text(allowed, "interface" if is_name else "address", each)
-    if family.kind is Medium.TCPV4:
+    if family.kind.is_tcp:
         _keep_dialling_whole(descriptor)
         ports = [url.port for url in family.urls if url.port]
         if ports:
@@ -458,17 +458,17 @@ def _add_user_traffic(rtps: ET.Element, found: Sequence[UrlTransport], domain_id
     """Say where data arrives, if any of it is fixed: then Fast DDS adds nothing by itself."""
     groups = [(family, url) for family in found for url in family.groups]
     ports = any(url.port for family in found if family.udp for url in family.unicast)
-    with_tcp = any(family.kind is Medium.TCPV4 for family in found)
-    if not groups and not ports and (not with_tcp or any(f.kind is Medium.SHM for f in found)):
+    with_tcp = any(family.kind.is_tcp for family in found)
+    if not groups and not ports and (not with_tcp or not all(f.kind.is_network for f in found)):
         return
     unicast = ET.SubElement(rtps, "defaultUnicastLocatorList")
     for family in found:
         for url in family.unicast:
             if family.udp:
                 _locator(unicast, family.kind, url.address, url.port)
-            elif family.kind is Medium.TCPV4:
+            elif family.kind.is_tcp:
                 logical = participant_ports(domain_id, 0).user_unicast
-                _tcp_locator(unicast, url.address, url.port, logical)
+                _tcp_locator(unicast, family.kind, url.address, url.port, logical)
         if family.udp and not family.unicast:
             # Readers of a group also need an address of their own: one that is alone is sent to
             # there, and what a reliable writer repeats.

@@ -41,7 +41,6 @@ from lifecycle.middleware.rcl.graph_queries import (
 )
 from lifecycle.middleware.rcl.hidden_node import quiet_node
 from lifecycle.middleware.rcl.stale_node_filter import StaleNodeFilter
-from lifecycle.network import Medium
 from lifecycle.plan import ParticipantConnections
 from lifecycle.verify import (
     NO_NAMES,
@@ -368,7 +367,7 @@ class GraphObserver:
         servers = [
             (server.address, server.port)
             for url in self.urls
-            if url.transport is Medium.TCPV4
+            if url.transport.is_tcp
             for server in url.server
             if server.port is not None
         ]

@@ -15,9 +15,18 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 
 from lifecycle.manifest import Discovery, DiscoveryMode, FlowTransport, RunKind
-from lifecycle.network import ConnectionUrl, Medium, Peer, parse
-from lifecycle.plan.connections.hosts import (
+from lifecycle.network import (
+    DEFAULT_TCP,
     LOOPBACK,
+    RMW_DEFAULT,
+    UDP_UNICAST,
+    ConnectionUrl,
+    Medium,
+    Peer,
+    parse,
+    udp_to,
+)
+from lifecycle.plan.connections.hosts import (
     Contact,
     Hosts,
     PortPool,
@@ -32,8 +41,7 @@ from lifecycle.plan.model import (
     PlannedServer,
 )
 
-DEFAULT_PREFIX = ConnectionUrl(transport=Medium.TCPV4).server_prefix
-_SHM = ParticipantConnections(urls=(str(ConnectionUrl(transport=Medium.SHM)),))
+DEFAULT_PREFIX = ConnectionUrl(transport=DEFAULT_TCP).server_prefix
 _FIXED = (DiscoveryMode.STATIC, DiscoveryMode.STATIC_ENDPOINTS)
 
 
@@ -64,10 +72,10 @@ def control_transport(discovery: Discovery, hosts: Hosts) -> FlowTransport:
     if discovery.transport is not FlowTransport.ANY or discovery.mode is DiscoveryMode.DYNAMIC:
         return discovery.transport
     if discovery.mode is DiscoveryMode.SERVER:
-        return FlowTransport.TCPV4
+        return FlowTransport(DEFAULT_TCP.value)
     if discovery.mode is DiscoveryMode.STATIC_ENDPOINTS and not hosts.several:
         return FlowTransport.SHM
-    return FlowTransport.UDPV6 if any(":" in host for host in hosts.used) else FlowTransport.UDPV4
+    return FlowTransport(udp_to("".join(hosts.used)).value)
 
 
 def is_fixed(discovery: Discovery) -> bool:
@@ -98,17 +106,15 @@ def connect_control(
     extra = discovery.mode is not DiscoveryMode.STATIC_ENDPOINTS
     server = None
     if discovery.mode is DiscoveryMode.SERVER:
-        server = _server(discovery, hosts, pool, tcp=transport is FlowTransport.TCPV4)
+        server = _server(
+            discovery, hosts, pool, tcp=bool(transport.medium and transport.medium.is_tcp)
+        )
     ports = tuple((host, pool.take(host, 4)) for host in hosts.used)
     control = Control(transport=transport, server=server, observer_ports=ports)
     if transport is FlowTransport.ANY:
         return tuple(nodes), control
-    if transport is FlowTransport.SHM:
-        return _everywhere(nodes, _SHM, extra=extra), dataclasses.replace(
-            control, observers=tuple((host, _SHM) for host in hosts.used)
-        )
     (kind,) = transport.media
-    if discovery.mode is DiscoveryMode.DYNAMIC:
+    if discovery.mode is DiscoveryMode.DYNAMIC or not kind.is_network:
         same = ParticipantConnections(urls=(str(ConnectionUrl(transport=kind)),))
         return _everywhere(nodes, same, extra=extra), dataclasses.replace(
             control, observers=tuple((host, same) for host in hosts.used)
@@ -160,10 +166,10 @@ def _with_ports(
     extra: bool,
 ) -> tuple[tuple[PlannedNode, ...], Control]:
     """Give each participant its own ports, and all the others as peers or the server."""
-    count = 1 if kind is Medium.TCPV4 else 3
+    count = kind.ports
     slots: dict[tuple[str, str, str], tuple[str, tuple[int, ...]]] = {}
     for host, ports in control.observer_ports:
-        slots["observer", host, ""] = (host, ports[3:] if count == 1 else ports[:3])
+        slots["observer", host, ""] = (host, ports[3:] if kind.is_tcp else ports[:3])
     ours = [node for node in nodes if node.run.kind is RunKind.PYTHON]
     for node in ours:
         key = ("process", node.process, "")
@@ -211,7 +217,7 @@ def _urls(
     hosts: Hosts,
 ) -> dict[tuple[str, str, str], str]:
     """Spell each participant's URL."""
-    v6 = kind is Medium.UDPV6
+    v6 = kind.ip_version == 6
     alone = {
         key: fixed_url(kind, hosts.address(host, ipv6=v6), ports, ())
         for key, (host, ports) in slots.items()
@@ -230,7 +236,7 @@ def _urls(
     def looks_for(key: tuple[str, str, str], other: tuple[str, str, str]) -> bool:
         # Two ends that dial each other refuse both connections (Fast DDS 2.14). Observers are
         # first, so that they are there when dialled.
-        return order[other] < order[key] if kind is Medium.TCPV4 else other != key
+        return order[other] < order[key] if kind.is_tcp else other != key
 
     return {
         key: str(
@@ -285,7 +291,7 @@ def connect_observers(
     ]
     kinds = {url.transport.unicast for _, url in urls if url.transport.is_network}
     if may_use_tcp:
-        kinds.add(Medium.TCPV4)
+        kinds.add(DEFAULT_TCP)
     # A peer found by multicast, or that looks for the observer, need not be looked for.
     ours = {
         contact.peer
@@ -295,7 +301,7 @@ def connect_observers(
     contacts = [
         contact
         for host, url in urls
-        if not url.multicast or url.transport is Medium.TCPV4
+        if not url.multicast or url.transport.is_tcp
         if not ours & {*url.peers}
         for contact in contacts_of(host, (str(url),))
     ]
@@ -330,9 +336,9 @@ def _observer(  # noqa: PLR0917 - all are needed, and it is called once
     needed = kinds - has
     if not needed and not any(_peers(url, wanted, host) for url in urls):
         return base
-    if Medium.TCPV4 in needed:
+    if any(each.is_tcp for each in needed):
         urls = _with_tcp(base, control, host, hosts)
-    for kind in (Medium.UDPV4, Medium.UDPV6):
+    for kind in UDP_UNICAST:
         if kind in needed:
             urls.append(ConnectionUrl(transport=kind))
     return dataclasses.replace(base, urls=tuple(str(_meeting(url, wanted, host)) for url in urls))
@@ -341,8 +347,7 @@ def _observer(  # noqa: PLR0917 - all are needed, and it is called once
 def _base_urls(base: ParticipantConnections) -> list[ConnectionUrl]:
     """Return the URLs of an observer; where the RMW chooses, what it would choose."""
     return [parse(text) for text in base.urls] or [
-        ConnectionUrl(transport=Medium.SHM),
-        ConnectionUrl(transport=Medium.UDPV4),
+        ConnectionUrl(transport=each) for each in RMW_DEFAULT
     ]
 
 
@@ -350,14 +355,14 @@ def _with_tcp(
     base: ParticipantConnections, control: Control, host: str, hosts: Hosts
 ) -> list[ConnectionUrl]:
     urls = _base_urls(base)
-    if control.transport is FlowTransport.TCPV4:
+    if control.transport.medium and control.transport.medium.is_tcp:
         return urls
     port = dict(control.observer_ports)[host][3]
     # TCP is IPv4 here; where the host is declared by IPv6, only its own nodes can use it.
     address = LOOPBACK if ":" in host else hosts.address(host) if host or not hosts.several else ""
     return [
         *urls,
-        ConnectionUrl(transport=Medium.TCPV4, address=address, port=port),
+        ConnectionUrl(transport=DEFAULT_TCP, address=address, port=port),
     ]
 
 

@@ -19,12 +19,14 @@ from lifecycle.manifest import (
     DiscoveryMode,
     DiscoveryRange,
     EndpointKind,
-    FlowTransport,
     Machine,
     RunKind,
 )
 from lifecycle.network import (
+    LOOPBACK,
+    LOOPBACK6,
     MAX_PORT,
+    RMW_DISCOVERY,
     ConnectionUrl,
     Medium,
     Peer,
@@ -33,9 +35,6 @@ from lifecycle.network import (
     participant_ports,
 )
 from lifecycle.plan.model import Plan, PlanError, PlannedNode, PlannedProcess
-
-LOOPBACK = "127.0.0.1"
-LOOPBACK6 = "::1"
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -253,8 +252,8 @@ def _participant(
 ) -> ParticipantDemand:
     parsed = [parse(text) for text in urls]
     # A group's port is the group's, not the participant's.
-    fixed = [each for each in parsed if each.transport is not Medium.UDPM]
-    if parsed and all(each.transport is Medium.SHM for each in parsed):
+    fixed = [each for each in parsed if not each.transport.is_group]
+    if parsed and not any(each.transport.is_network for each in parsed):
         return ParticipantDemand(
             owner=owner, index=index, discovery_port=0, user_port=0, shared_memory=True
         )
@@ -309,10 +308,10 @@ def contacts_of(host: str, urls: Iterable[str]) -> tuple[Contact, ...]:
 
 def _contact(host: str, url: ConnectionUrl) -> Contact | None:
     address, port = url.address, url.metatraffic_port
-    if url.transport is Medium.UDPM:
+    if url.transport.is_group:
         # The group is for data; discovery listens on the interfaces.
         address = next(iter(url.interfaces), "")
-    elif url.transport is Medium.TCPV4:
+    elif url.transport.is_tcp:
         port = url.port
     if port is None:
         return None
@@ -329,7 +328,7 @@ def ports_of(urls: Iterable[ConnectionUrl]) -> tuple[int, ...]:
         port
         for url in urls
         for port in (
-            None if url.transport is Medium.UDPM else url.port,
+            None if url.transport.is_group else url.port,
             url.metatraffic_port,
             url.output_port,
         )
@@ -345,7 +344,7 @@ def peers_by(transport: Medium, contacts: Iterable[Contact], *, host: str) -> tu
         contacts: all participants to be found.
         host: of the participant with the URL; a group with TTL 0 reaches no other host.
     """
-    group = transport is Medium.UDPM
+    group = transport.is_group
     return tuple(
         sorted(
             {
@@ -371,7 +370,7 @@ def fixed_url(
         ports: metatraffic, user data and source port for UDP; the listening port for TCP.
         peers: what it looks for.
     """
-    if transport is Medium.TCPV4:
+    if transport.is_tcp:
         return ConnectionUrl(
             transport=transport, address=address, port=ports[0], peers=tuple(peers)
         )
@@ -403,7 +402,7 @@ def reached_hosts(plan: Plan, own: Collection[str]) -> Mapping[str, int]:
         participant that the plan adds, and a few of others.
     """
     far = plan.discovery_range in (DiscoveryRange.SUBNET, DiscoveryRange.SYSTEM_DEFAULT)
-    by_ipv4 = plan.discovery.transport in (FlowTransport.ANY, FlowTransport.UDPV4)
+    by_ipv4 = (plan.discovery.transport.medium or RMW_DISCOVERY) is RMW_DISCOVERY
     if plan.discovery_mode is not DiscoveryMode.DYNAMIC or not far or not by_ipv4:
         return {}
     hosts: dict[str, int] = {}

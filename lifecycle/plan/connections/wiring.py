@@ -33,7 +33,13 @@ from lifecycle.manifest import (
     RunKind,
     error,
 )
-from lifecycle.network import TRANSPORTS_VARIABLE, Medium, UniqueRequirement, describe
+from lifecycle.network import (
+    TRANSPORTS_VARIABLE,
+    UniqueRequirement,
+    describe,
+    medium_of,
+    udp_to,
+)
 from lifecycle.plan.connections.control import (
     connect_control,
     connect_observers,
@@ -153,7 +159,7 @@ def _services(
 def _without_udp(
     node: PlannedNode, each: PlannedEndpoint, by: tuple[str, ...]
 ) -> Iterator[Diagnostic]:
-    if not by or not {*by} <= {Medium.SHM, Medium.TCPV4}:
+    if not by or any(medium_of(each).is_udp for each in by):
         return
     has = ", ".join(by)
     if each.dscp is not None and each.enforce_dscp:
@@ -342,10 +348,10 @@ def _by_machine(
 
 def _may_use_tcp(nodes: Sequence[PlannedNode], flows: Sequence[PlannedFlow]) -> bool:
     """Whether anything declares that TCP may be negotiated while the system runs."""
-    wishes = {each.transport for each in flows}
-    wishes |= {each.transport for node in nodes for each in node.endpoints}
+    wishes = {each.transport.medium for each in flows}
+    wishes |= {each.transport.medium for node in nodes for each in node.endpoints}
     reliable = any(each.lossy is False for node in nodes for each in node.endpoints)
-    return reliable or bool({FlowTransport.TCPV4, FlowTransport.MULTICAST} & wishes)
+    return reliable or any(each and (each.is_tcp or each.is_group) for each in wishes)
 
 
 def _unconnectable(
@@ -454,8 +460,7 @@ def place_static(
         PlanError: too few ports, or more endpoints than there are ids.
     """
     placed = [_place(node) for node in nodes]
-    v6 = any(":" in host for host in hosts.used)
-    kind = Medium.UDPV6 if v6 else Medium.UDPV4
+    kind = udp_to("".join(hosts.used))
     ports = {
         (node.key, each.name): (hosts.host(node.machine), pool.take(hosts.host(node.machine), 3))
         for node in placed

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 
 from lifecycle.manifest import EndpointKind, FlowTransport, QosProfile
-from lifecycle.network import CONNECTABLE, RMW_DEFAULT, Medium, Peer
+from lifecycle.network import CONNECTABLE, DEFAULT_TCP, RMW_DEFAULT, Medium, Peer
 from lifecycle.plan.connections.hosts import Contact
 
 PARADIGMS = ("publish-subscribe", "request-response")
@@ -103,7 +103,7 @@ class Terms:
 
     fixed: bool = False
     server: Peer | None = None
-    server_medium: Medium = Medium.TCPV4
+    server_medium: Medium = DEFAULT_TCP
     first_port: int = 7910
     taken: tuple[tuple[str, tuple[int, ...]], ...] = ()
     multicast_group: str = "239.255.1.1"

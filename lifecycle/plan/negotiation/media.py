@@ -10,7 +10,7 @@ import dataclasses
 from collections.abc import Collection
 
 from lifecycle.manifest import FlowTransport
-from lifecycle.network import Medium, is_fragmented, max_unfragmented
+from lifecycle.network import CONNECTABLE, Medium, is_fragmented, max_unfragmented
 from lifecycle.plan.negotiation.data_layer import Party, PartyEndpoint
 
 
@@ -66,6 +66,20 @@ class Choice:
     problem: str = ""
     hint: str = ""
 
+    @property
+    def inside(self) -> bool:
+        """Whether it is handed over inside a process."""
+        return self.medium == Medium.INTRAPROCESS
+
+    @property
+    def by_group(self) -> bool:
+        """Whether one datagram of it goes to a group."""
+        return self.medium == Medium.UDPM
+
+
+MEETING = Medium.SHM
+"""By what participants of one process find each other, if they have nothing else in common."""
+
 
 def carried(writer: Collection[str], reader: Collection[str], *, same_host: bool) -> list[str]:
     """Return by what Fast DDS 2.14 sends from a participant with some transports to another.
@@ -82,23 +96,26 @@ def carried(writer: Collection[str], reader: Collection[str], *, same_host: bool
     Returns:
         Media, sorted; empty if they never meet.
     """
-    if same_host and Medium.SHM in writer and Medium.SHM in reader:
-        return [Medium.SHM]
-    found: set[str] = set()
-    groups = {each for each in writer if each.startswith(Medium.UDPM)}
-    if same_host and groups & {*reader}:
-        found.add(Medium.UDPM)
-    elif _has_ipv4(writer, same_host=same_host) and _has_ipv4(reader, same_host=same_host):
-        # A group with TTL 0 also receives what is sent to loopback by unicast.
-        found.add(Medium.UDPV4)
-    found |= {each for each in (Medium.UDPV6, Medium.TCPV4) if each in writer and each in reader}
+    common = _unicast(writer, same_host=same_host) & _unicast(reader, same_host=same_host)
+    found = {each for each in common if each.is_network}
+    if same_host and found != common:
+        return sorted(common - found)
+    if same_host:
+        for group in (each for each in CONNECTABLE if each.is_group):
+            if any(each.startswith(group) for each in {*writer} & {*reader}):
+                found = {*found - {group.unicast}, group}
     return sorted(found)
 
 
-def _has_ipv4(transports: Collection[str], *, same_host: bool) -> bool:
-    return Medium.UDPV4 in transports or (
-        same_host and any(each.startswith(Medium.UDPM) for each in transports)
-    )
+def _unicast(transports: Collection[str], *, same_host: bool) -> set[Medium]:
+    """Return by what a participant receives what is sent to it alone.
+
+    A group with TTL 0 also receives what is sent to loopback by unicast.
+    """
+    words = {each.partition("@")[0] for each in transports}
+    return {
+        each.unicast for each in CONNECTABLE if each in words and (same_host or not each.is_group)
+    }
 
 
 def wish_of(pair: Pair) -> tuple[FlowTransport, str]:
@@ -190,10 +207,9 @@ def _common(pair: Pair) -> set[str]:
     """Return media that both ends can have."""
     common = {*_able(pair.publisher)} & {*_able(pair.subscription)}
     if not pair.same_host:
-        common -= {Medium.SHM, Medium.UDPM}
-        families = {":" in each for each in (pair.publisher.host, pair.subscription.host) if each}
-        common -= {Medium.UDPV4, Medium.TCPV4} if True in families else set()
-        common -= {Medium.UDPV6} if False in families else set()
+        hosts = {pair.publisher.host, pair.subscription.host} - {""}
+        versions = {6 if ":" in each else 4 for each in hosts}
+        common -= {each for each in Medium if each.stays_on_host or versions - {each.ip_version}}
     return common
 
 
@@ -232,8 +248,8 @@ def _by(party: Party, endpoint: PartyEndpoint) -> tuple[str, ...]:
 
 def _ip_order(pair: Pair) -> tuple[str, ...]:
     ipv6 = ":" in pair.publisher.host or ":" in pair.subscription.host
-    udp = (Medium.UDPV6, Medium.UDPV4) if ipv6 else (Medium.UDPV4, Medium.UDPV6)
-    return (*udp, Medium.TCPV4)
+    ip = (each for each in CONNECTABLE if each.is_network and not each.is_group)
+    return tuple(sorted(ip, key=lambda each: (each.is_tcp, (each.ip_version == 6) is not ipv6)))
 
 
 def _unasked(

@@ -15,10 +15,8 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from lifecycle.manifest import EndpointKind, FlowTransport
-from lifecycle.network import ConnectionUrl, Medium, parse
+from lifecycle.network import LOOPBACK, UDP_UNICAST, ConnectionUrl, Medium, medium_of, parse
 from lifecycle.plan.connections.hosts import (
-    LOOPBACK,
-    LOOPBACK6,
     Contact,
     PortPool,
     contacts_of,
@@ -36,6 +34,7 @@ from lifecycle.plan.negotiation.data_layer import (
     Terms,
 )
 from lifecycle.plan.negotiation.media import (
+    MEETING,
     Choice,
     Pair,
     carried,
@@ -174,7 +173,7 @@ def _groups(
     for draft in drafts:
         for text in kept.get(draft.key, ()):
             url = parse(text)
-            if url.transport is Medium.UDPM:
+            if url.transport.is_group:
                 found.setdefault(_topic(draft), url)
     return found
 
@@ -188,9 +187,8 @@ def _reason(draft: _Draft) -> str:
 
 def _address(host: str, transport: Medium) -> str:
     """Return where a participant of a host listens; on loopback for the other IP version."""
-    if transport is Medium.UDPV6:
-        return host if ":" in host else LOOPBACK6
-    return LOOPBACK if ":" in host else host or LOOPBACK
+    is_other = (":" in host) != (transport.ip_version == 6)
+    return transport.loopback if is_other else host or transport.loopback
 
 
 class _Writer:
@@ -259,16 +257,16 @@ class _Writer:
         for transport in Medium:
             if transport not in _plain(draft.transports):
                 continue
-            if transport is Medium.SHM:
+            if not transport.is_network:
                 yield ConnectionUrl(transport=transport)
-            elif transport is Medium.UDPM:
+            elif transport.is_group:
                 group = self._groups[_topic(draft)]
                 bare = dataclasses.replace(group, metatraffic_port=None, peers=(), multicast=True)
                 if fixed:
                     (port,) = self._pool.take(host)
                     bare = dataclasses.replace(bare, metatraffic_port=port, multicast=False)
                 yield bare
-            elif transport is Medium.TCPV4:
+            elif transport.is_tcp:
                 (port,) = self._pool.take(host)
                 yield ConnectionUrl(
                     transport=transport, address=_address(host, transport), port=port
@@ -285,7 +283,7 @@ class _Writer:
                 )
             else:
                 # Each sample would go twice to IPv6's global and link-local addresses.
-                own = host if transport is Medium.UDPV6 and ":" in host else ""
+                own = host if transport.ip_version == 6 and ":" in host else ""
                 yield ConnectionUrl(transport=transport, address=own)
         server = self._terms.server_medium
         if self._terms.server is not None and server not in _plain(draft.transports):
@@ -300,9 +298,9 @@ class _Writer:
                 served = url.transport is self._terms.server_medium
                 server = (self._terms.server,) if served else ()
                 found.append(dataclasses.replace(url, server=server))
-            elif url.transport is Medium.SHM:
+            elif not url.transport.is_network:
                 found.append(url)
-            elif self._terms.fixed or url.transport is Medium.TCPV4:
+            elif self._terms.fixed or url.transport.is_tcp:
                 known = peers_by(url.transport, contacts, host=draft.party.host)
                 found.append(dataclasses.replace(url, peers=known))
             else:
@@ -420,7 +418,7 @@ def _choose(
                 listeners=len(listeners.get(writer, ())),
                 max_datagram_bytes=terms.max_datagram_bytes,
             )
-            if choices[index].medium == Medium.UDPM:
+            if choices[index].by_group:
                 groups.add(writer)
     chosen, problems = [], []
     for index, pair in enumerate(pairs):
@@ -464,9 +462,9 @@ def _foreign(pair: Pair) -> bool:
     return not (pair.publisher.connectable and pair.subscription.connectable)
 
 
-def _token(pair: Pair, medium: str) -> str:
-    """Spell a medium as a transport; a topic has a group of its own."""
-    return f"{medium}@{pair.writer.resolved}" if medium == Medium.UDPM else medium
+def _token(pair: Pair, choice: Choice) -> str:
+    """Spell what was chosen as a transport; a topic has a group of its own."""
+    return f"{choice.medium}@{pair.writer.resolved}" if choice.by_group else choice.medium
 
 
 class _PairCarriers:
@@ -490,8 +488,8 @@ class _PairCarriers:
             self._ends[ends[1]] = pair.subscription, pair.reader
             for key in ends:
                 found = self._needs.setdefault(key, set())
-                if choice.medium != Medium.INTRAPROCESS:
-                    found.add(_token(pair, choice.medium))
+                if not choice.inside:
+                    found.add(_token(pair, choice))
         self._settle()
 
     def _settle(self) -> None:
@@ -537,7 +535,8 @@ class _PairCarriers:
     def _impossible(self, key: _Key) -> bool:
         """Whether an endpoint's connection would need shared memory beside fixed UDP ports."""
         found = self._moved.get(key, set())
-        return self._fixed and Medium.SHM in found and bool({Medium.UDPV4, Medium.UDPV6} & found)
+        in_memory = any(not medium_of(each).is_network for each in found)
+        return self._fixed and in_memory and bool({*UDP_UNICAST} & found)
 
     def _transports(self, key: _Key) -> set[str]:
         if key in self._moved:
@@ -555,13 +554,13 @@ class _PairCarriers:
     def _holds(self, pair: Pair, choice: Choice) -> bool:
         present = self._present(pair)
         # Inside a process it is enough that the participants find each other.
-        return bool(present) if choice.medium == Medium.INTRAPROCESS else present == [choice.medium]
+        return bool(present) if choice.inside else present == [choice.medium]
 
     def _move(self, pair: Pair, choice: Choice) -> bool:
         for key in (_writer(pair), _reader(pair)):
             if key in self._moved:
-                if choice.medium == Medium.INTRAPROCESS and Medium.SHM not in self._moved[key]:
-                    self._moved[key].add(Medium.SHM)
+                if choice.inside and MEETING not in self._moved[key]:
+                    self._moved[key].add(MEETING)
                     return True
                 continue
             party, endpoint = self._ends[key]
@@ -615,8 +614,8 @@ class _PairCarriers:
 
 def _together(transports: set[str]) -> set[str]:
     """Return the transports of one participant: a group on loopback also receives by unicast."""
-    grouped = any(each.startswith(Medium.UDPM) for each in transports)
-    return transports - {Medium.UDPV4} if grouped else set(transports)
+    media = map(medium_of, transports)
+    return transports - {each.unicast for each in media if each.is_group}
 
 
 def _order(key: _Key) -> tuple[str, str, str]:

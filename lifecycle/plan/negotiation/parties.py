@@ -23,11 +23,12 @@ from lifecycle.manifest import (
 from lifecycle.network import (
     BUILTIN_TRANSPORTS,
     CONNECTABLE,
+    DEFAULT_TCP,
     DG,
     RMW_DEFAULT,
+    RMW_DISCOVERY,
     TRANSPORTS_VARIABLE,
     ConnectionUrl,
-    Medium,
     Peer,
     UniqueRequirement,
     domain_base,
@@ -62,7 +63,7 @@ def transports_of(urls: Iterable[str]) -> tuple[str, ...]:
 
 
 def _transport(url: ConnectionUrl) -> str:
-    if url.transport is Medium.UDPM:
+    if url.transport.is_group:
         return f"{url.transport}@{url.address}:{url.port}"
     return url.transport
 
@@ -273,7 +274,7 @@ def make_terms(
     return Terms(
         fixed=is_fixed(discovery),
         server=None if server is None else Peer(address=server.address, port=server.port),
-        server_medium=Medium.TCPV4 if server is None or server.tcp else Medium.UDPV4,
+        server_medium=DEFAULT_TCP if server is None or server.tcp else RMW_DISCOVERY,
         first_port=discovery.first_port,
         taken=tuple((host, tuple(sorted(ports))) for host, ports in sorted(taken.items())),
         multicast_group=data_layer.multicast_group,

@@ -43,8 +43,9 @@ MAX_FLOW_LABEL = 0xFFFFF
 """Twenty bits (RFC 6437)."""
 
 _UNSEEN = {
-    Medium.SHM.value: "shared memory: no packet that a network could see",
-    Medium.INTRAPROCESS.value: "one process: no packet that a network could see",
+    each.value: f"{each.stays_in}: no packet that a network could see"
+    for each in Medium
+    if each.stays_in
 }
 """Why no network sees a flow, by its effective transport."""
 

@@ -14,10 +14,10 @@ from lifecycle.errors import BringUpError, MiddlewareError
 from lifecycle.manifest import Run, RunKind
 from lifecycle.middleware import discovery_server_command, discovery_server_listens
 from lifecycle.plan import PlannedProcess, PlannedServer
+from lifecycle.supervisor.control.protocol import ProcessState
 from lifecycle.supervisor.nodes.bring_up import died
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.process import COMMAND_ESCALATION, ManagedProcess, Spawner
-from lifecycle.supervisor.run.events import ProcessState
 from lifecycle.supervisor.run.failure import StepFailedError, finding_of
 from lifecycle.verify import DEADLINE, START_FAILED, Finding
 

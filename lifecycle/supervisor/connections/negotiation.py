@@ -16,7 +16,7 @@ import dataclasses
 from collections.abc import Collection, Iterable, Iterator, Mapping
 
 from lifecycle.manifest import Authority, DataLayerSource, EndpointKind, EndpointPolicy
-from lifecycle.network import CONNECTABLE, RMW_DEFAULT, Medium, UniqueRequirement, parse
+from lifecycle.network import CONNECTABLE, RMW_DEFAULT, UniqueRequirement, parse
 from lifecycle.plan import (
     FAST_DDS,
     DataLayerGraph,
@@ -218,7 +218,7 @@ class NegotiatedSource:
         for each in self.graph.connections:
             if each.node in keys:
                 urls = (parse(text) for text in each.urls)
-                tcp = (url for url in urls if url.transport is Medium.TCPV4)
+                tcp = (url for url in urls if url.transport.is_tcp)
                 taken.setdefault(hosts[each.node], set()).update(ports_of(tcp))
         self._terms = dataclasses.replace(
             self._terms,

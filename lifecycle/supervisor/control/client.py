@@ -7,19 +7,23 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from lifecycle.errors import ExitCode, UsageError
-from lifecycle.plan import Plan
 from lifecycle.run_directory import RunDirectory, is_held, new_run_id
-from lifecycle.supervisor.control.server import (
+from lifecycle.supervisor.control.protocol import (
+    A,
     Answer,
     ControlRequest,
     Question,
-    SupervisorSnapshot,
+    SystemStatus,
     ask,
     strange,
 )
-from lifecycle.supervisor.control.status import SystemStatus
+
+if TYPE_CHECKING:
+    from lifecycle.plan import Plan
+    from lifecycle.supervisor.control.server import SupervisorSnapshot
 
 STATUS_S = 5.0
 _SOCKET = "control"
@@ -32,7 +36,7 @@ def status(path: Path) -> SystemStatus:
         UsageError: it runs no more.
         TimeoutError: it does not answer.
     """
-    answer = _asked(path, Question(ask=ControlRequest.STATUS), STATUS_S)
+    answer = _asked(path, Question(ask=ControlRequest.STATUS), STATUS_S, Answer)
     if answer is None:
         raise _killed(path)
     if answer.status is None:
@@ -47,7 +51,9 @@ def look(path: Path) -> SupervisorSnapshot:
         UsageError: it runs no more.
         TimeoutError: it does not answer.
     """
-    answer = _asked(path, Question(ask=ControlRequest.LOOK), STATUS_S)
+    from lifecycle.supervisor.control.server import LookAnswer  # its types are a whole plan's
+
+    answer = _asked(path, Question(ask=ControlRequest.LOOK), STATUS_S, LookAnswer)
     if answer is None:
         raise _killed(path)
     if answer.look is None:
@@ -63,7 +69,7 @@ def differences(path: Path, plan: Plan) -> tuple[str, ...]:
     """
     question = Question(ask=ControlRequest.DIFFERENCES, plan=plan)
     try:
-        answer = _asked(path, question, STATUS_S)
+        answer = _asked(path, question, STATUS_S, Answer)
     except TimeoutError:
         return ()
     return () if answer is None else answer.differences
@@ -83,7 +89,7 @@ def order(path: Path, question: Question, timeout_s: float) -> Answer:
         UsageError: it runs no more.
         TimeoutError: it is not done after `timeout_s`; it goes on all the same.
     """
-    answer = _asked(path, question, timeout_s)
+    answer = _asked(path, question, timeout_s, Answer)
     if answer is None:
         raise _killed(path)
     if answer.exit_code not in _ANSWERED:
@@ -93,10 +99,10 @@ def order(path: Path, question: Question, timeout_s: float) -> Answer:
     return answer
 
 
-def _asked(path: Path, question: Question, timeout_s: float) -> Answer | None:
+def _asked(path: Path, question: Question, timeout_s: float, type_: type[A]) -> A | None:
     """Return the answer of a supervisor; None if it is not there any more."""
     try:
-        return ask(path / _SOCKET, question, timeout_s)
+        return ask(path / _SOCKET, question, timeout_s, type_)
     except (FileNotFoundError, ConnectionError):
         return None
 
@@ -120,7 +126,7 @@ def down(path: Path, timeout_s: float) -> ExitCode:
         ProgrammingError: nothing runs, but something of it could not be removed from a network.
     """
     deadline = time.monotonic() + timeout_s
-    answer = _asked(path, Question(ask=ControlRequest.DOWN), timeout_s)
+    answer = _asked(path, Question(ask=ControlRequest.DOWN), timeout_s, Answer)
     if answer is not None and answer.exit_code is None:
         raise strange(path / _SOCKET, "it has no exit code")
     if answer is not None and _released(path, deadline):

@@ -17,10 +17,10 @@ from collections.abc import Collection, Iterable, Iterator
 from lifecycle.codec import to_plain
 from lifecycle.errors import BringUpError, ExitCode, UsageError
 from lifecycle.manifest import DataLayerSource
-from lifecycle.network import Medium
+from lifecycle.network import parse
 from lifecycle.plan import Plan, PlanDifference, PlannedNode, changes, with_files_of_now
+from lifecycle.supervisor.control.protocol import ProcessState
 from lifecycle.supervisor.nodes.system import NodeRun, System
-from lifecycle.supervisor.run.events import ProcessState
 from lifecycle.supervisor.run.options import UpOptions, local_processes
 
 ACTIVE = "active"
@@ -247,8 +247,7 @@ class Revisions:
             raise refuse("its data layer is negotiated by the manifest that runs")
         if self._options.program:
             raise refuse("networks are programmed by the manifest that runs")
-        tcp = f"{Medium.TCPV4}:"
-        if any(url.startswith(tcp) for each in (running, plan) for url in _urls(each)):
+        if any(parse(url).transport.is_tcp for each in (running, plan) for url in _urls(each)):
             raise refuse("a TCP port that was used is not connected to again by who used it")
         if order.node:
             self._check_node(order, plan, found)

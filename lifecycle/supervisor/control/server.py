@@ -1,6 +1,7 @@
 """The supervisor's control socket: what `lifecycle status`, `down`, `pause` and others ask.
 
-Owns: the requests and replies, one JSON object per line, on both sides. Must not import rclpy.
+Owns: listening, answering, and following what a supervisor knows; what is asked and answered is
+protocol.py's. Must not import rclpy.
 """
 
 from __future__ import annotations
@@ -8,9 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import dataclasses
-import enum
 import socket
-import time
 from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,7 +18,14 @@ from lifecycle.codec import from_json, to_json
 from lifecycle.errors import UsageError
 from lifecycle.plan import Plan
 from lifecycle.run_directory import connect, short_path
-from lifecycle.supervisor.control.status import SystemStatus
+from lifecycle.supervisor.control.protocol import (
+    ANSWER_S,
+    Answer,
+    ControlRequest,
+    Question,
+    SystemStatus,
+    read_answer,
+)
 from lifecycle.verify import Observation, Verdict
 
 if TYPE_CHECKING:
@@ -30,41 +36,6 @@ _CLOSE_S = 1.0
 """In the end, a client that reads nothing for so long loses what it was not sent."""
 _LARGEST_QUESTION = 64 * 2**20
 """Bytes of a line; a question may hold a whole plan."""
-_LARGEST_ANSWER = 64 * 2**20
-"""Bytes of a line; a look holds a whole plan and all that was seen."""
-_ANSWER_S = 10.0
-"""For the rest of an answer that has begun."""
-_READ = 2**18
-
-
-class ControlRequest(enum.Enum):
-    """What a supervisor can be asked."""
-
-    STATUS = "status"
-    DOWN = "down"
-    LOOK = "look"
-    FOLLOW = "follow"
-    PAUSE = "pause"
-    RESUME = "resume"
-    RESTART = "restart"
-    DIFFERENCES = "differences"
-
-
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Question:
-    """Client → supervisor.
-
-    Attributes:
-        node: for RESTART, manifest key or fully qualified name; empty for the whole system.
-        plan: for DIFFERENCES and orders, the plan of the client's manifest as it is now;
-            None if it was given none.
-        reload: for RESTART, `plan` is to run from now on.
-    """
-
-    ask: ControlRequest
-    node: str = ""
-    plan: Plan | None = None
-    reload: bool = False
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,24 +53,20 @@ class SupervisorSnapshot:
     verdict: Verdict | None
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Answer:
-    """Supervisor → client.
+class QuestionWithPlan(Question, frozen=True, kw_only=True):
+    """Question as a supervisor reads it."""
+
+    plan: Plan | None = None
+
+
+class LookAnswer(Answer, frozen=True, kw_only=True):
+    """Answer to LOOK and FOLLOW.
 
     Attributes:
-        status: for STATUS.
-        exit_code: for DOWN, of the supervisor, sent once nothing of the system runs any more; for
-            an order, what came of it.
-        error: why an order was not carried out; empty if it was.
-        look: for LOOK; for FOLLOW one at once and one after each change.
-        differences: for DIFFERENCES, how the plan of the question differs from what runs.
+        look: for FOLLOW one at once and one after each change.
     """
 
-    status: SystemStatus | None = None
-    exit_code: int | None = None
-    error: str = ""
     look: SupervisorSnapshot | None = None
-    differences: tuple[str, ...] = ()
 
 
 class ControlServer:
@@ -157,7 +124,7 @@ class ControlServer:
         self._open.add(writer)
         try:
             while line := await reader.readline():
-                question = from_json(line, Question)
+                question = from_json(line, QuestionWithPlan)
                 if question.ask is ControlRequest.DOWN:
                     self._waiting.add(writer)
                     self._down()
@@ -178,9 +145,9 @@ class ControlServer:
         self._changed.set()
         self._changed = asyncio.Event()
 
-    async def _answer(self, question: Question) -> Answer:
+    async def _answer(self, question: QuestionWithPlan) -> Answer:
         if question.ask is ControlRequest.LOOK and self._look is not None:
-            return Answer(look=self._look())
+            return LookAnswer(look=self._look())
         from lifecycle.supervisor.control.orders import Order, OrderKind  # clients need neither
 
         if self._order is not None and question.ask.value in {each.value for each in OrderKind}:
@@ -202,7 +169,7 @@ class ControlServer:
         try:
             while self._look is not None and not gone.done():
                 changed = self._changed
-                await _say(writer, Answer(look=self._look()))
+                await _say(writer, LookAnswer(look=self._look()))
                 waiting = asyncio.ensure_future(changed.wait())
                 await asyncio.wait({gone, waiting}, return_when=asyncio.FIRST_COMPLETED)
                 waiting.cancel()
@@ -236,23 +203,6 @@ async def _say(writer: asyncio.StreamWriter, answer: Answer) -> None:
     await writer.drain()
 
 
-def ask(path: Path, question: Question, timeout_s: float) -> Answer | None:
-    """Ask the supervisor that listens at `path`.
-
-    Returns:
-        Its answer; None if it ended without one.
-
-    Raises:
-        TimeoutError: no whole answer within `timeout_s`.
-        UsageError: what answers is no supervisor of this version.
-        OSError: no supervisor listens there.
-    """
-    deadline = time.monotonic() + timeout_s
-    with connect(path, timeout_s) as sock:
-        sock.sendall(to_json(question) + b"\n")
-        return _answer(path, sock, bytearray(), deadline)
-
-
 def follow(path: Path) -> Iterator[SupervisorSnapshot]:
     """Yield what the supervisor that listens at `path` knows, now and after each change.
 
@@ -263,52 +213,9 @@ def follow(path: Path) -> Iterator[SupervisorSnapshot]:
         UsageError: what answers is no supervisor of this version.
         OSError: no supervisor listens there.
     """
-    with connect(path, _ANSWER_S) as sock:
+    with connect(path, ANSWER_S) as sock:
         sock.sendall(to_json(Question(ask=ControlRequest.FOLLOW)) + b"\n")
         rest = bytearray()
-        while (answer := _answer(path, sock, rest, None)) is not None:
+        while (answer := read_answer(path, sock, rest, None, LookAnswer)) is not None:
             if answer.look is not None:
                 yield answer.look
-
-
-def _answer(
-    path: Path, sock: socket.socket, rest: bytearray, deadline_s: float | None
-) -> Answer | None:
-    """Read one answer, bounded in time and size; None if there is none any more.
-
-    Args:
-        path: of the socket.
-        sock: connected to it.
-        rest: what was read beyond the answer before.
-        deadline_s: monotonic; None to wait for ever until one begins, and not long for its end.
-    """
-    searched = 0
-    while (end := rest.find(b"\n", searched)) < 0:
-        searched = len(rest)
-        if searched > _LARGEST_ANSWER:
-            raise strange(path, f"{searched} bytes without an end")
-        left_s = None if deadline_s is None else deadline_s - time.monotonic()
-        if left_s is not None and left_s <= 0:
-            raise TimeoutError
-        sock.settimeout(left_s)
-        data = sock.recv(_READ)
-        if not data:
-            return None
-        if deadline_s is None:
-            deadline_s = time.monotonic() + _ANSWER_S
-        rest += data
-    line = bytes(rest[:end])
-    del rest[: end + 1]
-    try:
-        return from_json(line, Answer)
-    except ValueError as error:
-        raise strange(path, str(error)) from error
-
-
-def strange(path: Path, why: str) -> UsageError:
-    """Return the error that an answer is which no supervisor of this version gives."""
-    return UsageError(
-        f"cannot understand the answer of {path.parent.name!r}: {why}",
-        hint="use the version of lifecycle that started it, or end the process that listens at "
-        f"{path}",
-    )

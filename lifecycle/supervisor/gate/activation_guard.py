@@ -14,9 +14,10 @@ from collections.abc import Iterable
 from lifecycle.errors import BringUpError
 from lifecycle.node import Operation
 from lifecycle.plan import Plan
+from lifecycle.supervisor.control.protocol import Reach
 from lifecycle.supervisor.nodes.driver import ACTIVE
 from lifecycle.supervisor.nodes.system import ChangeSource, NodeRun, ObservationSource, System
-from lifecycle.supervisor.run.events import Notice, Reach
+from lifecycle.supervisor.run.events import Notice
 from lifecycle.supervisor.run.failure import ended
 from lifecycle.verify import ACTIVATED_AT_CLOSED_GATE, Finding, Observation, Outcome
 

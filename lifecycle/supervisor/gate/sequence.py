@@ -34,19 +34,13 @@ from lifecycle.supervisor.control.orders import (
     OrderKind,
     node_of,
 )
+from lifecycle.supervisor.control.protocol import ProcessState, Reach
 from lifecycle.supervisor.gate.gate import Gate, Permit, VerificationError, behind_s, closes
 from lifecycle.supervisor.gate.verification_loop import VerificationLoop
 from lifecycle.supervisor.nodes.bring_up import BringUp
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.processes.process import Spawner
-from lifecycle.supervisor.run.events import (
-    Emitter,
-    GateOpened,
-    Notice,
-    ProcessState,
-    Reach,
-    SystemReached,
-)
+from lifecycle.supervisor.run.events import Emitter, GateOpened, Notice, SystemReached
 from lifecycle.supervisor.run.failure import StepFailedError, together
 from lifecycle.supervisor.run.shutdown import TakeDown
 from lifecycle.verify import (

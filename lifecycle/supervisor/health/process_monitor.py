@@ -13,11 +13,12 @@ import asyncio
 from collections.abc import Coroutine, Iterable
 from typing import Any, Protocol
 
+from lifecycle.supervisor.control.protocol import ProcessState
 from lifecycle.supervisor.gate.verification_loop import ChangeCounter
 from lifecycle.supervisor.nodes.bring_up import ALSO_S, died
 from lifecycle.supervisor.nodes.system import NodeRun, ObservedGraph, System
 from lifecycle.supervisor.processes.process import ManagedProcess
-from lifecycle.supervisor.run.events import Event, ProcessChanged, ProcessState
+from lifecycle.supervisor.run.events import Event, ProcessChanged
 from lifecycle.supervisor.run.failure import StepFailedError, ended
 
 _SPEAK_S = 0.7 + ALSO_S

@@ -19,6 +19,7 @@ from lifecycle.errors import BringUpError, MiddlewareError
 from lifecycle.manifest import Condition, RosArguments, RunKind, TargetState
 from lifecycle.node import HostSpec, Operation
 from lifecycle.plan import PlannedNode
+from lifecycle.supervisor.control.protocol import ProcessState, Reach
 from lifecycle.supervisor.gate.gate import Permit
 from lifecycle.supervisor.nodes.driver import ControlDriver, NodeCondition, NodeDriver
 from lifecycle.supervisor.nodes.system import NodeRun, System
@@ -28,7 +29,7 @@ from lifecycle.supervisor.processes.control_channel import (
     HostFailedError,
 )
 from lifecycle.supervisor.processes.process import ManagedProcess, Spawner, wait_under_load
-from lifecycle.supervisor.run.events import Notice, ProcessState, Reach
+from lifecycle.supervisor.run.events import Notice
 from lifecycle.supervisor.run.failure import StepFailedError, ended
 from lifecycle.verify import (
     DEADLINE,

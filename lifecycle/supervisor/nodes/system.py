@@ -20,20 +20,14 @@ from lifecycle.manifest import Condition, RunKind, TargetState
 from lifecycle.node import INTERFACE_ON_DEMAND, Operation
 from lifecycle.node import Event as HostEvent
 from lifecycle.plan import Plan, PlannedNode, PlannedProcess
+from lifecycle.supervisor.control.protocol import ProcessState, Reach
 from lifecycle.supervisor.gate.gate import Permit
 from lifecycle.supervisor.health.liveliness import SilenceMonitor
 from lifecycle.supervisor.nodes.driver import ACTIVE, INACTIVE, NodeCondition, NodeDriver
 from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.supervisor.processes.logs import LogDirectory
 from lifecycle.supervisor.processes.process import ManagedProcess, own_run_delay_s
-from lifecycle.supervisor.run.events import (
-    Emitter,
-    NodeChanged,
-    Notice,
-    ProcessState,
-    Reach,
-    RequestSent,
-)
+from lifecycle.supervisor.run.events import Emitter, NodeChanged, Notice, RequestSent
 from lifecycle.verify import NodeConfiguration, Observation
 
 ASK_AGAIN_S = 0.2

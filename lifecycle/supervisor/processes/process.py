@@ -21,6 +21,7 @@ from typing import Any, Protocol
 
 from lifecycle.manifest import Output
 from lifecycle.plan import PlannedProcess
+from lifecycle.supervisor.control.protocol import ProcessState
 from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.supervisor.processes.logs import (
     LineReader,
@@ -29,7 +30,7 @@ from lifecycle.supervisor.processes.logs import (
     logger_in,
     logger_of,
 )
-from lifecycle.supervisor.run.events import Emitter, LogLine, ProcessChanged, ProcessState
+from lifecycle.supervisor.run.events import Emitter, LogLine, ProcessChanged
 
 CHANGES: dict[ProcessState, frozenset[ProcessState]] = {
     ProcessState.STARTING: frozenset(

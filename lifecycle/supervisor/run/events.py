@@ -7,35 +7,14 @@ order. Presentation lives in cli/. Must not import rclpy.
 from __future__ import annotations
 
 import dataclasses
-import enum
 import time
 from collections.abc import Callable
 from typing import ClassVar, Union
 
 from lifecycle.codec import to_plain
 from lifecycle.node import Operation
+from lifecycle.supervisor.control.protocol import ProcessState, Reach
 from lifecycle.verify import Stage, Verdict
-
-
-class ProcessState(enum.Enum):
-    """The life of one operating system process; BACKOFF is the wait before it is started again."""
-
-    STARTING = "starting"
-    RUNNING = "running"
-    BACKOFF = "backoff"
-    STOPPING = "stopping"
-    EXITED = "exited"
-
-
-class Reach(enum.Enum):
-    """How far one node is brought up; ordered, one value per step of bring-up."""
-
-    WAITING = "waiting"
-    STARTED = "started"
-    CONFIGURED = "configured"
-    CONNECTED = "connected"
-    ACTIVE = "active"
-    STOPPED = "stopped"
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

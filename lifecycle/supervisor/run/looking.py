@@ -34,12 +34,11 @@ from lifecycle.plan import Plan, reached_hosts
 from lifecycle.run_directory import is_held, run_name, running, runtime_root
 from lifecycle.supervisor.connections.negotiation import Expectation, is_negotiated
 from lifecycle.supervisor.control.client import look
+from lifecycle.supervisor.control.protocol import ProcessState, Reach, SystemStatus
 from lifecycle.supervisor.control.server import SupervisorSnapshot, follow
-from lifecycle.supervisor.control.status import SystemStatus
 from lifecycle.supervisor.gate.gate import closes
 from lifecycle.supervisor.gate.verification_loop import GracePeriod, with_findings
 from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
-from lifecycle.supervisor.run.events import ProcessState, Reach
 from lifecycle.supervisor.run.options import onlooker_connections, own_machines
 from lifecycle.verify import (
     Heals,

@@ -17,7 +17,7 @@ import psutil
 
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest import Machine, Manifest
-from lifecycle.network import Medium, Peer, parse
+from lifecycle.network import Peer, parse
 from lifecycle.plan import ParticipantConnections, Plan, PlannedProcess, urls_of
 from lifecycle.verify import NodeConfiguration, Verdict, only_shared_memory
 
@@ -179,9 +179,9 @@ def onlooker_connections(
     urls = []
     for text in connections.urls:
         url = parse(text)
-        if url.transport is not Medium.UDPM:
+        if not url.transport.is_group:
             url = dataclasses.replace(url, port=None, metatraffic_port=None, output_port=None)
-        if url.transport is Medium.TCPV4 and not url.server:
+        if url.transport.is_tcp and not url.server:
             url = dataclasses.replace(url, peers=tuple(sorted({*url.peers, *listening})))
         urls.append(str(url))
     return dataclasses.replace(connections, urls=tuple(urls))
@@ -191,7 +191,7 @@ def _tcp_listeners(urls: Iterable[str]) -> Iterator[Peer]:
     """Yield where participants with these URLs listen for TCP."""
     for text in urls:
         url = parse(text)
-        if url.transport is Medium.TCPV4 and url.port and url.address:
+        if url.transport.is_tcp and url.port and url.address:
             yield Peer(address=url.address, port=url.port)
 
 

@@ -21,8 +21,9 @@ from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.connections.authority import Reaching, authority_of
 from lifecycle.supervisor.connections.networks import Networks
 from lifecycle.supervisor.control.orders import ACTIVE, HELD, PAUSED, Revisions
+from lifecycle.supervisor.control.protocol import SystemStatus
 from lifecycle.supervisor.control.server import ControlServer, SupervisorSnapshot
-from lifecycle.supervisor.control.status import SystemStatus, system_status
+from lifecycle.supervisor.control.status import system_status
 from lifecycle.supervisor.gate.activation_guard import ActivationGuard
 from lifecycle.supervisor.gate.gate import Gate, VerificationError, closes
 from lifecycle.supervisor.gate.hold import Holding

@@ -14,6 +14,7 @@ from lifecycle.errors import BringUpError
 from lifecycle.manifest import RunKind
 from lifecycle.node import Operation
 from lifecycle.supervisor.connections.desired_state import Step
+from lifecycle.supervisor.control.protocol import ProcessState, Reach
 from lifecycle.supervisor.nodes.driver import ACTIVE, FINALIZED, INACTIVE
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.processes.process import (
@@ -24,7 +25,7 @@ from lifecycle.supervisor.processes.process import (
     ManagedProcess,
     wait_under_load,
 )
-from lifecycle.supervisor.run.events import Emitter, Notice, ProcessState, Reach, WiringChanged
+from lifecycle.supervisor.run.events import Emitter, Notice, WiringChanged
 
 _UNDO = {
     Operation.ACTIVATE: Operation.DEACTIVATE,

@@ -11,7 +11,8 @@ import enum
 
 from lifecycle.manifest import EndpointKind, Position
 from lifecycle.plan import PlannedNode
-from lifecycle.verify.verdict import Finding, Outcome
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.verdict import Finding
 from lifecycle.verify.view import Actual
 
 

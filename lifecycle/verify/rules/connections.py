@@ -10,9 +10,9 @@ from collections.abc import Iterator, Sequence
 
 from lifecycle.network import ConnectionUrl, ConnectionUrlError, parse
 from lifecycle.plan import ParticipantConnections, is_restarted_url
-from lifecycle.verify.observation import ConnectionReport
+from lifecycle.verify.outcome import ConnectionReport, Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
-from lifecycle.verify.verdict import Finding, Outcome
+from lifecycle.verify.verdict import Finding
 from lifecycle.verify.view import Actual, NodeFacts, View, connection_of
 
 MISSING = Rule(

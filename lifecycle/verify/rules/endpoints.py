@@ -12,9 +12,10 @@ from collections.abc import Iterator, Mapping
 
 from lifecycle.manifest import EndpointKind, EndpointPolicy, Position
 from lifecycle.verify.observation import ObservedEndpoint
+from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.tool_filter import OFFERS
-from lifecycle.verify.verdict import Finding, Outcome
+from lifecycle.verify.verdict import Finding
 from lifecycle.verify.view import (
     Actual,
     Frame,
@@ -172,7 +173,7 @@ def _is_hidden(actual: Actual) -> bool:
 
 
 def _unseen(
-    view: View, actual: Actual, known_ends: Mapping[tuple[str, EndpointKind | None], int]
+    view: View, actual: Actual, known_ends: Counter[tuple[str, EndpointKind | None]]
 ) -> Iterator[Finding]:
     """What discovery does not show is proven by its node's report and by matched counts."""
     node, planned, report = actual.node, actual.planned, actual.report
@@ -184,7 +185,7 @@ def _unseen(
     elif report.matched is None:
         reason = "discovery does not show it here, and nobody counts whom it is matched with"
     else:
-        known = known_ends.get((planned.resolved, _OTHER.get(planned.kind)), 0)
+        known = known_ends[planned.resolved, _OTHER.get(planned.kind)]
         more = report.matched - known
         if more <= 0 or view.plan.policy.undeclared_nodes is EndpointPolicy.OPEN:
             return

@@ -27,6 +27,7 @@ from lifecycle.network import (
     describe,
     meets,
 )
+from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import Heals, Rule
 from lifecycle.verify.rules.state import MISSING_REPORT
 from lifecycle.verify.transport import (
@@ -35,7 +36,7 @@ from lifecycle.verify.transport import (
     effective_transport,
 )
 from lifecycle.verify.uniqueness import Uniqueness
-from lifecycle.verify.verdict import Finding, Outcome
+from lifecycle.verify.verdict import Finding
 from lifecycle.verify.view import Actual, FlowView, Frame, NodeFacts, View, connection_of, once
 
 NOT_UNIQUE = Rule(
@@ -262,7 +263,7 @@ def _spell_all(nfes: tuple[NetworkFlowEndpoint, ...]) -> str:
 
 def _spell(nfe: NetworkFlowEndpoint) -> str:
     if nfe.transport_protocol is TransportProtocol.UNKNOWN:
-        return Medium.SHM
+        return nfe.medium
     address = nfe.internet_address
     host = f"[{address}]" if ":" in address else address
     return f"{nfe.transport_protocol.value} {host}:{nfe.transport_port}"
@@ -343,7 +344,7 @@ def _not_by_network(flow: FlowView, demanding: Actual, used: str) -> Finding:
 def _otherwise(flow: FlowView, used: str) -> Finding:
     unknown = used == UNKNOWN
     planned = _WORDS.get(flow.planned.medium, flow.planned.medium)
-    word = _WORDS.get(used, used)
+    word = _WORDS[used]
     return WRONG_MEDIUM.finding(
         Outcome.UNVERIFIABLE if unknown else Outcome.VIOLATED,
         subject=flow.subject,

@@ -21,8 +21,9 @@ from collections.abc import Iterable, Iterator, Sequence
 
 from lifecycle.manifest import Certainty, EndpointKind, QosProfile, incompatibilities
 from lifecycle.verify.observation import EndpointReport, ObservedEndpoint
+from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
-from lifecycle.verify.verdict import Finding, Outcome
+from lifecycle.verify.verdict import Finding
 from lifecycle.verify.view import (
     UNKNOWN_QOS,
     Actual,
@@ -81,9 +82,9 @@ class MatchEnd:
     kind: EndpointKind
     type: str
     qos: QosProfile
-    gid: str
-    report: EndpointReport | None
-    expected: bool
+    gid: str = ""
+    report: EndpointReport | None = None
+    expected: bool = True
 
 
 def obstacle(publisher: MatchEnd, subscription: MatchEnd) -> str:
@@ -243,7 +244,6 @@ def _end(actual: Actual) -> MatchEnd:
         qos=actual_qos(shown.qos if shown else None, report.qos if report else None) or UNKNOWN_QOS,
         gid=(shown.gid if shown else "") or (report.gid if report else ""),
         report=report,
-        expected=True,
     )
 
 
@@ -257,12 +257,11 @@ def _ends_of_graph(topic: TopicFacts) -> tuple[list[MatchEnd], list[MatchEnd]]:
 
 
 def _end_of_graph(seen: SeenEndpoint) -> MatchEnd:
+    """Return an end as one of all that others can match: it is not asked whom it matches."""
     return MatchEnd(
         kind=seen.kind,
         type=seen.type,
         qos=seen.qos or UNKNOWN_QOS,
-        gid="",
-        report=seen.report,
         expected=seen.planned is not None,
     )
 

@@ -12,9 +12,10 @@ from collections.abc import Iterator
 
 from lifecycle.manifest import EndpointPolicy, RunKind
 from lifecycle.verify.observation import ObservedEndpoint
+from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.rules.endpoints import UNDECLARED
-from lifecycle.verify.verdict import Finding, Outcome, Stage
+from lifecycle.verify.verdict import Finding, Stage
 from lifecycle.verify.view import View
 
 MISSING_NODE = Rule(

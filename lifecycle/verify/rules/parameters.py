@@ -7,8 +7,9 @@ from collections.abc import Iterator, Sequence
 from lifecycle.manifest import ParameterValue
 from lifecycle.plan import COMMAND, DEFAULT, GIVEN, NOT_FINITE, ExpectedParameter, PlannedNode
 from lifecycle.verify.observation import ParameterReport, digest_of
+from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import Heals, Rule
-from lifecycle.verify.verdict import Finding, Outcome
+from lifecycle.verify.verdict import Finding
 from lifecycle.verify.view import NodeFacts, View
 
 MISSING = Rule(

@@ -17,8 +17,9 @@ from lifecycle.manifest import (
     incompatibilities,
 )
 from lifecycle.plan import PlannedEndpoint, PlannedNode
+from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import Rule
-from lifecycle.verify.verdict import Finding, Outcome
+from lifecycle.verify.verdict import Finding
 from lifecycle.verify.view import (
     UNKNOWN_QOS,
     Actual,

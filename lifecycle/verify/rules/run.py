@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
-from lifecycle.verify.verdict import Finding, Outcome
+from lifecycle.verify.verdict import Finding
 from lifecycle.verify.view import View
 
 PROCESS_DIED = Rule(

@@ -6,8 +6,9 @@ from collections.abc import Iterator
 
 from lifecycle.manifest import TargetState
 from lifecycle.plan import PlannedNode
+from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
-from lifecycle.verify.verdict import Finding, Outcome, Stage
+from lifecycle.verify.verdict import Finding, Stage
 from lifecycle.verify.view import NodeFacts, View
 
 WRONG_STATE = Rule(

@@ -454,6 +454,8 @@ def test_status_and_down_talk_to_a_running_supervisor(tmp_path: Path, fresh_doma
         run.note_segments()
         told = json.loads(verb("status", "pair", "--format", "json", runtime=tmp_path).stdout)
         assert told["phase"] == "active"
+        probe = verb("status", "pair", "--probe", "ready", runtime=tmp_path)
+        assert (probe.returncode, probe.stdout, probe.stderr) == (0, "", "")
         assert told["verdict"] == "ok"
         states = {each["node"]: (each["state"], each["matched"]) for each in told["nodes"]}
         assert states == {"/talker": ("active", 1), "/listener": ("active", 1)}

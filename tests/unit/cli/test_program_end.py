@@ -51,8 +51,38 @@ def test_fast_dds_is_unloaded_where_it_still_has_shared_memory(end: Callable[...
     assert end(holds=True) is ExitCode.VIOLATED
 
 
-def test_a_process_without_ros_has_nothing_to_skip(
+@pytest.mark.parametrize(
+    ("verb", "code", "collects"),
+    [
+        ("verify", ExitCode.OK, False),
+        ("verify", ExitCode.VIOLATED, False),
+        ("verify", ExitCode.INTERRUPTED, True),
+        ("up", ExitCode.INTERRUPTED, False),
+        ("up", ExitCode.BRING_UP_FAILED, True),
+    ],
+)
+def test_only_what_may_have_failed_is_searched_for_participants(
+    end: Callable[..., int],
+    monkeypatch: pytest.MonkeyPatch,
+    verb: str,
+    code: ExitCode,
+    *,
+    collects: bool,
+) -> None:
+    collected: list[bool] = []
+    monkeypatch.setattr(sys, "argv", ["lifecycle", verb])
+    monkeypatch.setattr(cli, "main", lambda: code)
+    monkeypatch.setattr(cli.gc, "collect", lambda: collected.append(True))
+    monkeypatch.setattr(cli.signal, "signal", lambda *_: None)
+    with pytest.raises(_EndedAtOnce):
+        end(holds=False)
+    assert bool(collected) is collects
+
+
+def test_a_process_without_ros_ends_at_once_and_loads_none_of_it(
     end: Callable[..., int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delitem(sys.modules, "rclpy")
-    assert end(holds=False) is ExitCode.VIOLATED
+    with pytest.raises(_EndedAtOnce) as ended:
+        end(holds=True)
+    assert ended.value.args == (ExitCode.VIOLATED,)

@@ -17,13 +17,13 @@ from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan import build_plan
 from lifecycle.verify import Outcome, Stage, verify
 from lifecycle.verify.observation import (
-    ConnectionReport,
     NodeParameters,
     Observation,
     ObservedEndpoint,
     ObservedNode,
     ParameterReport,
 )
+from lifecycle.verify.outcome import ConnectionReport
 from tests.builders import configuration, reported
 
 PUBLISHER, SUBSCRIPTION = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION

@@ -17,12 +17,8 @@ from lifecycle.graph import (
 from lifecycle.graph.state import Fetch
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.node.configuration import checksum
-from lifecycle.verify.observation import (
-    ConnectionReport,
-    EndpointReport,
-    Identity,
-    NodeConfiguration,
-)
+from lifecycle.verify.observation import EndpointReport, Identity, NodeConfiguration
+from lifecycle.verify.outcome import ConnectionReport
 
 PERIOD_S = 2.0
 SILENT_AFTER_S = 7.0

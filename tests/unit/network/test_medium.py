@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import ast
+import ipaddress
 import json
+import socket
 from pathlib import Path
 
 import pytest
@@ -12,15 +14,20 @@ import lifecycle
 from lifecycle.codec import from_json, to_json
 from lifecycle.network.medium import (
     CONNECTABLE,
+    DEFAULT_TCP,
     NETWORK_MEDIA,
+    RMW_DISCOVERY,
     RTPS_OVERHEAD_BYTES,
     SAFE_DATAGRAM_BYTES,
     SCHEMES,
+    UDP_UNICAST,
     FlowTransport,
     Medium,
     datagram_bytes,
     is_fragmented,
     max_unfragmented,
+    medium_of,
+    udp_to,
 )
 
 
@@ -37,6 +44,55 @@ def test_connections_are_made_of_the_same_media_however_they_are_listed() -> Non
     assert {*CONNECTABLE} == {*SCHEMES}
     assert {*Medium} - {*SCHEMES} == {Medium.TCPV6, Medium.INTRAPROCESS}
     assert {*Medium} - NETWORK_MEDIA == {Medium.SHM, Medium.INTRAPROCESS}
+
+
+@pytest.mark.parametrize(
+    ("medium", "meaning", "stays_in", "on_host", "ports", "address"),
+    [
+        (Medium.SHM, "shared memory", "shared memory", True, 0, ""),
+        (Medium.UDPM, "UDP multicast", "", True, 3, "127.0.0.1"),
+        (Medium.UDPV4, "udpv4", "", False, 3, "127.0.0.1"),
+        (Medium.UDPV6, "udpv6", "", False, 3, "::1"),
+        (Medium.TCPV4, "tcpv4", "", False, 1, "127.0.0.1"),
+        (Medium.TCPV6, "tcpv6", "", False, 1, "::1"),
+        (Medium.INTRAPROCESS, "handed over inside their process", "one process", True, 0, ""),
+    ],
+)
+def test_a_medium_says_what_others_need_to_know_of_it(
+    medium: Medium, meaning: str, stays_in: str, on_host: bool, ports: int, address: str
+) -> None:
+    assert (medium.meaning, medium.stays_in) == (meaning, stays_in)
+    assert (medium.stays_on_host, medium.ports) == (on_host, ports)
+    assert medium.is_network is bool(address)
+    if address:
+        with socket.socket(medium.socket_family) as any_:
+            any_.bind((medium.loopback, 0))
+            assert any_.getsockname()[0] == address
+        any_of_its_version = type(ipaddress.ip_address(address))(0)
+        assert medium.any_address == str(any_of_its_version)
+
+
+def test_the_medium_to_an_address_is_udp_over_its_version_of_ip() -> None:
+    assert [udp_to(each) for each in ("10.0.0.1", "", "fd77::2")] == ["udpv4", "udpv4", "udpv6"]
+    assert medium_of("udpm@239.255.1.9:7901") is Medium.UDPM
+    assert medium_of("shm").unicast is Medium.SHM
+    assert Medium.UDPM.unicast is Medium.UDPV4
+
+
+def test_media_are_listed_in_the_orders_that_messages_have() -> None:
+    assert ", ".join(CONNECTABLE) == "shm, udpv4, udpv6, udpm, tcpv4"
+    assert ", ".join(SCHEMES) == "udpv4, udpv6, udpm, tcpv4, shm"
+    assert ", ".join(UDP_UNICAST) == "udpv4, udpv6"
+    assert (RMW_DISCOVERY, DEFAULT_TCP) == ("udpv4", "tcpv4")
+
+
+def test_a_transport_asks_for_memory_or_for_what_is_found_by_udp() -> None:
+    assert [each for each in FlowTransport if each.in_memory] == [FlowTransport.SHM]
+    assert {each for each in FlowTransport if each.by_udp} == {
+        FlowTransport.ANY,
+        FlowTransport.UDPV4,
+        FlowTransport.UDPV6,
+    }
 
 
 @pytest.mark.parametrize(
@@ -60,6 +116,30 @@ def test_what_a_manifest_asks_for_is_met_by_some_media(
 ) -> None:
     assert {each for each in Medium if asked.accepts(each)} == accepted
     assert asked.builtin == builtin
+
+
+def test_whoever_chooses_or_names_a_medium_knows_it_and_all_others_ask_it() -> None:
+    root = Path(lifecycle.__file__).parent
+    found = {
+        str(path.relative_to(root))
+        for path in root.rglob("*.py")
+        for each in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(each, ast.Attribute)
+        and isinstance(each.value, ast.Name)
+        and each.value.id == "Medium"
+        and each.attr.isupper()
+    }
+    assert found == {
+        "network/medium.py",
+        "network/nfe.py",  # shared memory, which an NFE shows by showing no address
+        "verify/judge.py",
+        "verify/transport.py",
+        "verify/view.py",
+        "programming/rules/rules.py",
+        "middleware/fastdds/url_profile.py",  # what Fast DDS calls it
+        "plan/negotiation/media.py",  # which medium two ends get
+        "plan/negotiation/negotiate.py",
+    }
 
 
 def test_no_module_spells_a_medium_itself() -> None:

@@ -8,11 +8,8 @@ import pytest
 
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.node.configuration import checksum
-from lifecycle.verify.observation import (
-    ConnectionReport,
-    EndpointReport,
-    NodeConfiguration,
-)
+from lifecycle.verify.observation import EndpointReport, NodeConfiguration
+from lifecycle.verify.outcome import ConnectionReport
 from tests.builders import configuration
 
 VIDEO = EndpointReport(

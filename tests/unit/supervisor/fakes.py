@@ -26,12 +26,9 @@ from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.process import ProcessExit, SpawnRequest
 from lifecycle.supervisor.run.events import Emitter
 from lifecycle.supervisor.run.events import Event as SupervisorEvent
-from lifecycle.verify.observation import (
-    ConnectionReport,
-    NodeConfiguration,
-    Observation,
-)
-from lifecycle.verify.verdict import Finding, Outcome, Verdict
+from lifecycle.verify.observation import NodeConfiguration, Observation
+from lifecycle.verify.outcome import ConnectionReport, Outcome
+from lifecycle.verify.verdict import Finding, Verdict
 from tests.builders import configuration, reported
 
 T = TypeVar("T")

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import dataclasses
 import signal
 from collections.abc import Awaitable, Callable, Coroutine, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -17,10 +18,10 @@ from typing import Any, TypeVar
 from lifecycle.codec import from_json, to_json
 from lifecycle.manifest.model import Condition, RunKind
 from lifecycle.node.host.control import Operation
-from lifecycle.plan.model import Plan, PlannedNode
+from lifecycle.plan.model import ParticipantConnections, Plan, PlannedNode
 from lifecycle.run_directory import RunDirectory, short_path
 from lifecycle.supervisor.connections.networks import Networks
-from lifecycle.supervisor.control.server import Answer, ControlRequest, Question
+from lifecycle.supervisor.control.protocol import Answer, ControlRequest, Question
 from lifecycle.supervisor.health.peer_supervisors import Listener
 from lifecycle.supervisor.nodes.driver import NodeDriver, NodeInterfaceClient, ServiceDriver
 from lifecycle.supervisor.nodes.system import System
@@ -493,12 +494,15 @@ class SessionWorld:
         finally:
             self._directory.release()
 
-    async def order(self, ask: ControlRequest, node: str = "") -> str:
+    async def order(
+        self, ask: ControlRequest, node: str = "", *, reload: Plan | None = None
+    ) -> str:
         """Order something through the control socket; return the answer, `0` or `4 cannot …`."""
         assert self._directory is not None
         with short_path(self._directory.socket_path) as path:
             reader, writer = await asyncio.open_unix_connection(path)
-        writer.write(to_json(Question(ask=ask, node=node)) + b"\n")
+        question = Question(ask=ask, node=node, plan=reload, reload=reload is not None)
+        writer.write(to_json(question) + b"\n")
         answer = from_json(await reader.readline(), Answer)
         writer.close()
         await writer.wait_closed()
@@ -564,7 +568,20 @@ class SessionWorld:
                 assert verdict in ("ok", "unverifiable"), f"{kind} was activated on {verdict}"
 
 
+def connected_by(*urls: str) -> ParticipantConnections:
+    """How a node's own participant is connected."""
+    return ParticipantConnections(urls=urls)
+
+
 CHAIN = plan_of(planned_node("camera"), planned_node("viewer", after={"camera": Condition.ACTIVE}))
+
+DIALLING = plan_of(
+    dataclasses.replace(CHAIN.nodes[0], connections=connected_by("tcpv4://127.0.0.1:7911")),
+    dataclasses.replace(
+        CHAIN.nodes[1], connections=connected_by("tcpv4://127.0.0.1:7912?peer=127.0.0.1:7911")
+    ),
+)
+"""The same by TCP alone: `viewer` gets another port when it is started again."""
 
 CONNECTED = [
     "camera start",

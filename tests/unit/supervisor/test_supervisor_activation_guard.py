@@ -8,10 +8,11 @@ from typing import cast
 
 from lifecycle.manifest.model import RunKind
 from lifecycle.node.host.control import Operation
+from lifecycle.supervisor.control.protocol import Reach
 from lifecycle.supervisor.gate.activation_guard import TRIES, ActivationGuard
 from lifecycle.supervisor.nodes.driver import LifecycleClients, ServiceDriver
 from lifecycle.supervisor.nodes.system import NodeRun
-from lifecycle.supervisor.run.events import Notice, Reach
+from lifecycle.supervisor.run.events import Notice
 from lifecycle.verify.observation import Observation, ObservedNode
 from tests.builders import plan_of, planned_node
 from tests.unit.supervisor.fakes import World, run

@@ -19,9 +19,10 @@ from lifecycle.supervisor.health.agreement import ANNOUNCED_S, Agreement
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.run.events import Emitter
 from lifecycle.verify.observation import Observation, ObservedNode
+from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.matching import UNMATCHED_FLOW
 from lifecycle.verify.rules.nodes import MISSING_NODE, UNDECLARED_NODE
-from lifecycle.verify.verdict import Finding, Outcome, Verdict
+from lifecycle.verify.verdict import Finding, Verdict
 from tests.builders import HERE, plan_of, planned_node
 from tests.unit.supervisor.fakes import run
 

@@ -11,18 +11,20 @@ import pytest
 from lifecycle.errors import BringUpError
 from lifecycle.manifest.model import Condition, RunKind, Timeouts
 from lifecycle.node.host.control import HostSpec, Operation
+from lifecycle.supervisor.control.protocol import ProcessState, Reach
 from lifecycle.supervisor.gate.gate import Gate, Permit, VerificationError
 from lifecycle.supervisor.gate.verification_loop import ChangeCounter, VerificationLoop
 from lifecycle.supervisor.health.process_monitor import ProcessMonitor
 from lifecycle.supervisor.nodes.bring_up import ALSO_S, Gathering
 from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.supervisor.processes.process import ProcessExit
-from lifecycle.supervisor.run.events import Notice, ProcessChanged, ProcessState, Reach, RequestSent
+from lifecycle.supervisor.run.events import Notice, ProcessChanged, RequestSent
 from lifecycle.supervisor.run.failure import StepFailedError, with_failure
 from lifecycle.supervisor.run.shutdown import TakeDown
 from lifecycle.verify import rule
 from lifecycle.verify.observation import Observation, ObservedNode
-from lifecycle.verify.verdict import NOT_JUDGED, Outcome, Stage, Verdict
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.verdict import NOT_JUDGED, Stage, Verdict
 from tests.builders import plan_of, planned_node
 from tests.unit.supervisor.fakes import FakeGraph, World, run, verdict_of
 

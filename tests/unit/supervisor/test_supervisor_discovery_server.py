@@ -14,10 +14,10 @@ import pytest
 from lifecycle.network.connection_url import parse
 from lifecycle.plan.model import ParticipantConnections, Plan, PlannedServer
 from lifecycle.supervisor.connections import discovery_server
+from lifecycle.supervisor.control.protocol import ProcessState
 from lifecycle.supervisor.health.process_monitor import first_death
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.process import ProcessExit
-from lifecycle.supervisor.run.events import ProcessState
 from lifecycle.supervisor.run.failure import StepFailedError
 from lifecycle.supervisor.run.options import observer_connections, onlooker_connections
 from tests.builders import plan_of, planned_node

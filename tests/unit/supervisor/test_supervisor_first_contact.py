@@ -7,7 +7,8 @@ import dataclasses
 import pytest
 
 from lifecycle.supervisor.gate.sequence import undiscovered
-from lifecycle.verify.verdict import Finding, Outcome, Verdict
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.verdict import Finding, Verdict
 
 OURS = frozenset(("/talker", "/listener", "/neighbour"))
 MISSING = ("graph.missing-node", "/listener")

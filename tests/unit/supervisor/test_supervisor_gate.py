@@ -12,7 +12,8 @@ from lifecycle.errors import BringUpError, ExitCode
 from lifecycle.node.host.control import Operation
 from lifecycle.supervisor.gate.gate import Gate, Permit, VerificationError, behind_s
 from lifecycle.supervisor.nodes.driver import ServiceDriver
-from lifecycle.verify.verdict import Outcome, Verdict
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.verdict import Verdict
 from tests.builders import planned_node
 from tests.unit.supervisor.fakes import verdict_of
 

@@ -13,6 +13,7 @@ import pytest
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.node.host.control import Event
 from lifecycle.plan.model import Plan
+from lifecycle.supervisor.control.protocol import ProcessState, Reach
 from lifecycle.supervisor.gate.hold import Watch
 from lifecycle.supervisor.gate.verification_loop import (
     PASSING_S,
@@ -27,7 +28,7 @@ from lifecycle.supervisor.health.process_monitor import first_death
 from lifecycle.supervisor.nodes.driver import NodeCondition
 from lifecycle.supervisor.nodes.system import RemoteNode, System
 from lifecycle.supervisor.processes.process import ManagedProcess, ProcessExit
-from lifecycle.supervisor.run.events import NodeJoined, ProcessState, Reach, VerdictChanged
+from lifecycle.supervisor.run.events import NodeJoined, VerdictChanged
 from lifecycle.verify.observation import (
     NodeConfiguration,
     NodeParameters,
@@ -35,7 +36,8 @@ from lifecycle.verify.observation import (
     ObservedEndpoint,
     ObservedNode,
 )
-from lifecycle.verify.verdict import Finding, Outcome, Stage, Verdict
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.verdict import Finding, Stage, Verdict
 from tests.builders import plan_of, planned_node
 from tests.unit.supervisor.fakes import FakeGraph, World, interface_of, run, verdict_of
 from tests.unit.supervisor.test_supervisor_negotiation import plan_of as negotiated_plan

@@ -37,7 +37,7 @@ from lifecycle.supervisor.run.events import (
     NodeSilent,
 )
 from lifecycle.verify.observation import Observation, ObservedNode
-from lifecycle.verify.verdict import Outcome
+from lifecycle.verify.outcome import Outcome
 from tests.builders import HERE, plan_of, planned_node
 from tests.unit.supervisor.fakes import World, run
 

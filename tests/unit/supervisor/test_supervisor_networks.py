@@ -26,7 +26,8 @@ from lifecycle.supervisor.processes.orphans import reap_adopted
 from lifecycle.supervisor.run.events import Emitter, Notice, VerdictChanged
 from lifecycle.supervisor.run.failure import StepFailedError
 from lifecycle.supervisor.run.options import UpOptions
-from lifecycle.verify.verdict import FlowReport, Outcome, Stage, Verdict
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.verdict import FlowReport, Stage, Verdict
 from tests.unit.programming.apply.samples import nef_settings, settings_file
 from tests.unit.programming.apply.servers import TOKEN, NefServer
 from tests.unit.programming.rules.samples import plan, report

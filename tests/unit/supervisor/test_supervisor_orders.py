@@ -21,18 +21,12 @@ from lifecycle.supervisor.control.orders import (
     OrderKind,
     check_order,
 )
-from lifecycle.supervisor.control.server import (
-    ControlRequest,
-    ControlServer,
-    Question,
-    SupervisorSnapshot,
-    follow,
-)
+from lifecycle.supervisor.control.protocol import ControlRequest, Question, Reach
+from lifecycle.supervisor.control.server import ControlServer, SupervisorSnapshot, follow
 from lifecycle.supervisor.gate.gate import Gate
-from lifecycle.supervisor.run.events import Reach
 from lifecycle.supervisor.run.shutdown import TakeDown
 from lifecycle.verify.observation import Observation
-from lifecycle.verify.verdict import Outcome
+from lifecycle.verify.outcome import Outcome
 from tests.builders import plan_of, planned_node
 from tests.unit.supervisor.fakes import World, run, verdict_of
 from tests.unit.test_run_directory import STATUS

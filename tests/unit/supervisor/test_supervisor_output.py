@@ -7,6 +7,7 @@ import dataclasses
 import io
 import json
 
+import msgspec
 import pytest
 from rich.console import Console
 
@@ -23,7 +24,7 @@ from lifecycle.network.nfe import (
     UniqueRequirement,
 )
 from lifecycle.node.host.control import Operation
-from lifecycle.supervisor.control.status import NodeStatus, SystemStatus
+from lifecycle.supervisor.control.protocol import NodeStatus, ProcessState, Reach, SystemStatus
 from lifecycle.supervisor.run.events import (
     Event,
     Failure,
@@ -31,8 +32,6 @@ from lifecycle.supervisor.run.events import (
     LogLine,
     NodeChanged,
     ProcessChanged,
-    ProcessState,
-    Reach,
     RequestSent,
     RunStarted,
     Stopping,
@@ -44,7 +43,7 @@ from lifecycle.supervisor.run.events import (
 )
 from lifecycle.supervisor.run.options import UpResult
 from lifecycle.verify import FlowReport, Outcome, Stage, to_json
-from lifecycle.verify.observation import ConnectionReport
+from lifecycle.verify.outcome import ConnectionReport
 from tests.unit.supervisor.fakes import verdict_of
 
 EVENTS: tuple[Event, ...] = (
@@ -361,7 +360,9 @@ def test_a_status_is_a_head_and_a_line_for_each_node() -> None:
 
 
 def test_a_status_says_what_keeps_the_verdict_from_being_ok() -> None:
-    wrong = dataclasses.replace(STATUS, verdict=Outcome.VIOLATED, not_ok="missing: /camera (node)")
+    wrong = msgspec.structs.replace(
+        STATUS, verdict=Outcome.VIOLATED, not_ok="missing: /camera (node)"
+    )
     assert status_text(wrong).splitlines()[0] == (
         "robot: active, verdict violated (missing: /camera (node)), domain 30, supervisor 1, "
         "up for 1.5 s"
@@ -527,7 +528,7 @@ def test_a_step_of_wiring_is_one_line(event: Event, line: str) -> None:
 
 
 def test_a_status_lists_connections_below_their_node() -> None:
-    node = dataclasses.replace(
+    node = msgspec.structs.replace(
         STATUS.nodes[0],
         connections=(
             ConnectionReport(
@@ -540,7 +541,7 @@ def test_a_status_lists_connections_below_their_node() -> None:
             ConnectionReport(name="idle", urls=("shm://",)),
         ),
     )
-    lines = status_text(dataclasses.replace(STATUS, nodes=(node,))).splitlines()
+    lines = status_text(msgspec.structs.replace(STATUS, nodes=(node,))).splitlines()
     assert lines[3:] == [
         "  connection net established; udpv4://10.77.0.1:7911; carries publishers/video",
         "  connection far failed: no route; tcpv4://10.77.0.1:5100; carries nothing",
@@ -549,14 +550,14 @@ def test_a_status_lists_connections_below_their_node() -> None:
 
 
 def test_a_dead_node_is_shown_as_dead_with_how_it_ended() -> None:
-    dead = dataclasses.replace(
+    dead = msgspec.structs.replace(
         STATUS.nodes[0],
         process_state=ProcessState.EXITED,
         state="",
         matched=0,
         died="pid 7 died: killed by SIGKILL",
     )
-    lines = status_text(dataclasses.replace(STATUS, nodes=(dead, *STATUS.nodes))).splitlines()
+    lines = status_text(msgspec.structs.replace(STATUS, nodes=(dead, *STATUS.nodes))).splitlines()
     assert lines[0].startswith("robot: active 1/2, verdict ok, ")
     assert lines[2].split(maxsplit=6) == [
         "/camera",

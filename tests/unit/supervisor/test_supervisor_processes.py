@@ -23,6 +23,7 @@ from lifecycle.node.host.control import HostSpec
 from lifecycle.plan import build_plan
 from lifecycle.plan.model import PlannedProcess
 from lifecycle.run_directory import RUN_VARIABLE, ChildRecord, RunRecord, boot_id, start_ticks
+from lifecycle.supervisor.control.protocol import ProcessState
 from lifecycle.supervisor.processes import logs
 from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.supervisor.processes.fork_server import ForkServer, ForkServerProcess
@@ -40,7 +41,7 @@ from lifecycle.supervisor.processes.process import (
     ProcessExit,
     change,
 )
-from lifecycle.supervisor.run.events import Emitter, LogLine, ProcessState
+from lifecycle.supervisor.run.events import Emitter, LogLine
 from tests.builders import teleop
 
 PYTHON = sys.executable

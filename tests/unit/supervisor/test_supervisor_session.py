@@ -15,17 +15,19 @@ from pathlib import Path
 import pytest
 
 from lifecycle.manifest.model import Condition, Timeouts
-from lifecycle.supervisor.control.server import ControlRequest
+from lifecycle.supervisor.control.protocol import ControlRequest
 from lifecycle.supervisor.run.options import Until
 from tests.builders import plan_of, planned_node
 from tests.unit.supervisor.fakes import run
 from tests.unit.supervisor.session_world import (
+    ACTIVATED,
     ATTACHED,
     BACK,
     CAMERA_DOWN,
     CHAIN,
     CHANGED,
     CONNECTED,
+    DIALLING,
     DOWN,
     INTRUDED,
     KILLED,
@@ -36,6 +38,9 @@ from tests.unit.supervisor.session_world import (
     SessionWorld,
     over,
 )
+
+ENDING = 1 + len(DOWN) + len(over(0))
+"""Lines of an outline from "[stopping]" on, of what was active."""
 
 # Bring-up
 
@@ -574,6 +579,112 @@ def test_what_became_active_is_judged_again_and_must_be_what_was_verified(tmp_pa
             f"[verdict] active violated {INTRUDED}",
             "[stopping] at 3.5 s: what became active is not what was verified",
             *DOWN,
+            *over(4),
+        ]
+
+    run(main())
+
+
+# Started again before the gate
+
+
+UNDISCOVERED = "not discovered over TCP for 5 s (missing: /viewer (node))"
+
+
+def started_again(attempt: int) -> list[str]:
+    """What is reported when `viewer` is not discovered by TCP, and what is done."""
+    return [
+        f"[notice] '/viewer' is started again on a fresh port: {UNDISCOVERED}; try {attempt} of 3",
+        *VIEWER_DOWN,
+        "viewer start",
+        "/viewer configure",
+        "/viewer connect",
+    ]
+
+
+@pytest.mark.parametrize("needed", [1, 3])
+def test_a_node_that_is_not_discovered_over_tcp_is_started_again_on_a_fresh_port(
+    tmp_path: Path, needed: int
+) -> None:
+    async def main() -> None:
+        world = SessionWorld(DIALLING, tmp_path, stop_after_s=0.0)
+        world.graph.unseen.add("/viewer")
+
+        async def appear() -> None:
+            await world.story.until("viewer start", needed + 1)
+            world.graph.unseen.clear()
+
+        await world.run(appear())
+        again = [line for attempt in range(needed) for line in started_again(attempt + 1)]
+        assert world.since("[system] connected")[1:-ENDING] == [
+            "[verdict] connected violated graph.missing-node /viewer",
+            *again,
+            "[verdict] connected ok",
+            f"[system] verified at {5 * needed:.1f} s",
+            "networks programmed (ok)",
+            *ACTIVATED[:-1],
+            f"[system] active at {5 * needed:.1f} s",
+        ]
+        camera, viewer = world.system.plan.nodes
+        assert camera.connections.urls == ("tcpv4://127.0.0.1:7911",)
+        (url,) = viewer.connections.urls
+        assert url.endswith("?peer=127.0.0.1:7911")
+        assert url not in DIALLING.nodes[1].connections.urls
+
+    run(main())
+
+
+def test_a_node_that_is_never_discovered_is_started_three_times_and_then_waited_for(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        world = SessionWorld(DIALLING, tmp_path)
+        world.graph.unseen.add("/viewer")
+        await world.run()
+        again = [line for attempt in (1, 2, 3) for line in started_again(attempt)]
+        assert world.since("[verdict]")[1:] == [
+            *again,
+            "[stopping] at 30.0 s: the verdict keeps the gate closed",
+            *BACK,
+            *over(4),
+        ]
+
+    run(main())
+
+
+def test_a_node_that_would_get_no_other_port_is_waited_for(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = SessionWorld(DIALLING, tmp_path, stop_after_s=0.0)
+        world.graph.unseen.add("/camera")
+
+        async def appear() -> None:
+            await world.story.until("[system] connected")
+            await asyncio.sleep(12.0)
+            world.graph.unseen.clear()
+            world.graph.note()
+
+        await world.run(appear())
+        assert world.since("[system] connected")[1:4] == [
+            "[verdict] connected violated graph.missing-node /camera",
+            "[verdict] connected ok",
+            "[system] verified at 12.0 s",
+        ]
+
+    run(main())
+
+
+def test_nobody_is_started_again_while_something_is_wrong_that_no_port_would_mend(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        world = SessionWorld(DIALLING, tmp_path)
+        world.graph.unseen.add("/viewer")
+        world.graph.others["/intruder"] = ""
+        await world.run()
+        assert world.since("[system] connected")[1:] == [
+            f"[verdict] connected violated graph.missing-node /viewer, {INTRUDED}",
+            "[stopping] at 1.0 s: the verdict keeps the gate closed",
+            *BACK,
             *over(4),
         ]
 

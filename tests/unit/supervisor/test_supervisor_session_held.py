@@ -6,12 +6,14 @@ As in test_supervisor_session.py whole outlines of whole runs are compared.
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import signal
 from pathlib import Path
 
 import pytest
 
-from lifecycle.supervisor.control.server import ControlRequest
+from lifecycle.supervisor.control.protocol import ControlRequest
+from tests.builders import plan_of
 from tests.unit.supervisor.fakes import run
 from tests.unit.supervisor.session_world import (
     ACTIVATED,
@@ -342,6 +344,64 @@ def test_a_restarted_node_stays_inactive_while_the_system_is_wrong_and_can_be_re
             "[system] active at 1.5 s",
         ]
         assert world.report == "ended after it was active, exit code 0: lifecycle down"
+
+    run(main())
+
+
+@pytest.mark.parametrize("node", ["viewer", ""])
+def test_a_changed_manifest_is_taken_by_what_restarts(tmp_path: Path, node: str) -> None:
+    camera, viewer = CHAIN.nodes
+    changed = plan_of(camera, dataclasses.replace(viewer, log_level="debug"))
+
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path)
+
+        async def order() -> None:
+            await world.story.until("[system] active")
+            assert await world.order(ControlRequest.RESTART, node, reload=changed) == "0"
+            # It is the one that runs now, and restarting it changes nothing.
+            assert await world.order(ControlRequest.RESTART, node, reload=changed) == "0"
+            assert await world.order(ControlRequest.DOWN) == "0"
+
+        await world.run(order())
+        difference = 'robot.lifecycle.yaml:1:1: nodes.viewer.log_level: was not set, is "debug"'
+        assert [line for line in world.outline if line.startswith("[notice]")] == [
+            f"[notice] takes the changed manifest: {difference}"
+        ]
+        assert world.story.count("/viewer configure") == 3
+        assert world.story.count("/camera configure") == (1 if node else 3)
+        assert world.system.plan == changed
+
+    run(main())
+
+
+def test_an_order_that_comes_during_another_is_refused_by_what_the_system_is_doing(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path)
+        world.hosts.takes_s |= {"/viewer deactivate": 3.0, "/viewer configure": 3.0}
+        answers = []
+
+        async def order() -> None:
+            await world.story.until("[system] active")
+            for first, second, line, times in (
+                (ControlRequest.RESTART, ControlRequest.PAUSE, "/viewer deactivate", 1),
+                (ControlRequest.RESTART, ControlRequest.PAUSE, "/viewer configure", 3),
+                (ControlRequest.PAUSE, ControlRequest.RESTART, "/viewer deactivate", 3),
+            ):
+                carried_out = asyncio.ensure_future(world.order(first))
+                await world.story.until(line, times)
+                answers.append(await world.order(second))
+                assert await carried_out == "0"
+            assert await world.order(ControlRequest.DOWN) == "0"
+
+        await world.run(order())
+        assert [each.partition(": it is ")[2].partition(";")[0] for each in answers] == [
+            "restarting",
+            "connecting",
+            "pausing",
+        ]
 
     run(main())
 

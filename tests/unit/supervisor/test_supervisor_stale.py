@@ -8,9 +8,10 @@ from collections.abc import Iterable
 from types import SimpleNamespace
 from typing import Any, cast
 
+from lifecycle.supervisor.control.protocol import ProcessState
 from lifecycle.supervisor.health.process_monitor import StaleNodes
 from lifecycle.supervisor.nodes.system import System
-from lifecycle.supervisor.run.events import ProcessChanged, ProcessState
+from lifecycle.supervisor.run.events import ProcessChanged
 
 PREFIX = "010f7f015d3c1b4c00000000"
 ENDED = ProcessChanged(process="camera", state=ProcessState.EXITED, pid=7)

@@ -35,7 +35,8 @@ from lifecycle.verify import (
     ObservedNode,
     Stage,
 )
-from lifecycle.verify.observation import ConnectionReport, ParameterReport
+from lifecycle.verify.observation import ParameterReport
+from lifecycle.verify.outcome import ConnectionReport
 from lifecycle.verify.view import connection_of
 
 _TOPIC_KINDS = (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION)

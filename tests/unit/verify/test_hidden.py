@@ -7,7 +7,8 @@ import dataclasses
 import pytest
 
 from lifecycle.plan.model import PlannedParticipant
-from lifecycle.verify.observation import ConnectionReport, NodeConfiguration
+from lifecycle.verify.observation import NodeConfiguration
+from lifecycle.verify.outcome import ConnectionReport
 from lifecycle.verify.tool_filter import Owners, is_hidden_node
 from tests.builders import configuration, node, planned, publisher
 
@@ -104,6 +105,7 @@ def test_a_node_is_hidden_by_the_underscore_of_its_own_name(name: str, hidden: b
     [
         (("a",), "/_a_net", "/a"),
         (("camera",), "/_camera_net_low_1", "/camera"),
+        (("a",), "/_a_net_low_1", "/a"),
         (("a", "a_b"), "/_a_b_net_low_1", "/a_b"),
         (("b",), "/_a_net", ""),
     ],

@@ -16,7 +16,7 @@ from lifecycle.plan.model import ParticipantConnections, PlannedNode, PlannedPar
 from lifecycle.plan.negotiation.data_layer import Party, PartyEndpoint
 from lifecycle.supervisor.connections.negotiation import party_of
 from lifecycle.verify import NodeConfiguration
-from lifecycle.verify.observation import ConnectionReport
+from lifecycle.verify.outcome import ConnectionReport
 from tests.builders import configuration, need, node, planned, publisher, reported, subscription
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION

@@ -21,7 +21,7 @@ from lifecycle.network.nfe import InternetProtocol, NetworkFlowEndpoint, Transpo
 from lifecycle.plan import Plan, PlannedNode
 from lifecycle.plan.model import ParticipantConnections, PlannedParticipant
 from lifecycle.verify import Finding, Observation, Outcome, Stage, render_text, to_json, verify
-from lifecycle.verify.observation import ConnectionReport
+from lifecycle.verify.outcome import ConnectionReport
 from lifecycle.verify.verdict import OpenEndpoint
 from tests.builders import at, link, node, planned, publisher, subscription
 from tests.unit.verify.edits import (

@@ -1080,6 +1080,12 @@ def test_a_missing_endpoint_is_told_whole():
     )
 
 
+def test_a_client_without_a_server_names_both_as_who_may_be_undiscovered():
+    edit = change_report(CLIENT, "/robot/camera/calibrate", server_matched=False)
+    (finding,) = verify(PLAN, edit(perfect(PLAN)), stage=Stage.CONNECTED).findings
+    assert finding.ends == ("/viewer", "/robot/camera")
+
+
 def test_an_incompatible_pair_names_the_policy_and_both_ends():
     edit = both(
         change_announced_qos(SUB, VIDEO, reliability=Reliability.RELIABLE),

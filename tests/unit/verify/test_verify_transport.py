@@ -16,7 +16,7 @@ from lifecycle.network.nfe import (
 from lifecycle.plan import Plan
 from lifecycle.plan.model import ParticipantConnections, PlannedParticipant
 from lifecycle.verify import Finding, Identity, Outcome, Stage, verify
-from lifecycle.verify.observation import ConnectionReport
+from lifecycle.verify.outcome import ConnectionReport
 from lifecycle.verify.transport import carrier
 from tests.builders import at, link, need, node, planned, publisher, subscription
 from tests.unit.verify.edits import (
@@ -472,6 +472,7 @@ MEDIUM_FIX = (
         ("udpm", (UDP4,), "UDP multicast", "udpv4"),
         ("udpv4", (UDP6,), "udpv4", "no transport that both have"),
         ("intraprocess", (TCP4,), "handed over inside their process", "tcpv4"),
+        ("quic", (UDP4,), "quic", "udpv4"),  # of a plan that a later release has made
     ],
 )
 def test_a_flow_that_another_medium_carries_is_told_whole(medium, nfes, planned_words, used_words):

@@ -24,7 +24,8 @@ from lifecycle.programming.apply.targets.registry import Targets, target_kind
 from lifecycle.supervisor.connections.networks import Networks
 from lifecycle.supervisor.run.events import Emitter, Notice
 from lifecycle.supervisor.run.failure import StepFailedError
-from lifecycle.verify.verdict import Outcome, Verdict
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.verdict import Verdict
 from tests.unit.programming.apply.samples import (
     camara_settings,
     ledger_in,

@@ -39,7 +39,8 @@ from lifecycle.programming.rules.rules import flow_rules
 from lifecycle.supervisor.connections import networks as keeper_module
 from lifecycle.supervisor.connections.networks import Keeper
 from lifecycle.supervisor.run.failure import Worker
-from lifecycle.verify.verdict import FlowReport, Outcome
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.verdict import FlowReport
 from tests.unit.programming.apply.fakes import FakeTarget
 from tests.unit.programming.apply.samples import (
     ledger_in,

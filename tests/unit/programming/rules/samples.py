@@ -18,7 +18,8 @@ from lifecycle.network.nfe import (
 )
 from lifecycle.plan import Plan
 from lifecycle.programming.rules.rules import FlowRule, LeftOut
-from lifecycle.verify.verdict import FlowReport, Outcome
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.verdict import FlowReport
 from tests.builders import at, need, node, planned, publisher, subscription
 
 EXPECTED = Path(__file__).parent / "expected"

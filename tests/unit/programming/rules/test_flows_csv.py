@@ -14,7 +14,8 @@ from lifecycle.network.nfe import (
     UniqueRequirement,
 )
 from lifecycle.programming.rules.registry import COLUMNS, flows_to_csv
-from lifecycle.verify.verdict import FlowReport, Outcome
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.verdict import FlowReport
 
 
 def udp(address: str, port: int) -> NetworkFlowEndpoint:

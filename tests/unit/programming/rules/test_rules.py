@@ -11,7 +11,8 @@ from lifecycle.network.five_qi import dscp_mapping
 from lifecycle.network.nfe import TransportProtocol
 from lifecycle.plan import PlannedNode
 from lifecycle.programming.rules.rules import FlowRule, asks, flow_rules, named, rules_digest
-from lifecycle.verify.verdict import FlowReport, Outcome
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.verdict import FlowReport
 from tests.unit.programming.rules.samples import SHM, VIDEO, nfe, plan, report, rule
 
 

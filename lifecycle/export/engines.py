@@ -1,0 +1,393 @@
+"""A plan as units and manifests of the engines that start programs: each machine's part as one.
+
+Owns: what systemd, podman (Quadlet), Kubernetes and Compose are given so that the supervisor of a
+machine is started with it, is ready only once its system is active and verified, is ended when its
+event loop hangs, and is started again where that can help: by the engine where the manifest leaves
+that to it, never by both. Pure; nothing is asked of an engine.
+
+Sources: systemd.service(5), systemd.exec(5); podman-systemd.unit(5); the Kubernetes API v1 and
+apps/v1; the Compose Specification.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping
+
+import yaml
+
+from lifecycle.errors import ExitCode
+from lifecycle.plan import Plan
+from lifecycle.run_directory import run_name
+
+START_MARGIN_S = 60.0
+"""For imports, and for discovery; the deadlines of bring-up end it before."""
+
+STOP_S = 30
+"""What is left after so long is killed; an orderly shutdown takes its deadlines at most."""
+
+WATCHDOG_S = 10
+PROBE_S = 5
+"""How often a container's engine asks, and how long it waits for the answer."""
+
+_USER = 1000
+_LONGEST_NAME = 63
+
+_USELESS = (
+    ExitCode.USAGE,
+    ExitCode.MANIFEST_INVALID,
+    ExitCode.VIOLATED,
+    ExitCode.UNVERIFIABLE,
+    ExitCode.SUPERVISION_GAVE_UP,
+)
+"""Exit codes after which the same command would end the same way, or that say so themselves."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Deployment:
+    """What is to be started, and with what.
+
+    Attributes:
+        plan: all machines of it.
+        manifest: path of the manifest where it is started: on the machine, or in the image.
+        words: further words of `lifecycle up`: arguments and options.
+        image: of containers; has the programs of all nodes.
+        program: path of `lifecycle`; in containers it is found by name.
+        restarts: the supervisor restarts its nodes itself, and says when it gives up.
+        programs_networks: it is told to program networks, which takes CAP_NET_ADMIN.
+    """
+
+    plan: Plan
+    manifest: str
+    words: tuple[str, ...] = ()
+    image: str = ""
+    program: str = "/opt/lifecycle/bin/lifecycle"
+    restarts: bool = False
+    programs_networks: bool = False
+
+    @property
+    def machines(self) -> tuple[str, ...]:
+        """Names of the machines that have a part of it; one empty name where none is declared."""
+        return tuple(dict.fromkeys(each.machine for each in self.plan.processes)) or ("",)
+
+    def name(self, machine: str) -> str:
+        """Return what the part of one machine is called: a DNS label, RFC 1123."""
+        name = self.plan.system + (f"-{machine}" if machine else "")
+        return re.sub(r"[^a-z0-9-]+", "-", name.lower())[:_LONGEST_NAME].strip("-")
+
+    def arguments(self, machine: str) -> tuple[str, ...]:
+        """Return the words of `lifecycle` that start a machine's part."""
+        where = ("--machine", machine) if machine else ()
+        return ("up", self.manifest, *where, *self.words)
+
+    def probe(self, what: str) -> tuple[str, ...]:
+        """Return the command that says, in a container, whether it is "live" or "ready"."""
+        return ("lifecycle", "status", run_name(self.plan).rpartition("@")[0], "--probe", what)
+
+    @property
+    def start_s(self) -> int:
+        """Seconds within which a part is ready or has given up, by its own deadlines."""
+        steps = 0.0
+        for level in self.plan.levels:
+            limits = [self.plan.node(key).timeouts for key in level]
+            steps += max(
+                (each.start_s + each.configure_s + each.connect_s + each.activate_s)
+                for each in limits
+            )
+        return math.ceil(steps + START_MARGIN_S)
+
+
+def systemd(deployment: Deployment) -> dict[str, str]:
+    """Return a service unit for each machine, by file name."""
+    return {
+        f"{deployment.name(machine)}.service": _systemd_unit(deployment, machine)
+        for machine in deployment.machines
+    }
+
+
+def _systemd_unit(deployment: Deployment, machine: str) -> str:
+    name = deployment.name(machine)
+    service: list[tuple[str, object]] = [
+        ("Type", "notify"),
+        ("NotifyAccess", "main"),
+        ("ExecStart", _command((deployment.program, *deployment.arguments(machine)))),
+        ("TimeoutStartSec", deployment.start_s),
+        ("TimeoutStopSec", STOP_S),
+        ("WatchdogSec", WATCHDOG_S),
+        *_systemd_restart(deployment),
+        ("RuntimeDirectory", name),
+        ("StateDirectory", name),
+        ("Environment", f"XDG_RUNTIME_DIR=%t/{name}"),
+        ("Environment", f"ROS_HOME=%S/{name}"),
+        ("DynamicUser", "yes"),
+        ("NoNewPrivileges", "yes"),
+        ("ProtectSystem", "strict"),
+        ("ProtectHome", "read-only"),
+        ("RestrictSUIDSGID", "yes"),
+        ("LockPersonality", "yes"),
+        *_systemd_capabilities(deployment),
+    ]
+    return _sections(
+        deployment,
+        machine,
+        Unit=[
+            ("Description", _title(deployment, machine)),
+            ("Wants", "network-online.target"),
+            ("After", "network-online.target"),
+        ],
+        Service=service,
+        Install=[("WantedBy", "multi-user.target")],
+    )
+
+
+def _systemd_capabilities(deployment: Deployment) -> Iterator[tuple[str, object]]:
+    allowed = "CAP_NET_ADMIN" if deployment.programs_networks else ""
+    yield "CapabilityBoundingSet", allowed
+    if allowed:
+        yield "AmbientCapabilities", allowed
+
+
+def _systemd_restart(deployment: Deployment) -> Iterator[tuple[str, object]]:
+    """What is restarted by whom: nodes by the supervisor, or all of it by systemd; never both.
+
+    A supervisor that is killed, or hangs, cannot restart anything: that is systemd's in any case.
+    """
+    if deployment.restarts:
+        yield "Restart", "on-abnormal"
+    else:
+        yield "Restart", "on-failure"
+        yield "RestartPreventExitStatus", " ".join(str(int(each)) for each in _USELESS)
+    yield "RestartSec", 2
+
+
+def quadlet(deployment: Deployment) -> dict[str, str]:
+    """Return a `.container` file for each machine, by file name; podman makes units of them."""
+    return {
+        f"{deployment.name(machine)}.container": _quadlet_unit(deployment, machine)
+        for machine in deployment.machines
+    }
+
+
+def _quadlet_unit(deployment: Deployment, machine: str) -> str:
+    return _sections(
+        deployment,
+        machine,
+        Unit=[
+            ("Description", _title(deployment, machine)),
+            ("Wants", "network-online.target"),
+            ("After", "network-online.target"),
+        ],
+        Container=[
+            ("Image", deployment.image),
+            ("Exec", _command(deployment.arguments(machine))),
+            ("Network", "host"),
+            ("PodmanArgs", f"--entrypoint=lifecycle --ipc=host --stop-timeout={STOP_S}"),
+            ("Notify", "true"),
+            # podman passes readiness on, but no watchdog.
+            ("HealthCmd", _command(deployment.probe("live"))),
+            ("HealthInterval", f"{PROBE_S}s"),
+            ("HealthTimeout", f"{PROBE_S}s"),
+            ("HealthRetries", WATCHDOG_S // PROBE_S),
+            ("HealthStartPeriod", f"{deployment.start_s}s"),
+            ("HealthOnFailure", "kill"),
+            ("User", _USER),
+            ("DropCapability", "all"),
+            ("NoNewPrivileges", "true"),
+            ("ReadOnly", "true"),
+            ("Tmpfs", "/tmp"),  # noqa: S108 - the container's own
+            *(("Environment", f"{name}={value}") for name, value in _ENVIRONMENT.items()),
+        ],
+        Service=[
+            ("TimeoutStartSec", deployment.start_s),
+            ("TimeoutStopSec", STOP_S + PROBE_S),
+            *_systemd_restart(deployment),
+        ],
+        Install=[("WantedBy", "default.target")],
+    )
+
+
+_ENVIRONMENT = {"HOME": "/tmp", "ROS_LOG_DIR": "/tmp/log"}  # noqa: S108 - the container's own
+
+
+def compose(deployment: Deployment) -> dict[str, str]:
+    """Return a Compose file for each machine, by file name."""
+    return {
+        f"compose.{deployment.name(machine)}.yaml": _yaml(
+            deployment, machine, [_compose_project(deployment, machine)]
+        )
+        for machine in deployment.machines
+    }
+
+
+def _compose_project(deployment: Deployment, machine: str) -> dict[str, object]:
+    service = {
+        "image": deployment.image,
+        "entrypoint": ["lifecycle"],
+        "command": [each.replace("$", "$$") for each in deployment.arguments(machine)],
+        "network_mode": "host",
+        "ipc": "host",
+        "user": f"{_USER}:{_USER}",
+        "read_only": True,
+        "tmpfs": ["/tmp"],  # noqa: S108 - the container's own
+        "environment": dict(_ENVIRONMENT),
+        "cap_drop": ["ALL"],
+        "security_opt": ["no-new-privileges:true"],
+        "init": False,
+        "stop_signal": "SIGTERM",
+        "stop_grace_period": f"{STOP_S}s",
+        # Compose knows no exit codes: `on-failure` with a bound starts no hopeless case for ever.
+        "restart": "no" if deployment.restarts else "on-failure:5",
+        "healthcheck": {
+            "test": ["CMD", *deployment.probe("ready")],
+            "interval": f"{PROBE_S}s",
+            "timeout": f"{PROBE_S}s",
+            "retries": 3,
+            "start_period": f"{deployment.start_s}s",
+        },
+    }
+    return {"name": deployment.name(machine), "services": {deployment.name(machine): service}}
+
+
+def kubernetes(deployment: Deployment) -> dict[str, str]:
+    """Return the objects of each machine, by file name: one pod on the node of its name."""
+    return {
+        f"{deployment.name(machine)}.yaml": _yaml(
+            deployment, machine, [_kubernetes_object(deployment, machine)]
+        )
+        for machine in deployment.machines
+    }
+
+
+def _kubernetes_object(deployment: Deployment, machine: str) -> dict[str, object]:
+    name = deployment.name(machine)
+    labels = {
+        "app.kubernetes.io/name": deployment.name(""),
+        "app.kubernetes.io/instance": name,
+        "app.kubernetes.io/component": "supervisor",
+    }
+    pod: dict[str, object] = {
+        "metadata": {"labels": labels},
+        "spec": _pod(deployment, machine),
+    }
+    if deployment.restarts:
+        # A supervisor that gives up is not started again by the engine; one that the machine
+        # loses is, when the pod is applied again.
+        return {
+            "apiVersion": "v1",
+            "kind": "Pod",
+            "metadata": {"name": name, "labels": labels},
+            "spec": {**_pod(deployment, machine), "restartPolicy": "Never"},
+        }
+    return {
+        "apiVersion": "apps/v1",
+        "kind": "Deployment",
+        "metadata": {"name": name, "labels": labels},
+        "spec": {
+            "replicas": 1,
+            # Never two of a system in one domain.
+            "strategy": {"type": "Recreate"},
+            "selector": {"matchLabels": {"app.kubernetes.io/instance": name}},
+            "template": pod,
+        },
+    }
+
+
+def _pod(deployment: Deployment, machine: str) -> dict[str, object]:
+    def probe(what: str, failures: int) -> dict[str, object]:
+        return {
+            "exec": {"command": list(deployment.probe(what))},
+            "periodSeconds": PROBE_S,
+            "timeoutSeconds": PROBE_S,
+            "failureThreshold": failures,
+        }
+
+    container: dict[str, object] = {
+        "name": "supervisor",
+        "image": deployment.image,
+        "command": ["lifecycle"],
+        "args": [each.replace("$(", "$$(") for each in deployment.arguments(machine)],
+        "env": [{"name": name, "value": value} for name, value in _ENVIRONMENT.items()],
+        # Live as soon as it answers at all; until then it has the time that bring-up may take.
+        "startupProbe": probe("live", math.ceil(deployment.start_s / PROBE_S)),
+        "livenessProbe": probe("live", max(1, WATCHDOG_S // PROBE_S)),
+        "readinessProbe": probe("ready", 1),
+        "securityContext": {
+            "runAsNonRoot": True,
+            "runAsUser": _USER,
+            "runAsGroup": _USER,
+            "allowPrivilegeEscalation": False,
+            "readOnlyRootFilesystem": True,
+            "capabilities": {"drop": ["ALL"]},
+            "seccompProfile": {"type": "RuntimeDefault"},
+        },
+        "volumeMounts": [{"name": "tmp", "mountPath": "/tmp"}],  # noqa: S108
+    }
+    spec: dict[str, object] = {
+        "hostNetwork": True,
+        "hostIPC": True,
+        "dnsPolicy": "ClusterFirstWithHostNet",
+        "terminationGracePeriodSeconds": STOP_S,
+        "containers": [container],
+        "volumes": [{"name": "tmp", "emptyDir": {}}],
+    }
+    if machine:
+        spec["nodeSelector"] = {"kubernetes.io/hostname": machine}
+    return spec
+
+
+ENGINES: Mapping[str, Callable[[Deployment], dict[str, str]]] = {
+    "systemd": systemd,
+    "quadlet": quadlet,
+    "compose": compose,
+    "kubernetes": kubernetes,
+}
+"""What each engine is given: a new one is a function and a line here."""
+
+
+def _title(deployment: Deployment, machine: str) -> str:
+    on = f" on {machine}" if machine else ""
+    return f"ROS 2 system {deployment.plan.system}{on}, verified before it is activated"
+
+
+def _head(deployment: Deployment, machine: str) -> str:
+    by = "its supervisor" if deployment.restarts else "the engine"
+    return (
+        f"# {_title(deployment, machine)}.\n"
+        f"# Written by lifecycle export from {deployment.manifest}; {by} restarts what fails.\n"
+    )
+
+
+def _sections(deployment: Deployment, machine: str, **sections: list[tuple[str, object]]) -> str:
+    """Return a file in the syntax of systemd.syntax(7)."""
+    parts = [
+        f"[{name}]\n" + "".join(f"{key}={value}\n" for key, value in entries)
+        for name, entries in sections.items()
+    ]
+    return _head(deployment, machine) + "\n".join(parts)
+
+
+def _yaml(deployment: Deployment, machine: str, documents: list[dict[str, object]]) -> str:
+    text = yaml.dump_all(documents, Dumper=_Plain, sort_keys=False, allow_unicode=True, width=100)
+    return _head(deployment, machine) + text
+
+
+class _Plain(yaml.SafeDumper):
+    """Writes what stands twice twice: an alias surprises people."""
+
+    def ignore_aliases(self, data: object) -> bool:
+        """Ignore all."""
+        del data
+        return True
+
+
+def _command(words: tuple[str, ...]) -> str:
+    """Return a command line as systemd.service(5) reads it; `%` and `$` stand for themselves."""
+    return " ".join(map(_word, words))
+
+
+def _word(word: str) -> str:
+    escaped = word.replace("\\", "\\\\").replace('"', '\\"').replace("%", "%%").replace("$", "$$")
+    plain = re.fullmatch(r"[A-Za-z0-9_@%+=:,./$-]+", escaped)
+    return escaped if plain else f'"{escaped}"'

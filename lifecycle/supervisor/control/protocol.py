@@ -1,0 +1,217 @@
+"""What is asked on a supervisor's control socket and what it answers: the client's side.
+
+Owns: the requests and replies, one JSON object per line; the words of a status; asking. All that a
+verb loads which asks a running supervisor, so nothing here imports plans, rules or asyncio, and
+the types are Structs: a dataclass takes forty times as long to make (0.7 ms).
+"""
+
+from __future__ import annotations
+
+import enum
+import socket
+import time
+from pathlib import Path
+from typing import TypeVar
+
+import msgspec
+
+from lifecycle.codec import from_json, to_json
+from lifecycle.errors import UsageError
+from lifecycle.run_directory import connect
+from lifecycle.verify import ConnectionReport, Outcome
+
+_LARGEST_ANSWER = 64 * 2**20
+"""Bytes of a line; a look holds a whole plan and all that was seen."""
+ANSWER_S = 10.0
+"""For the rest of an answer that has begun."""
+_READ = 2**18
+
+
+class ProcessState(enum.Enum):
+    """The life of one operating system process; BACKOFF is the wait before it is started again."""
+
+    STARTING = "starting"
+    RUNNING = "running"
+    BACKOFF = "backoff"
+    STOPPING = "stopping"
+    EXITED = "exited"
+
+
+class Reach(enum.Enum):
+    """How far one node is brought up; ordered, one value per step of bring-up."""
+
+    WAITING = "waiting"
+    STARTED = "started"
+    CONFIGURED = "configured"
+    CONNECTED = "connected"
+    ACTIVE = "active"
+    STOPPED = "stopped"
+
+
+class NodeStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """One node.
+
+    Attributes:
+        node: fully qualified name.
+        process: name of its process; empty if this supervisor does not run it.
+        process_state: None if this supervisor does not run it.
+        state: lifecycle_msgs/State label; empty for a node that is not managed.
+        doing: what it does or waits for; empty when nothing.
+        matched: publishers and subscriptions that report at least one match.
+        endpoints: declared publishers and subscriptions.
+        unique_flows: flows from or to it that are weakly or strongly unique.
+        flows: flows from or to it.
+        findings: findings of the last verdict that concern it.
+        silent: why nothing can be expected of it; empty while it is alive.
+        died: how its process ended unasked; empty while it runs. It then has no state, and no
+            matches.
+        connections: as it reports them, its own participant left out.
+    """
+
+    node: str
+    process: str
+    process_state: ProcessState | None
+    pid: int
+    managed: bool
+    reach: Reach
+    state: str
+    doing: str
+    matched: int
+    endpoints: int
+    unique_flows: int
+    flows: int
+    findings: int
+    silent: str = ""
+    died: str = ""
+    connections: tuple[ConnectionReport, ...] = ()
+
+
+class SystemStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """One system.
+
+    Attributes:
+        phase: "connecting", "verifying", "activating", "active", "pausing", "paused", "held" (some
+            nodes wait at a gate that stayed closed), "restarting" or "stopping".
+        verdict: of the last judgement; None before the first.
+        not_ok: what keeps it from being ok, in one line; empty where nothing does.
+        supervisor: pid.
+    """
+
+    system: str
+    domain_id: int
+    phase: str
+    verdict: Outcome | None
+    supervisor: int
+    elapsed_s: float
+    nodes: tuple[NodeStatus, ...]
+    not_ok: str = ""
+
+
+class ControlRequest(enum.Enum):
+    """What a supervisor can be asked."""
+
+    STATUS = "status"
+    DOWN = "down"
+    LOOK = "look"
+    FOLLOW = "follow"
+    PAUSE = "pause"
+    RESUME = "resume"
+    RESTART = "restart"
+    DIFFERENCES = "differences"
+
+
+class Question(msgspec.Struct, frozen=True, kw_only=True):
+    """Client → supervisor.
+
+    Attributes:
+        node: for RESTART, manifest key or fully qualified name; empty for the whole system.
+        plan: for DIFFERENCES and orders, the Plan of the client's manifest as it is now; None if
+            it was given none. What reads it knows its type, see server.py.
+        reload: for RESTART, `plan` is to run from now on.
+    """
+
+    ask: ControlRequest
+    node: str = ""
+    plan: object = None
+    reload: bool = False
+
+
+class Answer(msgspec.Struct, frozen=True, kw_only=True):
+    """Supervisor → client.
+
+    Attributes:
+        status: for STATUS.
+        exit_code: for DOWN, of the supervisor, sent once nothing of the system runs any more; for
+            an order, what came of it.
+        error: why an order was not carried out; empty if it was.
+        differences: for DIFFERENCES, how the plan of the question differs from what runs.
+    """
+
+    status: SystemStatus | None = None
+    exit_code: int | None = None
+    error: str = ""
+    differences: tuple[str, ...] = ()
+
+
+A = TypeVar("A", bound=Answer)
+
+
+def ask(path: Path, question: Question, timeout_s: float, type_: type[A]) -> A | None:
+    """Ask the supervisor that listens at `path` what is answered as `type_`.
+
+    Returns:
+        Its answer; None if it ended without one.
+
+    Raises:
+        TimeoutError: no whole answer within `timeout_s`.
+        UsageError: what answers is no supervisor of this version.
+        OSError: no supervisor listens there.
+    """
+    deadline = time.monotonic() + timeout_s
+    with connect(path, timeout_s) as sock:
+        sock.sendall(to_json(question) + b"\n")
+        return read_answer(path, sock, bytearray(), deadline, type_)
+
+
+def read_answer(
+    path: Path, sock: socket.socket, rest: bytearray, deadline_s: float | None, type_: type[A]
+) -> A | None:
+    """Read one answer, bounded in time and size; None if there is none any more.
+
+    Args:
+        path: of the socket.
+        sock: connected to it.
+        rest: what was read beyond the answer before.
+        deadline_s: monotonic; None to wait for ever until one begins, and not long for its end.
+        type_: of the answer.
+    """
+    searched = 0
+    while (end := rest.find(b"\n", searched)) < 0:
+        searched = len(rest)
+        if searched > _LARGEST_ANSWER:
+            raise strange(path, f"{searched} bytes without an end")
+        left_s = None if deadline_s is None else deadline_s - time.monotonic()
+        if left_s is not None and left_s <= 0:
+            raise TimeoutError
+        sock.settimeout(left_s)
+        data = sock.recv(_READ)
+        if not data:
+            return None
+        if deadline_s is None:
+            deadline_s = time.monotonic() + ANSWER_S
+        rest += data
+    line = bytes(rest[:end])
+    del rest[: end + 1]
+    try:
+        return from_json(line, type_)
+    except ValueError as error:
+        raise strange(path, str(error)) from error
+
+
+def strange(path: Path, why: str) -> UsageError:
+    """Return the error that an answer is which no supervisor of this version gives."""
+    return UsageError(
+        f"cannot understand the answer of {path.parent.name!r}: {why}",
+        hint="use the version of lifecycle that started it, or end the process that listens at "
+        f"{path}",
+    )

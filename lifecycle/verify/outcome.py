@@ -1,0 +1,46 @@
+"""The three outcomes, and what a node reports of a connection: the words of a status.
+
+Owns: `Outcome`, `ConnectionReport`. Apart from verdicts and observations because `lifecycle status`
+shows them, which loads no plan, no manifest and no rule. Pure.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+from collections.abc import Iterable
+
+
+class Outcome(enum.Enum):
+    """The three outcomes; nothing unknown is silently OK."""
+
+    OK = "ok"
+    VIOLATED = "violated"
+    UNVERIFIABLE = "unverifiable"
+
+    @classmethod
+    def worst(cls, found: Iterable[Outcome]) -> Outcome:
+        """Return VIOLATED if any is; else UNVERIFIABLE if any is; else OK."""
+        outcomes = set(found)
+        return next((each for each in (cls.VIOLATED, cls.UNVERIFIABLE) if each in outcomes), cls.OK)
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class ConnectionReport:
+    """What a node reports of one of its connections.
+
+    Attributes:
+        name: as `connect_to` named it; empty for the node's own participant.
+        urls: what it was given, as text; empty if the RMW chose.
+        node_name: base name of the hidden node that carries it; empty for the node's own.
+        established: it exists and, where it has mappings, all of them have a matched peer.
+        mappings: declared names of what is mapped onto it, `publishers/video`.
+        error: why it could not be made; empty if it was.
+    """
+
+    name: str
+    urls: tuple[str, ...] = ()
+    node_name: str = ""
+    established: bool = False
+    mappings: tuple[str, ...] = ()
+    error: str = ""
