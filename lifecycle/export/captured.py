@@ -26,6 +26,7 @@ from lifecycle.manifest import (
     QosProfile,
     TargetState,
     full_name_problem,
+    is_implicit,
     name_problem,
     namespace_problem,
     node_name_problem,
@@ -43,9 +44,6 @@ from lifecycle.verify import (
 )
 
 _TYPE = re.compile(r"[a-zA-Z][a-zA-Z0-9_]*/(msg|srv|action)/[a-zA-Z][a-zA-Z0-9_]*")
-_NOISE_PARAMETERS = ("use_sim_time", "start_type_description_service")
-_NOISE_PARAMETER_PREFIX = "qos_overrides."
-"""Parameters that client libraries declare for every node (rclpy, rclcpp)."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -96,7 +94,7 @@ class CapturedNode:
         state: lifecycle_msgs/State label; empty if not known.
         parameters: None where it did not answer.
         run: how its process was started; None where others are to start it.
-        may_end: its process may end by itself: the node does nothing but ask others.
+        may_end: its process may end by itself: it did so, or the node only asks others.
         has_configuration: its own configuration has more than discovery does.
         gaps: what is not known of it, one phrase each.
     """
@@ -469,7 +467,9 @@ def _node(
         process_id=configuration.identity.process_id if configuration else None,
         gaps=tuple(gaps),
         run=run,
-        may_end=run is not None and not node.managed and _only_asks(taken),
+        may_end=run is not None
+        and not node.managed
+        and (run.program.has_ended or _only_asks(taken)),
     )
 
 
@@ -494,9 +494,7 @@ def can_be_given(parameter: CapturedParameter) -> bool:
 def _is_own(parameter: CapturedParameter) -> bool:
     if parameter.name == "use_sim_time":
         return parameter.value is True
-    return parameter.name not in _NOISE_PARAMETERS and not parameter.name.startswith(
-        _NOISE_PARAMETER_PREFIX
-    )
+    return not is_implicit(parameter.name)
 
 
 def _endpoint(endpoint: ObservedEndpoint, reports: Iterable[EndpointReport]) -> CapturedEndpoint:

@@ -275,9 +275,10 @@ def _identity(node: CapturedNode) -> dict[str, Tree]:
     if node.managed and node.state in TARGETS and node.state != TargetState.ACTIVE.value:
         tree["state"] = node.state
     if node.may_end:
-        tree["may_end"] = Noted(
-            value=True, note="gap: it only asks others; whether it ends by itself is not seen"
-        )
+        note = "gap: it only asks others; whether it ends by itself is not seen"
+        if run is not None and run.program.has_ended:
+            note = "gap: it ended while it was captured; its exit status is not seen"
+        tree["may_end"] = Noted(value=True, note=note)
     return tree
 
 

@@ -38,6 +38,7 @@ class CapturedProgram:
         working_directory: absolute.
         environment: (name, value) of what matters and is otherwise here; sorted.
         withheld: names of variables that matter, whose values are secret or too long.
+        has_ended: it ended by itself while it was looked at.
     """
 
     process_id: int
@@ -45,6 +46,7 @@ class CapturedProgram:
     working_directory: str
     environment: tuple[tuple[str, str], ...] = ()
     withheld: tuple[str, ...] = ()
+    has_ended: bool = False
 
     @property
     def is_of_a_supervisor(self) -> bool:

@@ -194,9 +194,12 @@ class Observer:
         self._show(nodes, endpoints)
         given = self.state.given
         judged = {
-            node.full_name: frozenset(each.name for each in node.expected_parameters)
+            node.full_name: None
+            if node.has_all_parameters
+            else frozenset(each.name for each in node.expected_parameters)
             for node in plan.nodes
-            if node.expected_parameters and node.full_name in self._seen - given.keys()
+            if (node.expected_parameters or node.has_all_parameters)
+            and node.full_name in self._seen - given.keys()
         }
         self._parameters.listen(judged)
         answers = await self._ask_all(plan, nodes, planned, given)

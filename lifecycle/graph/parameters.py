@@ -15,7 +15,7 @@ from typing import Protocol
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.graph.scheduler import set_within
-from lifecycle.verify import NodeParameters, ParameterReport
+from lifecycle.verify import SERVES_NONE, NodeParameters, ParameterReport
 
 _logger = logging.getLogger(__name__)
 
@@ -34,8 +34,11 @@ AGAIN_AT_MOST_S = 10.0
 _BETWEEN_S = 0.02
 """At least so long between two readings, however often a parameter changes."""
 
-_NONE = "serves no parameters"
 _NO_ANSWER = f"did not answer its parameter services within {ANSWER_S:g} s"
+
+
+Names = frozenset[str] | None
+"""Of those parameters of a node that are read; None for all that it has."""
 
 
 class ParameterServices(Protocol):
@@ -45,9 +48,9 @@ class ParameterServices(Protocol):
         """Return whether a node has them; None while discovery may not show them yet."""
 
     async def report_parameters(
-        self, node: str, names: Collection[str], *, timeout_s: float
+        self, node: str, names: Collection[str] | None, *, timeout_s: float
     ) -> tuple[ParameterReport, ...]:
-        """Return those parameters that are named and that the node has."""
+        """Return those parameters that are named and that the node has; None returns all."""
 
     def on_parameters(self, callback: Callable[[str, frozenset[str]], None]) -> None:
         """Call `callback` from any thread with each change of parameters, by node and names."""
@@ -66,14 +69,14 @@ class ParameterReadings:
         self._wake = wake
         self._nodes: dict[str, _Node] = {}
         self._lock = threading.Lock()
-        self._named: dict[str, frozenset[str]] = {}
+        self._named: dict[str, Names] = {}
         self._loop: asyncio.AbstractEventLoop | None = None
 
-    def listen(self, named: Mapping[str, frozenset[str]]) -> None:
+    def listen(self, named: Mapping[str, Names]) -> None:
         """Take each change of a named parameter as a reason to look again.
 
         Args:
-            named: names of parameters by full node name; without any, nothing is subscribed to.
+            named: by full node name; without any, nothing is subscribed to.
         """
         with self._lock:
             # Looks at a part of the system go on beside those at all of it.
@@ -127,7 +130,8 @@ class ParameterReadings:
     def _changed(self, node: str, names: frozenset[str]) -> None:
         # Any thread.
         with self._lock:
-            concerned = not names.isdisjoint(self._named.get(node, frozenset()))
+            named = self._named.get(node, frozenset())
+            concerned = named is None or not names.isdisjoint(named)
         if not concerned or self._loop is None:
             return
         try:
@@ -147,7 +151,7 @@ class _Node:
     """The parameters of one node, read again and again by a task."""
 
     def __init__(
-        self, name: str, names: frozenset[str], clients: ParameterServices, wake: Callable[[], None]
+        self, name: str, names: Names, clients: ParameterServices, wake: Callable[[], None]
     ) -> None:
         self.names = names
         self.latest: NodeParameters | None = None
@@ -160,7 +164,7 @@ class _Node:
 
     def look(self) -> None:
         """Read at once if the services have come that were missing."""
-        missing = self.latest is not None and self.latest.error == _NONE
+        missing = self.latest is not None and self.latest.error == SERVES_NONE
         if missing and self._clients.serves_parameters(self._name):
             self.due.set()
 
@@ -209,7 +213,7 @@ class _Node:
                 return NodeParameters(node=self._name, parameters=found)
             serves = self._clients.serves_parameters(self._name)
         if not serves:
-            return NodeParameters(node=self._name, error=_NONE)
+            return NodeParameters(node=self._name, error=SERVES_NONE)
         found = await self._ask(ANSWER_S)
         error = _NO_ANSWER if found is None else ""
         return NodeParameters(node=self._name, parameters=found, error=error)

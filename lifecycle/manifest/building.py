@@ -16,6 +16,7 @@ from pathlib import Path
 
 from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.model import (
+    SUPERVISION_KEYS,
     After,
     Condition,
     ConnectionDeclaration,
@@ -32,6 +33,7 @@ from lifecycle.manifest.model import (
     Quantity,
     Run,
     RunKind,
+    Supervision,
     Timeouts,
 )
 from lifecycle.manifest.nodl import read_interface
@@ -217,7 +219,11 @@ def _inline(cursor: Cursor, found: Findings) -> Interface:
                 hint = f"the first stands at {other.at.file}:{other.at.line}:{other.at.column}"
                 found.append(error("manifest.duplicate-name", at, message, hint))
     parameters = [_declaration(name, each, found) for name, each in cursor.entries("parameters")]
-    return Interface(endpoints=tuple(endpoints), parameters=tuple(parameters))
+    return Interface(
+        endpoints=tuple(endpoints),
+        parameters=tuple(parameters),
+        has_all_parameters="parameters" in cursor,
+    )
 
 
 def _endpoint(kind: EndpointKind, cursor: Cursor, found: Findings) -> Endpoint:
@@ -347,7 +353,7 @@ __all__ = ["Findings", "build_node", "build_parameters", "quantities"]
 _PROGRAMS = ("python", "command", "package", "executable", "component", "container", "ros_args")
 _POSITIONED = (
     *("machine", "namespace", "name", "process", "run", "interface", "log_level"),
-    *("state", "may_end"),
+    *("state", "may_end", *SUPERVISION_KEYS),
 )
 
 
@@ -390,6 +396,7 @@ def build_node(
             for name, each in cursor.entries("after")
         ),
         timeouts=_timeouts(cursor),
+        supervision=cursor.build(Supervision),
         interface=interface,
         flows=tuple(_flows(cursor)),
         connections=build_connections(cursor, interface, found),

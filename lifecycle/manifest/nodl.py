@@ -355,7 +355,10 @@ def read_interface(
     reading.follow(reference, Path(base), at, ())
     reading.report_collisions()
     interface = Interface(
-        endpoints=tuple(reading.endpoints), parameters=tuple(reading.parameters), source=reference
+        endpoints=tuple(reading.endpoints),
+        parameters=tuple(reading.parameters),
+        source=reference,
+        has_all_parameters=True,
     )
     return interface, tuple(reading.found)
 

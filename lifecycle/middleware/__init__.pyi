@@ -9,6 +9,7 @@ from .discovery.liveliness import node_topic as node_topic
 from .discovery.probe import discovery_peers as discovery_peers
 from .discovery.probe import peers_environment as peers_environment
 from .discovery.rediscovery import call_out as call_out
+from .discovery.rediscovery import introduce as introduce
 from .discovery.rediscovery import republish_names as republish_names
 from .discovery.rediscovery import send_again_soon as send_again_soon
 from .fastdds.dscp import widen_discovery_buffers as widen_discovery_buffers
@@ -30,6 +31,7 @@ from .process.control import check_threads as check_threads
 from .process.control import exit_after as exit_after
 from .process.control import machine_id as machine_id
 from .process.control import no_room_for_threads as no_room_for_threads
+from .process.process_table import note_ended as note_ended
 from .process.shared_memory import Creations as Creations
 from .process.shared_memory import check_room as check_room
 from .process.shared_memory import holds_shared_memory as holds_shared_memory

@@ -18,6 +18,7 @@ import functools
 import hashlib
 import os
 import traceback
+import weakref
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -377,8 +378,18 @@ def _own_endpoint(node: Node, topic: str, kind: EndpointKind, gid: str = "") -> 
     return own[0] if len(own) == 1 else None
 
 
+_GID_PREFIXES: weakref.WeakKeyDictionary[Node, str] = weakref.WeakKeyDictionary()
+
+
 def _gid_prefix(node: Node) -> str:
     """Return the participant's part of the node's GIDs in hex; empty if unknown."""
+    known = _GID_PREFIXES.get(node, "") or _read_gid_prefix(node)
+    if known:
+        _GID_PREFIXES[node] = known
+    return known
+
+
+def _read_gid_prefix(node: Node) -> str:
     for name in ("~/transition_event", "/parameter_events"):
         topic = node.resolve_topic_name(name)
         info = _own_endpoint(node, topic, EndpointKind.PUBLISHER)

@@ -24,6 +24,7 @@ from lifecycle.manifest import (
     DiscoveryRange,
     Endpoint,
     EndpointKind,
+    EndpointPolicy,
     FlowNeeds,
     FlowTerms,
     FlowTransport,
@@ -458,6 +459,8 @@ def _planned_node(
         endpoints=endpoints,
         declared_parameters=node.interface.parameters,
         expected_parameters=files.expected(node),
+        has_all_parameters=node.interface.has_all_parameters
+        and node.endpoints is EndpointPolicy.DECLARED,
         unread_parameter_files=files.unread(node),
         participants=(*connected, *participants),
         endpoint_policy=node.endpoints,

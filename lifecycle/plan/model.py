@@ -230,6 +230,7 @@ class PlannedNode(NodeDeclaration):
         held_by: what holds it until the system is verified.
         expected_parameters: what its parameters must be once it is configured: those declared and
             those given, see lifecycle.plan.parameters.
+        has_all_parameters: it may have no others than those, and those that ROS declares itself.
         unread_parameter_files: those whose values are not known here and so not expected.
         transports: all that the node's own participant may use, UDPV4, UDPV6; empty leaves it
             to the RMW. Nodes of one process share a participant if these and `max_datagram_bytes`
@@ -257,6 +258,7 @@ class PlannedNode(NodeDeclaration):
     membership: bool = False
     files: tuple[PlannedFile, ...] = ()
     expected_parameters: tuple[ExpectedParameter, ...] = ()
+    has_all_parameters: bool = False
     unread_parameter_files: tuple[str, ...] = ()
     held_by: HeldBy = HeldBy.STATE_MACHINE
 

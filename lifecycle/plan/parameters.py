@@ -69,20 +69,22 @@ class ParameterFiles:
 
     def unread(self, node: Node) -> tuple[str, ...]:
         """Return the files of a node whose values are not known here."""
-        named = [path for path, _, _ in _command_line(node) if path]
+        named = [path for path, *_ in _command_line(node) if path]
         files = [self._file(path) for path in (*named, *node.parameter_files)]
         return tuple(each.shown for each in files if not each.is_read)
 
     def _given(self, node: Node) -> dict[str, _Given]:
         name_of_node = f"{node.namespace.rstrip('/')}/{node.name}"
         sections: dict[str, dict[str, _Given]] = {}
-        for path, name, text in (
+        for path, name, text, is_own in (
             *_command_line(node),
-            *((p, "", "") for p in node.parameter_files),
+            *((p, "", "", False) for p in node.parameter_files),
         ):
             if not path:
                 value = _scalar(text)
-                given = _Given(value, COMMAND, optional=False, at=node.at)
+                # What all nodes of a process are given only some of them need have.
+                optional = bool(node.process) and not is_own
+                given = _Given(value, COMMAND, optional=optional, at=node.at)
                 sections.setdefault("/**", {})[name] = given
                 continue
             file = self._file(path)
@@ -147,11 +149,12 @@ def _undeclared(name: str, given: _Given) -> ExpectedParameter | None:
     )
 
 
-def _command_line(node: Node) -> Iterator[tuple[str, str, str]]:
-    """Yield what a node's own command line sets of parameters: (file, "", "") or ("", name, text).
+def _command_line(node: Node) -> Iterator[tuple[str, str, str, bool]]:
+    """Yield what a node's own command line sets of parameters.
 
-    As rcl's parser reads it: between `--ros-args` and `--`, `-p name:=value`, which may begin with
-    the name of a node, and `--params-file`.
+    Each is (file, "", "", False) or ("", name, text, whether it is for this node alone). As rcl's
+    parser reads it: between `--ros-args` and `--`, `-p name:=value`, which may begin with the name
+    of a node, and `--params-file`.
     """
     words = iter(node.run.command)
     for word in words:
@@ -164,10 +167,11 @@ def _command_line(node: Node) -> Iterator[tuple[str, str, str]]:
                 name, separator, text = next(words, "").partition(":=")
                 base, _, alone = name.rpartition(":")
                 if separator and base in ("", node.name):
-                    yield "", alone, text
+                    yield "", alone, text, bool(base)
             elif option == "--params-file":
                 folder = node.run.working_directory or os.curdir
-                yield os.path.abspath(os.path.join(folder, next(words, ""))), "", ""  # noqa: PTH100, PTH118
+                path = os.path.abspath(os.path.join(folder, next(words, "")))  # noqa: PTH100, PTH118
+                yield path, "", "", False
 
 
 def _scalar(text: str) -> ParameterValue | None:

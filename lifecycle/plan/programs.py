@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 from lifecycle.manifest import (
+    Authority,
     Diagnostic,
     Endpoint,
     EndpointKind,
@@ -40,6 +41,7 @@ from lifecycle.plan.python_source import (
 RULE = "program.missing"
 UNHANDLED = "program.handler"
 UNDECLARED = "program.endpoint"
+IMMOVABLE = "program.connection"
 
 _WORDS = {
     EndpointKind.SUBSCRIPTION: ("subscription", "@on_message"),
@@ -95,7 +97,7 @@ def resolve_programs(
         is_ours: whether a machine, by name, is this host; what is missing here of the others is
             unresolved. Code that is found here is judged for them, too.
     """
-    looking = _Looking(environment)
+    looking = _Looking(environment, manifest.data_layer.authority)
     for node in manifest.nodes:
         looking.look(node, is_ours=is_ours(node.machine))
     return Resolution(diagnostics=tuple(looking.found), unresolved=tuple(looking.unresolved))
@@ -106,10 +108,11 @@ _Key = tuple[tuple[str, ...], str]
 
 
 class _Looking:
-    def __init__(self, environment: Mapping[str, str]) -> None:
+    def __init__(self, environment: Mapping[str, str], authority: Authority) -> None:
         self.found: list[Diagnostic] = []
         self.unresolved: list[UnresolvedProgram] = []
         self._environment = environment
+        self._authority = authority
         self._sources: dict[tuple[str, ...], Sources] = {}
         self._classes: dict[_Key, NodeClass | NotThereError | UnknownError] = {}
 
@@ -156,6 +159,8 @@ class _Looking:
             self.found.append(error(RULE, at, message, hint))
         else:
             self.found += _called(node, found, at)
+            if found.is_managed is not None and not found.is_ours and found.is_node:
+                self.found += _immovable(node, found, at, self._authority)
             self._interface(node, found, subject)
 
     def _class(self, node: Node) -> NodeClass | NotThereError | UnknownError:
@@ -266,6 +271,32 @@ def _called(node: Node, found: NodeClass, at: Position) -> Iterator[Diagnostic]:
             f"cannot call {found.name} ({found.file}) without {', '.join(missing)}",
             "give it under 'run: {arguments: …}'",
         )
+
+
+def _immovable(
+    node: Node, found: NodeClass, at: Position, authority: Authority
+) -> Iterator[Diagnostic]:
+    """Yield what is asked of the connections of a node whose endpoints its own code makes."""
+    what = f"{found.name} ({found.file or 'rclpy'})"
+    if authority is Authority.SUPERVISOR and node.managed:
+        yield error(
+            IMMOVABLE,
+            at,
+            f"cannot leave the connections of {node.key!r} to the supervisor: {what} is not "
+            "a lifecycle.LifecycleNode, and makes its endpoints itself",
+            "derive it from lifecycle.LifecycleNode, or use 'data_layer: {authority: nodes}'",
+        )
+    for connection in node.connections:
+        for kind, name in connection.map:
+            if not kind.is_topic:
+                yield error(
+                    IMMOVABLE,
+                    connection.at,
+                    f"cannot map {kind.noun} {name!r} of {node.key!r} to connection "
+                    f"{connection.name!r}: {what} is not a lifecycle.LifecycleNode, and only its "
+                    "topics can be placed",
+                    "derive it from lifecycle.LifecycleNode, or leave it out of 'map'",
+                )
 
 
 def _find_program(word: str, folder: Path, variables: Mapping[str, str]) -> None:

@@ -4,6 +4,7 @@ from .judge import not_ok as not_ok
 from .judge import taken_on_trust as taken_on_trust
 from .judge import verify as verify
 from .matcher import lay_out as lay_out
+from .observation import SERVES_NONE as SERVES_NONE
 from .observation import ConfigurationError as ConfigurationError
 from .observation import EndpointReport as EndpointReport
 from .observation import Identity as Identity
@@ -34,6 +35,7 @@ from .rules.matching import obstacle as obstacle
 from .rules.nodes import MISSING_NODE as MISSING_NODE
 from .rules.nodes import UNATTRIBUTED_ENDPOINT as UNATTRIBUTED_ENDPOINT
 from .rules.run import DEADLINE as DEADLINE
+from .rules.run import GAVE_UP as GAVE_UP
 from .rules.run import NOT_PROGRAMMED as NOT_PROGRAMMED
 from .rules.run import NOT_WIRED as NOT_WIRED
 from .rules.run import PLAN_UNKNOWN as PLAN_UNKNOWN

@@ -192,7 +192,8 @@ def verify(
             brought up elsewhere and may be active before ours. None: all are ours.
         ahead: fully qualified names of nodes that an earlier gate let through, which may be active
             although this one has not opened yet.
-        over: how the process ended of nodes that may end by themselves, by fully qualified name.
+        over: how the process ended of nodes that may end by themselves, by fully qualified name;
+            empty where it is not known whether it has.
     """
     return _verdict(lay_out(plan, observation, stage, machines=machines, ahead=ahead, over=over))
 

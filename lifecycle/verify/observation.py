@@ -243,6 +243,10 @@ def _is_address(text: str) -> bool:
     return True
 
 
+SERVES_NONE = "serves no parameters"
+"""Why nothing is known of the parameters of a node that has no parameter services."""
+
+
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class NodeParameters:
     """What a node's parameter services returned for the parameters that its plan names.

@@ -67,6 +67,14 @@ NODE_SERVICES: Mapping[str, str] = {
 }
 """Services that client libraries offer under a node's own name, `~/get_state`, and their types."""
 
+_CONTAINER = "/_container"
+_CONTAINER_SERVICES: Mapping[str, str] = {
+    "load_node": "composition_interfaces/srv/LoadNode",
+    "unload_node": "composition_interfaces/srv/UnloadNode",
+    "list_nodes": "composition_interfaces/srv/ListNodes",
+}
+"""Services of component containers, `~/_container/load_node` (rclcpp_components)."""
+
 OUR_SERVICES: Mapping[str, str] = {
     "get_configuration": "std_srvs/srv/Trigger",
     "connect_to": "rcl_interfaces/srv/SetParameters",
@@ -254,11 +262,14 @@ def is_noise_endpoint(kind: EndpointKind, node: str, name: str, type_: str, *, o
     if of_observers or (kind, name) in NOISE_TOPICS or _is_service_event(kind, name, type_):
         return True
     owner, _, base = name.rpartition("/")
+    of_container = owner.endswith(_CONTAINER) and _CONTAINER_SERVICES.get(base) == type_
+    if of_container:
+        owner = owner.removesuffix(_CONTAINER)
     offers = kind in (EndpointKind.SERVICE_SERVER, EndpointKind.PUBLISHER)
     if offers and owner != node:
         return False
     if kind in (EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT):
-        if NODE_SERVICES.get(base) == type_:
+        if of_container or NODE_SERVICES.get(base) == type_:
             return True
         return OUR_SERVICES.get(base) == type_ and (ours or not offers)
     return base in NODE_TOPICS

@@ -101,7 +101,8 @@ class Frame:
     Attributes:
         machines: names of the machines whose nodes the caller brings up; None: all.
         ahead: full names of the nodes that an earlier gate let through.
-        over: how they ended, of the nodes whose process has ended as it may, by full name.
+        over: how they ended, of the nodes whose process has ended as it may, by full name; empty
+            where it may have.
         planned: nodes of the plan by full name, in plan order.
         order: their places in it.
         by_key: full names of nodes by their keys.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import gc
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -19,11 +21,12 @@ from lifecycle.cli.report import ReportFile, report_option, written_or_said
 from lifecycle.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from lifecycle.cli.up_output import RunOutput
     from lifecycle.programming import TargetOptions, Treatment
-    from lifecycle.supervisor import UpResult
+    from lifecycle.supervisor import SystemStatus, UpResult
 
 
 @click.command("up", cls=NetworkCommand)
@@ -116,7 +119,11 @@ def command(
     from lifecycle.supervisor import Ended, Ending
 
     try:
-        with Ending() as ending, ReportFile(report, strict=strict) as written:
+        with (
+            _collecting_later() as collect,
+            Ending() as ending,
+            ReportFile(report, strict=strict) as written,
+        ):
             from lifecycle.supervisor import Forerunner
 
             # Its imports and ours, and reading the manifest, take as long as each other: side by
@@ -146,6 +153,10 @@ def command(
                 timed = until if timings else ""
                 with output(format_, timings_until=timed) as listener, ending.noted():
 
+                    def on_start(status: Callable[[], SystemStatus]) -> None:
+                        collect()
+                        listener.watch(status)
+
                     def conclude(result: UpResult) -> ExitCode:
                         return _finished(result, listener, written)
 
@@ -156,7 +167,7 @@ def command(
                             [listener],
                             forerunner=forerunner,
                             ending=ending,
-                            on_start=listener.watch,
+                            on_start=on_start,
                             conclude=conclude,
                         ).exit_code
                     except Ended as ended:
@@ -166,6 +177,24 @@ def command(
     except Ended as ended:
         click.echo(f"ended before anything was started: {ended.reason}", err=True)
         return ended.exit_code
+
+
+@contextlib.contextmanager
+def _collecting_later() -> Iterator[Callable[[], None]]:
+    """Collect no garbage until told to: importing makes next to none, and a lot to look through.
+
+    What is there by then stays until the end, and is not looked through any more.
+    """
+
+    def collect() -> None:
+        gc.freeze()
+        gc.enable()
+
+    gc.disable()
+    try:
+        yield collect
+    finally:
+        gc.enable()
 
 
 def _finished(result: UpResult, listener: RunOutput, written: ReportFile) -> ExitCode:

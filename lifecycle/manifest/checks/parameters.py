@@ -142,7 +142,7 @@ def _given(node: Node) -> Iterator[Diagnostic]:
 
 def _no_effect(node: Node) -> Iterator[Diagnostic]:
     """Warn of values that an attached node is judged by but never given."""
-    if node.run.kind is not RunKind.ATTACH:
+    if node.run.kind is not RunKind.ATTACH or node.run.component:
         return
     own = [f"parameters.{name}" for name, _ in node.parameters]
     places = [(place, "parameters") for place in own if place not in node.shared]

@@ -24,8 +24,6 @@ import struct
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-import psutil
-
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds.dscp import own_udp_socket
 from lifecycle.middleware.fastdds.participant_profile import default_profile
@@ -457,6 +455,8 @@ def addresses_of(kind: Medium, *, loopback: bool = False) -> dict[str, tuple[str
 
     Link-local ones of IPv6 mean nothing to others without an interface of theirs.
     """
+    import psutil
+
     found = {}
     for name, entries in sorted(psutil.net_if_addrs().items()):
         texts = [each.address for each in entries if each.family is kind.socket_family]

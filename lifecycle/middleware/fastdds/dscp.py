@@ -21,9 +21,9 @@ import ipaddress
 import os
 import socket
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 
 from lifecycle.errors import MiddlewareError
+from lifecycle.middleware.process.shared_memory import open_files
 from lifecycle.network import (
     DG,
     InternetProtocol,
@@ -105,12 +105,7 @@ def own_udp_socket(family: int, port: int) -> socket.socket | None:
 
 def socket_descriptors() -> list[int]:
     """Return the descriptors of this process that are sockets."""
-    numbers = []
-    for entry in Path("/proc/self/fd").iterdir():
-        with contextlib.suppress(OSError):
-            if str(entry.readlink()).startswith("socket:"):
-                numbers.append(int(entry.name))
-    return numbers
+    return [number for number, to in open_files() if to.startswith("socket:")]
 
 
 _DISCOVERY_BYTES = 1 << 22

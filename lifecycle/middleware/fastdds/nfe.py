@@ -32,6 +32,7 @@ from rclpy.validate_topic_name import validate_topic_name
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest import QosProfile
+from lifecycle.middleware.fastdds.settings import noted_shared_memory
 from lifecycle.middleware.rcl import abi
 from lifecycle.middleware.rcl.hidden_node import is_moved
 from lifecycle.middleware.rcl.qos import to_rclpy
@@ -99,6 +100,8 @@ def has_shared_memory(node: Node) -> bool:
     existing = next((each for each in node.subscriptions if not is_moved(each)), None)
     if existing is not None:
         return _listens_on_shared_memory(existing)
+    if (noted := noted_shared_memory(node.context)) is not None:
+        return noted
     probe = node.create_subscription(
         ParameterEvent,
         "/parameter_events",

@@ -5,7 +5,7 @@ reads them. Must not import rclpy.
 
 Fast DDS announces a new participant five times at 100 ms and then once each 3 s; when those five
 are lost or arrive too early, discovery stalls in steps of 3 s. Announcements for 2 s remove the
-stall. Each goes to every participant that is known already, so there are twenty at 100 ms. The
+stall. Each goes to every participant that is known already, so there are ten at 200 ms. The
 environment is used, not Fast DDS's C++ API: the children of a supervisor, whatever they are written
 in, inherit it.
 """
@@ -30,7 +30,7 @@ _FILE_NAME = "quick_discovery.xml"
 
 
 def discovery_profile(
-    *, announcements: int = 20, period_ms: int = 100, peers: Iterable[tuple[str, int]] = ()
+    *, announcements: int = 10, period_ms: int = 200, peers: Iterable[tuple[str, int]] = ()
 ) -> str:
     """Return the profile as XML, a default participant profile that only sets discovery.
 

@@ -25,6 +25,7 @@ import functools
 import hashlib
 import os
 import threading
+import weakref
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -45,6 +46,7 @@ from lifecycle.middleware.fastdds.url_check import (
     check_sockets,
     open_sockets,
 )
+from lifecycle.middleware.process.shared_memory import has_shared_memory_open
 from lifecycle.middleware.rcl import abi
 
 _LIBRARY = "libfastrtps.so.2.14"
@@ -345,13 +347,26 @@ _RMW = "rmw_fastrtps_cpp"
 _SERVER_VARIABLE = "ROS_DISCOVERY_SERVER"
 
 
+_SHARED_MEMORY_OF: weakref.WeakKeyDictionary[Context, bool] = weakref.WeakKeyDictionary()
+
+
+def noted_shared_memory(context: Context) -> bool | None:
+    """Return whether the participant of a context has it, where that was seen when it was made.
+
+    To ask for it costs a subscription, which is announced to everybody and taken back.
+    """
+    return _SHARED_MEMORY_OF.get(context)
+
+
 @contextlib.contextmanager
-def once_participant_is_made(call: Callable[[], None]) -> Iterator[None]:
+def once_participant_is_made(context: Context, call: Callable[[], None]) -> Iterator[None]:
     """Call this when the next node's participant is there, and nothing of the node but its name.
 
-    rclpy makes services, publishers and subscriptions of a node after rcl has made the node.
+    rclpy makes services, publishers and subscriptions of a node after rcl has made the node. Where
+    it is this process's first participant, what it opens shows whether it has shared memory.
 
     Args:
+        context: of that node.
         call: blocks the constructor of the first node that is made in the block, in its thread.
     """
     library = rclpy.node._rclpy  # noqa: SLF001 - there is no other moment
@@ -359,7 +374,11 @@ def once_participant_is_made(call: Callable[[], None]) -> Iterator[None]:
 
     def make(*args: Any, **kwargs: Any) -> Any:
         library.Node = made
+        before = has_shared_memory_open()
         node = made(*args, **kwargs)
+        its = any(each is context.handle for each in args)
+        if its and not before and get_rmw_implementation_identifier() == _RMW:
+            _SHARED_MEMORY_OF[context] = has_shared_memory_open()
         call()
         return node
 

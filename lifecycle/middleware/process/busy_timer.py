@@ -93,6 +93,7 @@ class BusySign:
         self._thread = 0
         self._turns = -1
         self._looked: tuple[int, _Turns] | None = None
+        self._of_process = False
         self._set_time = _set_time()
 
     @classmethod
@@ -130,10 +131,14 @@ class BusySign:
 
     # The holder's side.
 
-    def begin(self) -> None:
-        """Be busy from now on."""
+    def speak_for_process(self) -> None:
+        """Be busy for all threads: what any of them waited for a processor is not its own time."""
+        self._of_process = True
+
+    def begin(self, after_s: float = 0.0) -> None:
+        """Be busy from now on, or from so many seconds on unless `begin` or `end` comes before."""
         words = self._words
-        words[_SINCE] = time.monotonic_ns()
+        words[_SINCE] = time.monotonic_ns() + round(after_s * _NS)
         # Read anew, after the page says busy: a watcher that the timer wakes must see it.
         now = time.monotonic_ns()
         if now >= self._armed_until:
@@ -218,6 +223,11 @@ class BusySign:
 
     def _note_turns(self) -> None:
         """Write into the page who the holder is, and for how long it has waited for processors."""
+        if self._of_process:
+            self._words[_THREAD] = -os.getpid()
+            turns = _turns_of(-os.getpid(), 0)
+            self._words[_DELAY] = turns.waited_ns if turns else 0
+            return
         thread = threading.get_native_id()
         if thread != self._thread:
             self._thread = thread
@@ -238,7 +248,18 @@ class BusySign:
 
 
 def _turns_of(thread: int, now: int) -> _Turns | None:
-    """Read what a thread of this host had of the processors; None where that is not known."""
+    """Read what a thread of this host had of the processors; None where that is not known.
+
+    Of a process, a negative pid, it is what all of its threads waited together.
+    """
+    if thread < 0:
+        folder = Path(f"/proc/{-thread}/task")
+        try:
+            every = [_turns_of(int(each.name), now) for each in folder.iterdir()]
+        except OSError:
+            return None
+        waited = sum(each.waited_ns for each in every if each is not None)
+        return _Turns(at_ns=now, ran_ns=0, waited_ns=waited, ready=False)
     try:
         counted = Path(f"/proc/{thread}/schedstat").read_bytes().split()
         state = Path(f"/proc/{thread}/stat").read_bytes().rpartition(b")")[2].split()[0]

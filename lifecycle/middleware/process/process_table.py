@@ -6,6 +6,7 @@ environment variables matter to who starts it again. Reads /proc, and runs nothi
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import re
 import shutil
@@ -100,6 +101,19 @@ def read_program(pid: int, environment: Mapping[str, str]) -> CapturedProgram | 
         ),
         withheld=withheld,
     )
+
+
+def note_ended(
+    programs: Mapping[str, Mapping[str, CapturedProgram]],
+) -> dict[str, dict[str, CapturedProgram]]:
+    """Return what `GraphObserver.programs` did, with those noted that have ended since."""
+    return {
+        name: {
+            prefix: dataclasses.replace(each, has_ended=not _speaks_ros(each.process_id))
+            for prefix, each in found.items()
+        }
+        for name, found in programs.items()
+    }
 
 
 def _variables(block: bytes) -> dict[str, str]:

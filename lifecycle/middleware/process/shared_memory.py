@@ -58,11 +58,24 @@ def holds_shared_memory() -> bool:
     Fast DDS removes these when it is unloaded; a process that ends before that leaves them.
     """
     found = Path("/proc/self/maps").read_text(encoding="utf-8", errors="replace").splitlines()
-    for entry in Path("/proc/self/fd").iterdir():
-        with contextlib.suppress(OSError):  # closed since
-            found.append(str(entry.readlink()))
+    found += [to for _, to in open_files()]
     own = f"{_DIRECTORY}/"
     return any(own in line and "fastrtps_" in line and "(deleted)" not in line for line in found)
+
+
+def open_files() -> list[tuple[int, str]]:
+    """Return the descriptors of this process and what proc(5) says they are open to."""
+    found = []
+    for name in os.listdir("/proc/self/fd"):  # noqa: PTH208 - hot loop
+        with contextlib.suppress(OSError):  # closed since
+            found.append((int(name), os.readlink(f"/proc/self/fd/{name}")))  # noqa: PTH115
+    return found
+
+
+def has_shared_memory_open() -> bool:
+    """Return whether a participant of this process has a shared memory transport."""
+    own = f"{_DIRECTORY}/fastrtps_"
+    return any(to.startswith(own) for _, to in open_files())
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import ctypes
 import functools
-import importlib.metadata
 import re
+import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from lifecycle.errors import MiddlewareError
@@ -264,6 +265,16 @@ def load() -> Rcl:
 
 def rcl_version() -> str:
     """Return the version of rcl: of its wheel, else of its ament package; empty if unknown."""
+    # By the name that an installed wheel's directory has; importing importlib.metadata and reading
+    # what it reads takes 20 ms, in the supervisor and in each node that is started alone.
+    for entry in sys.path:
+        found = [*Path(entry or ".").glob("ros_rcl-*.dist-info")]
+        if len(found) == 1:
+            return found[0].name.removeprefix("ros_rcl-").removesuffix(".dist-info")
+        if found:
+            break
+    import importlib.metadata
+
     try:
         return importlib.metadata.version("ros-rcl")
     except importlib.metadata.PackageNotFoundError:

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import asyncio
 import importlib
-from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Collection, Sequence
+from typing import TYPE_CHECKING, Any
 
 from lifecycle_msgs.msg import TransitionEvent
 from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
@@ -21,18 +22,19 @@ from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.export import CapturedParameter
-from lifecycle.manifest import ParameterValue as GivenValue
 from lifecycle.middleware.rcl.graph import GraphObserver
 from lifecycle.middleware.services.parameters import read_parameters, report_parameters
 from lifecycle.middleware.services.service_calls import ServiceCalls, ServiceUnansweredError
-from lifecycle.plan import PlannedNode
+from lifecycle.plan import COMMAND, DEFAULT, NOT_FINITE, PlannedNode
 from lifecycle.verify import (
     ConfigurationError,
     NodeConfiguration,
     ParameterReport,
     decode_configuration,
 )
+
+if TYPE_CHECKING:
+    from lifecycle.export import CapturedParameter
 
 TIMEOUT_S = 5.0
 """For services that answer at once; a transition takes as long as the node's callback does."""
@@ -197,7 +199,7 @@ class NodeClients:
 
     async def load_component(
         self, node: PlannedNode, container: str, *, timeout_s: float = TIMEOUT_S
-    ) -> None:
+    ) -> Callable[[], Awaitable[None]]:
         """Have a component container load a node (composition_interfaces/srv/LoadNode).
 
         Args:
@@ -205,12 +207,15 @@ class NodeClients:
             container: full name of the container's node.
             timeout_s: seconds, > 0.
 
+        Returns:
+            What has the container unload it again; raises as this does.
+
         Raises:
             ServiceUnansweredError: no such container, or no answer.
             MiddlewareError: composition_interfaces is not installed, or the container refuses.
         """
         try:
-            load_node = importlib.import_module("composition_interfaces.srv").LoadNode
+            services = importlib.import_module("composition_interfaces.srv")
         except ImportError as error:
             raise MiddlewareError(
                 f"cannot load {node.run.component!r} into {container!r}: composition_interfaces is "
@@ -218,7 +223,7 @@ class NodeClients:
                 hint="install it, or start the node as a command",
             ) from error
         package, _, plugin = node.run.component.partition("/")
-        request = load_node.Request(
+        request = services.LoadNode.Request(
             package_name=package,
             plugin_name=plugin,
             node_name=node.name,
@@ -226,12 +231,12 @@ class NodeClients:
             remap_rules=[f"{source}:={target}" for source, target in node.remap],
             parameters=[
                 RclpyParameter(name, value=value).to_parameter_msg()
-                for name, value in node.parameters
+                for name, value in _given_values(node).items()
             ],
         )
         response = await self._calls.call(
             f"{container}/_container/load_node",
-            load_node,
+            services.LoadNode,
             request,
             timeout_s=timeout_s,
             repeat=False,
@@ -241,16 +246,35 @@ class NodeClients:
                 f"cannot load {node.run.component!r} into {container!r}: "
                 f"it says {response.error_message!r}"
             )
+        number = response.unique_id
 
-    async def give_parameters(
-        self, node: str, values: Mapping[str, GivenValue], *, timeout_s: float = TIMEOUT_S
-    ) -> None:
-        """Set those parameters of `node` that it has with another value.
+        async def unload() -> None:
+            answer = await self._calls.call(
+                f"{container}/_container/unload_node",
+                services.UnloadNode,
+                services.UnloadNode.Request(unique_id=number),
+                timeout_s=timeout_s,
+                repeat=False,
+            )
+            if not answer.success:
+                raise MiddlewareError(
+                    f"cannot unload {node.full_name!r} from {container!r}: "
+                    f"it says {answer.error_message!r}"
+                )
+
+        return unload
+
+    async def give_parameters(self, planned: PlannedNode, *, timeout_s: float = TIMEOUT_S) -> None:
+        """Set the parameters that a running node has with other values than its plan gives it.
 
         Raises:
             ServiceUnansweredError: the node serves no parameters, or did not answer.
             MiddlewareError: it refuses a value, with its reason.
         """
+        values = _given_values(planned)
+        if not values:
+            return
+        node = planned.full_name
         has = {each.name: each.value for each in await self.get_parameters(node)}
         wanted = {name: value for name, value in values.items() if has.get(name, value) != value}
         if not wanted:
@@ -274,9 +298,9 @@ class NodeClients:
                 )
 
     async def report_parameters(
-        self, node: str, names: Collection[str], *, timeout_s: float = TIMEOUT_S
+        self, node: str, names: Collection[str] | None, *, timeout_s: float = TIMEOUT_S
     ) -> tuple[ParameterReport, ...]:
-        """Read those parameters of `node` that are named and that it has.
+        """Read those parameters of `node` that are named and that it has; None reads all.
 
         Raises:
             ServiceUnansweredError: the node serves no parameters, or did not answer.
@@ -419,3 +443,18 @@ class NodeClients:
             return await self.get_state(node, timeout_s=_REREAD_S) == goal
         except ServiceUnansweredError:
             return False
+
+
+def _given_values(node: PlannedNode) -> dict[str, Any]:
+    """Return what a plan gives a node's parameters, as rclpy has it, but by its command line."""
+    return {
+        each.name: _not_finite(each.value) if each.type.startswith("double") else each.value
+        for each in node.expected_parameters
+        if each.value is not None and each.source not in (DEFAULT, COMMAND)
+    }
+
+
+def _not_finite(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return tuple(map(_not_finite, value))
+    return float(value.replace(".", "")) if value in NOT_FINITE else value

@@ -63,7 +63,7 @@ async def read_parameters(
 
 
 async def report_parameters(
-    calls: ServiceCalls, node: str, names: Collection[str], *, timeout_s: float
+    calls: ServiceCalls, node: str, names: Collection[str] | None, *, timeout_s: float
 ) -> tuple[ParameterReport, ...]:
     """Read those parameters of a node that are named and that it has; as `read_parameters`."""
     return tuple(

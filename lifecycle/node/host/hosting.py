@@ -25,6 +25,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from lifecycle import codec
 from lifecycle.errors import LifecycleError
+from lifecycle.manifest import Executor
 from lifecycle.middleware import (
     BusySign,
     ParticipantSettings,
@@ -46,7 +47,7 @@ from lifecycle.node.host.control import (
     report_failure,
 )
 from lifecycle.node.host.foreign import Adoption, ForeignNode, Hosted, refuse_unmanaged
-from lifecycle.node.host.loop import NodeLoop, Watchdog, on_signal
+from lifecycle.node.host.loop import NodeLoop, Prober, Watchdog, on_signal
 from lifecycle.node.lifecycle.machine import CallbackOutcome
 from lifecycle.plan import PlannedNode
 from lifecycle.verify import NodeConfiguration
@@ -227,11 +228,12 @@ class Host:
         self._spec = spec
         self._context = context
         self._channel = channel
-        watchdog = None
+        run = spec.nodes[0].run
+        watchdog: Watchdog | Prober | None = None
         if channel.descriptors:
             sign = BusySign(*channel.descriptors)
-            watchdog = Watchdog(sign, lambda _: channel.write(Event(kind="beat")))
-        run = spec.nodes[0].run
+            kind = Watchdog if run.executor is Executor.SINGLE else Prober
+            watchdog = kind(sign, lambda _: channel.write(Event(kind="beat")))
         self._loop = NodeLoop(context, watchdog, executor=run.executor, threads=run.threads)
         self._lock = threading.Lock()
         self._imports = False
@@ -265,7 +267,9 @@ class Host:
                     maker = self._import(planned)
                     with contextlib.ExitStack() as stack:
                         if first:
-                            stack.enter_context(once_participant_is_made(self._gather))
+                            stack.enter_context(
+                                once_participant_is_made(self._context, self._gather)
+                            )
                         self._construct(planned, maker)
                 except Exception as error:  # noqa: BLE001 - reported to the supervisor
                     failure = error

@@ -143,7 +143,7 @@ class BringUp:
         appears: waits until a node of this name is in the graph.
         recorded: called after each spawn, to keep the record of children true.
         gives: sets the parameters of a running node that its command line does not give it.
-        loads: has the container of this full name load a node.
+        loads: has the container of this full name load a node, and returns what unloads it.
         wirer: wires each node between its configure and its connect; None leaves it to the nodes.
     """
 
@@ -157,7 +157,7 @@ class BringUp:
         recorded: Callable[[], None],
         wirer: Wirer | None = None,
         gives: Callable[[PlannedNode], Awaitable[None]] | None = None,
-        loads: Callable[[PlannedNode, str], Awaitable[None]] | None = None,
+        loads: Callable[[PlannedNode, str], Awaitable[Callable[[], Awaitable[None]]]] | None = None,
     ) -> None:
         self._gives = gives
         self._loads = loads
@@ -324,6 +324,12 @@ class BringUp:
             self._step_over.set()
 
     async def _walk(self, node: NodeRun) -> None:
+        """Bring a node as far as its gate, from where it is."""
+        if not node.is_up:
+            await self._walk_on(node)
+            node.is_up = True
+
+    async def _walk_on(self, node: NodeRun) -> None:
         await self._start(node)
         if node.planned.managed:
             await self._connect(node)
@@ -344,6 +350,7 @@ class BringUp:
             self._appearing.append(asyncio.ensure_future(self._appear(node)))
 
     async def _appear(self, node: NodeRun) -> None:
+        process = node.process
         appears = asyncio.ensure_future(self._appears(node.name))
         waits: set[asyncio.Future[Any]] = {appears}
         if node.process is not None:
@@ -354,7 +361,9 @@ class BringUp:
             await ended(appears)
         if appears.done() and not appears.cancelled():
             appears.result()
-        self._started(node)
+        # Who is started again meanwhile has another process, and is waited for anew.
+        if node.process is process and (process is None or not process.died):
+            self._started(node)
 
     async def _load(self, node: NodeRun) -> None:
         """Have its container load a component, once that runs."""
@@ -368,7 +377,7 @@ class BringUp:
             return
         full_name = name if container is None else container.name
         try:
-            await self._loads(node.planned, full_name)
+            node.unload = await self._loads(node.planned, full_name)
         except MiddlewareError as error:
             message = f"{error.message}; {error.hint}" if error.hint else error.message
             raise StepFailedError(message, rule=START_FAILED, subject=node.name) from error
@@ -403,16 +412,18 @@ class BringUp:
 
     async def _connect(self, node: NodeRun) -> None:
         assert node.driver is not None
-        node.doing = "starting"
-        limit_s = node.planned.timeouts.start_s
-        standing = await self._step(node, node.driver.start(), limit_s, rule=START_FAILED)
-        self._started(node, standing)
-        await self._give(node)
+        if node.reach is Reach.WAITING:
+            node.doing = "starting"
+            limit_s = node.planned.timeouts.start_s
+            standing = await self._step(node, node.driver.start(), limit_s, rule=START_FAILED)
+            self._started(node, standing)
+            await self._give(node)
         if node.planned.state is TargetState.UNCONFIGURED:
             return
-        await self._system.reached(node, Condition.CONFIGURED, "configure")
-        await self._operate(node, Operation.CONFIGURE, Reach.CONFIGURED)
-        await self._give(node)
+        if node.reach is Reach.STARTED:
+            await self._system.reached(node, Condition.CONFIGURED, "configure")
+            await self._operate(node, Operation.CONFIGURE, Reach.CONFIGURED)
+            await self._give(node)
         await self._system.reached(node, Condition.CONNECTED, "connect")
         if self._wirer is not None:
             await self._wirer.ready(node)
@@ -461,6 +472,8 @@ class BringUp:
 
     async def _start(self, node: NodeRun) -> None:
         """Have the node's process started, or find a node that others start."""
+        if node.driver is not None:
+            return  # it went on from here before another's failure had it wait
         process = node.process
         if process is None:
             await self._hold_start(node)

@@ -7,10 +7,10 @@ and nowhere else in this room.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Awaitable, Callable, Iterable
 from typing import TYPE_CHECKING
 
-from lifecycle.plan import COMMAND, DEFAULT, ParticipantConnections, Plan, PlannedNode
+from lifecycle.plan import ParticipantConnections, Plan, PlannedNode
 from lifecycle.supervisor.health.peer_supervisors import Listener
 from lifecycle.supervisor.nodes.driver import NodeDriver, NodeInterfaceClient, ServiceDriver
 from lifecycle.verify import NodeConfiguration, Observation
@@ -90,18 +90,16 @@ class ObserverParticipant:
         Raises:
             MiddlewareError: it does not answer, or refuses.
         """
-        values = {
-            each.name: each.value
-            for each in node.expected_parameters
-            if each.value is not None and each.source not in (DEFAULT, COMMAND)
-        }
-        if values:
-            await self._graph.clients.give_parameters(node.full_name, values)
+        await self._graph.clients.give_parameters(node)
 
-    async def load(self, node: PlannedNode, container: str) -> None:
-        """Have a component container load a node; raises MiddlewareError with the reason."""
+    async def load(self, node: PlannedNode, container: str) -> Callable[[], Awaitable[None]]:
+        """Have a component container load a node; return what unloads it.
+
+        Raises:
+            MiddlewareError: with the reason; so does what unloads.
+        """
         limit_s = node.timeouts.start_s
-        await self._graph.clients.load_component(node, container, timeout_s=limit_s)
+        return await self._graph.clients.load_component(node, container, timeout_s=limit_s)
 
     async def observe(self, plan: Plan) -> Observation:
         """Return what is there now."""
@@ -167,6 +165,13 @@ class ObserverParticipant:
         from lifecycle.middleware import call_out
 
         call_out(self._graph.discovery.domain_id, self._graph.discovery.urls, addresses, os.environ)
+
+    def introduce(self, newcomers: Iterable[int], pids: Iterable[int]) -> None:
+        """Have new participants discovered by, and discover, those that were there before."""
+        from lifecycle.middleware import introduce
+
+        discovery = self._graph.discovery
+        introduce(newcomers, discovery.domain_id, discovery.urls, os.environ, pids)
 
     def send_again_soon(self) -> None:
         """Have what waits for a link to come back be sent soon when it does."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import dataclasses
-from collections.abc import Collection, Iterable
+from collections.abc import Awaitable, Callable, Collection, Iterable
 from pathlib import Path
 from typing import Protocol
 
@@ -252,6 +252,8 @@ class NodeRun:
         stuck: an operation on it was given up: a polite request would wait behind it.
         connections: names of what the authority connected it to, oldest first.
         reports_changes: its host reports unasked when its configuration changes.
+        unload: has its container unload a component; None for what is not loaded into one.
+        is_up: it was started and brought as far as its gate; cleared when it goes down.
     """
 
     def __init__(self, planned: PlannedNode, emit: Emitter) -> None:
@@ -267,6 +269,8 @@ class NodeRun:
         self.stuck = False
         self.connections: tuple[str, ...] = ()
         self.reports_changes = False
+        self.unload: Callable[[], Awaitable[None]] | None = None
+        self.is_up = False
         self.changed = asyncio.Event()
         self._emit = emit
 
@@ -279,6 +283,8 @@ class NodeRun:
         self.stuck = False
         self.connections = ()
         self.reports_changes = False
+        self.unload = None
+        self.is_up = False
         self.doing = ""
         self.connected = False
         self.state = ""
@@ -493,6 +499,7 @@ class System:
             old = node.process
             if old is not None and old.name not in processes:
                 processes[old.name] = self._process(old.planned)
+                processes[old.name].is_restarted = True
             node.renew(None if old is None else processes[old.name])
         self.processes.update(processes)
 
@@ -504,7 +511,7 @@ class System:
     def living(self) -> tuple[ManagedProcess, ...]:
         """Every process that was started and has not ended, the discovery server included."""
         every = (*self.processes.values(), *(() if self.server is None else (self.server,)))
-        return tuple(each for each in every if each.pid and each.state is not ProcessState.EXITED)
+        return tuple(each for each in every if each.pid and not each.is_gone)
 
     def output_positions(self) -> dict[str, int]:
         """Return how many bytes the log file of each process has."""
@@ -522,7 +529,7 @@ class System:
         return frozenset(
             node.name
             for node in self.nodes.values()
-            if node.process is not None and node.process.state is ProcessState.EXITED
+            if node.process is not None and node.process.is_gone
         )
 
     def on_host_event(self, event: HostEvent) -> None:
@@ -567,7 +574,8 @@ class System:
         return tuple(
             node
             for node in self.nodes.values()
-            if any(after.node == key for after in node.planned.after)
+            if node.planned.run.container == key
+            or any(after.node == key for after in node.planned.after)
         )
 
     async def refresh(self, observer: ObservedGraph) -> None:

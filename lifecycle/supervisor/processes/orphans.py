@@ -18,8 +18,6 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Protocol
 
-import psutil
-
 from lifecycle.middleware import segments_of
 from lifecycle.run_directory import (
     OWN_CHILD,
@@ -136,16 +134,22 @@ def children() -> frozenset[int]:
     except OSError:
         found = []  # a thread that has just ended
     if not found:  # or a kernel without CONFIG_PROC_CHILDREN
-        return frozenset(each.pid for each in psutil.Process().children())
+        return frozenset(_children().get(os.getpid(), ()))
     return frozenset(int(pid) for text in found for pid in text.split())
 
 
 def descendants(pid: int) -> tuple[int, ...]:
     """Return the pids of everything that descends from a process; nothing once it has ended."""
-    try:
-        return tuple(each.pid for each in psutil.Process(pid).children(recursive=True))
-    except psutil.NoSuchProcess:
-        return ()
+    return tuple(Lineage().of(pid) - {pid})
+
+
+def _children() -> dict[int, list[int]]:
+    """Return the pids of the children of every process that has any."""
+    found: dict[int, list[int]] = {}
+    for entry in os.listdir("/proc"):  # noqa: PTH208 - hot loop
+        if entry.isdigit() and (parent := parent_of(int(entry))) is not None:
+            found.setdefault(parent, []).append(int(entry))
+    return found
 
 
 class Lineage:
@@ -160,10 +164,7 @@ class Lineage:
     def of(self, pid: int) -> set[int]:
         """Return a process and all that descends from it."""
         if time.monotonic() - self._read_s > self.FRESH_S:
-            self._children = {}
-            for entry in os.listdir("/proc"):  # noqa: PTH208 - hot loop
-                if entry.isdigit() and (parent := parent_of(int(entry))) is not None:
-                    self._children.setdefault(parent, []).append(int(entry))
+            self._children = _children()
             self._read_s = time.monotonic()
         found: set[int] = set()
         left = [pid]

@@ -23,13 +23,14 @@ from lifecycle.export import (
     CapturedParameter,
     CapturedSystem,
     Picture,
+    Programs,
     Supervised,
     build_picture,
     capture,
 )
 from lifecycle.graph import Look, set_within
 from lifecycle.manifest import DiscoveryRange, EndpointPolicy
-from lifecycle.middleware import peers_environment
+from lifecycle.middleware import note_ended, peers_environment
 from lifecycle.plan import Plan, reached_hosts
 from lifecycle.run_directory import is_held, run_name, running, runtime_root
 from lifecycle.supervisor.connections.negotiation import Expectation, is_negotiated
@@ -201,13 +202,21 @@ def _reported_to_supervisors(plan: Plan) -> tuple[NodeConfiguration, ...]:
 
 async def _see(plan: Plan, observer_participant: ObserverParticipant) -> JudgedSystem:
     observation = await observer_participant.observe(plan)
+    return _judged(plan, observation, observer_participant.rmw)
+
+
+def _judged(
+    plan: Plan, observation: Observation, rmw: str, *, may_be_over: bool = True
+) -> JudgedSystem:
+    """Judge what was seen; of a node that may end by itself and is not there, it may have ended."""
     expected = Expectation.of(plan, observation)
-    verdict = verify(expected.plan, observation, stage=Stage.ACTIVE)
+    over = {each.full_name: "" for each in expected.plan.nodes if each.may_end and may_be_over}
+    verdict = verify(expected.plan, observation, stage=Stage.ACTIVE, over=over)
     return JudgedSystem(
         plan=expected.plan,
         observation=observation,
         verdict=with_findings(verdict, expected.findings),
-        rmw=observer_participant.rmw,
+        rmw=rmw,
     )
 
 
@@ -222,13 +231,15 @@ async def _judge(
     loop = asyncio.get_running_loop()
     began = loop.time()
     while True:
-        seen = await _see(plan, observer_participant)
+        observation = await observer_participant.observe(plan)
+        # One that is not there may be yet to come.
+        seen = _judged(plan, observation, observer_participant.rmw, may_be_over=False)
         limit_s = timeout_s
         if empty_graph_s is not None and seen.where:
             limit_s = min(empty_graph_s, timeout_s)
         left_s = began + limit_s - loop.time()
         if left_s <= 0 or not _worth_waiting(seen.verdict, strict=strict):
-            return seen
+            return _judged(plan, observation, observer_participant.rmw)
         await _change(observer_participant, min(left_s, _ASK_AGAIN_S))
 
 
@@ -321,7 +332,8 @@ def _supervised(status: SystemStatus) -> dict[str, Supervised]:
     return {
         each.node: Supervised(
             pid=each.pid,
-            dead=each.process_state is ProcessState.EXITED and each.reach is not Reach.STOPPED,
+            dead=each.process_state is ProcessState.BACKOFF
+            or (each.process_state is ProcessState.EXITED and each.reach is not Reach.STOPPED),
             silent=bool(each.silent),
             doing=each.doing or each.silent,
         )
@@ -370,8 +382,9 @@ def capture_running(
     os.environ["ROS_DOMAIN_ID"] = str(domain_id)
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = discovery_range.name
     with Graph.in_loop(domain_id) as graph:
-        observation, parameters, unsettled = asyncio.run(_look(graph, wait_s))
-        programs = {} if attach else graph.discovery.programs(environment)
+        observation, parameters, unsettled, programs = asyncio.run(
+            _look(graph, wait_s, None if attach else environment)
+        )
     return capture(
         observation,
         parameters,
@@ -387,8 +400,12 @@ def capture_running(
 _Parameters = dict[str, "tuple[CapturedParameter, ...] | None"]
 
 
-async def _look(graph: Graph, wait_s: float) -> tuple[Observation, _Parameters, str]:
+async def _look(
+    graph: Graph, wait_s: float, environment: Mapping[str, str] | None
+) -> tuple[Observation, _Parameters, str, Programs]:
     (nodes, endpoints), unsettled = await _settled(graph.discovery, wait_s)
+    # Before anything is asked: a program may end meanwhile.
+    programs = {} if environment is None else graph.discovery.programs(environment)
     serving = {
         node.full_name
         for node in nodes
@@ -411,7 +428,7 @@ async def _look(graph: Graph, wait_s: float) -> tuple[Observation, _Parameters, 
     parameters = {
         name: each for name, (_, _, each) in zip(names, answers, strict=True) if name in serving
     }
-    return graph.state.observation(), parameters, unsettled
+    return graph.state.observation(), parameters, unsettled, note_ended(programs)
 
 
 async def _settled(graph: GraphObserver, wait_s: float) -> tuple[Snapshot, str]:

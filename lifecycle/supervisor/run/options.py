@@ -13,8 +13,6 @@ import socket
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
-import psutil
-
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest import Machine, Manifest
 from lifecycle.network import Peer, parse
@@ -113,7 +111,7 @@ def own_machines(plan: Plan | Manifest, machine: str) -> frozenset[str]:
                 f"declared: {allowed}"
             )
         return frozenset({machine})
-    own = _own_addresses()
+    own = _own_addresses() if any(each.address for each in plan.machines) else set[str]()
     return frozenset({"", *(each.name for each in plan.machines if _is_local(each, own))})
 
 
@@ -196,6 +194,8 @@ def _tcp_listeners(urls: Iterable[str]) -> Iterator[Peer]:
 
 
 def _own_addresses() -> set[str]:
+    import psutil
+
     return {
         address.address.partition("%")[0]
         for addresses in psutil.net_if_addrs().values()

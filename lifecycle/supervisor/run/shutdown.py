@@ -7,10 +7,10 @@ run and to roll back one that failed. Must not import rclpy.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Coroutine, Iterable
+from collections.abc import Awaitable, Callable, Coroutine, Iterable
 from typing import Any
 
-from lifecycle.errors import BringUpError
+from lifecycle.errors import BringUpError, MiddlewareError
 from lifecycle.manifest import RunKind
 from lifecycle.node import Operation
 from lifecycle.supervisor.connections.desired_state import Step
@@ -77,11 +77,24 @@ class TakeDown:
             for dependent in self._system.dependents(key):
                 await self._polite[dependent.planned.key].wait()
             await self._undo(node)
+            await self._unload(node)
             if not node.planned.managed and node.process is not None:
                 # All there is to undo is the process itself.
                 await self._end(node.process)
         finally:
             self._polite[key].set()
+
+    async def _unload(self, node: NodeRun) -> None:
+        """Have its container unload a component; one that ends now takes it along."""
+        if node.unload is None:
+            return
+        container = node.planned.run.container
+        ends = container in self._nodes and self._nodes[container].process is not None
+        if not ends and not self._hurry.is_set():
+            what, limit_s = f"unload {node.name!r}", node.planned.timeouts.cleanup_s
+            await self._bounded(node, _unload(node.unload), what, limit_s)
+        node.unload = None
+        node.advance(Reach.STOPPED)
 
     async def _process(self, process: ManagedProcess) -> None:
         for key in process.planned.nodes:
@@ -177,6 +190,13 @@ class TakeDown:
             self._emit(Notice(message=f"process {process.name!r} had to be ended with {needed}"))
 
 
+async def _unload(unload: Callable[[], Awaitable[None]]) -> None:
+    try:
+        await unload()
+    except MiddlewareError as error:
+        raise BringUpError(error.message) from error
+
+
 def _applies(operation: Operation, node: NodeRun) -> bool:
     """Whether there is something to undo in the state that the node is in; it may have failed."""
     return {
@@ -188,4 +208,4 @@ def _applies(operation: Operation, node: NodeRun) -> bool:
 
 
 def _gone(node: NodeRun) -> bool:
-    return node.process is not None and node.process.state is ProcessState.EXITED
+    return node.process is not None and node.process.is_gone

@@ -70,8 +70,10 @@ def _missing(view: View) -> Iterator[Finding]:
                 Outcome.UNVERIFIABLE,
                 node,
                 expected="node in the graph, or ended by itself",
-                observed=view.over[name],
-                message=f"cannot verify node {name}: it has ended by itself, as it may",
+                observed=view.over[name] or "no such node",
+                message=f"cannot verify node {name}: it has ended by itself, as it may"
+                if view.over[name]
+                else f"cannot verify node {name}: it may have ended by itself, or not have started",
             )
             continue
         hint = ""

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
-from lifecycle.manifest import ParameterValue
+from lifecycle.manifest import ParameterValue, is_implicit
 from lifecycle.plan import COMMAND, DEFAULT, GIVEN, NOT_FINITE, ExpectedParameter, PlannedNode
-from lifecycle.verify.observation import ParameterReport, digest_of
+from lifecycle.verify.observation import SERVES_NONE, ParameterReport, digest_of
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import Heals, Rule
 from lifecycle.verify.verdict import Finding
@@ -37,13 +37,19 @@ READ_ONLY_DIFFERS = Rule(
     outcomes=(Outcome.VIOLATED,),
     fix="have the node declare it read-only, or remove read_only from the interface",
 )
+UNDECLARED = Rule(
+    id="param.undeclared",
+    meaning="a declared node has parameters that its interface does not declare",
+    outcomes=(Outcome.VIOLATED,),
+    fix="declare them in the node's interface, remove them, or set `endpoints: open` on the node",
+)
 UNVERIFIABLE = Rule(
     id="param.unverifiable",
     meaning="parameters of a node could not be read, or not what they must be",
     outcomes=(Outcome.UNVERIFIABLE,),
     fix="see whether `ros2 param list` shows the node's parameters; look at its log",
 )
-RULES = (MISSING, TYPE_DIFFERS, VALUE_DIFFERS, READ_ONLY_DIFFERS, UNVERIFIABLE)
+RULES = (MISSING, UNDECLARED, TYPE_DIFFERS, VALUE_DIFFERS, READ_ONLY_DIFFERS, UNVERIFIABLE)
 
 _NAMED = 8
 _SHOWN_ITEMS = 8
@@ -61,12 +67,16 @@ def _judge_node(facts: NodeFacts) -> Iterator[Finding]:
         return
     for file in node.unread_parameter_files:
         yield _unread(node, file)
-    if not node.expected_parameters:
+    if not node.expected_parameters and not node.has_all_parameters:
         return
     known = _known(facts)
     if not isinstance(known, str):
         for expected in node.expected_parameters:
             yield from _judge(node, expected, known.get(expected.name))
+        if node.has_all_parameters:
+            yield from _undeclared(node, known)
+    elif not node.expected_parameters and known == f"it {SERVES_NONE}":
+        return  # it has none that anybody could know of, and none are declared
     elif known or facts.configuration is not None or not facts.frame.ours(node):
         # Of a node of ours without a report config.missing-report says it all.
         yield _unknown(node, known or "they were not read")
@@ -136,6 +146,25 @@ def _judge(
         )
 
 
+def _undeclared(node: PlannedNode, known: Mapping[str, ParameterReport]) -> Iterator[Finding]:
+    declared = {each.name for each in node.expected_parameters}
+    # One that has never been set has a name and nothing else to declare.
+    names = sorted(
+        name
+        for name, each in known.items()
+        if name not in declared and not is_implicit(name) and each.type
+    )
+    if names:
+        yield UNDECLARED.on_node(
+            Outcome.VIOLATED,
+            node,
+            expected="no such parameter",
+            observed=", ".join(f"{name} ({known[name].type})" for name in names[:_NAMED]),
+            message=f"cannot allow {_listed(names)} of node {node.full_name}: its interface does"
+            f" not declare {'it' if len(names) == 1 else 'them'}",
+        )
+
+
 def _finding(
     rule: Rule,
     node: PlannedNode,
@@ -160,12 +189,13 @@ def _finding(
 
 def _unknown(node: PlannedNode, why: str) -> Finding:
     names = [each.name for each in node.expected_parameters]
+    what = _listed(names) if names else "that there are no parameters"
     return UNVERIFIABLE.on_node(
         Outcome.UNVERIFIABLE,
         node,
-        expected=", ".join(names),
+        expected=", ".join(names) or "no parameters",
         observed="unknown",
-        message=f"cannot verify {_listed(names)} of node {node.full_name}: {why}",
+        message=f"cannot verify {what} of node {node.full_name}: {why}",
     )
 
 

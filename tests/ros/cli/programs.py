@@ -7,11 +7,13 @@ a parameter is set, a managed node is activated, a client's server does not come
 from __future__ import annotations
 
 import argparse
+import contextlib
 import sys
 import time
 from pathlib import Path
 
 import rclpy
+from rcl_interfaces.srv import ListParameters
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.node import Node
@@ -74,6 +76,24 @@ def client(go: Path) -> None:
     node.destroy_node()
 
 
+class AskedError(Exception):
+    """Somebody wants to know."""
+
+
+def brief() -> None:
+    """Publish, and be gone before anybody who asks for the parameters has an answer."""
+
+    def ask(request: object, response: object) -> object:
+        raise AskedError
+
+    node = rclpy.create_node("brief", start_parameter_services=False)
+    node.create_publisher(String, "news", 5)
+    node.create_service(ListParameters, "~/list_parameters", ask)
+    with contextlib.suppress(AskedError):
+        rclpy.spin(node)
+    node.destroy_node()
+
+
 def main() -> None:
     own = None
     if "--ros-args" not in sys.argv:  # as with argparse in most programs: no other word is taken
@@ -85,8 +105,8 @@ def main() -> None:
     else:
         role, go = sys.argv[1], Path("go")
     rclpy.init(args=own)
-    if role == "client":
-        client(go)
+    if role in ("client", "brief"):
+        client(go) if role == "client" else brief()
         rclpy.try_shutdown()
         return
     nodes = {

@@ -93,3 +93,27 @@ def test_programs_started_by_hand_come_up_again_from_what_was_captured(
     assert {each["node"] for each in over["findings"] if each["rule"] == "graph.ended-node"} == {
         "/client"
     }
+
+
+def test_a_program_that_ends_while_it_is_captured_may_end(tmp_path: Path, domain_id: int) -> None:
+    manifest = tmp_path / "found.lifecycle.yaml"
+    deadline = time.monotonic() + BOUND_S
+    while not manifest.exists():
+        assert time.monotonic() < deadline
+        brief = subprocess.Popen(
+            [sys.executable, str(PROGRAM), "brief"],
+            env={**os.environ, "ROS_DOMAIN_ID": str(domain_id)},
+        )
+        try:
+            verb("capture", "--domain", str(domain_id), "--output", str(manifest), runtime=tmp_path)
+        finally:
+            brief.terminate()
+            brief.wait(BOUND_S)
+    (node,) = load(str(manifest), {}).manifest.nodes
+    assert (node.may_end, node.run.command[1:]) == (True, (str(PROGRAM), "brief"))
+    judged = verb(
+        *("verify", str(manifest), "--timeout", "0.2", "--format", "json"), runtime=tmp_path
+    )
+    assert judged.returncode == ExitCode.OK, judged.stdout
+    rules = [each["rule"] for each in json.loads(judged.stdout)["findings"]]
+    assert rules == ["graph.ended-node"]

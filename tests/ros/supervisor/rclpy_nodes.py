@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import time
+
 import rclpy
 from rclpy.action import ActionServer
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.event_handler import PublisherEventCallbacks, QoSPublisherMatchedInfo
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
@@ -38,6 +41,20 @@ class Talker(Node):
 
     def matched(self, status: QoSPublisherMatchedInfo) -> None:
         self.get_logger().info(f"matched with {status.current_count}")
+
+
+class Sleeper(Node):
+    """Sleeps once in a timer's callback, `alone` in a group of its own."""
+
+    def __init__(self, *, alone: bool = False) -> None:
+        super().__init__("sleeper")
+        group = MutuallyExclusiveCallbackGroup() if alone else None
+        self.timer = self.create_timer(0.05, self.sleep, callback_group=group)
+
+    def sleep(self) -> None:
+        self.timer.cancel()
+        time.sleep(2.5)
+        self.get_logger().info("slept")
 
 
 class Listener(Node):

@@ -25,6 +25,7 @@ DECLARED = {
     "limits.low": {"type": "int", "default_value": -3, "read_only": True},
     "joints": {"type": "string_array", "default_value": ["a", "b"]},
     "mode": {"type": "string"},
+    "offset": {"type": "double"},
     "unset": {"type": "double"},
 }
 
@@ -142,7 +143,7 @@ def test_the_gate_stays_closed_over_parameters_that_are_not_what_is_declared(
         "limits.low": {"type": "double"},
         "joints": {"type": "string_array", "read_only": True},
         "bogus": {"type": "bool"},
-    }
+    }  # neither its offset, nor its mode
     manifest = system(tmp_path, fresh_domain, arm(interface={"parameters": declared}))
     with up(manifest, "--timeout", "8", runtime=tmp_path) as run:
         assert run.finish() == ExitCode.VIOLATED
@@ -153,6 +154,7 @@ def test_the_gate_stays_closed_over_parameters_that_are_not_what_is_declared(
             ("param.type-differs", "/arm: limits.low"),
             ("param.read-only-differs", "/arm: joints"),
             ("param.missing", "/arm: bogus"),
+            ("param.undeclared", "/arm"),
         }
 
 

@@ -213,6 +213,34 @@ def test_callbacks_run_in_several_threads_where_the_executor_has_them(
 _SERVICES = ("inner", "outer")
 
 
+def test_a_hung_callback_is_noticed_whatever_the_executor_unless_others_go_on_beside_it(
+    fresh_domain: int, tmp_path: Path, wait_until: Any
+) -> None:
+    limits = {**LIMITS, "silent_s": 0.5}
+
+    def sleeper(executor: str, **arguments: Any) -> dict[str, Any]:
+        made = node("Sleeper", managed=False, executor=executor, arguments=arguments)
+        return {**made, "timeouts": limits}
+
+    manifest = write(
+        tmp_path,
+        fresh_domain,
+        {
+            "many": sleeper("multi"),
+            "events": sleeper("events"),
+            "beside": sleeper("multi", alone=True),
+        },
+    )
+    with running.up(manifest, runtime=tmp_path) as up:
+        for kind in ("silent", "alive"):
+            for name in ("/many", "/events"):
+                up.met(kind, node=name)
+        assert {each["cause"] for each in up.of_kind("silent")} <= {"hung", "unserved"}
+        wait_until(lambda: "slept" in log_of(up, "beside"))
+        up.catch_up()
+        assert {each["node"] for each in up.of_kind("silent")} == {"/many", "/events"}
+
+
 def test_what_a_callback_of_rclpy_lifecycle_raises_is_logged_and_ends_the_bring_up(
     fresh_domain: int, tmp_path: Path
 ) -> None:

@@ -220,7 +220,10 @@ def test_nodl_documents_stand_in_for_interfaces(tmp_path: Path) -> None:
 
     assert interfaces(by_reference) == interfaces(inline)
     verdict = verify(build_plan(by_reference, environment={}), ASKED, stage=Stage.ACTIVE)
-    assert verdict.findings == ()
+    # A document cannot say that parameters are not known: without any, there are to be none.
+    assert [(each.rule, each.subject) for each in verdict.findings] == [
+        ("param.unverifiable", "/right/scanner")
+    ]
 
 
 @pytest.mark.parametrize(

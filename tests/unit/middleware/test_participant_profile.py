@@ -131,7 +131,7 @@ def test_quick_discovery_is_kept(tmp_path: Path) -> None:
     path = tmp_path / "quick.xml"
     path.write_text(discovery_profile())
     base = default_profile({"FASTRTPS_DEFAULT_PROFILES_FILE": str(path)})
-    assert texts(made(UDP, base=base), ".//initialAnnouncements/count") == ["20"]
+    assert texts(made(UDP, base=base), ".//initialAnnouncements/count") == ["10"]
 
 
 @pytest.mark.parametrize(

@@ -150,6 +150,14 @@ def test_a_command_line_gives_values_too_and_files_and_parameters_win_over_it(tm
     assert values(made)["b"][2].endswith("0.yaml")
 
 
+def test_what_a_command_line_gives_all_nodes_of_a_process_only_some_of_them_have():
+    argv = ("both", "--ros-args", "-p", "a:=1", "-p", "camera:b:=1")
+    made = camera(run=Run(kind=RunKind.COMMAND, command=argv), process="both")
+    (planned,) = plan_of(made).nodes
+    found = {each.name: each.optional for each in planned.expected_parameters}
+    assert found == {"a": True, "b": False}
+
+
 def test_a_file_that_a_command_line_names_is_read(tmp_path: Path):
     files(tmp_path, EVERYONE)
     argv = ("node", "--ros-args", "--params-file", "0.yaml", "--params-file", "gone.yaml")

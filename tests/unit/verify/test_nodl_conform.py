@@ -3,8 +3,7 @@
 A document is fed in by reference, a running node differs from it in one thing. NoDL's comparison
 knows missing, extra and of another type, for publishers, subscriptions, services and parameters,
 and reliability, history and durability of topics; what it takes for equal because it cannot be seen
-is `unverifiable` here. A parameter that no interface declares is an exception: it is the node's own
-business here (docs/rules.md), and a difference there.
+is `unverifiable` here.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from lifecycle.manifest import EndpointKind, load
 from lifecycle.manifest.qos import Durability, History, Reliability
 from lifecycle.plan import Plan, build_plan
 from lifecycle.verify import Observation, Outcome, Stage, verify
-from lifecycle.verify.observation import NodeParameters, ParameterReport
+from lifecycle.verify.observation import SERVES_NONE, NodeParameters, ParameterReport
 from tests.unit.verify.edits import (
     Edit,
     add_endpoint,
@@ -138,13 +137,63 @@ def test_each_difference_is_violated(tmp_path: Path, name: str) -> None:
     [
         (HAS[:1], "param.missing"),
         ((ParameterReport.of("rate", "int", 1, read_only=False), HAS[1]), "param.type-differs"),
+        ((*HAS, ParameterReport.of("gain", "double", 1.0, read_only=False)), "param.undeclared"),
     ],
 )
-def test_parameters_are_missing_or_of_another_type(
+def test_parameters_are_missing_or_extra_or_of_another_type(
     tmp_path: Path, parameters: tuple[ParameterReport, ...], rule: str
 ) -> None:
     plan = _plan(tmp_path)
     assert _violated(plan, _seen(plan, parameters)) == [rule]
+
+
+OF_ROS = (
+    ParameterReport.of("use_sim_time", "bool", False, read_only=False),
+    ParameterReport.of("start_type_description_service", "bool", True, read_only=True),
+    ParameterReport.of("qos_overrides./a.publisher.depth", "int", 3, read_only=True),
+)
+NEVER_SET = ParameterReport.of("later", "", None, read_only=False)
+GAIN = ParameterReport.of("gain", "double", 1.0, read_only=False)
+LESS = DOCUMENT.partition("parameters:")[0]
+
+
+@pytest.mark.parametrize(
+    ("document", "open_", "found"),
+    [
+        (DOCUMENT, False, ["gain"]),
+        (LESS, False, ["gain", "label", "rate"]),  # a document without any describes a node so
+        (DOCUMENT, True, []),
+    ],
+)
+def test_parameters_are_all_declared_but_those_of_ros(
+    tmp_path: Path, document: str, found: list[str], *, open_: bool
+) -> None:
+    plan = _plan(tmp_path, document)
+    if open_:
+        text = (tmp_path / "arm.lifecycle.yaml").read_text()
+        (tmp_path / "arm.lifecycle.yaml").write_text(text + "    endpoints: open\n")
+        plan = build_plan(load(tmp_path / "arm.lifecycle.yaml").manifest, environment={})
+    seen = _seen(plan, (*HAS, *OF_ROS, NEVER_SET, GAIN))
+    named = [each.observed for each in verify(plan, seen, stage=Stage.ACTIVE).findings]
+    shown = {"gain": "gain (double)", "label": "label (string)", "rate": "rate (double)"}
+    assert named == ([", ".join(shown[each] for each in found)] if found else [])
+
+
+@pytest.mark.parametrize(
+    ("known", "outcomes"),
+    [
+        (NodeParameters(node=ARM, error=SERVES_NONE), []),
+        (NodeParameters(node=ARM, error="did not answer"), [Outcome.UNVERIFIABLE]),
+    ],
+)
+def test_that_there_are_no_parameters_is_proven_or_unverifiable(
+    tmp_path: Path, known: NodeParameters, outcomes: list[Outcome]
+) -> None:
+    plan = _plan(tmp_path, LESS)
+    seen = dataclasses.replace(_seen(plan), parameters=(known,))
+    found = verify(plan, seen, stage=Stage.ACTIVE).findings
+    assert [each.outcome for each in found] == outcomes
+    assert all("that there are no parameters" in each.message for each in found)
 
 
 def test_what_cannot_be_seen_is_unverifiable_and_not_equal(tmp_path: Path) -> None:

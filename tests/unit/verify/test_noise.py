@@ -73,6 +73,7 @@ STRING = "std_msgs/msg/String"
 SET_PARAMETERS = "rcl_interfaces/srv/SetParameters"
 TRIGGER = "std_srvs/srv/Trigger"
 GET_PARAMETERS = "rcl_interfaces/srv/GetParameters"
+LOAD_NODE = "composition_interfaces/srv/LoadNode"
 
 
 @pytest.mark.parametrize(
@@ -90,6 +91,8 @@ GET_PARAMETERS = "rcl_interfaces/srv/GetParameters"
         (PUB, "/ns/a", "/lifecycle/graph", STRING),
         (SUB, "/b", "/lifecycle/graph", STRING),
         (CLIENT, "/b", "/ns/a/change_state", "lifecycle_msgs/srv/ChangeState"),
+        (SERVER, "/ns/a", "/ns/a/_container/load_node", LOAD_NODE),
+        (CLIENT, "/b", "/ns/a/_container/load_node", LOAD_NODE),
         (PUB, "/a", "/reset/_service_event", "std_srvs/srv/Trigger_Event"),
     ],
 )
@@ -110,6 +113,8 @@ def test_an_endpoint_of_a_client_library_is_noise(
         (SUB, "/a", "/reset/_service_event", "std_srvs/srv/Trigger_Event"),
         (PUB, "", "/lifecycle/graph", STRING),  # the first sign of a node that nobody knows
         (SERVER, "/a", "/a/get_map", STRING),
+        (SERVER, "/a", "/b/_container/load_node", LOAD_NODE),
+        (SERVER, "/a", "/a/_container/load_node", STRING),
         (PUB, "/a", "/a/get_parameters", GET_PARAMETERS),
         (SERVER, "/a", "/a/get_parameters", TRIGGER),  # only the name is the library's
         (SERVER, "/a", "/a/disconnect", TRIGGER),

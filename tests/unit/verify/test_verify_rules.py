@@ -551,6 +551,10 @@ def test_a_node_that_has_ended_as_it_may_is_unverifiable_and_not_missing():
     (finding,) = (each for each in verdict.findings if each.node == "/viewer")
     assert (finding.rule, finding.outcome) == ("graph.ended-node", Outcome.UNVERIFIABLE)
     assert finding.message == "cannot verify node /viewer: it has ended by itself, as it may"
+    from_outside = verify(PLAN, seen, stage=Stage.CONNECTED, over={"/viewer": ""})
+    assert [each.message for each in from_outside.findings if each.node == "/viewer"] == [
+        "cannot verify node /viewer: it may have ended by itself, or not have started"
+    ]
 
 
 # --- policies
