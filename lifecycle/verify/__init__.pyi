@@ -1,3 +1,4 @@
+from .judge import Verifier as Verifier
 from .judge import missing as missing
 from .judge import not_ok as not_ok
 from .judge import taken_on_trust as taken_on_trust

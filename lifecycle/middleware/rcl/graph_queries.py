@@ -62,13 +62,25 @@ class _Strings(ctypes.Structure):
     )
 
     def all(self) -> tuple[bytes, ...]:
-        return tuple(self.data[index] or b"" for index in range(self.size))
+        return tuple([each or b"" for each in self.data[: self.size]])
 
 
 class _NamesAndTypes(ctypes.Structure):
     """rmw_names_and_types_t."""
 
     _fields_ = (("names", _Strings), ("types", ctypes.POINTER(_Strings)))
+
+
+class _Announced(ctypes.Structure):
+    """The part of rmw_topic_endpoint_info_t that is no pointer: it comes last."""
+
+    _fields_ = (
+        ("hash_version", ctypes.c_uint8),
+        ("hash_value", ctypes.c_uint8 * _HASH_BYTES),
+        ("endpoint_type", ctypes.c_int),
+        ("gid", ctypes.c_uint8 * _GID_BYTES),
+        ("qos", abi.Qos),
+    )
 
 
 class _Info(ctypes.Structure):
@@ -78,12 +90,12 @@ class _Info(ctypes.Structure):
         ("node_name", ctypes.c_char_p),
         ("node_namespace", ctypes.c_char_p),
         ("topic_type", ctypes.c_char_p),
-        ("hash_version", ctypes.c_uint8),
-        ("hash_value", ctypes.c_uint8 * _HASH_BYTES),
-        ("endpoint_type", ctypes.c_int),
-        ("gid", ctypes.c_uint8 * _GID_BYTES),
-        ("qos", abi.Qos),
+        ("announced", _Announced),
     )
+
+
+_Named = tuple[tuple[bytes, tuple[bytes, ...]], ...]
+"""Names, and the types of each."""
 
 
 class _Infos(ctypes.Structure):
@@ -95,6 +107,8 @@ class _Infos(ctypes.Structure):
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class EndpointInfo:
     """A DDS endpoint as discovery shows it.
+
+    Queries return the same object for as long as discovery shows the same.
 
     Attributes:
         node: fully qualified name of its node; empty while that is not known.
@@ -188,7 +202,7 @@ def endpoints_of(
 
 def endpoints_of_node(
     node: Node, kind: EndpointKind, full_name: str
-) -> list[tuple[str, str]] | None:
+) -> tuple[tuple[str, str], ...] | None:
     """Return name and type of a node's publishers, subscriptions, servers or clients.
 
     Returns:
@@ -207,9 +221,13 @@ def endpoints_of_node(
         return int(function(handle, library.allocator, *arguments, result))
 
     found = _names_and_types(node, query, "")
-    if found is None:
-        return None
-    return [(_text(each), _text(type_)) for each, types in found for type_ in types]
+    return None if found is None else _as_text(found)
+
+
+@functools.lru_cache(maxsize=1 << 10)
+def _as_text(found: _Named) -> tuple[tuple[str, str], ...]:
+    """Return name and type as text; the same object for the same bytes."""
+    return tuple((_text(each), _text(type_)) for each, types in found for type_ in types)
 
 
 def full_name(name: str, namespace: str) -> str:
@@ -245,17 +263,36 @@ def _endpoints(
                 ),
                 "endpoints",
             )
-            return [_endpoint(infos.items[index]) for index in range(infos.size)]
+            if not infos.size:
+                return []
+            raw = ctypes.string_at(infos.items, infos.size * _INFO_BYTES)
+            return [
+                _endpoint(
+                    info.node_name or b"",
+                    info.node_namespace or b"",
+                    info.topic_type or b"",
+                    raw[index * _INFO_BYTES + _ANNOUNCED_AT : (index + 1) * _INFO_BYTES],
+                )
+                for index, info in enumerate(infos.items[: infos.size])
+            ]
         finally:
             library.infos_fini(ctypes.byref(infos), library.allocator)
 
 
-def _endpoint(info: Any) -> EndpointInfo:
-    name = _text(info.node_name or b"")
-    version = info.hash_version
+_INFO_BYTES = ctypes.sizeof(_Info)
+_ANNOUNCED_AT = _Info.announced.offset
+_MOST_KEPT = 1 << 14
+"""Endpoints whose infos are kept, 0.8 kB each; the graph of 200 nodes has about 4,000."""
+
+
+@functools.lru_cache(maxsize=_MOST_KEPT)
+def _endpoint(name: bytes, namespace: bytes, type_: bytes, announced: bytes) -> EndpointInfo:
+    """Read an info; the same object for the same bytes, so that what has not changed is known."""
+    info = _Announced.from_buffer_copy(announced)
+    base, version = _text(name), info.hash_version
     return EndpointInfo(
-        node="" if name == _UNKNOWN_NODE else full_name(name, _text(info.node_namespace or b"")),
-        type=_text(info.topic_type or b""),
+        node="" if base == _UNKNOWN_NODE else full_name(base, _text(namespace)),
+        type=_text(type_),
         gid=bytes(info.gid).hex(),
         qos=QosProfile(
             history=_HISTORIES.get(info.qos.history, History.UNKNOWN),
@@ -332,9 +369,7 @@ def _nanoseconds(duration: Any) -> int | None:
     return value if 0 < value < _INFINITE_NS else None
 
 
-def _names_and_types(
-    node: Node, query: Callable[[int, object], int], what: str
-) -> list[tuple[bytes, tuple[bytes, ...]]] | None:
+def _names_and_types(node: Node, query: Callable[[int, object], int], what: str) -> _Named | None:
     """Return what `query` fills in; None if it fails and `what` does not say what of."""
     library = _library()
     found = _NamesAndTypes()
@@ -345,9 +380,11 @@ def _names_and_types(
                 library.take_error()
                 return None
             library.check(status, what)
-            return [
-                (name, found.types[index].all()) for index, name in enumerate(found.names.all())
-            ]
+            size = found.names.size
+            types = found.types[:size] if size else []
+            return tuple(
+                [(n, each.all()) for n, each in zip(found.names.all(), types, strict=True)]
+            )
         finally:
             library.names_and_types_fini(ctypes.byref(found))
 
