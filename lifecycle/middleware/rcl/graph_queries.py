@@ -350,7 +350,7 @@ def _spelled(type_hash: Any) -> str:
 
 def _shown_of_node(
     node: Node, kind: EndpointKind, name: str, namespace: str
-) -> list[tuple[str, str]] | None:
+) -> tuple[tuple[str, str], ...] | None:
     """As `endpoints_of_node`, by rclpy's own queries."""
     ask = {
         EndpointKind.PUBLISHER: node.get_publisher_names_and_types_by_node,
@@ -359,7 +359,7 @@ def _shown_of_node(
         EndpointKind.SERVICE_CLIENT: node.get_client_names_and_types_by_node,
     }[kind]
     try:
-        return [(each, type_) for each, types in ask(name, namespace) for type_ in types]
+        return tuple((each, type_) for each, types in ask(name, namespace) for type_ in types)
     except (*_REFUSED, rclpy_implementation.NodeNameNonExistentError):
         return None
 
