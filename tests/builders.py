@@ -28,6 +28,7 @@ from lifecycle.manifest.model import (
     Policy,
     Run,
     RunKind,
+    Supervision,
     Timeouts,
     UniqueHow,
 )
@@ -187,6 +188,7 @@ def planned_node(
     kind: RunKind = RunKind.PYTHON,
     managed: bool = True,
     timeouts: Timeouts = Timeouts(),  # noqa: B008 - frozen
+    supervision: Supervision = Supervision(),  # noqa: B008 - frozen
 ) -> PlannedNode:
     """One node without endpoints, in the root namespace; python by default."""
     return PlannedNode(
@@ -205,6 +207,7 @@ def planned_node(
         participants=(),
         after=tuple(After(node=other, condition=when, at=HERE) for other, when in after.items()),
         timeouts=timeouts,
+        supervision=supervision,
         endpoint_policy=EndpointPolicy.DECLARED,
         log_level="",
         at=HERE,

@@ -186,6 +186,7 @@ def _row(node: NodeStatus) -> tuple[RenderableType, ...]:
     nested = " · connected" if node.state == "inactive" and node.matched else ""
     state = node.state if node.managed else node.reach.value
     state = "dead" if node.died else state
+    style = "red" if node.died else "yellow"
     complete = "green" if node.matched >= node.endpoints else "yellow"
     return (
         Text(one_line(node.node), style="red" if node.findings else "bold"),
@@ -196,5 +197,12 @@ def _row(node: NodeStatus) -> tuple[RenderableType, ...]:
         ),
         Text(f"{node.matched}/{node.endpoints}", style=complete if node.endpoints else "dim"),
         Text(f"{node.unique_flows}/{node.flows}" if node.flows else "–", style="dim"),
-        Text(one_line(node.died or node.doing), style="red" if node.died else "yellow"),
+        Text(one_line(node.died or node.doing or _away(node)), style=style),
     )
+
+
+def _away(node: NodeStatus) -> str:
+    """Say of a node whose process failed when it is started again, and how often it was."""
+    if node.next_try_s is not None:
+        return f"starts again in {node.next_try_s:.1f} s"
+    return f"restarted {node.restarts}×" if node.restarts else ""

@@ -25,6 +25,7 @@ from lifecycle.supervisor import (
     Event,
     Failure,
     GateOpened,
+    GaveUp,
     LogLine,
     MachineConnection,
     NodeAlive,
@@ -34,6 +35,8 @@ from lifecycle.supervisor import (
     ProcessChanged,
     ProcessState,
     Reach,
+    Restarted,
+    RestartScheduled,
     RunStarted,
     StageTimed,
     Stopped,
@@ -413,6 +416,27 @@ def _(event: Failure) -> str:
     # What ends the run comes first in the last verdict; once is enough.
     named = f"failed: {event.subject} ({event.rule})"
     return named if event.ends_run else f"{named}: {event.message}"
+
+
+@_describe.register
+def _(event: RestartScheduled) -> str:
+    last = f"; its last line: {event.stderr}" if event.stderr else ""
+    others = len(event.nodes) - 1
+    with_it = f" with {_count(others, 'other node')}" if others else ""
+    return f"{event.process} is started again in {event.in_s:.1f} s{with_it}{last}"
+
+
+@_describe.register
+def _(event: Restarted) -> str:
+    return (
+        f"{event.process} is back {event.took_s:.2f} s after its failure; "
+        f"restarted {_count(event.restarts, 'time')}"
+    )
+
+
+@_describe.register
+def _(event: GaveUp) -> str:
+    return f"gave up {event.process} after {_count(len(event.history), 'failure')}"
 
 
 @_describe.register

@@ -44,14 +44,17 @@ from .model import Machine as Machine
 from .model import Manifest as Manifest
 from .model import Node as Node
 from .model import NodeDeclaration as NodeDeclaration
+from .model import OnFailure as OnFailure
 from .model import Output as Output
 from .model import ParameterDeclaration as ParameterDeclaration
 from .model import ParameterValue as ParameterValue
 from .model import Policy as Policy
 from .model import Quantity as Quantity
+from .model import Restart as Restart
 from .model import RosArguments as RosArguments
 from .model import Run as Run
 from .model import RunKind as RunKind
+from .model import Supervision as Supervision
 from .model import SystemDeclaration as SystemDeclaration
 from .model import TargetState as TargetState
 from .model import Timeouts as Timeouts

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.model import (
+    SUPERVISION_KEYS,
     After,
     Condition,
     ConnectionDeclaration,
@@ -32,6 +33,7 @@ from lifecycle.manifest.model import (
     Quantity,
     Run,
     RunKind,
+    Supervision,
     Timeouts,
 )
 from lifecycle.manifest.nodl import read_interface
@@ -351,7 +353,7 @@ __all__ = ["Findings", "build_node", "build_parameters", "quantities"]
 _PROGRAMS = ("python", "command", "package", "executable", "component", "container", "ros_args")
 _POSITIONED = (
     *("machine", "namespace", "name", "process", "run", "interface", "log_level"),
-    *("state", "may_end"),
+    *("state", "may_end", *SUPERVISION_KEYS),
 )
 
 
@@ -394,6 +396,7 @@ def build_node(
             for name, each in cursor.entries("after")
         ),
         timeouts=_timeouts(cursor),
+        supervision=cursor.build(Supervision),
         interface=interface,
         flows=tuple(_flows(cursor)),
         connections=build_connections(cursor, interface, found),

@@ -226,6 +226,56 @@ class Timeouts:
     silent_s: float = 0.8
 
 
+class Restart(enum.Enum):
+    """When a process that ended unasked is started again, in the words of systemd.service(5)."""
+
+    NO = "no"
+    ON_FAILURE = "on-failure"
+    ALWAYS = "always"
+
+
+class OnFailure(enum.Enum):
+    """What is restarted with a process that failed."""
+
+    NODE = "node"
+    DEPENDENTS = "dependents"
+    ALL = "all"
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Supervision:
+    """What is done when the process of a node fails; keys of a node as systemd spells them.
+
+    All nodes of one process have the same. Seconds.
+
+    Attributes:
+        restart: ON_FAILURE: it ended with another status than 0 or by a signal, a step on one of
+            its nodes failed, or its watchdog ended it; ALWAYS: also with exit status 0.
+        restart_sec: from the failure to the next start, >= 0.
+        restart_steps: failures in a row until the delay is `restart_max_delay_sec`; 0: it does not
+            grow.
+        restart_max_delay_sec: None if the delay does not grow.
+        start_limit_burst: so many starts within the interval, and no more, >= 1.
+        start_limit_interval_sec: 0 for no limit; after running for so long the delay is again
+            `restart_sec`.
+        on_failure: who goes down, and comes again, with it.
+        watchdog_sec: a process that is stopped by a signal or hangs in a callback for so long is
+            ended with SIGKILL, which is a failure; 0 for never.
+    """
+
+    restart: Restart = Restart.NO
+    restart_sec: float = 0.1
+    restart_steps: int = 0
+    restart_max_delay_sec: float | None = None
+    start_limit_burst: int = 5
+    start_limit_interval_sec: float = 10.0
+    on_failure: OnFailure = OnFailure.NODE
+    watchdog_sec: float = 3.0
+
+
+SUPERVISION_KEYS = tuple(each.name for each in dataclasses.fields(Supervision))
+
+
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Endpoint:
     """One declared endpoint.
@@ -379,6 +429,7 @@ class NodeDeclaration:
         remap: (from, to) as written.
         state: where a managed node is brought to, and kept.
         may_end: its process may end by itself with exit status 0.
+        supervision: what is done when its process fails.
     """
 
     key: str
@@ -395,6 +446,7 @@ class NodeDeclaration:
     log_level: str = ""
     state: TargetState = TargetState.ACTIVE
     may_end: bool = False
+    supervision: Supervision = Supervision()
     at: Position
 
     @property
@@ -410,8 +462,8 @@ class Node(NodeDeclaration):
     Attributes:
         process: nodes with the same non-empty process name share one process.
         positions: where parts of the node are, by path below it: `machine`, `namespace`, `name`,
-            `process`, `remap.scan`, `parameters.rate`, `parameter_files.0`; sorted, read with
-            `where`.
+            `process`, `restart_sec`, `remap.scan`, `parameters.rate`, `parameter_files.0`; sorted,
+            read with `where`.
         written_paths: paths as the manifest writes them, by place: `parameter_files.0`,
             `run.working_directory`; what other fields have of them is absolute.
         shared: parts that are written for several nodes, by path as in `positions`.
@@ -442,6 +494,7 @@ def _path(entry: tuple[str, Position]) -> str:
 
 
 __all__ = [
+    "SUPERVISION_KEYS",
     "TOLERATED_NODES",
     "After",
     "Authority",
@@ -465,14 +518,17 @@ __all__ = [
     "Manifest",
     "Network",
     "Node",
+    "OnFailure",
     "Output",
     "ParameterDeclaration",
     "ParameterValue",
     "Policy",
     "Quantity",
+    "Restart",
     "RosArguments",
     "Run",
     "RunKind",
+    "Supervision",
     "TargetState",
     "Timeouts",
     "UniqueHow",

@@ -1,9 +1,10 @@
-"""What nodes share: `parameters:`, `remap:`, `machine:` … of documents and groups, by nearness.
+"""What nodes share: `parameters:`, `remap:`, `restart:` … of documents and groups, by nearness.
 
 Owns: how values that are written for many nodes reach each of them; what is nearer to a node wins:
 the node itself, its parameter files, its group, the groups around it, its document, the documents
 that include that. A shared parameter is for the nodes that have it, as under `/**` in a parameter
-file: an interface without it is not given it, and where a node lacks it nothing is wrong.
+file: an interface without it is not given it, and where a node lacks it nothing is wrong. What is
+done when a process fails (`restart:` …) all nodes of the process share, whichever of them says it.
 """
 
 from __future__ import annotations
@@ -15,7 +16,14 @@ from lifecycle.manifest.building import Findings, build_parameters
 from lifecycle.manifest.checks.parameters import is_implicit, read_sections, shown_path
 from lifecycle.manifest.checks.system import full_name
 from lifecycle.manifest.diagnostics import Position
-from lifecycle.manifest.model import Manifest, Node, ParameterValue
+from lifecycle.manifest.model import (
+    SUPERVISION_KEYS,
+    Manifest,
+    Node,
+    ParameterValue,
+    RunKind,
+    Supervision,
+)
 from lifecycle.manifest.yaml.document import Cursor, error
 
 SIM_TIME = "use_sim_time"
@@ -29,6 +37,7 @@ class Shared:
         parameters: value and place, by name.
         remap: new name and place, by the name in the node's code.
         machine: where a node runs that names no machine.
+        supervision: value and place, by key of `Supervision`.
     """
 
     machine: str
@@ -36,6 +45,7 @@ class Shared:
         default_factory=dict
     )
     remap: Mapping[str, tuple[str, Position]] = dataclasses.field(default_factory=dict)
+    supervision: Mapping[str, tuple[object, Position]] = dataclasses.field(default_factory=dict)
 
     def inner(self, cursor: Cursor, found: Findings) -> Shared:
         """Return what holds inside a document or group.
@@ -54,14 +64,22 @@ class Shared:
         elif sim_time is not None and isinstance(sim_time.scalar, bool):
             parameters[SIM_TIME] = (sim_time.scalar, sim_time.key_at)
         remap = {name: (each.value.text, each.key_at) for name, each in cursor.entries("remap")}
+        written = cursor.build(Supervision)
+        supervision = {
+            key: (getattr(written, key), each.at)
+            for key in SUPERVISION_KEYS
+            if (each := cursor.get(key)) is not None
+        }
         return Shared(
             machine=cursor.text("machine", self.machine),
             parameters={**self.parameters, **parameters},
             remap={**self.remap, **remap},
+            supervision={**self.supervision, **supervision},
         )
 
     def given_to(self, node: Node) -> Node:
         """Return a node with what it does not set itself."""
+        node = self._supervised(node)
         if not self.parameters and not self.remap:
             return node
         own = dict(node.parameters)
@@ -84,15 +102,51 @@ class Shared:
             positions=(*node.positions, *positions.items()),
         )
 
+    def _supervised(self, node: Node) -> Node:
+        """Return a node with what is done when it fails; of who starts it otherwise, nothing."""
+        own = dict(node.positions)
+        given = {key: each for key, each in self.supervision.items() if key not in own}
+        if not given or node.run.kind is RunKind.ATTACH:
+            return node
+        values = {key: value for key, (value, _) in given.items()}
+        return dataclasses.replace(
+            node,
+            supervision=dataclasses.replace(node.supervision, **values),  # type: ignore[arg-type]
+            shared=node.shared | given.keys(),
+            positions=(*node.positions, *((key, at) for key, (_, at) in given.items())),
+        )
+
 
 def settle(manifest: Manifest) -> Manifest:
     """Take from nodes the shared parameters that their files set, and those they do not declare.
 
+    Nodes of one process get what any of them says of its supervision.
+
     Args:
         manifest: with all that it includes, so that each node has its full name.
     """
-    nodes = tuple(_settled(node, manifest.path) for node in manifest.nodes)
+    own: dict[str, dict[str, object]] = {}
+    for node in manifest.nodes:
+        if node.process:
+            for key, value in _own_supervision(node).items():
+                own.setdefault(node.process, {}).setdefault(key, value)
+    nodes = tuple(
+        _settled(_as_its_process(node, own.get(node.process, {})), manifest.path)
+        for node in manifest.nodes
+    )
     return dataclasses.replace(manifest, nodes=nodes)
+
+
+def _own_supervision(node: Node) -> dict[str, object]:
+    """Return what is written at the node itself."""
+    written = {key for key, _ in node.positions} - node.shared
+    return {key: getattr(node.supervision, key) for key in SUPERVISION_KEYS if key in written}
+
+
+def _as_its_process(node: Node, process: Mapping[str, object]) -> Node:
+    values = {**process, **_own_supervision(node)}
+    supervision = dataclasses.replace(node.supervision, **values)  # type: ignore[arg-type]
+    return dataclasses.replace(node, supervision=supervision) if process else node
 
 
 def _settled(node: Node, manifest: str) -> Node:

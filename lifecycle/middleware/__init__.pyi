@@ -9,6 +9,7 @@ from .discovery.liveliness import node_topic as node_topic
 from .discovery.probe import discovery_peers as discovery_peers
 from .discovery.probe import peers_environment as peers_environment
 from .discovery.rediscovery import call_out as call_out
+from .discovery.rediscovery import introduce as introduce
 from .discovery.rediscovery import republish_names as republish_names
 from .discovery.rediscovery import send_again_soon as send_again_soon
 from .fastdds.dscp import widen_discovery_buffers as widen_discovery_buffers

@@ -42,7 +42,7 @@ _NODE_DERIVED = (
     *("key", "at", "run", "endpoints", "declared_parameters", "parameters", "parameter_files"),
     *("remap", "participants", "after", "transports", "max_datagram_bytes", "connections"),
     *("authority", "events", "membership", "files", "held_by"),
-    *("expected_parameters", "unread_parameter_files"),
+    *("expected_parameters", "unread_parameter_files", "supervision"),
 )
 _ENDPOINT_DERIVED = (
     *("kind", "name", "resolved", "type", "qos", "participant", "at"),
@@ -151,6 +151,7 @@ def _node(node: PlannedNode) -> _Tree:
     files = [written.get(f"parameter_files.{index}") for index in range(len(node.parameter_files))]
     return {
         **_fields(node, *_NODE_DERIVED),
+        **_fields(node.supervision),
         "run": run,
         "parameters": {name: to_plain(value) for name, value in node.parameters},
         "parameter_files": [

@@ -17,6 +17,7 @@ from .run.events import Emitter as Emitter
 from .run.events import Event as Event
 from .run.events import Failure as Failure
 from .run.events import GateOpened as GateOpened
+from .run.events import GaveUp as GaveUp
 from .run.events import Listener as Listener
 from .run.events import LogLine as LogLine
 from .run.events import MachineConnection as MachineConnection
@@ -25,6 +26,8 @@ from .run.events import NodeChanged as NodeChanged
 from .run.events import NodeSilent as NodeSilent
 from .run.events import Notice as Notice
 from .run.events import ProcessChanged as ProcessChanged
+from .run.events import Restarted as Restarted
+from .run.events import RestartScheduled as RestartScheduled
 from .run.events import RunStarted as RunStarted
 from .run.events import StageTimed as StageTimed
 from .run.events import Stopped as Stopped

@@ -38,7 +38,7 @@ def status_text(status: SystemStatus) -> str:
     verdict += f" ({status.not_ok})" if status.not_ok else ""
     rows = [_HEADS, *(tuple(map(one_line, _row(node))) for node in status.nodes)]
     widths = [max(len(row[index]) for row in rows) for index in range(len(_HEADS))]
-    living = sum(not node.died for node in status.nodes)
+    living = sum(not node.died and node.next_try_s is None for node in status.nodes)
     count = "" if living == len(status.nodes) else f" {living}/{len(status.nodes)}"
     head = (
         f"{status.system}: {status.phase}{count}, verdict {verdict}, domain {status.domain_id}, "
@@ -71,8 +71,23 @@ def _row(node: NodeStatus) -> tuple[str, ...]:
         "dead" if node.died else (node.state if node.managed else node.reach.value) or "–",
         f"{node.matched}/{node.endpoints}",
         f"{node.unique_flows}/{node.flows}",
-        node.died or (f"silent: {node.silent}" if node.silent else node.doing),
+        node.died or (f"silent: {node.silent}" if node.silent else node.doing) or _history(node),
     )
+
+
+def _history(node: NodeStatus) -> str:
+    """Say since when a node's process runs, how often it was started again, and after what."""
+    parts = []
+    if node.next_try_s is not None:
+        parts.append(f"starts again in {node.next_try_s:.1f} s")
+    elif node.restarts and node.uptime_s is not None:
+        parts.append(f"up for {node.uptime_s:.1f} s")
+    if node.restarts:
+        parts.append(f"restarted {node.restarts} time{'s' * (node.restarts != 1)}")
+    if (last := node.last_failure) is not None:
+        stderr = f" ({last.stderr})" if last.stderr else ""
+        parts.append(f"last failure {last.at}: {last.message}{stderr}")
+    return "; ".join(parts)
 
 
 @click.command("status")

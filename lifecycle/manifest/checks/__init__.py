@@ -36,6 +36,7 @@ from lifecycle.manifest.checks.nodes import (
     check_ports,
     check_processes,
     check_programs,
+    check_supervision,
 )
 from lifecycle.manifest.checks.parameters import check_parameter_files, check_parameters
 from lifecycle.manifest.checks.system import DeclaredSystem, Partial
@@ -119,6 +120,7 @@ CHECKS = (
     Check(run=lambda scope: check_machines(scope.system, scope.machines), machines=True),
     Check(run=lambda scope: check_processes(scope.system), parts=("run",)),
     Check(run=lambda scope: check_programs(scope.system), parts=("run",)),
+    Check(run=lambda scope: check_supervision(scope.system), parts=("run",)),
     Check(
         run=lambda scope: check_ports(scope.system, scope.needs, scope.environment),
         whole=True,

@@ -2,6 +2,7 @@
 
 Owns: check.unknown-machine, check.process-machine, check.process-run, check.process-environment,
 check.process-name, check.ros-args, check.container, check.may-end, check.state,
+check.restart, check.start-limit,
 check.domain, check.ports, check.localhost, check.after-unknown,
 check.after-self, check.after-cycle, check.after-unmanaged. Port arithmetic is in
 `lifecycle.network`. Pure.
@@ -17,6 +18,7 @@ from lifecycle.manifest.checks.system import DeclaredSystem, rmw_of, spell
 from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.flows import FlowNeeds
 from lifecycle.manifest.model import (
+    SUPERVISION_KEYS,
     After,
     Condition,
     DiscoveryMode,
@@ -25,6 +27,7 @@ from lifecycle.manifest.model import (
     Executor,
     Machine,
     Node,
+    Restart,
     RosArguments,
     Run,
     RunKind,
@@ -121,6 +124,77 @@ def _apart(node: Node, other: Node, at: Position) -> Iterator[Diagnostic]:
     for name in different:
         message = f"{together}: a process has one {name}, these nodes ask for two"
         yield error("check.process-environment", at, message, f"give both the same 'run.{name}'")
+    for key in SUPERVISION_KEYS:
+        if getattr(node.supervision, key) != getattr(other.supervision, key):
+            message = f"{together}: a process has one {key}, these nodes ask for two"
+            yield error("check.restart", node.where(key), message, f"write '{key}' at one of them")
+
+
+def check_supervision(system: DeclaredSystem) -> Iterator[Diagnostic]:
+    """Yield findings about what is to be done when processes fail."""
+    restarted = {
+        node.process or node.key: None
+        for node in system.manifest.nodes
+        if node.supervision.restart is not Restart.NO
+    }
+    for node in system.manifest.nodes:
+        places = dict(node.positions)
+        own = [key for key in SUPERVISION_KEYS if key in places and key not in node.shared]
+        if node.run.kind is RunKind.ATTACH:
+            what = "it has its container's process" if node.run.component else "others start it"
+            for key in own:
+                message = f"cannot set {key} of {node.key!r}: {what}"
+                hint = "set it at the container" if node.run.component else "remove it"
+                yield error("check.restart", places[key], message, hint)
+            continue
+        if (node.process or node.key) not in restarted:
+            for key in own:
+                if key != "restart":
+                    message = f"cannot use {key} of {node.key!r}: it is not started again"
+                    yield error("check.restart", places[key], message, _NOT_RESTARTED)
+            continue
+        if node.may_end and "restart" in own and node.supervision.restart is Restart.ALWAYS:
+            message = f"cannot start {node.key!r} again whenever it ends: it may end by itself"
+            hint = "write 'restart: on-failure', or remove 'may_end'"
+            yield error("check.restart", places["restart"], message, hint)
+        yield from _delays(node, places)
+
+
+_NOT_RESTARTED = "write 'restart: on-failure', or remove it"
+
+
+def _delays(node: Node, places: Mapping[str, Position]) -> Iterator[Diagnostic]:
+    """Judge the delays of a process that is started again."""
+    how = node.supervision
+    longest = how.restart_max_delay_sec
+    if longest is not None and longest < how.restart_sec:
+        message = (
+            f"cannot wait {longest:g} s at most: restart_sec is {how.restart_sec:g}, the shortest"
+        )
+        at = places.get("restart_max_delay_sec", node.at)
+        yield error("check.restart", at, message, "set restart_max_delay_sec >= restart_sec")
+    elif longest is not None and longest > how.restart_sec and how.restart_steps == 0:
+        message = f"cannot let the delay grow to {longest:g} s: no restart_steps say how fast"
+        at = places.get("restart_max_delay_sec", node.at)
+        yield error("check.restart", at, message, "set 'restart_steps: 5' beside it")
+    if how.restart_steps and longest is None:
+        message = f"cannot let the delay grow in {how.restart_steps} steps: up to what is not said"
+        at = places.get("restart_steps", node.at)
+        yield error("check.restart", at, message, "set 'restart_max_delay_sec' beside it")
+    elif how.restart_steps and not how.restart_sec:
+        message = "cannot let the delay grow from 0 s: it grows by a factor"
+        at = places.get("restart_sec", node.at)
+        yield error("check.restart", at, message, "set 'restart_sec: 0.1' or more")
+    least_s = how.restart_sec * how.start_limit_burst
+    interval_s = how.start_limit_interval_sec
+    if interval_s and least_s > interval_s:
+        message = (
+            f"cannot reach the limit of {how.start_limit_burst} starts in {interval_s:g} s: with "
+            f"restart_sec {how.restart_sec:g} they take {least_s:g} s, so it is never given up"
+        )
+        at = places.get("start_limit_interval_sec", places.get("restart_sec", node.at))
+        hint = f"set start_limit_interval_sec > {least_s:g}, or to 0 if that is meant"
+        yield warning("check.start-limit", at, message, hint)
 
 
 def _program(run: Run) -> str:

@@ -33,7 +33,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from lifecycle.middleware.discovery.probe import HEADER, ProbeTarget, probe_targets, send
 from lifecycle.middleware.fastdds.dscp import own_udp_socket, socket_descriptors
-from lifecycle.middleware.fastdds.url_check import open_sockets
+from lifecycle.middleware.fastdds.url_check import sockets_of
 from lifecycle.network import UDP_UNICAST, ConnectionUrl, Medium
 
 _UNANSWERED = 2
@@ -184,8 +184,8 @@ def remove_participants(
     """
     messages = [disposal(each) for each in prefixes]
     targets = {
-        kind: [*_asked(domain_id, urls, environment, kind), *_listening(pids, kind)]
-        for kind in UDP_UNICAST
+        kind: [*_asked(domain_id, urls, environment, kind), *found]
+        for kind, found in listening(pids).items()
     }
     output = next((url.output_port for url in urls if url.output_port), None)
     for kind in UDP_UNICAST:
@@ -206,12 +206,14 @@ def _asked(
             yield from targets
 
 
-def _listening(pids: Iterable[int], kind: Medium) -> Iterator[ProbeTarget]:
-    """Yield where processes of this host receive; those that are gone receive nothing."""
-    for pid in pids:
-        with contextlib.suppress(OSError):
-            for each in open_sockets(pid):
-                if each.kind == kind and not ipaddress.ip_address(each.address).is_multicast:
-                    any_ = ipaddress.ip_address(each.address).is_unspecified
-                    address = kind.loopback if any_ else each.address
-                    yield ProbeTarget(address=address, port=each.port)
+def listening(pids: Iterable[int]) -> dict[Medium, dict[ProbeTarget, int]]:
+    """Return where processes of this host receive UDP, by medium; the values are their pids."""
+    found: dict[Medium, dict[ProbeTarget, int]] = {kind: {} for kind in UDP_UNICAST}
+    for pid, sockets in sockets_of(pids).items():
+        for each in sockets:
+            if each.kind not in found or ipaddress.ip_address(each.address).is_multicast:
+                continue
+            any_ = ipaddress.ip_address(each.address).is_unspecified
+            address = each.kind.loopback if any_ else each.address
+            found[each.kind][ProbeTarget(address=address, port=each.port)] = pid
+    return found

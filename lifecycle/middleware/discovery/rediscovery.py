@@ -1,4 +1,4 @@
-"""Rediscovery after a link is back: announcements, node names in the graph, TCP retransmission.
+"""Rediscovery after an outage or a restart: announcements, node names, TCP retransmission.
 
 Owns: what is sent while a peer is unreachable, what makes node names complete again, and how long
 the kernel waits at most before it retransmits over TCP.
@@ -25,6 +25,7 @@ from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
+from lifecycle.middleware.discovery.dead_peers import listening
 from lifecycle.middleware.discovery.probe import (
     RANGE_VARIABLE,
     ProbeTarget,
@@ -33,6 +34,7 @@ from lifecycle.middleware.discovery.probe import (
     chosen_otherwise,
     discovery_ports,
     group_targets,
+    probe_targets,
     send,
     well_known_targets,
 )
@@ -126,6 +128,41 @@ def _call_listed(domain_id: int, family: UrlTransport) -> None:
         return
     with own as sender:
         send(sender, announcement(answered_at[:_ANSWERED_AT]), targets)
+
+
+def introduce(
+    newcomers: Iterable[int],
+    domain_id: int,
+    urls: Sequence[ConnectionUrl],
+    environment: Mapping[str, str],
+    pids: Iterable[int],
+) -> None:
+    """Make participants that have been there for long announce themselves to new ones at once.
+
+    They answered the first announcement of a new one before it listened, and else announce
+    themselves once in 3 s (see probe.py). Nothing is sent where a plan fixes the port that this
+    process sends by, nor over shared memory and TCP.
+
+    Args:
+        newcomers: pids of the new processes of this host, whose participants listen by now.
+        domain_id: 0–232.
+        urls: of this process's observer.
+        environment: see `probe.probe_targets`.
+        pids: of this host's processes whose participants are to answer, besides all that the
+            observer could find.
+    """
+    if any(url.output_port for url in urls):
+        return
+    new = frozenset(newcomers)
+    asked = dict(probe_targets(domain_id, urls, environment))
+    for kind, found in listening((*new, *pids)).items():
+        family = kind.socket_family
+        answered_at = [(each.address, each.port) for each, pid in found.items() if pid in new]
+        targets = dict.fromkeys((*asked.get(kind, ()), *found))
+        if not answered_at or not targets:
+            continue
+        with contextlib.suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as sender:
+            send(sender, announcement(answered_at[:_ANSWERED_AT]), targets)
 
 
 def republish_names(nodes: Iterable[Node]) -> None:

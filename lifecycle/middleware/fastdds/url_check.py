@@ -12,7 +12,7 @@ import dataclasses
 import ipaddress
 import socket
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from lifecycle.errors import MiddlewareError
@@ -123,6 +123,19 @@ def open_sockets(pid: int | None = None) -> tuple[OpenSocket, ...]:
     """
     ours = set(_socket_inodes("self" if pid is None else str(pid)))
     return tuple(each for each in _bound_sockets() if each.inode in ours)
+
+
+def sockets_of(pids: Iterable[int]) -> dict[int, tuple[OpenSocket, ...]]:
+    """Return the same of several processes; those that are gone, or not ours, have none."""
+    inodes: dict[int, int] = {}
+    for pid in pids:
+        with contextlib.suppress(OSError):
+            inodes |= dict.fromkeys(_socket_inodes(str(pid)), pid)
+    found: dict[int, list[OpenSocket]] = {}
+    for each in _bound_sockets() if inodes else ():
+        if each.inode in inodes:
+            found.setdefault(inodes[each.inode], []).append(each)
+    return {pid: tuple(sockets) for pid, sockets in found.items()}
 
 
 def _is_free(kind: Medium, address: str, port: int) -> bool:

@@ -45,10 +45,12 @@ class Order:
         node: for RESTART, manifest key or fully qualified name; empty for the whole system.
         plan: the plan of the manifest that the order names, as it is now; None if it names none.
         reload: for RESTART, `plan` is to run from now on.
+        keys: for RESTART by policy, of the nodes, which are down already; empty for one by hand.
     """
 
     kind: OrderKind
     node: str = ""
+    keys: tuple[str, ...] = ()
     plan: Plan | None = None
     reload: bool = False
 
@@ -141,6 +143,7 @@ class Mailbox:
     def __init__(self) -> None:
         self._queue: asyncio.Queue[Pending] = asyncio.Queue()
         self._open: set[Pending] = set()
+        self._placed = asyncio.Event()
 
     async def place(self, order: Order) -> Done:
         """Give an order and wait for what comes of it."""
@@ -148,6 +151,8 @@ class Mailbox:
         self._open.add(pending)
         try:
             await self._queue.put(pending)
+            self._placed.set()
+            self._placed = asyncio.Event()
             return await asyncio.shield(pending.done)
         finally:
             self._open.discard(pending)
@@ -155,6 +160,11 @@ class Mailbox:
     async def next(self) -> Pending:
         """Wait for the next order."""
         return await self._queue.get()
+
+    async def arrives(self) -> None:
+        """Return once an order waits; it stays where it is."""
+        while self._queue.empty():
+            await self._placed.wait()
 
     def close(self, reason: str) -> None:
         """Refuse what is still open."""

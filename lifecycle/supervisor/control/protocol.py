@@ -48,6 +48,30 @@ class Reach(enum.Enum):
     STOPPED = "stopped"
 
 
+class Failed(msgspec.Struct, frozen=True, kw_only=True):
+    """One failure of a process.
+
+    Attributes:
+        rule: id of the finding that it is, `run.process-died`.
+        subject: node or process, as in that finding.
+        message: a whole sentence.
+        exit_status: of the process; None if it did not end by itself, or a signal ended it.
+        signal: name of the signal that ended it, `SIGKILL`; empty if none did.
+        stderr: the last line that it wrote to standard error; empty if none.
+        elapsed_s: when, in seconds since the supervisor started.
+        at: when, UTC by ISO 8601, for people and logs.
+    """
+
+    rule: str
+    subject: str
+    message: str
+    exit_status: int | None = None
+    signal: str = ""
+    stderr: str = ""
+    elapsed_s: float = 0.0
+    at: str = ""
+
+
 class NodeStatus(msgspec.Struct, frozen=True, kw_only=True):
     """One node.
 
@@ -67,6 +91,11 @@ class NodeStatus(msgspec.Struct, frozen=True, kw_only=True):
         died: how its process ended unasked; empty while it runs. It then has no state, and no
             matches.
         connections: as it reports them, its own participant left out.
+        uptime_s: since its process was started; None while there is none of ours.
+        restarts: how often its process was started again by policy.
+        last_failure: of its process, that it was, or is to be, started again after; None if there
+            was none.
+        next_try_s: seconds until its process is started again; None if that is not planned.
     """
 
     node: str
@@ -85,6 +114,10 @@ class NodeStatus(msgspec.Struct, frozen=True, kw_only=True):
     silent: str = ""
     died: str = ""
     connections: tuple[ConnectionReport, ...] = ()
+    uptime_s: float | None = None
+    restarts: int = 0
+    last_failure: Failed | None = None
+    next_try_s: float | None = None
 
 
 class SystemStatus(msgspec.Struct, frozen=True, kw_only=True):

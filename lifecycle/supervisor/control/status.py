@@ -13,10 +13,21 @@ from lifecycle.verify import Verdict, not_ok
 
 if TYPE_CHECKING:
     from lifecycle.supervisor.nodes.system import NodeRun, System
+    from lifecycle.supervisor.policy.schedule import RestartSchedule
 
 
-def node_status(node: NodeRun, verdict: Verdict | None, silent: str = "") -> NodeStatus:
+def node_status(
+    node: NodeRun,
+    verdict: Verdict | None,
+    silent: str = "",
+    *,
+    elapsed_s: float = 0.0,
+    schedule: RestartSchedule | None = None,
+) -> NodeStatus:
     """Return what is known of one node."""
+    process = node.process
+    runs = process is not None and process.pid != 0 and not process.is_gone
+    known = None if process is None else schedule
     died = _died(node)
     configuration = None if died else node.configuration
     reports = () if configuration is None else configuration.endpoints
@@ -50,6 +61,10 @@ def node_status(node: NodeRun, verdict: Verdict | None, silent: str = "") -> Nod
             for each in (() if configuration is None else configuration.connections)
             if each.name
         ),
+        uptime_s=elapsed_s - process.started_s if runs and process is not None else None,
+        restarts=0 if known is None else known.restarts(node.planned.process),
+        last_failure=None if known is None else known.last_failure(node.planned.process),
+        next_try_s=None if known is None else known.next_try_s(node.planned.process),
     )
 
 
@@ -62,7 +77,13 @@ def _died(node: NodeRun) -> str:
 
 
 def system_status(
-    system: System, verdict: Verdict | None, *, phase: str, supervisor: int, elapsed_s: float
+    system: System,
+    verdict: Verdict | None,
+    *,
+    phase: str,
+    supervisor: int,
+    elapsed_s: float,
+    schedule: RestartSchedule | None = None,
 ) -> SystemStatus:
     """Return what is known of the whole system."""
     silent = system.liveliness.silent
@@ -74,7 +95,10 @@ def system_status(
         supervisor=supervisor,
         elapsed_s=elapsed_s,
         nodes=tuple(
-            node_status(node, verdict, silent.get(node.name, "")) for node in system.nodes.values()
+            node_status(
+                node, verdict, silent.get(node.name, ""), elapsed_s=elapsed_s, schedule=schedule
+            )
+            for node in system.nodes.values()
         ),
         not_ok="" if verdict is None else not_ok(verdict),
     )

@@ -9,10 +9,11 @@ It dies with the gate: once anything goes wrong, nodes not yet activated stay in
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 from typing import Protocol
 
 from lifecycle.errors import BringUpError, ExitCode, LifecycleError
-from lifecycle.verify import Outcome, Verdict
+from lifecycle.verify import Finding, Outcome, Verdict, rule
 
 
 class VerificationError(LifecycleError):
@@ -58,6 +59,40 @@ def closes(verdict: Verdict, *, strict: bool) -> bool:
     return strict and verdict.verdict is Outcome.UNVERIFIABLE
 
 
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Scope:
+    """Whose gate it is, where only some nodes come again and the rest stays active.
+
+    Attributes:
+        others: full names of all other nodes of the system: what concerns these alone keeps nobody
+            else at the gate. What cannot be attributed does, and so does what no manifest declares.
+        unverifiable_blocks: as in the manifest's policy.
+    """
+
+    others: frozenset[str]
+    unverifiable_blocks: bool
+
+    def of(self, verdict: Verdict) -> Verdict:
+        """Return the part of a verdict that this gate is judged by."""
+        findings = tuple(each for each in verdict.findings if not self._is_others(each))
+        if len(findings) == len(verdict.findings):
+            return verdict
+        return dataclasses.replace(
+            verdict,
+            verdict=Outcome.worst(each.outcome for each in findings),
+            blocking=any(
+                each.outcome is Outcome.VIOLATED
+                or (self.unverifiable_blocks and rule(each.rule).may_block)
+                for each in findings
+            ),
+            findings=findings,
+        )
+
+    def _is_others(self, finding: Finding) -> bool:
+        names = finding.nodes or (finding.subject,)
+        return all(name in self.others for name in names)
+
+
 class Judging(Protocol):
     """What a permit asks about the verdict that it came from, see VerificationLoop."""
 
@@ -77,7 +112,7 @@ class Permit:
     """
 
     def __init__(self, gate: Gate, verdict: Verdict) -> None:
-        if gate.permit is not None or closes(verdict, strict=gate.strict):
+        if gate.permit is not None or gate.closes(verdict):
             raise BringUpError("cannot make a permit without an open gate; ask Gate.judge for one")
         self._gate = gate
         self.sent: set[str] = set()
@@ -131,7 +166,7 @@ class Permit:
         verdict = await self._gate.judged_again(frozenset(self.sent))
         if self._gate.permit is not self:
             return
-        if closes(verdict, strict=self._gate.strict):
+        if self._gate.closes(verdict):
             self._refused = verdict
             self._gate.close()
         else:
@@ -154,12 +189,22 @@ class Gate:
     Attributes:
         strict: refuse an unverifiable verdict even where the manifest's policy lets it pass.
         permit: the one that holds at this moment; None while the gate is closed.
+        scope: whose gate it is; None: of the whole system.
     """
 
     def __init__(self, *, strict: bool, judging: Judging | None = None) -> None:
         self.strict = strict
         self.permit: Permit | None = None
+        self.scope: Scope | None = None
         self._judging = judging
+
+    def concerning(self, verdict: Verdict) -> Verdict:
+        """Return the part of a verdict that this gate is judged by."""
+        return verdict if self.scope is None else self.scope.of(verdict)
+
+    def closes(self, verdict: Verdict) -> bool:
+        """Whether what concerns this gate keeps it closed."""
+        return closes(self.concerning(verdict), strict=self.strict)
 
     def judge(self, verdict: Verdict) -> Permit:
         """Open on a verdict that allows it.
@@ -168,8 +213,8 @@ class Gate:
             VerificationError: the verdict does not allow it; the gate is closed.
         """
         self.permit = None
-        if closes(verdict, strict=self.strict):
-            raise VerificationError(verdict)
+        if self.closes(verdict):
+            raise VerificationError(self.concerning(verdict))
         self.permit = Permit(self, verdict)
         return self.permit
 

@@ -1,7 +1,8 @@
 """Holds a system that is up: judges it at every change, and carries out orders.
 
-Owns: `Watch`, which judges again and again, and `Holding`: for how long, what ends it, and how
-orders (pause, resume, restart) are received and answered. What an order does is sequence.py's. Must
+Owns: `Watch`, which judges again and again, and `Holding`: for how long, what ends it, how orders
+(pause, resume, restart) are received and answered, and that what fails is restarted when policy
+says so, by the same orders. What an order does is sequence.py's, when to restart policy/'s. Must
 not import rclpy.
 """
 
@@ -9,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+import enum
 from collections.abc import Awaitable, Callable
 from typing import Any
 
@@ -20,44 +22,81 @@ from lifecycle.supervisor.control.orders import (
     Mailbox,
     NotBegunError,
     Order,
+    OrderKind,
     Pending,
     Revisions,
     check_order,
 )
 from lifecycle.supervisor.gate.gate import VerificationError
-from lifecycle.supervisor.gate.sequence import GateSequence
+from lifecycle.supervisor.gate.sequence import GateSequence, OutrunError
 from lifecycle.supervisor.gate.verification_loop import SETTLED_S, ChangeCounter, VerificationLoop
 from lifecycle.supervisor.health.process_monitor import ProcessMonitor
 from lifecycle.supervisor.nodes.system import System
+from lifecycle.supervisor.policy.schedule import RestartSchedule
 from lifecycle.supervisor.run.events import Emitter, Notice
-from lifecycle.supervisor.run.failure import StepFailedError, ended
-from lifecycle.verify import Outcome, Stage, not_ok
+from lifecycle.supervisor.run.failure import StepFailedError, ended, failure_of
+from lifecycle.verify import Outcome, Stage, Verdict, not_ok
 
 
 class Watch:
     """Judges a system again and again while it is held.
 
+    Args:
+        schedule: what is away, to be started again by policy, violates nothing by that.
+        opens: whether a verdict opens a gate that is waited for; `run` returns then.
+
     Attributes:
         violated: what was seen violated for longer than a passing moment; empty if nothing was.
     """
 
-    def __init__(self, judge: VerificationLoop, changes: ChangeCounter, stage: Stage) -> None:
+    def __init__(
+        self,
+        judge: VerificationLoop,
+        changes: ChangeCounter,
+        stage: Stage,
+        schedule: RestartSchedule | None = None,
+        opens: Callable[[Verdict], bool] = lambda _: False,
+    ) -> None:
+        self._schedule = schedule
+        self._opens = opens
         self._judge = judge
         self._changes = changes
         self._stage = stage
         self.violated = ""
 
     async def run(self) -> None:
-        """Judge at every change, until cancelled."""
+        """Judge at every change, until cancelled or a gate may open that is waited for."""
         while True:
             count = self._changes.count
-            verdict, again_s = await self._judge.settled(self._stage)
+            whole, again_s = await self._judge.settled(self._stage)
+            if again_s is None and self._opens(whole):
+                return
+            away = frozenset[str]() if self._schedule is None else self._schedule.away
+            verdict = _without(whole, away)
             bad = verdict.verdict is Outcome.VIOLATED and not self.violated
             wait_s = SETTLED_S if again_s is None and bad else again_s
             if await self._changes.beyond(count, wait_s):
                 await self._judge.quiet()
             elif again_s is None:
                 self.violated = not_ok(verdict) or verdict.verdict.value  # no change: it lasts
+
+
+def _without(verdict: Verdict, away: frozenset[str]) -> Verdict:
+    """Return a verdict without what is found of nodes that are to be started again."""
+    if not away:
+        return verdict
+    findings = tuple(
+        each for each in verdict.findings if away.isdisjoint((*each.nodes, each.subject))
+    )
+    outcome = Outcome.worst(each.outcome for each in findings)
+    return dataclasses.replace(verdict, verdict=outcome, findings=findings)
+
+
+class _Next(enum.Enum):
+    """What is to be done beside orders."""
+
+    RESTART = "restart"
+    LET_THROUGH = "let_through"
 
 
 class Holding:
@@ -68,6 +107,7 @@ class Holding:
         judge: judges it at every change.
         changes: what it waits for.
         gate_sequence: carries out orders, and knows the phase.
+        schedule: knows what is to be started again when.
         revisions: knows which manifest runs.
         process_monitor: notices processes that end.
         emit: where events go.
@@ -82,6 +122,7 @@ class Holding:
         judge: VerificationLoop,
         changes: ChangeCounter,
         gate_sequence: GateSequence,
+        schedule: RestartSchedule,
         revisions: Revisions,
         process_monitor: ProcessMonitor,
         emit: Emitter,
@@ -92,6 +133,7 @@ class Holding:
         self._judge = judge
         self._changes = changes
         self._gate_sequence = gate_sequence
+        self._schedule = schedule
         self._revisions = revisions
         self._process_monitor = process_monitor
         self._emit = emit
@@ -99,6 +141,7 @@ class Holding:
         self._keep_going = keep_going
         self._mailbox = Mailbox()
         self._violated = ""
+        self._before = ""  # phase of a system that is being restarted by policy
 
     async def hold(self, stage: Stage, hold_s: float | None) -> str:
         """Keep the system as it is, or as it is ordered; return what was violated, else nothing.
@@ -115,17 +158,23 @@ class Holding:
         await self._note_segments()
         deadline = None if hold_s is None else asyncio.get_running_loop().time() + hold_s
         while True:
-            watch = Watch(self._judge, self._changes, stage)
+            opens = self._gate_sequence.may_let_through
+            watch = Watch(self._judge, self._changes, stage, self._schedule, opens)
             watching = asyncio.ensure_future(watch.run())
             try:
-                pending = await self._until_ordered(deadline, watching)
+                what = await self._until_ordered(deadline, watching)
             finally:
                 await ended(watching)
             if stage is Stage.ACTIVE:
                 self._violated = self._violated or watch.violated
-            if pending is None:
+            if what is None:
                 return self._violated
-            await self._carry_out(pending)
+            if isinstance(what, Pending):
+                await self._carry_out(what)
+            elif isinstance(what, StepFailedError):
+                await self._gate_sequence.put_down(what)
+            else:
+                await self._by_policy(what)
             stage = self._gate_sequence.stage
 
     async def ordered(self, order: Order) -> Done:
@@ -136,8 +185,46 @@ class Holding:
             return Done(exit_code=error.exit_code, error=str(error))
         return await self._mailbox.place(order)
 
+    async def outrun(self) -> None:
+        """Return once an order waits, or something else is to be started again."""
+        waits = [
+            asyncio.ensure_future(self._mailbox.arrives()),
+            asyncio.ensure_future(self._schedule.due()),
+        ]
+        try:
+            await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            await ended(*waits)
+
+    async def _by_policy(self, what: _Next) -> None:
+        """Start again what is due, or let through its gate what waits there; who fails comes later.
+
+        Raises:
+            StepFailedError: something failed that is not to be started again, or too often.
+        """
+        failure = None
+        self._before = self._gate_sequence.phase
+        try:
+            if what is _Next.RESTART:
+                keys = self._schedule.begin()
+                await self._gate_sequence.carry_out(Order(kind=OrderKind.RESTART, keys=keys))
+                await self._note_segments()
+            else:
+                await self._gate_sequence.let_through()
+        except OutrunError:
+            pass
+        except VerificationError as error:
+            self._emit(Notice(message=str(error)))
+        except StepFailedError as error:
+            failure = error
+        finally:
+            self._before = ""
+        if failure is not None:
+            await self._gate_sequence.put_down(failure)
+
     def _check(self, order: Order) -> None:
-        check_order(order, self._system, self._gate_sequence.phase)
+        # A restart by policy is nobody's order: what comes meanwhile is carried out after it.
+        check_order(order, self._system, self._before or self._gate_sequence.phase)
         self._revisions.check(order)
 
     def close(self, reason: str) -> None:
@@ -155,40 +242,58 @@ class Holding:
                     self._emit(Notice(message=f"takes the changed manifest: {line}"))
             else:
                 pending.order = dataclasses.replace(pending.order, plan=None, reload=False)
-            await self._gate_sequence.carry_out(pending.order)
+            await self._carry_out_in_spite(pending.order)
             await self._note_segments()
         except (UsageError, NotBegunError) as error:
             pending.finish(Done(exit_code=error.exit_code, error=str(error)))
-        except (VerificationError, StepFailedError) as error:
+        except StepFailedError as error:
             pending.finish(Done(exit_code=error.exit_code, error=str(error)))
-            held = self._gate_sequence.phase in (PAUSED, HELD)
-            if not held or not isinstance(error, VerificationError):
+            await self._gate_sequence.put_down(error)
+        except VerificationError as error:
+            pending.finish(Done(exit_code=error.exit_code, error=str(error)))
+            if self._gate_sequence.phase not in (PAUSED, HELD):
                 raise
             self._emit(Notice(message=str(error)))
         else:
             pending.finish(Done())
 
+    async def _carry_out_in_spite(self, order: Order) -> None:
+        """Carry an order out; a pause is not given up because something fails meanwhile."""
+        while (failure := await failure_of(self._gate_sequence.carry_out(order))) is not None:
+            if order.kind is not OrderKind.PAUSE or not self._schedule.covers(failure):
+                raise failure
+            await self._gate_sequence.put_down(failure)
+
     async def _until_ordered(
         self, deadline: float | None, watching: asyncio.Task[None]
-    ) -> Pending | None:
-        """Wait for an order; None once the time is over."""
+    ) -> Pending | StepFailedError | _Next | None:
+        """Wait for an order, a failure that is not the end, or a restart; None at the deadline."""
         loop = asyncio.get_running_loop()
         while True:
             death = asyncio.ensure_future(self._process_monitor.next_death())
-            order = asyncio.ensure_future(self._mailbox.next())
+            order = asyncio.ensure_future(self._mailbox.arrives())
+            due = asyncio.ensure_future(self._schedule.due())
             try:
                 left = None if deadline is None else max(0.0, deadline - loop.time())
-                waits: set[asyncio.Future[Any]] = {death, watching, order}
+                waits: set[asyncio.Future[Any]] = {death, watching, order, due}
                 await asyncio.wait(waits, timeout=left, return_when=asyncio.FIRST_COMPLETED)
                 if watching.done():
                     watching.result()
                 if not death.done():
-                    return order.result() if order.done() else None
+                    if order.done():
+                        return await self._mailbox.next()
+                    if due.done():
+                        return _Next.RESTART
+                    return _Next.LET_THROUGH if watching.done() else None
                 failure = death.result()
+                if self._schedule.covers(failure):
+                    return failure
                 if not self._keep_going:
                     raise failure
+                if failure.process:
+                    self._schedule.write_off(failure.process)
                 self._emit(failure.event(ends_run=False))
                 self._violated = self._violated or failure.reason
                 self._system.touched.set()
             finally:
-                await ended(death, order)
+                await ended(death, order, due)

@@ -1,10 +1,10 @@
 """The gate sequence up to activation, and the orders that go through it: pause, resume, restart.
 
 Owns: the one way from a connected to an active system: judge, permit, networks, activate, judge
-again; the steps of each order; and `undiscovered`, which reads from a verdict which node was not
-discovered over TCP although it runs, and is to be started again on a fresh port. What is active
-stays so only as long as the gate that let it through; nothing is activated again before a new
-verdict opens it again. Must not import rclpy.
+again; the steps of each order, given by a person or by policy; and `undiscovered`, which reads from
+a verdict which node was not discovered over TCP although it runs, and is to be started again on a
+fresh port. What is active stays so only as long as the gate that let it through; nothing is
+activated again before a new verdict opens it again. Must not import rclpy.
 
 Fast DDS 2.14 sometimes never uses a TCP connection that it has dialled: if the answer to its first
 message arrives before the port inside the connection was noted, which happens when the dialling
@@ -35,17 +35,26 @@ from lifecycle.supervisor.control.orders import (
     node_of,
 )
 from lifecycle.supervisor.control.protocol import ProcessState, Reach
-from lifecycle.supervisor.gate.gate import Gate, Permit, VerificationError, behind_s, closes
+from lifecycle.supervisor.gate.gate import (
+    Gate,
+    Permit,
+    Scope,
+    VerificationError,
+    behind_s,
+    closes,
+)
 from lifecycle.supervisor.gate.verification_loop import VerificationLoop
 from lifecycle.supervisor.nodes.bring_up import BringUp
 from lifecycle.supervisor.nodes.system import NodeRun, System
+from lifecycle.supervisor.policy.schedule import RestartSchedule
 from lifecycle.supervisor.processes.process import Spawner
 from lifecycle.supervisor.run.events import Emitter, GateOpened, Notice, SystemReached
-from lifecycle.supervisor.run.failure import StepFailedError, together
+from lifecycle.supervisor.run.failure import StepFailedError, ended, failure_of, together
 from lifecycle.supervisor.run.shutdown import TakeDown
 from lifecycle.verify import (
     MISSING_NODE,
     START_FAILED,
+    TRANSITION_FAILED,
     About,
     Outcome,
     Stage,
@@ -99,10 +108,18 @@ Alive = Callable[[Coroutine[Any, Any, object]], Coroutine[Any, Any, None]]
 """Runs a step; the unexpected end of any process ends it."""
 
 
+class OutrunError(Exception):
+    """What was restarted by policy was still waiting for its gate when something else came first.
+
+    It is connected, and stays at its gate.
+    """
+
+
 class GateSequence:
     """Carries out orders on one system.
 
     Args:
+        schedule: what is started again by policy, and when.
         alive: see above.
         leaves: called with the names of processes that end because we want it, and `comes_back`
             once they are started again.
@@ -112,6 +129,7 @@ class GateSequence:
         program: programs networks with the flows of a verdict within seconds, done when it returns.
         following: keeps looking at the nodes of others, and at ours that others may drive, for the
             length of its block.
+        outrun: returns once something is to be done before a gate that stays closed.
         spawner: must be able to start processes before any is ended to be started again.
         timeout_s: for bringing up again what an order took down.
 
@@ -125,6 +143,7 @@ class GateSequence:
         system: System,
         *,
         bring_up: BringUp,
+        schedule: RestartSchedule,
         judge: VerificationLoop,
         gate: Gate,
         emit: Emitter,
@@ -137,12 +156,14 @@ class GateSequence:
         program: Callable[[Verdict, float], Coroutine[Any, Any, None]],
         spawner: Spawner,
         following: Callable[[], contextlib.AbstractAsyncContextManager[None]],
+        outrun: Callable[[], Coroutine[Any, Any, None]],
         hurry: asyncio.Event,
         timeout_s: float,
     ) -> None:
         self._spawner = spawner
         self._system = system
         self._bring_up = bring_up
+        self._schedule = schedule
         self._judge = judge
         self._gate = gate
         self._emit = emit
@@ -154,6 +175,7 @@ class GateSequence:
         self._replanned = replanned
         self._program = program
         self._following = following
+        self._outrun = outrun
         self._hurry = hurry
         self._timeout_s = timeout_s
         self.phase = "connecting"
@@ -178,6 +200,8 @@ class GateSequence:
             await self._pause()
         elif order.kind is OrderKind.RESUME:
             await self._through_the_gate()
+        elif order.keys:
+            await self._restart_by_policy(order.keys)
         else:
             await self._restart(order)
 
@@ -203,12 +227,224 @@ class GateSequence:
             ) from error
         self._gate.close()
         self.phase = "restarting"
+        self._schedule.by_hand([each.planned.key for each in nodes])
         await self._again(nodes, self._timeout_s, order.plan if order.reload else None)
         self._emit(SystemReached(reached="connected", elapsed_s=self._emit.elapsed_s))
         if was_paused:
             self._reached(PAUSED)
         else:
             await self._through_the_gate()
+
+    async def connect(self, timeout_s: float) -> None:
+        """Bring the system up as far as connected; who fails is started again as policy says.
+
+        Args:
+            timeout_s: seconds, counted anew whenever something is started again.
+
+        Raises:
+            StepFailedError: a step failed that nothing is to be started again after, or too often.
+        """
+        connecting = self._alive(self._bring_up.connect(timeout_s))
+        while (failure := await failure_of(connecting)) is not None:
+            await self.recover(failure, timeout_s)
+            connecting = self._alive(self._bring_up.connect(timeout_s))
+
+    async def recover(self, failure: StepFailedError, timeout_s: float) -> None:
+        """Start again what failed before the system was up; return once it is where it was.
+
+        Args:
+            failure: of a step, or an unexpected end.
+            timeout_s: seconds, for bringing it up each time.
+
+        Raises:
+            StepFailedError: `failure`, if nothing is to be started again after it; or one that ends
+                the run since.
+        """
+        self._gate.close()
+        phase = self.phase
+        await self.put_down(failure)
+        while self._schedule.down:
+            another = await failure_of(self._bring_back(timeout_s))
+            if another is not None:
+                await self.put_down(another)
+        self.phase = phase
+
+    async def _bring_back(self, timeout_s: float) -> None:
+        await self._alive(self._schedule.due())
+        self.phase = "restarting"
+        keys = self._schedule.begin()
+        await self._begin_again(tuple(self._system.nodes[key] for key in keys))
+        await self._connect_unfinished(timeout_s)
+
+    async def put_down(self, failure: StepFailedError) -> None:
+        """Take down what failed, and what goes down with it, to be started again later.
+
+        Who was interrupted in a step by it has an unknown state: it begins anew, too.
+
+        Raises:
+            StepFailedError: `failure`, if nothing is to be started again after it; or that
+                supervision gives up.
+        """
+        if not self._schedule.covers(failure):
+            raise failure
+        keys = self._schedule.take(failure)
+        interrupted = self._interrupted() - keys
+        self._schedule.again(interrupted)
+        down = tuple(
+            each for key, each in self._system.nodes.items() if key in keys or key in interrupted
+        )
+        await self._take_down(down)
+        for node in down:
+            node.renew(node.process)
+            if node.process is not None:
+                node.process.back_off()
+        self._judge.ahead = self.active()
+        self._system.touched.set()
+        self._schedule.announce(keys)
+        if self.phase == HELD and not self._inactive():
+            self.phase = ACTIVE
+
+    def _interrupted(self) -> frozenset[str]:
+        """Return the keys of the nodes, with their processes, that were cut off in a step."""
+        nodes = self._system.nodes
+        processes = {
+            each.process
+            for each in nodes.values()
+            if each.process is not None
+            and not each.process.is_gone
+            and (each.stuck or (each.reach is Reach.WAITING and _is_in_step(each)))
+        }
+        return frozenset(key for key, each in nodes.items() if each.process in processes)
+
+    async def _restart_by_policy(self, keys: tuple[str, ...]) -> None:
+        """Bring what is down as far as the system is: through its gate, while the rest stays.
+
+        Raises:
+            OutrunError: something else is to be done before its gate opens.
+        """
+        before = self.phase
+        goes_on = before in (ACTIVE, HELD)
+        try:
+            await self._spawner.ready()
+        except BringUpError as error:
+            raise self._not_started(keys, error.message) from error
+        self._gate.close()
+        self.phase = "restarting"
+        try:
+            await self._begin_again(tuple(self._system.nodes[key] for key in keys))
+            await self._connect_unfinished(self._timeout_s)
+            self._emit(SystemReached(reached="connected", elapsed_s=self._emit.elapsed_s))
+        except StepFailedError:
+            self.phase = HELD if goes_on else before
+            raise
+        if goes_on:
+            await self.let_through()
+        else:
+            self.phase = before
+            self._schedule.returned(self._keys(self._schedule.returning))
+
+    async def let_through(self) -> None:
+        """Judge what concerns the nodes that were started again by policy, and activate these.
+
+        Raises:
+            OutrunError: something else is to be done before their gate opens.
+            VerificationError: their gate stays closed; they wait at it.
+            StepFailedError: as for `activate`.
+        """
+        names = self._schedule.returning
+        deadline = asyncio.get_running_loop().time() + self._timeout_s
+        scope = Scope(
+            others=frozenset(each.full_name for each in self._system.plan.nodes) - names,
+            unverifiable_blocks=self._system.plan.policy.unverifiable_blocks,
+        )
+        self._gate.scope = self._judge.scope = scope
+        try:
+            permit = await self._unless_outrun(self.verify(self._timeout_s))
+            waiting = tuple(each for each in self._inactive() if each.name in names)
+            await self.activate(permit, deadline, waiting)
+        except VerificationError as error:
+            if not error.again and self.phase == "activating":
+                raise self._not_as_verified(names, error) from error
+            if error.again and self.phase == "activating":
+                await self._withdraw(permit)
+            raise
+        finally:
+            self._gate.scope = self._judge.scope = None
+            if self.phase != ACTIVE:
+                self.phase = HELD
+        self._schedule.returned(self._keys(names))
+
+    def may_let_through(self, verdict: Verdict) -> bool:
+        """Whether nodes wait that were started again by policy, and `verdict` opens their gate."""
+        names = self._schedule.returning
+        if self.phase != HELD or not names or names & self._schedule.down:
+            return False
+        others = frozenset(each.full_name for each in self._system.plan.nodes) - names
+        blocks = self._system.plan.policy.unverifiable_blocks
+        scope = Scope(others=others, unverifiable_blocks=blocks)
+        return not closes(scope.of(verdict), strict=self._gate.strict)
+
+    def _not_started(self, keys: Collection[str], why: str) -> StepFailedError:
+        failures = [
+            StepFailedError(
+                f"cannot start {each.name!r} again: {why}",
+                rule=START_FAILED,
+                subject=each.name,
+                process=each.planned.process,
+            )
+            for key, each in self._system.nodes.items()
+            if key in keys
+        ]
+        return failures[0].joined(failures[1:])
+
+    def _not_as_verified(self, names: Collection[str], error: VerificationError) -> StepFailedError:
+        """Return the failure of nodes that became other than what was verified."""
+        failures = [
+            StepFailedError(
+                f"cannot keep {each.name!r} active: what became active is not what was verified; "
+                f"{not_ok(error.verdict)}",
+                rule=TRANSITION_FAILED,
+                subject=each.name,
+                process=each.planned.process,
+            )
+            for each in self._system.nodes.values()
+            if each.name in names
+        ]
+        return failures[0].joined(failures[1:])
+
+    async def _unless_outrun(self, judging: Coroutine[Any, Any, Permit]) -> Permit:
+        running = asyncio.ensure_future(judging)
+        first = asyncio.ensure_future(self._outrun())
+        try:
+            waits: set[asyncio.Future[Any]] = {running, first}
+            await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+            if not running.done():
+                raise OutrunError
+            return running.result()
+        finally:
+            await ended(running, first)
+
+    def _keys(self, names: Collection[str]) -> tuple[str, ...]:
+        return tuple(key for key, each in self._system.nodes.items() if each.name in names)
+
+    async def _connect_unfinished(self, timeout_s: float) -> None:
+        """Bring every node that is not down, and waits for none that is, as far as its gate."""
+        down = self._schedule.down
+        held = {key for key, each in self._system.nodes.items() if each.name in down}
+        while more := {
+            key
+            for key, each in self._system.nodes.items()
+            if key not in held and any(after.node in held for after in each.planned.after)
+        }:
+            held |= more
+        nodes = [
+            each
+            for key, each in self._system.nodes.items()
+            if key not in held and not each.is_up and not _is_written_off(each)
+        ]
+        self.phase = "connecting"
+        self._judge.ahead = self.active()
+        await self._alive(self._bring_up.connect(timeout_s, nodes))
 
     async def until_clear(self, timeout_s: float) -> None:
         """Judge a connected system until its gate may open, or stays closed; activate nothing.
@@ -292,13 +528,32 @@ class GateSequence:
             timeout_s: seconds, for bringing them up.
             plan: another manifest's, to be taken meanwhile; None to keep this one.
         """
-        names = {each.process.name for each in nodes if each.process is not None}
-        self._leaves(names)
+        await self._take_down(nodes)
+        nodes = await self._begin_again(nodes, plan)
+        self.phase = "connecting"
+        self._judge.ahead = self.active()
+        await self._alive(self._bring_up.connect(timeout_s, nodes))
+
+    async def _take_down(self, nodes: tuple[NodeRun, ...]) -> None:
+        self._leaves({each.process.name for each in nodes if each.process is not None})
+        for node in nodes:
+            container = self._system.nodes.get(node.planned.run.container)
+            if container is not None and container.process is not None:
+                # Nobody answers for a component whose container is gone.
+                node.stuck = node.stuck or container.process.is_gone
         await TakeDown(self._system, self._emit, self._hurry, nodes=nodes).run()
-        # A participant that was killed haunts the graph; who comes back would be taken for two.
-        gone = [each.name for each in nodes if each.process or each.planned.run.component]
         for node in nodes:
             self._forget(node.name)
+
+    async def _begin_again(
+        self, nodes: tuple[NodeRun, ...], plan: Plan | None = None
+    ) -> tuple[NodeRun, ...]:
+        """Make nodes that are down ready to be brought up; return those to bring up."""
+        names = {each.process.name for each in nodes if each.process is not None}
+        # A participant that was killed haunts the graph; who comes back would be taken for two.
+        gone = [
+            each.name for each in nodes if each.process is not None or each.planned.run.component
+        ]
         if plan is not None:
             nodes = self._reload(plan, nodes)
         else:
@@ -306,9 +561,7 @@ class GateSequence:
             self._system.renew(nodes)
         self._comes_back(names)
         await self._alive(together(self._vanishes(name) for name in gone))
-        self.phase = "connecting"
-        self._judge.ahead = self.active()
-        await self._alive(self._bring_up.connect(timeout_s, nodes))
+        return nodes
 
     def _reload(self, plan: Plan, nodes: tuple[NodeRun, ...]) -> tuple[NodeRun, ...]:
         """Take another manifest's plan for nodes that are down; return those to bring up."""
@@ -355,12 +608,15 @@ class GateSequence:
         self._emit(SystemReached(reached="verified", elapsed_s=self._emit.elapsed_s))
         return permit
 
-    async def activate(self, permit: Permit, deadline: float) -> None:
+    async def activate(
+        self, permit: Permit, deadline: float, nodes: tuple[NodeRun, ...] | None = None
+    ) -> None:
         """Program networks, activate what is not active, and judge what it has become.
 
         Args:
             permit: of `verify`.
             deadline: of all of it, by the running loop's clock, see `behind_s`.
+            nodes: only these; None for all that are not active.
 
         Raises:
             StepFailedError: a step failed, or a network could not be programmed.
@@ -371,10 +627,10 @@ class GateSequence:
         await self._alive(self._program_flows(permit, deadline))
         self.trusted = taken_on_trust(permit.verdict)
         self.phase = "activating"
-        waiting = self._inactive()
+        waiting = self._inactive() if nodes is None else nodes
         self._emit(
             GateOpened(
-                outcome=permit.verdict.verdict.value,
+                outcome=self._gate.concerning(permit.verdict).verdict.value,
                 nodes=tuple(each.name for each in waiting),
                 trusted=self.trusted,
             )
@@ -386,7 +642,8 @@ class GateSequence:
         # The same question as at the gate: what became active must be what was verified.
         assert self._judge.latest is not None
         self._gate.judge(self._judge.latest)
-        self._reached(ACTIVE)
+        if nodes is None or not self._inactive():
+            self._reached(ACTIVE)
 
     async def _through_the_gate(self) -> None:
         """Judge the system as it is, and activate what is not active."""
@@ -432,7 +689,7 @@ class GateSequence:
         return tuple(
             each
             for each in self._system.nodes.values()
-            if each.is_to_be_active and each.reach is not Reach.ACTIVE
+            if each.is_to_be_active and each.is_up and each.reach is not Reach.ACTIVE
         )
 
     def active(self) -> frozenset[str]:
@@ -446,3 +703,13 @@ class GateSequence:
     def _reached(self, phase: str) -> None:
         self.phase = phase
         self._emit(SystemReached(reached=phase, elapsed_s=self._emit.elapsed_s))
+        self._schedule.returned([key for key, each in self._system.nodes.items() if each.is_up])
+
+
+def _is_in_step(node: NodeRun) -> bool:
+    """Whether a node that is not up was doing something itself, and did not wait for another."""
+    return not node.is_up and bool(node.doing) and not node.doing.startswith("waits")
+
+
+def _is_written_off(node: NodeRun) -> bool:
+    return node.process is not None and node.process.state is ProcessState.EXITED

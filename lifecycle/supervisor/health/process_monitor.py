@@ -13,13 +13,13 @@ import asyncio
 from collections.abc import Coroutine, Iterable, Sequence
 from typing import Any, Protocol
 
-from lifecycle.supervisor.control.protocol import ProcessState
+from lifecycle.supervisor.control.protocol import ProcessState, Reach
 from lifecycle.supervisor.gate.verification_loop import ChangeCounter
 from lifecycle.supervisor.nodes.bring_up import ALSO_S, died
 from lifecycle.supervisor.nodes.system import NodeRun, ObservedGraph, System
 from lifecycle.supervisor.processes.adopted_process import AdoptedProcess
 from lifecycle.supervisor.processes.process import ManagedProcess
-from lifecycle.supervisor.run.events import Event, ProcessChanged
+from lifecycle.supervisor.run.events import Event, NodeChanged, ProcessChanged
 from lifecycle.supervisor.run.failure import StepFailedError, ended
 
 _SPEAK_S = 0.7 + ALSO_S
@@ -115,6 +115,9 @@ AGAIN_S = (0.1, 0.5, 1.0, 2.0, 4.0)
 """Seconds between repetitions: what the process itself had sent may be read after the first, and a
 datagram may be lost. After the first two only while discovery still shows a participant."""
 
+INTRODUCED_AGAIN_S = (0.1, 0.2, 0.4, 0.8)
+"""Seconds between repetitions: a datagram may be lost, and be answered before it is listened."""
+
 _ALWAYS = 3
 """Times that it is sent in any case: at once and after the first two pauses."""
 
@@ -131,6 +134,9 @@ class ParticipantRegistry(Protocol):
 
     def remove_participants(self, prefixes: Iterable[str], pids: Iterable[int]) -> None:
         """Have all others forget participants whose process is dead."""
+
+    def introduce(self, newcomers: Iterable[int], pids: Iterable[int]) -> None:
+        """Have new participants discovered by, and discover, those that were there before."""
 
 
 class StaleNodes:
@@ -152,11 +158,34 @@ class StaleNodes:
         self._closed = False
 
     def on_event(self, event: Event) -> None:
-        """Take an event of the system; only the end of a process is of interest."""
+        """Take an event of the system; of interest are ends of processes, and restarted ones."""
+        if isinstance(event, NodeChanged) and event.reach in (Reach.STARTED, Reach.CONNECTED):
+            self._came_again(event.node, event.reach)
         if isinstance(event, ProcessChanged) and event.state is ProcessState.EXITED:
             process = self._system.processes.get(event.process)
             if process is not None and process.pid == event.pid:
                 asyncio.get_running_loop().call_soon(self._ended, process)
+
+    def _came_again(self, name: str, reach: Reach, repetition: int = 0) -> None:
+        """Introduce a process that was started again to the others, while it is so far."""
+        node = self._system.node_named(name)
+        process = None if node is None else node.process
+        if node is None or process is None or not process.is_restarted or not process.pid:
+            return
+        if self._closed or node.reach is not reach or process.is_gone:
+            return
+        pids = [each.pid for each in self._system.living if each is not process]
+        self._graph.introduce([process.pid], pids)
+        if repetition == len(INTRODUCED_AGAIN_S):
+            return
+
+        def again() -> None:
+            self._later.discard(handle)
+            self._came_again(name, reach, repetition + 1)
+
+        loop = asyncio.get_running_loop()
+        handle = loop.call_later(INTRODUCED_AGAIN_S[repetition], again)
+        self._later.add(handle)
 
     def close(self) -> None:
         """Repeat nothing any more."""

@@ -328,6 +328,12 @@ class BringUp:
             self._step_over.set()
 
     async def _walk(self, node: NodeRun) -> None:
+        """Bring a node as far as its gate, from where it is."""
+        if not node.is_up:
+            await self._walk_on(node)
+            node.is_up = True
+
+    async def _walk_on(self, node: NodeRun) -> None:
         await self._start(node)
         if node.planned.managed:
             await self._connect(node)
@@ -350,10 +356,12 @@ class BringUp:
         """Wait, bounded, for a node that its services are asked of: nobody else may get that."""
         limit_s = node.planned.timeouts.start_s
         await self._step(node, self._appears(node.name), limit_s, rule=START_FAILED)
-        if self._alone is not None and node.process is not None:
+        process = node.process
+        if self._alone is not None and process is not None and not process.is_restarted:
             self._alone(node)
 
     async def _appear(self, node: NodeRun) -> None:
+        process = node.process
         appears = asyncio.ensure_future(self._appears(node.name))
         waits: set[asyncio.Future[Any]] = {appears}
         if node.process is not None:
@@ -364,7 +372,9 @@ class BringUp:
             await ended(appears)
         if appears.done() and not appears.cancelled():
             appears.result()
-        self._started(node)
+        # Who is started again meanwhile has another process, and is waited for anew.
+        if node.process is process and (process is None or not process.died):
+            self._started(node)
 
     async def _load(self, node: NodeRun) -> None:
         """Have its container load a component, once that runs."""
@@ -424,20 +434,22 @@ class BringUp:
 
     async def _connect(self, node: NodeRun) -> None:
         assert node.driver is not None
-        node.doing = "starting"
-        limit_s = node.planned.timeouts.start_s
-        standing = await self._step(node, node.driver.start(), limit_s, rule=START_FAILED)
-        self._started(node, standing)
-        if node.found and standing.state == ACTIVE:
-            # It is verified as it is: nothing is asked of it, and the gate has nothing to let in.
-            node.advance(Reach.ACTIVE, standing)
-            return
-        await self._give(node)
+        if node.reach is Reach.WAITING:
+            node.doing = "starting"
+            limit_s = node.planned.timeouts.start_s
+            standing = await self._step(node, node.driver.start(), limit_s, rule=START_FAILED)
+            self._started(node, standing)
+            if node.found and standing.state == ACTIVE:
+                # It is verified as it is: nothing is asked of it, and no gate has to let it in.
+                node.advance(Reach.ACTIVE, standing)
+                return
+            await self._give(node)
         if node.planned.state is TargetState.UNCONFIGURED:
             return
-        await self._system.reached(node, Condition.CONFIGURED, "configure")
-        await self._operate(node, Operation.CONFIGURE, Reach.CONFIGURED)
-        await self._give(node)
+        if node.reach is Reach.STARTED:
+            await self._system.reached(node, Condition.CONFIGURED, "configure")
+            await self._operate(node, Operation.CONFIGURE, Reach.CONFIGURED)
+            await self._give(node)
         await self._system.reached(node, Condition.CONNECTED, "connect")
         if self._wirer is not None:
             await self._wirer.ready(node)
@@ -488,6 +500,8 @@ class BringUp:
 
     async def _start(self, node: NodeRun) -> None:
         """Have the node's process started, or find a node that others start."""
+        if node.driver is not None:
+            return  # it went on from here before another's failure had it wait
         process = node.process
         if process is None:
             await self._hold_start(node)

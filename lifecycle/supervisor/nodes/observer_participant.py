@@ -206,6 +206,13 @@ class ObserverParticipant:
 
         call_out(self._graph.discovery.domain_id, self._graph.discovery.urls, addresses, os.environ)
 
+    def introduce(self, newcomers: Iterable[int], pids: Iterable[int]) -> None:
+        """Have new participants discovered by, and discover, those that were there before."""
+        from lifecycle.middleware import introduce
+
+        discovery = self._graph.discovery
+        introduce(newcomers, discovery.domain_id, discovery.urls, os.environ, pids)
+
     def send_again_soon(self) -> None:
         """Have what waits for a link to come back be sent soon when it does."""
         from lifecycle.middleware import send_again_soon

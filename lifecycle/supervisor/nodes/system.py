@@ -258,6 +258,7 @@ class NodeRun:
         adopted: the process that others started it in, where that is known.
         reports_changes: its host reports unasked when its configuration changes.
         unload: has its container unload a component; None for what is not loaded into one.
+        is_up: it was started and brought as far as its gate; cleared when it goes down.
     """
 
     def __init__(self, planned: PlannedNode, emit: Emitter) -> None:
@@ -277,6 +278,7 @@ class NodeRun:
         self.adopted: AdoptedProcess | None = None
         self.reports_changes = False
         self.unload: Callable[[], Awaitable[None]] | None = None
+        self.is_up = False
         self.changed = asyncio.Event()
         self._emit = emit
 
@@ -290,6 +292,7 @@ class NodeRun:
         self.connections = ()
         self.reports_changes = False
         self.unload = None
+        self.is_up = False
         self.doing = ""
         self.connected = False
         self.state = ""
@@ -316,7 +319,7 @@ class NodeRun:
     def is_gone(self) -> bool:
         """Whether its process has ended, as far as that is noticed."""
         if self.process is not None:
-            return self.process.state is ProcessState.EXITED
+            return self.process.is_gone
         return self.adopted is not None and self.adopted.ended.done()
 
     def run_delay_s(self) -> float:
@@ -552,6 +555,7 @@ class System:
             old = node.process
             if old is not None and old.name not in processes:
                 processes[old.name] = self._process(old.planned)
+                processes[old.name].is_restarted = True
             node.renew(None if old is None else processes[old.name])
         self.processes.update(processes)
 
@@ -563,7 +567,7 @@ class System:
     def living(self) -> tuple[ManagedProcess, ...]:
         """Every process that was started and has not ended, the discovery server included."""
         every = (*self.processes.values(), *(() if self.server is None else (self.server,)))
-        return tuple(each for each in every if each.pid and each.state is not ProcessState.EXITED)
+        return tuple(each for each in every if each.pid and not each.is_gone)
 
     def output_positions(self) -> dict[str, int]:
         """Return how many bytes the log file of each process has."""
@@ -581,7 +585,7 @@ class System:
         return frozenset(
             node.name
             for node in self.nodes.values()
-            if node.process is not None and node.process.state is ProcessState.EXITED
+            if node.process is not None and node.process.is_gone
         )
 
     def on_host_event(self, event: HostEvent) -> None:

@@ -208,6 +208,9 @@ class ManagedProcess:
         on_stop: called with True when a signal stopped it, False when it continues; set before
             `spawn`.
         may_end: it may end by itself, with exit status 0.
+        started_s: when it was spawned, in seconds since the supervisor started.
+        is_restarted: another one ran in its place before.
+        last_stderr: the last line that it wrote to standard error; empty if none.
     """
 
     def __init__(
@@ -228,6 +231,9 @@ class ManagedProcess:
         self.child: Child | None = None
         self.ended: asyncio.Future[ProcessExit] = asyncio.get_running_loop().create_future()
         self.asked_to_end = False
+        self.started_s = emit.elapsed_s
+        self.last_stderr = ""
+        self.is_restarted = False
         self.on_stop: Callable[[bool], None] = lambda _: None
         kept = planned.run.output is not Output.SCREEN
         self.log = ProcessLog(logs, planned.name, kept=kept)
@@ -290,6 +296,7 @@ class ManagedProcess:
                 os.close(descriptor)
             if control is not None:
                 control.close()
+        self.started_s = self._emit.elapsed_s
         self.child.exited.add_done_callback(self._exited)
 
     def run_delay_s(self) -> float:
@@ -300,6 +307,18 @@ class ManagedProcess:
         """Note that the process does its work: its nodes are there."""
         if self.state is ProcessState.STARTING:
             self._change(ProcessState.RUNNING)
+
+    def back_off(self) -> None:
+        """Note that it has ended and that another one is to be started in its place."""
+        if self.state is ProcessState.STARTING and self.child is None:
+            self.state = ProcessState.EXITED
+        if self.state is ProcessState.EXITED:
+            self._change(ProcessState.BACKOFF)
+
+    @property
+    def is_gone(self) -> bool:
+        """Whether it has ended, in backoff or for good."""
+        return self.state in (ProcessState.EXITED, ProcessState.BACKOFF)
 
     async def end(self, escalation: Escalation, hurry: asyncio.Event) -> str:
         """End the process and everything in its group, bounded.
@@ -371,6 +390,8 @@ class ManagedProcess:
 
     def _line(self, stream: str, line: str) -> None:
         self.log.add(line)
+        if stream == "stderr" and line.strip():
+            self.last_stderr = line
         if self._node_logs and (logger := logger_in(line, self._node_logs)):
             self._node_logs[logger].add(line)
         if self.planned.run.output is not Output.LOG:

@@ -13,7 +13,7 @@ from typing import ClassVar, Union
 
 from lifecycle.codec import to_plain
 from lifecycle.node import Operation
-from lifecycle.supervisor.control.protocol import ProcessState, Reach
+from lifecycle.supervisor.control.protocol import Failed, ProcessState, Reach
 from lifecycle.verify import Stage, Verdict
 
 
@@ -258,7 +258,7 @@ class Failure:
         subject: node or process, as in that finding.
         process: name of the process concerned; empty if there is none of ours.
         log: the file with all that its process wrote, which came as log events, too.
-        ends_run: the run ends for it; not so under --keep-going.
+        ends_run: the run ends for it; not so under --keep-going, and where it is started again.
     """
 
     kind: ClassVar[str] = "failure"
@@ -268,6 +268,58 @@ class Failure:
     process: str = ""
     log: str = ""
     ends_run: bool = True
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class RestartScheduled:
+    """A process failed that is to be started again; until then it is in backoff.
+
+    Attributes:
+        nodes: those that are started again with it; all of them are down.
+        reason: the failure, a whole sentence.
+        stderr: the last line that it wrote to standard error; empty if none.
+        restarts: how often it was started again before.
+        in_s: seconds until it is.
+    """
+
+    kind: ClassVar[str] = "backoff"
+    process: str
+    nodes: tuple[str, ...]
+    reason: str
+    stderr: str
+    restarts: int
+    in_s: float
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Restarted:
+    """A process that failed is as far again as the system is: active and verified, or paused.
+
+    Attributes:
+        nodes: those in it.
+        restarts: how often it has been started again.
+        took_s: since its failure.
+    """
+
+    kind: ClassVar[str] = "restarted"
+    process: str
+    nodes: tuple[str, ...]
+    restarts: int
+    took_s: float
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class GaveUp:
+    """A process failed too often to be started again; the run ends for it.
+
+    Attributes:
+        history: its failures, the last at the end.
+    """
+
+    kind: ClassVar[str] = "gave_up"
+    process: str
+    restarts: int
+    history: tuple[Failed, ...]
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -313,6 +365,9 @@ Event = Union[  # noqa: UP007 - a run-time alias on Python 3.10
     SystemReached,
     StageTimed,
     Failure,
+    RestartScheduled,
+    Restarted,
+    GaveUp,
     Notice,
     Stopping,
     Stopped,

@@ -2,7 +2,7 @@
 
 Owns: `StepFailedError`, how failures join a verdict, so that every
 run ends in one verdict that names each cause once; `together`, what asyncio.TaskGroup does, which
-Python 3.10 does not have; `ended`; and `Worker`, a thread for what blocks.
+Python 3.10 does not have; `failure_of`; `ended`; and `Worker`, a thread for what blocks.
 """
 
 from __future__ import annotations
@@ -135,6 +135,15 @@ async def ended(*tasks: asyncio.Future[Any]) -> None:
             each.cancel()
         await asyncio.wait(left, timeout=_AGAIN_S)
     await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def failure_of(step: Coroutine[Any, Any, None]) -> StepFailedError | None:
+    """Carry out a step; return its failure, None if there is none."""
+    try:
+        await step
+    except StepFailedError as failure:
+        return failure
+    return None
 
 
 async def together(coroutines: Iterable[Coroutine[Any, Any, None]]) -> None:

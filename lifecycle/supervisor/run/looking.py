@@ -330,7 +330,8 @@ def _supervised(status: SystemStatus) -> dict[str, Supervised]:
     return {
         each.node: Supervised(
             pid=each.pid,
-            dead=each.process_state is ProcessState.EXITED and each.reach is not Reach.STOPPED,
+            dead=each.process_state is ProcessState.BACKOFF
+            or (each.process_state is ProcessState.EXITED and each.reach is not Reach.STOPPED),
             silent=bool(each.silent),
             doing=each.doing or each.silent,
         )

@@ -49,6 +49,7 @@ from lifecycle.supervisor.nodes.system import (
     ServiceNames,
     System,
 )
+from lifecycle.supervisor.policy.schedule import RestartSchedule
 from lifecycle.supervisor.processes.adopted_process import AdoptedProcess
 from lifecycle.supervisor.processes.orphans import ProcessFamily, end_strays, reap_adopted
 from lifecycle.supervisor.processes.process import Spawner
@@ -213,6 +214,7 @@ class Session:
         emit.listen(self._stale.on_event)
         self._records = records
         self._process_monitor = ProcessMonitor(system)
+        self._schedule = RestartSchedule(system, emit)
         self._bring_up = BringUp(
             system,
             spawner_of=lambda _: fork_server,
@@ -231,6 +233,7 @@ class Session:
         self._gate_sequence = GateSequence(
             system,
             bring_up=self._bring_up,
+            schedule=self._schedule,
             judge=self._judge,
             gate=self._gate,
             emit=emit,
@@ -242,6 +245,7 @@ class Session:
             replanned=self._replanned,
             program=networks.begin,
             following=self._following,
+            outrun=self._outrun,
             spawner=fork_server,
             hurry=self._hurry,
             timeout_s=options.bring_up_s(len(system.processes)),
@@ -252,6 +256,7 @@ class Session:
             judge=self._judge,
             changes=self._changes,
             gate_sequence=self._gate_sequence,
+            schedule=self._schedule,
             revisions=self._revisions,
             process_monitor=self._process_monitor,
             emit=emit,
@@ -267,6 +272,7 @@ class Session:
             phase=self._gate_sequence.phase,
             supervisor=os.getpid(),
             elapsed_s=self._emit.elapsed_s,
+            schedule=self._schedule,
         )
 
     def look(self) -> SupervisorSnapshot:
@@ -359,6 +365,8 @@ class Session:
         self._ends = stopping
         if end.why:
             reason = f"{reason}, but {end.why}" if reason == "done" else f"{reason}; {end.why}"
+        if restarted := self._schedule.summary():
+            reason = f"{reason}; {restarted}"
         run = RunEnd(
             reason=reason,
             reached=self._furthest,
@@ -438,21 +446,29 @@ class Session:
         if self._options.adopt:
             await self._adopt()
         async with self._following():
-            await self._process_monitor.during(self._bring_up.connect(timeout_s))
+            await self._gate_sequence.connect(timeout_s)
         self._judge.ahead = self._gate_sequence.active()
         self._furthest = "connected"
         self._emit(SystemReached(reached="connected", elapsed_s=self._emit.elapsed_s))
         if self._options.until is Until.CONNECTED:
             await self._process_monitor.during(self._judge.until_clear(Stage.CONNECTED, _GLANCE_S))
             return await self._hold(Stage.CONNECTED)
-        deadline = loop.time() + self._options.gate_s(deadline - loop.time())
-        permit = await self._gate_sequence.verify(deadline - loop.time())
-        self._furthest = "verified"
-        if self._options.until is Until.VERIFIED:
-            return await self._hold(Stage.CONNECTED)
-        await self._gate_sequence.activate(permit, deadline)
-        self._furthest = "active"
-        return await self._hold(Stage.ACTIVE)
+        while True:
+            deadline = loop.time() + self._options.gate_s(deadline - loop.time())
+            try:
+                permit = await self._gate_sequence.verify(deadline - loop.time())
+                self._furthest = "verified"
+                if self._options.until is Until.VERIFIED:
+                    break
+                await self._gate_sequence.activate(permit, deadline)
+                self._furthest = "active"
+                break
+            except StepFailedError as failure:
+                await self._gate_sequence.recover(failure, timeout_s)
+                deadline = loop.time() + timeout_s
+        return await self._hold(
+            Stage.CONNECTED if self._options.until is Until.VERIFIED else Stage.ACTIVE
+        )
 
     async def _adopt(self) -> None:
         """Take what runs already as it is found, before anything is started.
@@ -519,6 +535,7 @@ class Session:
     async def _take_down(self) -> None:
         """End everything, also what our processes left behind."""
         self._gate_sequence.phase = _STOPPING
+        self._schedule.close()
         self._agreement.leave(self._ends)
         self._observer_participant.prepare_to_leave()
         self._holding.close(f"cannot go on: {self._system.plan.system!r} is being taken down")
@@ -564,6 +581,9 @@ class Session:
 
     def _ended_by(self, number: int) -> None:
         self.stop(*ENDED_BY[number])
+
+    async def _outrun(self) -> None:
+        await self._holding.outrun()
 
     def _replanned(self, nodes: Iterable[str]) -> None:
         if self._authority is not None:

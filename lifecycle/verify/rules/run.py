@@ -20,6 +20,13 @@ PROCESS_DIED = Rule(
     fix="look at the last lines of its log",
     names_log=True,
 )
+GAVE_UP = Rule(
+    id="run.gave-up",
+    meaning="a process failed too often to be started again",
+    outcomes=(Outcome.VIOLATED,),
+    fix="see what it failed of each time, in the message and in its log",
+    names_log=True,
+)
 START_FAILED = Rule(
     id="run.start-failed",
     meaning="a process or node could not be started",
@@ -75,6 +82,7 @@ PLAN_UNKNOWN = Rule(
 )
 RULES = (
     PROCESS_DIED,
+    GAVE_UP,
     START_FAILED,
     TRANSITION_FAILED,
     DEADLINE,

@@ -79,6 +79,13 @@ class Talker(LifecycleNode):
         self.publisher("chatter").publish(String(data="hello"))
 
 
+class Numbered(Talker):
+    """Says which process it is."""
+
+    def _tick(self) -> None:
+        self.publisher("chatter").publish(String(data=f"pid {os.getpid()}"))
+
+
 class Chatty(Talker):
     """Prints a megabyte a second, says how it is taken down, and has a child that nothing ends."""
 
@@ -105,12 +112,12 @@ class Chatty(Talker):
 
 
 class Listener(LifecycleNode):
-    _heard = False
+    _heard = ""
 
     @on_message("chatter")
     def hear(self, message: String) -> None:
-        if not self._heard:
-            self._heard = True
+        if message.data != self._heard:
+            self._heard = message.data
             print(f"heard {message.data}", flush=True)
 
 

@@ -21,11 +21,14 @@ from lifecycle.manifest import (
     Machine,
     Manifest,
     Node,
+    OnFailure,
     QosProfile,
     Reliability,
+    Restart,
     Run,
     RunKind,
     Severity,
+    Supervision,
     Timeouts,
     UniqueHow,
     load,
@@ -419,3 +422,24 @@ def test_a_process_that_only_needs_the_types_imports_neither_yaml_nor_json_schem
         [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True
     )
     assert done.stdout == "set()\n"
+
+
+def test_what_is_done_when_a_process_fails_is_its_nodes_or_nearest_to_it_or_any_of_its_nodes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    manifest = _corpus("restart", monkeypatch)
+    found = {node.key: node.supervision for node in manifest.nodes}
+    assert found["camera"] == Supervision(
+        restart=Restart.ALWAYS,
+        restart_sec=1.0,
+        restart_steps=4,
+        restart_max_delay_sec=16.0,
+        start_limit_burst=3,
+        start_limit_interval_sec=60.0,
+        on_failure=OnFailure.DEPENDENTS,
+        watchdog_sec=2.0,
+    )
+    arms = Supervision(restart=Restart.ON_FAILURE, restart_sec=0.2, on_failure=OnFailure.ALL)
+    assert found["left"] == found["right"] == arms
+    assert found["viewer"] == found["logger"] == Supervision(restart_sec=0.5)
+    assert found["others"] == Supervision()

@@ -1,0 +1,123 @@
+"""When a failed process is started again: delay with exponential backoff, start limit, giving up.
+
+Owns: `RestartPolicy`: given failures and a clock it says when to start again, or that it gives up;
+and who goes down and comes again with a process (`group_of`). What the keys
+mean is systemd.service(5)'s. Pure: it starts nothing and looks at no clock.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable
+
+from lifecycle.manifest import OnFailure, Restart, RunKind, Supervision
+from lifecycle.plan import PlannedNode
+
+
+class RestartPolicy:
+    """Decides for one process.
+
+    Args:
+        how: what the manifest says.
+        started_s: when it was started for the first time, by any clock that only goes forward.
+
+    Attributes:
+        restarts: how often it has been started again.
+    """
+
+    def __init__(self, how: Supervision, started_s: float) -> None:
+        self.how = how
+        self.restarts = 0
+        self._starts = [started_s]
+        self._in_a_row = 0
+
+    def takes(self, *, exit_status: int | None) -> bool:
+        """Whether it is to be started again after such an end; None: not an exit by itself."""
+        if self.how.restart is Restart.ON_FAILURE:
+            return exit_status != 0
+        return self.how.restart is Restart.ALWAYS
+
+    def failed(self, now_s: float) -> float | None:
+        """Take one failure.
+
+        Returns:
+            When it is to be started again, by the same clock; None to give up.
+        """
+        interval_s = self.how.start_limit_interval_sec
+        if interval_s and now_s - self._starts[-1] >= interval_s:
+            self._in_a_row = 0
+        self._in_a_row += 1
+        again_s = now_s + delay_s(self.how, self._in_a_row)
+        if interval_s:
+            self._starts = [each for each in self._starts if each > again_s - interval_s]
+            if len(self._starts) >= self.how.start_limit_burst:
+                return None
+        return again_s
+
+    def started(self, now_s: float) -> None:
+        """Note that it was started again after a failure."""
+        self.restarts += 1
+        # Without a limit they are not counted, and must not pile up.
+        kept = self._starts if self.how.start_limit_interval_sec else []
+        self._starts = [*kept, now_s]
+
+    def reset(self, now_s: float) -> None:
+        """Begin anew: a person restarted it."""
+        self._starts = [now_s]
+        self._in_a_row = 0
+
+
+def delay_s(how: Supervision, in_a_row: int) -> float:
+    """Return the seconds between a failure and the next start.
+
+    Args:
+        how: what the manifest says.
+        in_a_row: failures so far without a long run between them, this one included, >= 1.
+    """
+    longest = how.restart_max_delay_sec
+    if longest is None or not how.restart_steps or not how.restart_sec:
+        return how.restart_sec
+    if in_a_row > how.restart_steps:
+        return longest
+    exponent = (in_a_row - 1) / how.restart_steps
+    return how.restart_sec * math.pow(longest / how.restart_sec, exponent)
+
+
+def group_of(nodes: Iterable[PlannedNode], process: str) -> tuple[str, ...]:
+    """Return the keys of the nodes that go down and come again with a process, in plan order.
+
+    A component goes with its container, and a node with all others of its process.
+
+    Args:
+        nodes: all that this supervisor brings up.
+        process: name of the one that failed.
+    """
+    every = tuple(nodes)
+    failed = [each for each in every if each.process == process]
+    how = {each.supervision.on_failure for each in failed}
+    keys = {each.key for each in failed}
+    if OnFailure.ALL in how:
+        return tuple(each.key for each in every)
+    while more := _more(every, keys, dependents=OnFailure.DEPENDENTS in how):
+        keys |= more
+    return tuple(each.key for each in every if each.key in keys)
+
+
+def _more(
+    nodes: Iterable[PlannedNode], keys: Collection[str], *, dependents: bool
+) -> frozenset[str]:
+    """Return the nodes that go with some of `keys` and are not among them yet."""
+    every = tuple(nodes)
+    processes = {
+        each.process for each in every if each.key in keys and each.run.kind is not RunKind.ATTACH
+    }
+    return frozenset(
+        each.key
+        for each in every
+        if each.key not in keys
+        and (
+            (each.process in processes and each.run.kind is not RunKind.ATTACH)
+            or (each.run.component and each.run.container in keys)
+            or (dependents and any(after.node in keys for after in each.after))
+        )
+    )

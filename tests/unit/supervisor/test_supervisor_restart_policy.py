@@ -1,0 +1,496 @@
+"""What is restarted by policy: the pure policy, and whole sessions in which things fail.
+
+As in test_supervisor_session.py outlines of runs are compared.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from lifecycle.manifest import Condition, OnFailure, Restart, RunKind, Supervision
+from lifecycle.plan.model import Plan, PlannedNode
+from lifecycle.supervisor.control.server import ControlRequest
+from lifecycle.supervisor.policy.restart import RestartPolicy, delay_s, group_of
+from lifecycle.supervisor.processes.process import ProcessExit
+from tests.builders import plan_of, planned_node
+from tests.unit.supervisor.fakes import run
+from tests.unit.supervisor.session_world import (
+    ACTIVATED,
+    CAMERA_DOWN,
+    CONNECTED,
+    DOWN,
+    INTRUDED,
+    REFUSED,
+    VIEWER_DOWN,
+    SessionWorld,
+    over,
+)
+
+ON_FAILURE = Supervision(restart=Restart.ON_FAILURE, restart_sec=1.0)
+
+
+# The policy
+
+
+def test_the_delay_grows_by_one_factor_up_to_its_longest_and_stays() -> None:
+    how = Supervision(restart_sec=1.0, restart_steps=4, restart_max_delay_sec=16.0)
+    assert [delay_s(how, count) for count in range(1, 8)] == [1.0, 2.0, 4.0, 8.0, 16.0, 16.0, 16.0]
+    assert [delay_s(Supervision(restart_sec=2.0), count) for count in (1, 9)] == [2.0, 2.0]
+
+
+@pytest.mark.parametrize(
+    ("restart", "taken"),
+    [
+        (Restart.NO, {0: False, 1: False, None: False}),
+        (Restart.ON_FAILURE, {0: False, 1: True, None: True}),
+        (Restart.ALWAYS, {0: True, 1: True, None: True}),
+    ],
+)
+def test_which_ends_are_started_again_after(
+    restart: Restart, taken: dict[int | None, bool]
+) -> None:
+    policy = RestartPolicy(Supervision(restart=restart), 0.0)
+    assert {status: policy.takes(exit_status=status) for status in taken} == taken
+
+
+def test_it_gives_up_at_the_start_after_the_burst_and_never_without_an_interval() -> None:
+    policy = RestartPolicy(Supervision(restart=Restart.ALWAYS), 0.0)
+    found = []
+    for at_s in (0.1, 0.3, 0.5, 0.7, 0.9):
+        found.append(policy.failed(at_s))
+        policy.started(at_s + 0.1)
+    assert found == [pytest.approx(at_s + 0.1) for at_s in (0.1, 0.3, 0.5, 0.7)] + [None]
+    assert policy.restarts == 5
+    endless = RestartPolicy(Supervision(restart=Restart.ALWAYS, start_limit_interval_sec=0.0), 0.0)
+    for at_s in range(100):
+        assert endless.failed(float(at_s)) == at_s + 0.1
+        endless.started(at_s + 0.1)
+
+
+def test_after_a_long_run_and_after_a_person_the_delay_begins_anew() -> None:
+    how = Supervision(
+        restart=Restart.ALWAYS, restart_sec=1.0, restart_steps=2, restart_max_delay_sec=4.0
+    )
+    policy = RestartPolicy(how, 0.0)
+    assert policy.failed(1.0) == 2.0
+    policy.started(2.0)
+    assert policy.failed(3.0) == 5.0
+    policy.started(5.0)
+    assert policy.failed(15.0) == 16.0
+    policy.started(16.0)
+    assert policy.failed(17.0) == 19.0
+    policy.reset(19.0)
+    assert policy.failed(20.0) == 21.0
+
+
+@pytest.mark.parametrize(
+    ("how", "group"),
+    [
+        (OnFailure.NODE, "driver helper part"),
+        (OnFailure.DEPENDENTS, "driver helper camera viewer part"),
+        (OnFailure.ALL, "driver helper camera viewer other part"),
+    ],
+)
+def test_who_goes_down_with_a_process(how: OnFailure, group: str) -> None:
+    supervision = Supervision(restart=Restart.ALWAYS, on_failure=how)
+    nodes = (
+        planned_node("driver", process="p", supervision=supervision),
+        planned_node("helper", process="p", supervision=supervision),
+        planned_node("camera", after={"driver": Condition.STARTED}),
+        planned_node("viewer", after={"camera": Condition.ACTIVE}),
+        planned_node("other"),
+        _component("part", of="helper"),
+    )
+    assert " ".join(group_of(nodes, "p")) == group
+
+
+def _component(key: str, *, of: str) -> PlannedNode:
+    node = planned_node(key, kind=RunKind.ATTACH)
+    run_ = dataclasses.replace(node.run, component="parts/Part", container=of)
+    return dataclasses.replace(node, run=run_)
+
+
+# Sessions
+
+
+def _chain(camera: Supervision = ON_FAILURE, viewer: Supervision = ON_FAILURE) -> Plan:
+    return plan_of(
+        planned_node("camera", supervision=camera),
+        planned_node("viewer", supervision=viewer, after={"camera": Condition.ACTIVE}),
+    )
+
+
+GONE = "graph.missing-node /camera"
+VIEWER_GONE = "graph.missing-node /viewer"
+
+
+def _back(node: str, at_s: float) -> list[str]:
+    """The outline of a node that comes again by itself."""
+    return [
+        f"{node} start",
+        f"/{node} configure",
+        f"/{node} connect",
+        f"[system] connected at {at_s:.1f} s",
+        "[verdict] connected ok",
+        f"[system] verified at {at_s:.1f} s",
+        "networks programmed (ok)",
+        f"[gate] ok: /{node}",
+        f"/{node} activate",
+        f"[system] active at {at_s:.1f} s",
+    ]
+
+
+def test_a_node_that_crashed_comes_again_through_its_gate_and_the_others_are_not_touched(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        world = SessionWorld(_chain(), tmp_path, stop_after_s=10.0)
+
+        async def die() -> None:
+            await world.story.until("[system] active")
+            await asyncio.sleep(3.0)
+            world.kill("camera")
+
+        await world.run(die())
+        assert world.since("[system] active")[1:] == [
+            "[failure] run.process-died /camera, and the run goes on",
+            "[backoff] camera in 1.0 s",
+            f"[verdict] active violated {GONE}",
+            *_back("camera", 4.0),
+            "[restarted] camera (1)",
+            "[stopping] at 10.0 s: done",
+            *DOWN,
+            *over(0),
+        ]
+        assert world.report == (
+            "ended after it was active, exit code 0: done; restarted: 'camera' 1 time"
+        )
+
+    run(main())
+
+
+def test_a_process_that_fails_again_and_again_is_given_up_loudly_with_its_history(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        how = dataclasses.replace(ON_FAILURE, restart_sec=0.5, start_limit_burst=3)
+        world = SessionWorld(_chain(how), tmp_path)
+
+        async def die() -> None:
+            await world.story.until("[system] active")
+            world.hosts.ways["/camera configure"] = "no device"
+            world.kill("camera")
+
+        await world.run(die())
+        again = ["camera start", "/camera configure"]
+        failed = "[failure] run.transition-failed /camera, and the run goes on"
+        assert world.since("[verdict] active violated")[1:] == [
+            *again,
+            failed,
+            "/camera shutdown",
+            "[backoff] camera in 0.5 s",
+            *again,
+            failed,
+            "[gave_up] camera (3 failures)",
+            "[failure] run.gave-up /camera",
+            "[stopping] at 1.0 s: rolling back",
+            "/viewer deactivate",
+            *VIEWER_DOWN,
+            "/camera shutdown",
+            *over(7),
+        ]
+        assert world.messages[0] == (
+            "cannot keep 'camera' running: it was started 3 times within 10 s (start_limit_burst, "
+            "start_limit_interval_sec) and failed again:\n"
+            "  at 0.0 s: cannot keep '/camera' running: pid 5000001 died: killed by SIGSEGV\n"
+            "  at 0.5 s: cannot configure '/camera': no device\n"
+            "  at 1.0 s: cannot configure '/camera': no device"
+        )
+
+    run(main())
+
+
+@pytest.mark.parametrize("step", ["start", "/camera configure", "/camera connect"])
+def test_a_node_that_dies_during_bring_up_comes_again_while_the_others_wait(
+    tmp_path: Path, step: str
+) -> None:
+    async def main() -> None:
+        viewer = planned_node(
+            "viewer", after={"camera": Condition.CONFIGURED}, supervision=ON_FAILURE
+        )
+        plan = plan_of(planned_node("camera", supervision=ON_FAILURE), viewer)
+        world = SessionWorld(plan, tmp_path, stop_after_s=5.0)
+        world.hosts.ways[step if step.startswith("/") else "camera start"] = "die"
+
+        async def heal() -> None:
+            await world.story.until("[backoff] camera")
+            world.hosts.ways.clear()
+
+        await world.run(heal())
+        assert (
+            world.since("[backoff]")[-7 - len(DOWN) :][:2]
+            == [
+                "[system] active at 1.0 s",
+                "[restarted] camera (1)",
+            ]
+            or "[restarted] camera (1)" in world.outline
+        )
+        assert world.outline.count("viewer start") == 1
+        assert world.outline.count("/viewer configure") == 1
+        assert world.story[-1] == "[stopped] 0"
+
+    run(main())
+
+
+def test_a_node_that_fails_to_activate_is_restarted_and_what_is_active_stays_so(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        world = SessionWorld(_chain(), tmp_path, stop_after_s=5.0)
+        world.hosts.ways["/viewer activate"] = "die"
+
+        async def heal() -> None:
+            await world.story.until("[backoff]")
+            world.hosts.ways.clear()
+
+        await world.run(heal())
+        assert world.since("/viewer activate") == [
+            "/viewer activate",
+            "[failure] run.process-died /viewer, and the run goes on",
+            "[backoff] viewer in 1.0 s",
+            "viewer start",
+            "/viewer configure",
+            "/viewer connect",
+            "[system] verified at 1.0 s",
+            "networks programmed (ok)",
+            "[gate] ok: /viewer",
+            "/viewer activate",
+            "[system] active at 1.0 s",
+            "[restarted] viewer (1)",
+            "[stopping] at 6.0 s: done",
+            *DOWN,
+            *over(0),
+        ]
+
+    run(main())
+
+
+def test_dependents_go_down_in_order_and_come_again_with_it(tmp_path: Path) -> None:
+    async def main() -> None:
+        how = dataclasses.replace(ON_FAILURE, on_failure=OnFailure.DEPENDENTS)
+        world = SessionWorld(_chain(how, Supervision()), tmp_path, stop_after_s=5.0)
+
+        async def die() -> None:
+            await world.story.until("[system] active")
+            world.kill("camera")
+
+        await world.run(die())
+        assert world.since("[failure]") == [
+            "[failure] run.process-died /camera, and the run goes on",
+            "/viewer deactivate",
+            *VIEWER_DOWN,
+            "[backoff] camera in 1.0 s",
+            f"[verdict] active violated {GONE}, {VIEWER_GONE}",
+            *CONNECTED[:-1],
+            "[system] connected at 1.0 s",
+            "[verdict] connected ok",
+            "[system] verified at 1.0 s",
+            "networks programmed (ok)",
+            *ACTIVATED[:-1],
+            "[system] active at 1.0 s",
+            "[restarted] camera (1)",
+            "[stopping] at 5.0 s: done",
+            *DOWN,
+            *over(0),
+        ]
+
+    run(main())
+
+
+def test_what_fails_while_another_is_restarted_does_not_keep_that_one_at_its_gate(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        world = SessionWorld(_chain(), tmp_path, stop_after_s=10.0)
+        world.hosts.takes_s["/camera configure"] = 2.0
+
+        async def die() -> None:
+            await world.story.until("[system] active")
+            world.kill("camera")
+            await world.story.until("/camera configure", 2)
+            await asyncio.sleep(1.0)
+            world.kill("viewer")
+
+        await world.run(die())
+        assert world.since("/camera connect", 2) == [
+            "/camera connect",
+            "[failure] run.process-died /viewer, and the run goes on",
+            "[backoff] viewer in 1.0 s",
+            f"[verdict] connected violated {VIEWER_GONE}",
+            "[system] verified at 5.0 s",
+            "networks programmed (violated)",
+            "[gate] ok: /camera",
+            "/camera activate",
+            "[system] active at 5.0 s",
+            "[restarted] camera (1)",
+            *_back("viewer", 6.0),
+            "[restarted] viewer (1)",
+            "[stopping] at 12.0 s: done",
+            *DOWN,
+            *over(0),
+        ]
+
+    run(main())
+
+
+def test_a_restarted_node_waits_at_a_gate_that_stays_closed_and_passes_once_it_opens(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        world = SessionWorld(_chain(), tmp_path, stop_after_s=10.0)
+
+        async def die() -> None:
+            await world.story.until("[system] active")
+            world.intrude()
+            world.kill("camera")
+            await asyncio.sleep(5.0)
+            world.retreat()
+
+        await world.run(die())
+        assert world.since("[notice]")[:7] == [
+            f"[notice] {REFUSED}",
+            "[verdict] connected ok",
+            "[system] verified at 5.0 s",
+            "networks programmed (ok)",
+            "[gate] ok: /camera",
+            "/camera activate",
+            "[system] active at 5.0 s",
+        ]
+        assert f"[verdict] connected violated {INTRUDED}" in world.outline
+
+    run(main())
+
+
+def test_orders_in_backoff_are_carried_out_at_once(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = SessionWorld(_chain(), tmp_path)
+
+        async def order() -> None:
+            await world.story.until("[system] active")
+            world.kill("camera")
+            await world.story.until("[backoff]")
+            assert await world.order(ControlRequest.PAUSE) == "0"
+            assert world.story[-1] == "[system] paused at 0.0 s"
+            await world.story.until("[restarted]")
+            assert await world.order(ControlRequest.RESUME) == "0"
+            world.kill("viewer")
+            await world.story.until("[backoff] viewer")
+            assert await world.order(ControlRequest.RESTART, "viewer") == "0"
+            assert world.story[-1] == "[system] active at 1.0 s"
+            world.kill("viewer")
+            await world.story.until("[backoff] viewer", 2)
+            assert await world.order(ControlRequest.DOWN) == "4"
+
+        await world.run(order())
+        assert world.since("[system] paused")[:5] == [
+            "[system] paused at 0.0 s",
+            "camera start",
+            "/camera configure",
+            "/camera connect",
+            "[system] connected at 1.0 s",
+        ]
+        assert world.since("[stopping]") == [
+            "[stopping] at 1.0 s: lifecycle down",
+            "/camera deactivate",
+            *CAMERA_DOWN,
+            *over(4),
+        ]
+
+    run(main())
+
+
+def test_an_order_during_a_restart_waits_for_its_step_and_not_for_its_gate(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = SessionWorld(_chain(), tmp_path, stop_after_s=10.0)
+
+        async def order() -> None:
+            await world.story.until("[system] active")
+            world.intrude()
+            world.hosts.takes_s["/camera configure"] = 2.0
+            world.kill("camera")
+            await world.story.until("/camera configure", 2)
+            assert await world.order(ControlRequest.PAUSE) == "0"
+            assert world.story[-2:] == ["[system] paused at 3.0 s", "[restarted] camera (1)"]
+
+        await world.run(order())
+        assert "[gate] ok: /camera" not in world.outline
+
+    run(main())
+
+
+@pytest.mark.parametrize("restart", [Restart.ON_FAILURE, Restart.ALWAYS])
+def test_a_clean_exit_is_started_again_after_only_by_always(
+    tmp_path: Path, restart: Restart
+) -> None:
+    async def main() -> None:
+        how = dataclasses.replace(ON_FAILURE, restart=restart)
+        world = SessionWorld(_chain(how), tmp_path, stop_after_s=5.0)
+
+        async def leave() -> None:
+            await world.story.until("[system] active")
+            world.hosts.processes["camera"].end(ProcessExit(status=0))
+
+        await world.run(leave())
+        assert world.story[-1] == f"[stopped] {0 if restart is Restart.ALWAYS else 6}"
+
+    run(main())
+
+
+def test_a_hang_is_ended_by_the_watchdog_and_one_that_passes_is_not(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = SessionWorld(_chain(), tmp_path, stop_after_s=20.0)
+
+        async def hang() -> None:
+            await world.story.until("[system] active")
+            process = world.system.processes["camera"]
+            for hangs_s in (2.0, 10.0):
+                process.on_stop(True)
+                await asyncio.sleep(hangs_s)
+                process.on_stop(False)
+
+        await world.run(hang())
+        found = [
+            each for each in world.story if each in ("camera SIGKILL", "[backoff] camera in 1.0 s")
+        ]
+        assert found == ["camera SIGKILL", "[backoff] camera in 1.0 s"]
+
+    run(main())
+
+
+def test_status_says_what_failed_and_when_it_is_started_again(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = SessionWorld(_chain(), tmp_path, stop_after_s=5.0)
+
+        async def look() -> None:
+            await world.story.until("[system] active")
+            world.hosts.ways["/camera configure"] = "die"
+            world.kill("camera")
+            await world.story.until("[backoff]", 2)
+            await asyncio.sleep(0.25)
+            away, viewer = world.status().nodes
+            assert (away.restarts, away.uptime_s, away.next_try_s) == (1, None, 0.75)
+            assert away.process_state is not None
+            assert (away.process_state.value, away.state) == ("backoff", "")
+            assert away.last_failure is not None
+            assert away.last_failure.signal == "SIGSEGV"
+            assert away.last_failure.stderr == ""
+            assert (viewer.restarts, viewer.uptime_s, viewer.last_failure) == (0, 1.25, None)
+            world.hosts.ways.clear()
+
+        await world.run(look())
+
+    run(main())
