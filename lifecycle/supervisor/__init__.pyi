@@ -13,6 +13,7 @@ from .gate.gate import closes as closes
 from .processes.forerunner import Forerunner as Forerunner
 from .processes.logs import ros_log_root as ros_log_root
 from .processes.logs import runs_of as runs_of
+from .run.events import ConsequenceTaken as ConsequenceTaken
 from .run.events import Emitter as Emitter
 from .run.events import Event as Event
 from .run.events import Failure as Failure
