@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from lifecycle.network import Medium
+
 ROOT = Path(__file__).parents[2]
 ROOMS = sorted(each.parent.name for each in (ROOT / "lifecycle").glob("*/__init__.pyi"))
 PURE_ROOMS = (
@@ -160,4 +162,31 @@ def _imports() -> dict[str, set[str]]:
     return {
         name: {each for each in modules if files[each].name != "__init__.py"}
         for name, modules in found.items()
+    }
+
+
+def test_those_that_choose_or_name_a_medium_know_it_and_all_others_ask_it() -> None:
+    """A new medium is an entry of its table; who asks `is_tcp` of it need not be found."""
+    root = ROOT / "lifecycle"
+    words = {each.value for each in Medium}
+    knowing, spelling = set(), []
+    for path in root.rglob("*.py"):
+        name = str(path.relative_to(root))
+        for each in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(each, ast.Constant) and each.value in words:
+                spelling.append(f"{name}:{each.lineno}")
+            if isinstance(each, ast.Attribute) and each.attr in Medium.__members__:
+                of = each.value
+                knowing |= {name} if isinstance(of, ast.Name) and of.id == "Medium" else set()
+    assert {each.partition(":")[0] for each in spelling} == {"network/medium.py"}
+    assert knowing == {
+        "network/medium.py",
+        "network/nfe.py",  # shared memory is what shows no address
+        "verify/judge.py",
+        "verify/transport.py",
+        "verify/view.py",
+        "programming/rules/rules.py",
+        "middleware/fastdds/url_profile.py",  # what Fast DDS calls it
+        "plan/negotiation/media.py",  # which medium two ends get
+        "plan/negotiation/negotiate.py",
     }

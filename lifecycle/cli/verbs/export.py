@@ -15,7 +15,7 @@ import click
 
 from lifecycle.cli.common import load_manifest, manifest_arguments
 from lifecycle.errors import ExitCode, UsageError
-from lifecycle.manifest import EndpointPolicy
+from lifecycle.manifest import EndpointPolicy, Restart
 from lifecycle.printable import lines
 
 if TYPE_CHECKING:
@@ -137,12 +137,14 @@ def _engine_command(engine: str) -> click.Command:
         loaded = load_manifest(manifest, assignments, machine=None)
         here = str(Path(manifest).resolve())
         inside = f"/system/{Path(manifest).name}" if engine in _CONTAINERS else here
+        plan = build_plan(loaded.manifest)
         deployment = Deployment(
-            plan=build_plan(loaded.manifest),
+            plan=plan,
             manifest=at or inside,
             words=(*assignments, *words),
             image=rest.get("image", ""),
             program=rest.get("program", ""),
+            restarts=any(each.supervision.restart is not Restart.NO for each in plan.nodes),
             programs_networks="--program" in " ".join(words),
         )
         for name, text in ENGINES[engine](deployment).items():

@@ -124,9 +124,11 @@ class PortPool:
             if port not in taken:
                 found.append(port)
         if len(found) < count:
+            what = f"cannot give out {count} more ports{f' on {host}' if host else ''}"
             raise PlanError(
-                f"cannot give out {count} more ports{f' on {host}' if host else ''}: from "
-                f"{self._first} to {MAX_PORT} all are taken",
+                f"{what}: from {self._first} to {MAX_PORT} all are taken"
+                if self._first <= MAX_PORT
+                else f"{what}: they would begin at {self._first}, and the highest is {MAX_PORT}",
                 hint="lower 'discovery.first_port'",
             )
         taken.update(found)

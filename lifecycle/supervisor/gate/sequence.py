@@ -220,7 +220,7 @@ class GateSequence:
         try:
             await self._alive(self._bring_up.deactivate(nodes))
         finally:
-            self._judge.ahead = self._active()
+            self._judge.ahead = self.active()
             if order.keys:
                 self.phase = HELD
         if not order.keys:
@@ -312,7 +312,7 @@ class GateSequence:
             node.renew(node.process)
             if node.process is not None:
                 node.process.back_off()
-        self._judge.ahead = self._active()
+        self._judge.ahead = self.active()
         self._system.touched.set()
         self._schedule.announce(keys)
         if self.phase == HELD and not self._inactive():
@@ -462,7 +462,7 @@ class GateSequence:
             if key not in held and not each.is_up and not _is_written_off(each)
         ]
         self.phase = "connecting"
-        self._judge.ahead = self._active()
+        self._judge.ahead = self.active()
         await self._alive(self._bring_up.connect(timeout_s, nodes))
 
     async def until_clear(self, timeout_s: float) -> None:
@@ -550,7 +550,7 @@ class GateSequence:
         await self._take_down(nodes)
         nodes = await self._begin_again(nodes, plan)
         self.phase = "connecting"
-        self._judge.ahead = self._active()
+        self._judge.ahead = self.active()
         await self._alive(self._bring_up.connect(timeout_s, nodes))
 
     async def _take_down(self, nodes: tuple[NodeRun, ...]) -> None:
@@ -619,7 +619,7 @@ class GateSequence:
         """
         self._gate.close()
         self.phase = "verifying"
-        self._judge.ahead = self._active()
+        self._judge.ahead = self.active()
         await self.until_clear(timeout_s)
         assert self._judge.latest is not None
         permit = self._gate.judge(self._judge.latest)
@@ -695,7 +695,7 @@ class GateSequence:
             names = ", ".join(each.name for each in begun)
             self._emit(Notice(message=f"the gate closed again: {names} is deactivated"))
         await self._alive(self._bring_up.deactivate(begun))
-        self._judge.ahead = self._active()
+        self._judge.ahead = self.active()
 
     async def _program_flows(self, permit: Permit, deadline: float) -> None:
         """Program networks with the flows of the verdict that nodes are activated on."""
@@ -716,7 +716,8 @@ class GateSequence:
     def _withheld(self) -> frozenset[str]:
         return frozenset(each.name for each in self._system.nodes.values() if each.withheld)
 
-    def _active(self) -> frozenset[str]:
+    def active(self) -> frozenset[str]:
+        """Return the names of the nodes that are active, let through or found so."""
         return frozenset(
             each.name
             for each in self._system.nodes.values()

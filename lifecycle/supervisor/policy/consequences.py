@@ -26,7 +26,7 @@ def consequence_of(plan: Plan, finding: Finding) -> Consequence:
     """Return what is to be done about a violation.
 
     What is nearest counts: a link that it is about, then its nodes, then the system; there the id
-    of the rule, then its family, then the default. Of two ends the stronger word counts.
+    of the rule, then its family, then the default. Of two ends the stronger one counts.
     """
     links = _strongest(
         finding, (flow.on_violation for flow in plan.flows if _is_about(plan, flow, finding))
@@ -53,7 +53,7 @@ def _is_about(plan: Plan, flow: PlannedFlow, finding: Finding) -> bool:
 
 def _strongest(finding: Finding, said: Iterable[OnViolation]) -> Consequence | None:
     """Return the strongest of what several say about one finding; None if none says anything."""
-    family = finding.rule.partition(".")[0]
+    family = rule(finding.rule).family
     found: list[Consequence] = []
     for each in said:
         for name in (finding.rule, family, BY_DEFAULT):
@@ -138,7 +138,8 @@ class Consequences:
         if what is Consequence.DEACTIVATE:
             held = [node for node in own if node.is_to_be_active]
             if held:
-                keys = tuple(node.planned.key for node in held if node.reach is Reach.ACTIVE)
+                active = [each for each in held if each.reach is Reach.ACTIVE and not each.is_gone]
+                keys = tuple(each.planned.key for each in active)
                 return Due(what=what, keys=keys, finding=finding) if keys else None
             what = Consequence.PAUSE
         return Due(what=what, finding=finding)

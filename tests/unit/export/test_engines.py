@@ -163,3 +163,13 @@ def test_a_quadlet_is_probed_because_podman_passes_no_watchdog_on() -> None:
     assert unit["Container"]["HealthCmd"] == "lifecycle status robot --probe live"
     assert unit["Container"]["HealthOnFailure"] == "kill"
     assert unit["Container"]["Notify"] == "true"
+
+
+def test_a_manifest_that_restarts_a_node_leaves_the_engine_its_supervisor(tmp_path: Path) -> None:
+    manifest = tmp_path / "robot.lifecycle.yaml"
+    manifest.write_text(
+        "manifest_version: 1\nsystem: robot\nnodes:\n"
+        '  camera: {run: {python: "a:B"}, restart: on-failure}\n'
+    )
+    (text,) = exported(tmp_path / "out", "systemd", str(manifest)).values()
+    assert sections(text)["Service"]["Restart"] == "on-abnormal"

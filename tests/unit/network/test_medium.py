@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import ast
 import ipaddress
 import json
 import socket
-from pathlib import Path
 
 import pytest
 
-import lifecycle
 from lifecycle.codec import from_json, to_json
 from lifecycle.network.medium import (
     CONNECTABLE,
@@ -116,43 +113,6 @@ def test_what_a_manifest_asks_for_is_met_by_some_media(
 ) -> None:
     assert {each for each in Medium if asked.accepts(each)} == accepted
     assert asked.builtin == builtin
-
-
-def test_whoever_chooses_or_names_a_medium_knows_it_and_all_others_ask_it() -> None:
-    root = Path(lifecycle.__file__).parent
-    found = {
-        str(path.relative_to(root))
-        for path in root.rglob("*.py")
-        for each in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        if isinstance(each, ast.Attribute)
-        and isinstance(each.value, ast.Name)
-        and each.value.id == "Medium"
-        and each.attr.isupper()
-    }
-    assert found == {
-        "network/medium.py",
-        "network/nfe.py",  # shared memory, which an NFE shows by showing no address
-        "verify/judge.py",
-        "verify/transport.py",
-        "verify/view.py",
-        "programming/rules/rules.py",
-        "middleware/fastdds/url_profile.py",  # what Fast DDS calls it
-        "plan/negotiation/media.py",  # which medium two ends get
-        "plan/negotiation/negotiate.py",
-    }
-
-
-def test_no_module_spells_a_medium_itself() -> None:
-    root = Path(lifecycle.__file__).parent
-    words = {each.value for each in Medium}
-    found = [
-        f"{path.relative_to(root)}:{each.lineno}"
-        for path in root.rglob("*.py")
-        if path != root / "network/medium.py"
-        for each in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        if isinstance(each, ast.Constant) and each.value in words
-    ]
-    assert found == []
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""What is done about violations of an active system: the nearest word, and whole sessions.
+"""What is done about violations of an active system: what is nearest, and whole sessions.
 
 As in test_supervisor_session.py outlines of runs are compared.
 """
@@ -44,7 +44,7 @@ def _plan(
 def test_the_manifest_knows_every_rule_and_family() -> None:
     definition = read_schema(MANIFEST)["$defs"]["on_violation"]
     names = definition["anyOf"][1]["propertyNames"]["enum"]
-    families = dict.fromkeys(each.id.partition(".")[0] for each in RULES)
+    families = dict.fromkeys(each.family for each in RULES)
     assert names == ["default", *families, *(each.id for each in RULES)]
 
 

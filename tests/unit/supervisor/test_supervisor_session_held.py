@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from lifecycle.manifest.model import Discovery
 from lifecycle.supervisor.control.protocol import ControlRequest
 from tests.builders import plan_of
 from tests.unit.supervisor.fakes import run
@@ -21,6 +22,7 @@ from tests.unit.supervisor.session_world import (
     CAMERA_DOWN,
     CHAIN,
     CONNECTED,
+    DIALLING,
     DOWN,
     INTRUDED,
     OPENED,
@@ -171,6 +173,9 @@ def test_a_system_that_is_wrong_stays_paused_and_can_be_resumed_once_it_is_right
             assert await world.order(ControlRequest.PAUSE) == "0"
             world.intrude()
             assert await world.order(ControlRequest.RESUME) == f"4 {REFUSED}"
+            assert await world.order(ControlRequest.PAUSE) == (
+                "2 cannot pause 'robot': it is paused; only an active system can be paused"
+            )
             world.retreat()
             assert await world.order(ControlRequest.RESUME) == "0"
             assert await world.order(ControlRequest.DOWN) == "0"
@@ -371,6 +376,24 @@ def test_a_changed_manifest_is_taken_by_what_restarts(tmp_path: Path, node: str)
         assert world.story.count("/viewer configure") == 3
         assert world.story.count("/camera configure") == (1 if node else 3)
         assert world.system.plan == changed
+
+    run(main())
+
+
+def test_a_restart_for_which_no_port_is_left_ends_the_run(tmp_path: Path) -> None:
+    full = dataclasses.replace(DIALLING, discovery=Discovery(first_port=65535))
+    full_up = "cannot give out 2 more ports: they would begin at 67535, and the highest is 65535"
+
+    async def main() -> None:
+        world = SessionWorld(full, tmp_path)
+
+        async def order() -> None:
+            await world.story.until("[system] active")
+            assert await world.order(ControlRequest.RESTART, "viewer") == f"6 {full_up}"
+
+        await world.run(order())
+        assert "[failure] run.start-failed robot" in world.outline
+        assert world.report.startswith("ended after it was active, exit code 6: failed: robot")
 
     run(main())
 
