@@ -52,6 +52,7 @@ from .model import Policy as Policy
 from .model import Quantity as Quantity
 from .model import Restart as Restart
 from .model import RosArguments as RosArguments
+from .model import RosInterfaceAccess as RosInterfaceAccess
 from .model import Run as Run
 from .model import RunKind as RunKind
 from .model import Supervision as Supervision

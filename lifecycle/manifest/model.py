@@ -143,6 +143,14 @@ class EndpointPolicy(enum.Enum):
     OPEN = "open"
 
 
+class RosInterfaceAccess(enum.Enum):
+    """What a supervisor offers over ROS topics and services."""
+
+    OFF = "off"
+    READ_ONLY = "read_only"
+    FULL = "full"
+
+
 class UniqueHow(enum.Enum):
     """What a link demands of its flow."""
 
@@ -526,6 +534,7 @@ __all__ = [
     "Quantity",
     "Restart",
     "RosArguments",
+    "RosInterfaceAccess",
     "Run",
     "RunKind",
     "Supervision",
@@ -629,6 +638,7 @@ class Policy:
         unverifiable_blocks: an unverifiable finding closes the gate.
         unpublished: severity of a subscription without publisher; None ignores it.
         unheard: severity of a publisher without subscription; None ignores it.
+        ros_interface: what the supervisor publishes, and may be asked, in ROS.
     """
 
     undeclared_nodes: EndpointPolicy = EndpointPolicy.DECLARED
@@ -636,6 +646,7 @@ class Policy:
     unverifiable_blocks: bool = False
     unpublished: Severity | None = Severity.ERROR
     unheard: Severity | None = Severity.WARNING
+    ros_interface: RosInterfaceAccess = RosInterfaceAccess.OFF
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

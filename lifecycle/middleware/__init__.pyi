@@ -67,4 +67,5 @@ from .services.actions import GoalServer as GoalServer
 from .services.clients import NodeClients as NodeClients
 from .services.parameters import parameter_value as parameter_value
 from .services.parameters import type_word as type_word
+from .services.ros_interface import RosInterface as RosInterface
 from .services.service_calls import ServiceUnansweredError as ServiceUnansweredError
