@@ -65,8 +65,8 @@ bench: $(STAMP)
 # What needs root and network namespaces says so where it cannot run; the others go on.
 bench-all: $(STAMP)
 	@failed=; \
-	for each in "bring_up.py" "bring_up.py --shape chain" data_path.py graph_changes.py idle.py unique_flows.py \
-	  soak_bring_up.py congested_link.py liveliness.py; do \
+	for each in "bring_up.py" "bring_up.py --shape chain" data_path.py graph_changes.py changed_endpoint.py \
+	  idle.py unique_flows.py soak_bring_up.py congested_link.py liveliness.py; do \
 	  echo "== $$each"; $(BIN)/python benchmarks/$$each || failed="$$failed $$each,"; \
 	done; \
 	[ -z "$$failed" ] || { echo "failed:$$failed"; exit 1; }

@@ -4,17 +4,30 @@ One reader (`GraphEvents` and `GraphState`) holds a simulated system whose nodes
 each. Prints the median time from a message's sending until subscribers have been told, for each
 kind of change, and the time of a query; each also as a ratio to the smallest system. Nothing but
 the reader is measured: messages travel in memory, and nodes answer at once.
+
+Then the CPU time for which a supervisor looks and judges when one endpoint of a system of 5 to 200
+nodes, a chain, goes or comes back: what is given of nodes is put into the graph's state, what a
+simulated discovery shows is observed, and the observation is judged, from scratch and as a
+supervisor does that has judged it before. What DDS costs is not in it: `changed_endpoint.py`.
 """
 
 from __future__ import annotations
 
+import asyncio
 import dataclasses
 import functools
+import os
 import statistics
 import sys
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
+from pathlib import Path
+from typing import Any
 
+sys.path.insert(0, str(Path(__file__).parents[1]))  # as a script, only its own directory is there
+
+from benchmarks import scale
 from lifecycle.graph import (
     ConfigurationChanged,
     GraphEvents,
@@ -28,12 +41,27 @@ from lifecycle.graph import (
     StateChanged,
     encode,
 )
+from lifecycle.graph.observer import Observer
+from lifecycle.manifest import load
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.verify.observation import EndpointReport, Identity, NodeConfiguration
+from lifecycle.plan import Plan, build_plan
+from lifecycle.supervisor.gate.verification_loop import ChangeCounter, VerificationLoop
+from lifecycle.verify import NO_NAMES, DeclaredNames, Observation, Stage, Verdict, verify
+from lifecycle.verify.observation import (
+    EndpointReport,
+    Identity,
+    NodeConfiguration,
+    ObservedEndpoint,
+    ObservedNode,
+)
+from tests.unit.supervisor.fakes import World
+from tests.unit.verify.perfect import perfect
 
 SIZES = (10, 100, 1_000, 10_000)
 PER_NODE = 10
 CHANGES = 400
+SUPERVISED = (5, 20, 100, 200)
+LOOKS = 20
 
 
 class System:
@@ -159,6 +187,98 @@ MEASURED: dict[str, Callable[[System], float]] = {
 }
 
 
+class Shown:
+    """Discovery of a system that shows one endpoint every other time."""
+
+    def __init__(self, seen: Observation) -> None:
+        self._nodes = seen.nodes
+        self._endpoints = seen.endpoints, seen.endpoints[:-1]
+        self.turn = 0
+
+    def snapshot(
+        self, *, declared: Collection[str] = (), names: DeclaredNames = NO_NAMES
+    ) -> tuple[tuple[ObservedNode, ...], tuple[ObservedEndpoint, ...]]:
+        """Return what it shows now."""
+        del declared, names
+        return self._nodes, self._endpoints[self.turn % 2]
+
+    def settling_s(self) -> float:
+        """Return that nobody is on the way."""
+        return 0.0
+
+    def on_change(self, callback: Callable[[], None]) -> Callable[[], None]:
+        """Never call back: each look is asked for."""
+        del callback
+        return lambda: None
+
+
+class Supervised:
+    """What a supervisor has of a system that it holds: hosts report, discovery is simulated."""
+
+    def __init__(self, plan: Plan, folder: Path, verify_: Callable[..., Verdict] | None) -> None:
+        seen = perfect(plan, Stage.ACTIVE)
+        self.shown: Any = Shown(seen)
+        self._configurations = seen.configurations
+        scheduler = ManualScheduler()
+        events = GraphEvents(InMemoryNetwork(scheduler).transport(), scheduler)
+        self._graph = Observer(self.shown, None, events)  # type: ignore[arg-type]
+        self.changes = 0
+        world = World(plan, folder)
+        counter = ChangeCounter(world.system, self)
+        self.loop = VerificationLoop(
+            world.system, self, counter, world.emit, strict=False, verify_=verify_
+        )
+        self.close = counter.close
+
+    async def observe(self, plan: Plan) -> Observation:
+        """Give what nodes report, and look."""
+        for each in self._configurations:
+            self.put_configuration(each)
+        return await self._graph.observe(plan)
+
+    async def wait_change(self) -> None:
+        """Wait for ever: each look is asked for."""
+        await asyncio.Event().wait()
+
+    def put_configuration(self, configuration: NodeConfiguration) -> None:
+        """Give what a host reports."""
+        self._graph.state.put_configuration(configuration)
+
+    async def look(self) -> None:
+        """Look and judge after one endpoint has gone or come back."""
+        self.shown.turn += 1
+        await self.loop.settled(Stage.ACTIVE)
+
+
+async def measure_look(plan: Plan, folder: Path, verify_: Callable[..., Verdict] | None) -> float:
+    """Return the CPU milliseconds of one look and judgement."""
+    supervised = Supervised(plan, folder, verify_)
+    await supervised.look()
+    await supervised.look()
+    begun = time.process_time()
+    for _ in range(LOOKS):
+        await supervised.look()
+    took_s = time.process_time() - begun
+    await supervised.close()
+    return 1e3 * took_s / LOOKS
+
+
+def looks() -> None:
+    """Print what one changed endpoint costs a supervisor of systems of several sizes."""
+    costs: dict[str, list[float]] = {"from scratch": [], "what changed": []}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for size in SUPERVISED:
+            path = folder / "chain.lifecycle.yaml"
+            path.write_text(scale.manifest("chain", size), encoding="utf-8")
+            plan = build_plan(load(str(path)).manifest, environment=os.environ)
+            for title, judge in zip(costs, (verify, None), strict=True):
+                costs[title].append(asyncio.run(measure_look(plan, folder, judge)))
+    print(f"\n{'ms CPU per change, nodes':28}" + "".join(f"{size:>18,}" for size in SUPERVISED))
+    for title, found in costs.items():
+        print(f"{title:28}" + "".join(f"{each:18.2f}" for each in found))
+
+
 def main() -> int:
     """Print one line for each kind of change."""
     for cost in MEASURED.values():
@@ -171,6 +291,7 @@ def main() -> int:
     for title, found in costs.items():
         cells = (f"{each:9.1f} ({each / found[0]:5.2f} x)" for each in found)
         print(f"{title:28}" + "".join(f"{cell:>18}" for cell in cells))
+    looks()
     return 0
 
 

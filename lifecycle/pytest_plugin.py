@@ -422,7 +422,11 @@ def lifecycle_node(
                 warnings.simplefilter("ignore", DeprecationWarning)
                 from lifecycle.node import NodeInProcess
 
-                made = NodeInProcess(planned, domain_id=plan.domain_id)
+                made = NodeInProcess(
+                    planned,
+                    domain_id=plan.domain_id,
+                    group=[each for each in plan.nodes if each.process == planned.process],
+                )
             nodes.callback(made.close)
             made.bring_to(to)
             return made

@@ -108,11 +108,30 @@ def runtime_root(environment: Mapping[str, str]) -> Path:
     else:
         import tempfile
 
-        root = Path(tempfile.gettempdir()) / f"lifecycle-{os.getuid()}"
+        try:
+            temporary = tempfile.gettempdir()
+        except OSError as error:
+            raise UsageError(
+                "cannot find a directory for run directories: no temporary directory is writable",
+                hint="set XDG_RUNTIME_DIR to a directory of this user's own",
+            ) from error
+        root = Path(temporary) / f"lifecycle-{os.getuid()}"
     _refuse_unsafe_parents(root)
     if os.path.lexists(root):
         _refuse_unless_private(root)
     return root
+
+
+def home_directory(environment: Mapping[str, str]) -> str:
+    """Return HOME, else what the user database says; empty if there is neither."""
+    if home := environment.get("HOME"):
+        return home
+    import pwd
+
+    try:
+        return pwd.getpwuid(os.getuid()).pw_dir
+    except KeyError:
+        return ""
 
 
 def run_name(plan: Plan, machine: str = "") -> str:

@@ -14,6 +14,7 @@ import signal
 import sys
 
 import click
+from click.shell_completion import CompletionItem
 
 from lifecycle.cli.standard_streams import own_streams
 from lifecycle.errors import ExitCode, LifecycleError, UsageError
@@ -42,6 +43,7 @@ VERBS: dict[str, str] = {
     "ports": "DDS port arithmetic and platform limits",
     "init": "make a package of one's own: nodes, manifest, tests, CI workflow",
     "schema": "print the manifest's JSON Schema, or install it for editors",
+    "completion": "print what switches on completion in bash, zsh or fish",
 }
 
 _ELSEWHERE = {
@@ -59,6 +61,51 @@ _ORDERLY = frozenset({ExitCode.OK, ExitCode.VIOLATED, ExitCode.UNVERIFIABLE})
 """Exit codes that no exception becomes: what made participants has closed them itself."""
 
 
+_LINUX = _PARTICIPANTS | {"pause", "resume", "restart", "down", "status", "logs"}
+"""Verbs that run nodes, or are about what runs."""
+
+_NEEDS_ROS = (
+    "pip install 'ros-lifecycle-manifests[ros]', or source /opt/ros/jazzy/setup.bash for its Python"
+)
+
+
+def _check_platform(verb: str) -> None:
+    """Refuse what only Linux has; raises UsageError."""
+    if verb in _LINUX and sys.platform != "linux":
+        raise UsageError(
+            f"cannot run 'lifecycle {verb}' on {sys.platform}: nodes are run and watched on Linux",
+            hint="what is about manifests works here: check, plan, export, import, init, schema",
+        )
+
+
+def _check_ros(verb: str) -> None:
+    """Refuse a verb that needs ROS 2, before anything is imported for it.
+
+    Raises:
+        UsageError: there is no ROS 2 here, or not the RMW that the environment names.
+    """
+    from importlib.util import find_spec
+
+    if find_spec("rclpy") is None:
+        raise UsageError(
+            f"cannot run 'lifecycle {verb}': it needs ROS 2, and this Python has no rclpy",
+            hint=_NEEDS_ROS,
+        )
+    from lifecycle.middleware import check_rmw
+
+    check_rmw(os.environ)
+    if not os.environ.get("HOME"):
+        from lifecycle.run_directory import home_directory
+
+        # rcl asks the variable alone, and makes no node with logs without it.
+        if home := home_directory(os.environ):
+            os.environ["HOME"] = home
+
+
+COMPLETE = "_LIFECYCLE_COMPLETE"
+"""Variable by which a shell asks what can come next, see verbs/completion.py."""
+
+
 class _Verbs(click.Group):
     """Loads a verb's module on first use."""
 
@@ -66,21 +113,33 @@ class _Verbs(click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Look first whether there is such a verb, and one that needs the RMW can have it."""
+        if ctx.resilient_parsing:  # for shell completion
+            return super().resolve_command(ctx, args)
         if args and args[0] not in VERBS and not args[0].startswith("-"):
             from difflib import get_close_matches
 
             close = get_close_matches(args[0], VERBS, n=1)
             hint = f"did you mean {close[0]!r}?" if close else "lifecycle --help lists the verbs"
             raise UsageError(f"cannot find the verb {args[0]!r}", hint=hint)
+        if args:
+            _check_platform(args[0])
         if args and args[0] in _PARTICIPANTS and not {"-h", "--help"} & {*args}:
-            from lifecycle.middleware import check_rmw
-
-            check_rmw(os.environ)
+            _check_ros(args[0])
         return super().resolve_command(ctx, args)
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 - click's signature
         """Verbs in the order of the pipeline."""
         return list(VERBS)
+
+    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem[str]]:
+        """Complete verbs without importing them."""
+        if incomplete.startswith("-"):
+            return click.Command.shell_complete(self, ctx, incomplete)
+        return [
+            CompletionItem(verb, help=about)
+            for verb, about in VERBS.items()
+            if verb.startswith(incomplete)
+        ]
 
     def get_command(
         self,
@@ -114,6 +173,10 @@ def cli() -> None:
 
 def program() -> int:
     """Run `lifecycle` as a process of its own."""
+    if COMPLETE in os.environ:
+        from lifecycle.cli.verbs.completion import answer
+
+        return answer(cli, os.environ)
     verb = sys.argv[1:2]
     if verb == ["run"]:  # whose streams are the user's node's
         return main()
@@ -152,7 +215,13 @@ def main(arguments: list[str] | None = None) -> int:
     except LifecycleError as error:
         click.echo(lines(str(error)), err=True)
         return error.exit_code
-    except Exception:  # noqa: BLE001 - the boundary: report our bug, whatever it is
+    except Exception as error:  # noqa: BLE001 - the boundary: report our bug, whatever it is
+        if isinstance(error, ImportError) and "rclpy" in f"{error.name} {error}":
+            # Of another Python, most often: ROS 2 has its C extensions for one version only.
+            version = sys.version.split()[0]
+            message = f"cannot import rclpy with Python {version}: {error}; {_NEEDS_ROS}"
+            click.echo(lines(" ".join(message.split())), err=True)
+            return ExitCode.USAGE
         import traceback
 
         traceback.print_exc()

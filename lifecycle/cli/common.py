@@ -6,8 +6,9 @@ Owns: `MANIFEST [name:=value …]`, `TARGET [name:=value …]` of the verbs abou
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -22,12 +23,35 @@ if TYPE_CHECKING:
     from lifecycle.plan import Plan, Resolution
 
 F = TypeVar("F", bound=Callable[..., Any])
+Completer = Callable[[click.Context, click.Parameter, str], list[Any]]
 
 
 def manifest_arguments(function: F) -> F:
     """Add `MANIFEST [NAME:=VALUE …]` to a verb."""
-    function = click.argument("assignments", nargs=-1, metavar="[NAME:=VALUE]...")(function)
-    return click.argument("manifest", metavar="MANIFEST")(function)
+    function = assignments_argument(function)
+    complete = completing("manifests")
+    return click.argument("manifest", metavar="MANIFEST", shell_complete=complete)(function)
+
+
+def assignments_argument(function: F) -> F:
+    """Add `[NAME:=VALUE …]` to a verb."""
+    return click.argument(
+        "assignments",
+        nargs=-1,
+        metavar="[NAME:=VALUE]...",
+        shell_complete=completing("arguments"),
+    )(function)
+
+
+def completing(what: str) -> Completer:
+    """Return the shell completion of an argument; kinds as `completion.found` has them."""
+
+    def complete(context: click.Context, _: click.Parameter, incomplete: str) -> list[Any]:
+        from lifecycle.cli.verbs.completion import found
+
+        return found(what, context, incomplete)
+
+    return complete
 
 
 def format_option(*formats: str) -> Callable[[F], F]:
@@ -124,11 +148,25 @@ def resolve(manifest: Manifest, machine: str = "") -> Resolution:
 
 def target_arguments(function: F) -> F:
     """Add `TARGET [NAME:=VALUE …]` and `--machine` to a verb."""
-    function = click.option(
-        "--machine", default="", metavar="NAME", help="As it was given to `lifecycle up`."
-    )(function)
-    function = click.argument("assignments", nargs=-1, metavar="[NAME:=VALUE]...")(function)
-    return click.argument("target", metavar="TARGET")(function)
+    function = machine_option("As it was given to `lifecycle up`.")(function)
+    return target_argument(assignments_argument(function))
+
+
+def target_argument(function: F) -> F:
+    """Add `TARGET`: a manifest, or a running system."""
+    complete = completing("manifests systems")
+    return click.argument("target", metavar="TARGET", shell_complete=complete)(function)
+
+
+def machine_option(help_: str) -> Callable[[F], F]:
+    """Add `--machine`."""
+    return click.option(
+        "--machine",
+        default="",
+        metavar="NAME",
+        shell_complete=completing("machines"),
+        help=help_,
+    )
 
 
 def target_run(
@@ -146,6 +184,20 @@ def target_run(
     if plan is not None:
         say_differences(path, plan)
     return path
+
+
+@contextlib.contextmanager
+def asking(path: Path) -> Iterator[None]:
+    """Say which supervisor, that of a run directory, does not answer or is gone."""
+    try:
+        yield
+    except TimeoutError as error:
+        raise UsageError(f"cannot ask {path.name!r}: its supervisor does not answer") from error
+    except (FileNotFoundError, ConnectionRefusedError) as error:
+        raise UsageError(
+            f"cannot ask {path.name!r}: its supervisor was killed",
+            hint=f"clean up after it: lifecycle down {path.name}",
+        ) from error
 
 
 def say_differences(path: Path, plan: Plan) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from rich import box
 from rich.console import Console, Group, RenderableType
@@ -38,6 +38,10 @@ from lifecycle.verify import Outcome, render_text
 
 _REDRAW_S = 0.04
 """At most 25 times a second, however many events there are."""
+
+_AROUND_ROWS = 7
+"""Of the table: the system, the columns' names and the lines around them, the verdict, and one row
+for the cursor."""
 
 _PHASES = ("connecting", "verifying", "activating", "active")
 _OUTCOMES = {Outcome.OK: "green", Outcome.VIOLATED: "red", Outcome.UNVERIFIABLE: "yellow"}
@@ -141,11 +145,17 @@ class Live:
     def _picture(self, status: SystemStatus) -> RenderableType:
         table = Table(box=box.SIMPLE_HEAD, pad_edge=False, header_style="bold")
         for column in ("node", "process", "state", "matched", "unique flows", ""):
-            table.add_column(column, no_wrap=column != "")
-        for node in status.nodes:
+            # Where there is no room the others keep theirs; no row takes two lines.
+            table.add_column(column, no_wrap=column not in ("node", ""))
+        shown = _that_fit(status.nodes, self._console.height - _AROUND_ROWS)
+        for node in shown:
             table.add_row(*_row(node))
+        parts: list[RenderableType] = [_head(status), table]
+        if left := len(status.nodes) - len(shown):
+            parts.append(Text(f"… {left} more nodes: lifecycle status {status.system} --watch"))
         style = "white" if status.verdict is None else _OUTCOMES[status.verdict]
-        return Group(_head(status), table, Text(self._verdict, style=style))
+        parts.append(Text(self._verdict, style=style, overflow="ellipsis", no_wrap=True))
+        return Group(*parts)
 
     def _log_line(self, event: LogLine) -> Text:
         if event.process not in self._processes:
@@ -157,6 +167,16 @@ class Live:
 def _soon(loop: asyncio.AbstractEventLoop, call: Callable[[], None]) -> None:
     with contextlib.suppress(RuntimeError):  # closed: the last is drawn without it
         loop.call_soon_threadsafe(call)
+
+
+def _that_fit(nodes: Sequence[NodeStatus], rows: int) -> Sequence[NodeStatus]:
+    """Return as many nodes as there are rows, those that are not active first, in their order."""
+    if len(nodes) <= rows:
+        return nodes
+    waited_for = [each for each in nodes if each.died or each.findings or each.state != "active"]
+    others = [each for each in nodes if each not in waited_for]
+    kept = {each.node for each in (*waited_for, *others)[: max(1, rows - 1)]}
+    return [each for each in nodes if each.node in kept]
 
 
 def _head(status: SystemStatus) -> Text:
@@ -177,6 +197,10 @@ def _head(status: SystemStatus) -> Text:
     return head
 
 
+def _short(text: str, style: str) -> Text:
+    return Text(text, style=style, no_wrap=True, overflow="ellipsis")
+
+
 def _row(node: NodeStatus) -> tuple[RenderableType, ...]:
     if node.process_state is None:
         process = Text("not ours", style="dim")
@@ -189,7 +213,7 @@ def _row(node: NodeStatus) -> tuple[RenderableType, ...]:
     style = "red" if node.died else "yellow"
     complete = "green" if node.matched >= node.endpoints else "yellow"
     return (
-        Text(one_line(node.node), style="red" if node.findings else "bold"),
+        _short(one_line(node.node), "red" if node.findings else "bold"),
         process,
         Text(
             f"{one_line(state) or '–'}{nested}",
@@ -197,7 +221,7 @@ def _row(node: NodeStatus) -> tuple[RenderableType, ...]:
         ),
         Text(f"{node.matched}/{node.endpoints}", style=complete if node.endpoints else "dim"),
         Text(f"{node.unique_flows}/{node.flows}" if node.flows else "–", style="dim"),
-        Text(one_line(node.died or node.doing or _away(node)), style=style),
+        _short(one_line(node.died or node.doing or _away(node)), style),
     )
 
 

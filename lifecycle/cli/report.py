@@ -76,7 +76,7 @@ def write_report(path: Path, text: str) -> None:
     """
     data = (text.rstrip("\n") + "\n").encode()
     try:
-        file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        file = os.open(path, os.O_WRONLY | os.O_CREAT | getattr(os, "O_CLOEXEC", 0), 0o666)
         try:
             _replace(file, data)
         finally:
@@ -91,7 +91,7 @@ def _replace(file: int, data: bytes) -> None:
     Half a report might read as a success; what is there says that the command never ended.
     """
     is_file = stat.S_ISREG(os.fstat(file).st_mode)
-    if is_file:
+    if is_file and hasattr(os, "posix_fallocate"):
         os.posix_fallocate(file, 0, len(data))
     try:
         left = memoryview(data)

@@ -130,9 +130,6 @@ def _item(value: Tree, indent: str) -> Iterator[str]:
 
 
 SUFFIX = ".nodl.yaml"
-SCHEMA_COMMENT = "# yaml-language-server: $schema=manifest.v1.schema.json"
-"""For editors, by the name that `lifecycle schema` and a wheel give the file."""
-
 _Spell = Callable[[Scalar], Scalar]
 _WIDTH = 100
 _ANNOUNCED = "history and depth are not announced"
@@ -141,16 +138,22 @@ _SERVICES = "the graph does not show the QoS of services"
 _UNKNOWN_POLICY = "SYSTEM_DEFAULT"
 
 
-def to_manifest(system: CapturedSystem, *, references: Mapping[str, str] | None = None) -> str:
+def to_manifest(
+    system: CapturedSystem,
+    *,
+    references: Mapping[str, str] | None = None,
+    schema: str = "manifest.v1.schema.json",
+) -> str:
     """Return the manifest of a captured system.
 
     Args:
         system: what was captured.
         references: by node key, the reference to the node's interface, `local://camera.nodl.yaml`;
             interfaces are written out without it.
+        schema: where editors find the manifest's schema, a path or URL.
     """
     head = [
-        SCHEMA_COMMENT,
+        f"# yaml-language-server: $schema={schema}",
         *_comments(
             f"Captured from domain {system.domain_id}, discovery range "
             f"{system.discovery_range.value}. What a graph does not tell is marked: gap."

@@ -101,7 +101,8 @@ def run_of(
     """
     gaps: tuple[str, ...] = ()
     if program.withheld:
-        gaps = (f"not told of its environment: {', '.join(program.withheld)}",)
+        names = ", ".join(program.withheld)
+        gaps = (f"values of its environment left out, secret or too long: {names}",)
     run = CapturedRun(program=program, command=program.argv, process=process, gaps=gaps)
     if process:
         return run

@@ -373,23 +373,28 @@ class Observer:
     def _show(self, nodes: Collection[ObservedNode], endpoints: Iterable[ObservedEndpoint]) -> None:
         """Have nodes join that discovery shows, and forget those that it shows no more."""
         present = frozenset(node.full_name for node in nodes)
-        reporting = {each.node for each in self._events.members() if each.incarnation}
         for name in sorted(self._seen - present):
             self._forget(name)
-        for name in sorted(present - self._seen - reporting):
-            if _counts(name):
+        for name in sorted(present - self._seen):
+            if _counts(name) and not self._events.reports(name):
                 self._events.report_seen(name)
         self._seen = present
+        given = self.state.given
+        silent: list[ObservedNode] = []
+        for node in nodes:
+            name = node.full_name
+            if name in given or not _counts(name) or self._events.reports(name):
+                self._shown.pop(name, None)
+            else:
+                silent.append(node)
+        if not silent:
+            return
         by_node: dict[str, list[ObservedEndpoint]] = {}
         for endpoint in endpoints:
             by_node.setdefault(endpoint.node, []).append(endpoint)
         hidden = sorted(name for name in present if name.rpartition("/")[2].startswith("_"))
-        given = self.state.given
-        for node in nodes:
+        for node in silent:
             name = node.full_name
-            if name in reporting or name in given or not _counts(name):
-                self._shown.pop(name, None)
-                continue
             space, _, base = name.rpartition("/")
             own = f"{space}/_{base}_"
             shown = _Shown(

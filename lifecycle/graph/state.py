@@ -76,6 +76,7 @@ class Record:
         )
         self.reading: object | None = None
         """Token of the reading that is under way."""
+        self._taken: tuple[NodeConfiguration, NodeView] | None = None
         self._announced = member.checksum
         self._doubtful = member.checksum is None
         self._again = False
@@ -97,6 +98,16 @@ class Record:
             self._doubtful = True
         else:
             self._again = True
+
+    def holds(self, configuration: NodeConfiguration) -> bool:
+        """Whether this object was taken last, and nothing changed since."""
+        return (
+            self._taken is not None
+            and self._taken[0] is configuration
+            and self._taken[1] is self.view
+            and self.reading is None
+            and not self._doubtful
+        )
 
     def begin(self) -> object:
         """Begin to read; return the token of this reading."""
@@ -126,6 +137,7 @@ class Record:
             state=configuration.state,
             connected=configuration.connected,
         )
+        self._taken = configuration, self.view
         announced = False
         for message in meanwhile:
             announced |= isinstance(message, ConfigurationChanged | Heartbeat | Joined)
@@ -220,6 +232,7 @@ class GraphState:
         self._records: dict[str, Record] = {}
         self._given: Mapping[str, NodeConfiguration] = {}
         self._look = Look()
+        self._stated: dict[str, tuple[ObservedNode, ObservedNode]] = {}
         self._fetch = fetch
         self._callbacks: tuple[Callable[[GraphChange], None], ...] = ()
         self._unread: set[str] = set()
@@ -326,7 +339,14 @@ class GraphState:
         """
         name = configuration.name
         with self._lock:
-            self._given = {**self._given, name: configuration}
+            held = self._given.get(name)
+            record = self._records.get(name)
+            if held is configuration or held == configuration:
+                if record is not None and record.holds(held):
+                    return  # it is known already, and nothing came after it
+                configuration = held
+            else:
+                self._given = {**self._given, name: configuration}
         self.events.report_seen(name)
         self.events.scheduler.post(functools.partial(self._put, configuration))
 
@@ -372,23 +392,41 @@ class GraphState:
     # -- what is judged
 
     def put_look(self, look: Look) -> None:
-        """Give what discovery and the nodes that were asked say now."""
-        self._look = look
+        """Give what discovery and the nodes that were asked say now.
+
+        An answer that equals the last one is this: who judges knows by it that nothing changed.
+        """
+        answers = dict(look.answers)
+        for name, (state, configuration) in look.answers.items():
+            _, held = self._look.answers.get(name, (None, None))
+            if held is configuration or held == configuration:
+                answers[name] = state, held
+        self._look = dataclasses.replace(look, answers=answers)
 
     def learn(self, configuration: NodeConfiguration) -> None:
         """Show what a member answered, where no reading of this state would bring it."""
         self.events.scheduler.post(functools.partial(self._put, configuration))
 
     def observation(self) -> Observation:
-        """Return what `lifecycle.verify` judges: the last look, and what is given of nodes now."""
+        """Return what `lifecycle.verify` judges: the last look, and what is given of nodes now.
+
+        What is as in the last observation is the same object.
+        """
         look, given = self._look, self._given
         asked = {name: configuration for name, (_, configuration) in look.answers.items()}
         configurations = {**given, **asked}
+        before, self._stated = self._stated, {}
+        nodes = []
+        for each in look.nodes:
+            name = each.full_name
+            state = _state(name, look.answers, given)
+            known = before.get(name)
+            if known is None or known[0] is not each or known[1].state != state:
+                known = each, dataclasses.replace(each, state=state)
+            self._stated[name] = known
+            nodes.append(known[1])
         return Observation(
-            nodes=tuple(
-                dataclasses.replace(each, state=_state(each.full_name, look.answers, given))
-                for each in look.nodes
-            ),
+            nodes=tuple(nodes),
             endpoints=look.endpoints,
             configurations=tuple(each for each in configurations.values() if each is not None),
             parameters=look.parameters,

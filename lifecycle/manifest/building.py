@@ -429,7 +429,7 @@ def _run(node: Cursor, base: Path, found: Findings) -> Run:
         _refuse(cursor, _OF_A_PROCESS, "a component: its container's process has that", found)
     elif "attach" in cursor:
         kind = RunKind.ATTACH
-        _refuse(cursor, _OF_A_PROCESS, "a node that somebody else starts", found)
+        _refuse(cursor, _OF_A_PROCESS, "an attached node", found)
     _check_python_keys(cursor, kind, found)
     folder = cursor.text("working_directory")
     arguments = (

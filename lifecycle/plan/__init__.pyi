@@ -1,3 +1,4 @@
+from .build import attached_to as attached_to
 from .build import build_plan as build_plan
 from .build import check_plan as check_plan
 from .build import effective_domain as effective_domain

@@ -317,7 +317,18 @@ def started_by_others(plan: Plan, names: Collection[str]) -> Plan:
                 f"cannot leave out {min(left)!r} alone: its process runs {others}, too",
                 hint="name all of them, or give it a process of its own in the manifest",
             )
+    return attached_to(plan, chosen)
+
+
+def attached_to(plan: Plan, keys: Collection[str]) -> Plan:
+    """Return a plan in which others run some nodes, as if the manifest attached to them.
+
+    Args:
+        plan: of the whole system.
+        keys: of nodes.
+    """
     attached = Run(kind=RunKind.ATTACH)
+    chosen = frozenset(keys)
     return dataclasses.replace(
         plan,
         nodes=tuple(

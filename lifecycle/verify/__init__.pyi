@@ -1,3 +1,4 @@
+from .judge import Verifier as Verifier
 from .judge import missing as missing
 from .judge import not_ok as not_ok
 from .judge import taken_on_trust as taken_on_trust
@@ -31,6 +32,7 @@ from .rules.matching import SERVER_OF as SERVER_OF
 from .rules.matching import MatchEnd as MatchEnd
 from .rules.matching import match as match
 from .rules.matching import obstacle as obstacle
+from .rules.nodes import DUPLICATE_NODE as DUPLICATE_NODE
 from .rules.nodes import MISSING_NODE as MISSING_NODE
 from .rules.nodes import UNATTRIBUTED_ENDPOINT as UNATTRIBUTED_ENDPOINT
 from .rules.run import DEADLINE as DEADLINE

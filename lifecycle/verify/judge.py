@@ -8,7 +8,8 @@ its arguments. Pure.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import dataclasses
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from lifecycle.manifest import EndpointKind, EndpointPolicy, UniqueHow
 from lifecycle.network import Medium, NetworkFlowEndpoint, TransportProtocol, is_ip
@@ -28,15 +29,27 @@ from lifecycle.verify.verdict import (
     ToleratedNode,
     Verdict,
 )
-from lifecycle.verify.view import Actual, FlowView, View
+from lifecycle.verify.view import Actual, FlowView, Frame, View, once, subject_of
 
 _HOW = (UniqueHow.NOT, UniqueHow.WEAKLY, UniqueHow.STRONGLY)
 
 
 def flow_reports(view: View, findings: Sequence[Finding]) -> tuple[FlowReport, ...]:
     """Report every planned flow, in plan order."""
+    uniqueness = view.uniqueness
+
+    def unspoiled(flow: FlowView) -> Iterator[FlowReport]:
+        yield _reported(flow, uniqueness, Outcome.OK)
+
+    reports = list(view.by_flow.each(unspoiled, name=_reported, terms=uniqueness.judged))
     spoiled = _spoiled(findings)
-    return tuple(_report(view, flow, view.uniqueness, spoiled) for flow in view.flows)
+    if spoiled:
+        (places,) = once(view.frame, _flows_by_place)
+        for index in {index for place in spoiled for index in places.get(place, ())}:
+            reports[index] = dataclasses.replace(
+                reports[index], outcome=_outcome(view.frame, index, spoiled)
+            )
+    return tuple(reports)
 
 
 _Place = tuple[str, str, EndpointKind | None]
@@ -61,24 +74,38 @@ def _spoiled(findings: Iterable[Finding]) -> dict[_Place, Outcome]:
     return worst
 
 
-def _report(
-    view: View, flow: FlowView, uniqueness: Uniqueness, spoiled: dict[_Place, Outcome]
-) -> FlowReport:
+def _flows_by_place(frame: Frame) -> Iterator[dict[_Place, list[int]]]:
+    """Yield the indices of the flows that a finding at a place spoils."""
+    found: dict[_Place, list[int]] = {}
+    for index in range(len(frame.plan.flows)):
+        for place in _places(frame, index):
+            found.setdefault(place, []).append(index)
+    yield found
+
+
+def _places(frame: Frame, index: int) -> tuple[_Place, ...]:
+    flow = frame.plan.flows[index]
+    publisher, subscription = frame.by_key[flow.publisher], frame.by_key[flow.subscription]
+    return (
+        (subject_of(flow.topic, publisher, subscription), "", None),
+        (publisher, publisher, None),
+        (subscription, subscription, None),
+        (flow.topic, publisher, EndpointKind.PUBLISHER),
+        (flow.topic, subscription, EndpointKind.SUBSCRIPTION),
+    )
+
+
+def _outcome(frame: Frame, index: int, spoiled: dict[_Place, Outcome]) -> Outcome:
+    return Outcome.worst(spoiled[place] for place in _places(frame, index) if place in spoiled)
+
+
+def _reported(flow: FlowView, uniqueness: Uniqueness, outcome: Outcome) -> FlowReport:
+    ends = (uniqueness.all_unique(flow.publishers), uniqueness.all_unique(flow.subscriptions))
     source = uniqueness.nfes(flow.publishers)
     destination = uniqueness.nfes(flow.subscriptions)
-    ends = (uniqueness.all_unique(flow.publishers), uniqueness.all_unique(flow.subscriptions))
-    topic = flow.planned.topic
-    places: tuple[_Place, ...] = (
-        (flow.subject, "", None),
-        (flow.publisher, flow.publisher, None),
-        (flow.subscription, flow.subscription, None),
-        (topic, flow.publisher, EndpointKind.PUBLISHER),
-        (topic, flow.subscription, EndpointKind.SUBSCRIPTION),
-    )
-    outcomes = (spoiled[place] for place in places if place in spoiled)
-    carrier = effective_transport(view, flow)
+    carrier = effective_transport(flow)
     return FlowReport(
-        topic=topic,
+        topic=flow.planned.topic,
         publisher=flow.publisher,
         subscription=flow.subscription,
         source=_used(source, carrier),
@@ -88,8 +115,8 @@ def _report(
         reader_dscp=_dscp(flow.subscriptions, carrier),
         requirement=flow.requirement,
         demanded=flow.planned.unique,
-        transport=_transport(view, flow, source, destination),
-        outcome=Outcome.worst(outcomes),
+        transport=_transport(flow, source, destination),
+        outcome=outcome,
         max_delay_ms=flow.planned.max_delay_ms,
         five_qi=flow.five_qi,
         five_qi_reason="; ".join(
@@ -121,7 +148,6 @@ def _dscp(ends: Sequence[Actual], carrier: str) -> int | None:
 
 
 def _transport(
-    view: View,
     flow: FlowView,
     source: Sequence[NetworkFlowEndpoint],
     destination: Sequence[NetworkFlowEndpoint],
@@ -132,11 +158,7 @@ def _transport(
     """
     if not source or not destination:
         return "unknown"
-    machines = {
-        view.configurations[name].identity.machine_id
-        for name in (flow.publisher, flow.subscription)
-        if name in view.configurations
-    }
+    machines = {each.configuration.identity.machine_id for each in flow.nodes if each.configuration}
     common: list[str] = []
     if len(machines) == 1 and not all(map(is_ip, source)) and not all(map(is_ip, destination)):
         common.append(Medium.SHM)
@@ -173,11 +195,43 @@ def verify(
         over: how the process ended of nodes that may end by themselves, by fully qualified name;
             empty where it is not known whether it has.
     """
-    view = lay_out(plan, observation, stage, machines=machines, ahead=ahead, over=over or {})
+    return _verdict(lay_out(plan, observation, stage, machines=machines, ahead=ahead, over=over))
+
+
+class Verifier:
+    """Judges one system again and again: what has not changed since the last time is not redone.
+
+    `verify` gives what the function of that name gives for the same arguments, whatever it was
+    asked before. It recognises what has not changed by the identity of the parts of the observation
+    (`ObservedNode`, `ObservedEndpoint`, `NodeConfiguration`, `NodeParameters`): who observes keeps
+    those. It holds what it was asked last, and no more.
+    """
+
+    def __init__(self) -> None:
+        self._last: View | None = None
+
+    def verify(
+        self,
+        plan: Plan,
+        observation: Observation,
+        *,
+        stage: Stage,
+        machines: frozenset[str] | None = None,
+        ahead: frozenset[str] = frozenset(),
+        over: Mapping[str, str] | None = None,
+    ) -> Verdict:
+        """Judge what was seen of a system; see the function of this name."""
+        self._last = view = lay_out(
+            plan, observation, stage, machines=machines, ahead=ahead, over=over, last=self._last
+        )
+        return _verdict(view)
+
+
+def _verdict(view: View) -> Verdict:
     findings = tuple(finding for check in CHECKS for finding in check(view))
     return Verdict(
         verdict=Outcome.worst(each.outcome for each in findings),
-        blocking=_blocks(findings, unverifiable_blocks=plan.policy.unverifiable_blocks),
+        blocking=_blocks(findings, unverifiable_blocks=view.plan.policy.unverifiable_blocks),
         findings=findings,
         flows=flow_reports(view, findings),
         open_endpoints=tuple(

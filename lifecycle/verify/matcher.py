@@ -7,19 +7,21 @@ what is left over. All rules read the result, so that they agree on what is the 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Iterable, Mapping, Sequence
+import itertools
+import operator
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
 from lifecycle.manifest import EndpointKind
 from lifecycle.plan import Plan, PlannedEndpoint, PlannedFlow, PlannedNode
 from lifecycle.verify.observation import (
     EndpointReport,
     NodeConfiguration,
+    NodeParameters,
     Observation,
     ObservedEndpoint,
     ObservedNode,
 )
 from lifecycle.verify.tool_filter import (
-    DeclaredNames,
     Owners,
     action_part,
     fold_actions,
@@ -31,19 +33,22 @@ from lifecycle.verify.uniqueness import Uniqueness
 from lifecycle.verify.verdict import Stage
 from lifecycle.verify.view import (
     Actual,
+    Attributed,
     FlowView,
+    Frame,
+    NodeEndpoints,
+    NodeFacts,
+    Parts,
     SeenEndpoint,
+    TopicFacts,
     View,
     actual_qos,
     may_hide,
-    only_shared_memory,
+    once,
 )
 
 _Pools = dict[tuple[EndpointKind, str], list[ObservedEndpoint]]
 """One node's endpoints by kind and name."""
-
-_End = tuple[str, EndpointKind, str]
-"""Full name of a node, kind and resolved name of what it declares."""
 
 _TURNS = ((True, True), (True, False), (False, False))
 """Who chooses first among a node's endpoints: those whose type discovery shows as declared, those
@@ -62,100 +67,179 @@ def lay_out(
     machines: frozenset[str] | None = None,
     ahead: frozenset[str] = frozenset(),
     over: Mapping[str, str] | None = None,
+    last: View | None = None,
 ) -> View:
-    """Match everything observed to everything planned; deterministic for any input order."""
-    planned = {node.full_name: node for node in plan.nodes}
+    """Match everything observed to everything planned; deterministic for any input order.
+
+    Args:
+        plan: what must be.
+        observation: what was seen.
+        stage: which moment it is judged against.
+        machines: as `Frame` has them, and `ahead`, and `over`.
+        ahead: see there.
+        over: see there.
+        last: the view of an earlier moment, whose parts are taken over where all that they are
+            made of is the same: the same object, not an equal one. The result does not depend on
+            it but for what it costs.
+    """
+    over = over or {}
+    if last is not None and not last.frame.is_of(plan, stage, machines, ahead, over):
+        last = None
+    frame = last.frame if last is not None else Frame.of(plan, stage, machines, ahead, over)
+    planned = frame.planned
     reported = _by_identity(observation)
     configurations = {each.name: each for each in reversed(reported)}
     duplicated = {each.full_name for each in observation.nodes if each.count > 1}
     owners = Owners(planned.values(), reported, plan.policy.tolerated_nodes)
-    names = DeclaredNames.of(plan)
-    everything = _attributed(observation, planned, configurations, owners, names)
-    tools = _tools(observation, everything, planned, owners, plan.policy.tolerated_nodes)
-    endpoints = tuple(each for each in everything if each.node not in tools)
-    places: dict[str, _Pools] = {}
-    for endpoint in endpoints:
-        pools = places.setdefault(endpoint.node, {})
-        pools.setdefault((endpoint.kind, endpoint.name), []).append(endpoint)
-    by_node: dict[str, tuple[Actual, ...]] = {}
+    attributed, groups = _attributed(observation, frame, configurations, owners, last)
+    tools = _tools(observation, groups, planned, owners, plan.policy.tolerated_nodes)
+    observed = _graph_nodes(observation.nodes, planned, owners, tools)
+    parameters = {each.node: each for each in observation.parameters}
+    nodes: dict[str, NodeFacts] = {}
     left_over: list[ObservedEndpoint] = []
     for node in plan.nodes:
-        configuration = configurations.get(node.full_name)
-        remote_nodes = machines is not None and node.machine not in machines
-        matched, rest = _match_node(
+        name = node.full_name
+        group = groups.get(name)
+        facts = nodes[name] = _facts(
+            frame,
             node,
-            configuration,
-            places.get(node.full_name, {}),
-            beyond=remote_nodes and only_shared_memory(node.connections),
+            configurations.get(name),
+            observed.get(name),
+            parameters.get(name),
+            () if group is None else group.endpoints,
+            last.nodes.get(name) if last is not None else None,
         )
-        by_node[node.full_name] = tuple(matched)
         # A second node of the same name has the same endpoints again; that is one finding.
-        left_over += [] if node.full_name in duplicated else rest
-    actual = tuple(each for matched in by_node.values() for each in matched)
-    known_actions = {(each.node, each.kind, each.name) for each in endpoints} | {
-        (each.node.full_name, each.planned.kind, each.planned.resolved) for each in actual
-    }
-    undeclared = [each for each in left_over if not _is_part_of(each, known_actions)]
+        left_over += () if name in duplicated else facts.rest
+    by_node = Parts(
+        nodes, order=frame.order.__getitem__, last=last.by_node if last is not None else None
+    )
+    actual = tuple(itertools.chain.from_iterable(facts.actual for facts in nodes.values()))
+    strangers = [name for name in groups if name and name not in planned and name not in tools]
+    of_tools = tuple(
+        each for name, group in groups.items() if name in tools for each in group.endpoints
+    )
+    seen = _seen(groups, nodes, tools)
+    topics, retold = _topics(frame, seen, of_tools, last)
+    flows, moved = _flows(frame, nodes, topics, last, changed=(*by_node.changed, *retold))
     return View(
-        plan=plan,
-        stage=stage,
-        machines=machines,
-        ahead=ahead,
-        over=dict(over or {}),
-        planned=planned,
-        names=names,
-        observed=_graph_nodes(observation.nodes, planned, owners, tools),
+        frame=frame,
+        observed=observed,
         reported=reported,
         configurations=configurations,
-        parameters={each.node: each for each in observation.parameters},
+        parameters=parameters,
         actual=actual,
-        actual_by_node=by_node,
-        undeclared=_sorted(undeclared),
-        unattributed=tuple(each for each in endpoints if not each.node),
-        foreign=tuple(each for each in endpoints if each.node and each.node not in planned),
+        actual_by_node={name: facts.actual for name, facts in nodes.items()},
+        undeclared=_undeclared(left_over, groups, actual, tools),
+        unattributed=groups[""].endpoints if "" in groups else (),
+        foreign=tuple(each for name in strangers for each in groups[name].endpoints),
         tools=tools,
-        of_tools=tuple(each for each in everything if each.node in tools),
-        seen=_seen(
-            (*endpoints, *(each.observed for each in actual if each.unseen and each.observed)),
-            actual,
+        of_tools=of_tools,
+        seen=seen,
+        flows=flows,
+        uniqueness=Uniqueness.of(
+            reported, frame.addresses, last.uniqueness if last is not None else None
         ),
-        flows=_flows(plan, actual),
-        uniqueness=Uniqueness(reported, declared_addresses(plan)),
+        nodes=nodes,
+        topics=topics,
+        by_node=by_node,
+        by_topic=Parts(
+            topics,
+            order=str,
+            last=last.by_topic if last is not None else None,
+            changed=retold,
+        ),
+        by_flow=Parts(
+            dict(enumerate(flows)),
+            order=int,
+            last=last.by_flow if last is not None else None,
+            changed=moved,
+        ),
+        attributed=attributed,
+        groups=groups,
     )
 
 
-def declared_addresses(plan: Plan) -> dict[str, str]:
-    """Return the declared address of each node's machine, by full node name, where there is one."""
-    machines = {each.name: each.address for each in plan.machines if each.address}
-    return {
-        node.full_name: machines[node.machine] for node in plan.nodes if node.machine in machines
-    }
+def _same(one: Sequence[object], other: Sequence[object]) -> bool:
+    """Return whether two sequences hold the same objects: equal ones may have other identities."""
+    return one is other or (len(one) == len(other) and all(map(operator.is_, one, other)))
 
 
 def _by_identity(observation: Observation) -> tuple[NodeConfiguration, ...]:
-    return tuple(
-        sorted(observation.configurations, key=lambda each: (each.name, repr(each.identity)))
-    )
+    by_name = sorted(observation.configurations, key=lambda each: each.name)
+    if all(one.name != other.name for one, other in itertools.pairwise(by_name)):
+        return tuple(by_name)
+    return tuple(sorted(by_name, key=lambda each: (each.name, repr(each.identity))))
 
 
 def _attributed(
     observation: Observation,
-    planned: dict[str, PlannedNode],
+    frame: Frame,
     configurations: dict[str, NodeConfiguration],
     owners: Owners,
-    names: DeclaredNames,
-) -> tuple[ObservedEndpoint, ...]:
+    last: View | None,
+) -> tuple[dict[str, Attributed], dict[str, NodeEndpoints]]:
     """Give each endpoint to its node: by hidden participant, or by the GID that a node reported.
 
     Services have no GID of their own in reports: one whose node is not known is that of the node on
     its participant that declares it. What client libraries bring along is left out here, unless it
     is declared; under a declared name, unless it is a declared node's.
+
+    Returns:
+        The endpoints by the name that discovery shows, but for those without one; and all by the
+        name of the node whose they are, sorted by it.
     """
-    declared = {
-        (name, each.kind, each.resolved)
-        for name, node in planned.items()
-        for each in node.endpoints
+    shown: dict[str, list[ObservedEndpoint]] = {}
+    for name, of_node in itertools.groupby(observation.endpoints, operator.attrgetter("node")):
+        shown.setdefault(name, []).extend(of_node)
+    attributed: dict[str, Attributed] = {}
+    by_node: dict[str, list[Sequence[ObservedEndpoint]]] = {}
+    for name, endpoints in shown.items():
+        node = known_node(name)
+        if node not in frame.planned:
+            node = owners.of(node) or node
+        if not node:
+            for each in _unknown(endpoints, frame, configurations):
+                by_node.setdefault(each.node, []).append((each,))
+            continue
+        ours = node in configurations
+        known = last.attributed.get(name) if last is not None else None
+        if (
+            known is None
+            or known.node != node
+            or known.ours is not ours
+            or not _same(known.shown, endpoints)
+        ):
+            known = Attributed(
+                shown=tuple(endpoints),
+                node=node,
+                ours=ours,
+                judged=tuple(
+                    _as_of(each, node)
+                    for each in endpoints
+                    if _counts(each, node, frame, ours=ours)
+                ),
+            )
+        attributed[name] = known
+        if known.judged:
+            by_node.setdefault(node, []).append(known.judged)
+    groups = {
+        name: _group(
+            by_node[name],
+            last.groups.get(name) if last is not None else None,
+            declared=name in frame.planned,
+        )
+        for name in sorted(by_node)
     }
+    return attributed, groups
+
+
+def _unknown(
+    endpoints: Iterable[ObservedEndpoint],
+    frame: Frame,
+    configurations: dict[str, NodeConfiguration],
+) -> Iterator[ObservedEndpoint]:
+    """Yield the endpoints whose node discovery does not show, as far as they count."""
     by_gid = {
         report.gid: name
         for name, configuration in configurations.items()
@@ -165,41 +249,52 @@ def _attributed(
     by_participant: dict[str, dict[str, None]] = {}
     for gid, name in by_gid.items():
         by_participant.setdefault(gid[:_PREFIX_DIGITS], {})[name] = None
-    found: list[ObservedEndpoint] = []
-    for endpoint in observation.endpoints:
-        node = known_node(endpoint.node)
-        if node not in planned:
-            node = owners.of(node) or node
-        if not node:
-            node = by_gid.get(endpoint.gid, "")
+    for endpoint in endpoints:
+        node = by_gid.get(endpoint.gid, "")
         if not node and not endpoint.kind.is_topic:
             node = next(
                 (
                     each
                     for each in by_participant.get(endpoint.gid[:_PREFIX_DIGITS], ())
                     if (each, *(action_part(endpoint.kind, endpoint.name) or _place(endpoint)))
-                    in declared
+                    in frame.declared
                 ),
                 "",
             )
-        feeds = node not in planned and names.fed_by(endpoint.kind, endpoint.name)
-        if (
-            not feeds
-            and (node, endpoint.kind, endpoint.name) not in declared
-            and is_noise_endpoint(
-                endpoint.kind,
-                known_node(endpoint.node),
-                endpoint.name,
-                endpoint.type,
-                ours=node in configurations,
-            )
-        ):
-            continue
-        if node != endpoint.node:
-            gid = endpoint.gid if endpoint.kind.is_topic or not node else ""
-            endpoint = dataclasses.replace(endpoint, node=node, gid=gid)  # noqa: PLW2901
-        found.append(endpoint)
-    return _sorted(fold_actions(_sorted(found)))
+        if _counts(endpoint, node, frame, ours=node in configurations):
+            yield _as_of(endpoint, node)
+
+
+def _counts(endpoint: ObservedEndpoint, node: str, frame: Frame, *, ours: bool) -> bool:
+    """Return whether an endpoint of a node is declared, feeds what is, or was made on purpose."""
+    return (
+        (node, endpoint.kind, endpoint.name) in frame.declared
+        or (node not in frame.planned and frame.names.fed_by(endpoint.kind, endpoint.name))
+        or not is_noise_endpoint(
+            endpoint.kind, known_node(endpoint.node), endpoint.name, endpoint.type, ours=ours
+        )
+    )
+
+
+def _as_of(endpoint: ObservedEndpoint, node: str) -> ObservedEndpoint:
+    if node == endpoint.node:
+        return endpoint
+    gid = endpoint.gid if endpoint.kind.is_topic or not node else ""
+    return dataclasses.replace(endpoint, node=node, gid=gid)
+
+
+def _group(
+    parts: Sequence[Sequence[ObservedEndpoint]], last: NodeEndpoints | None, *, declared: bool
+) -> NodeEndpoints:
+    judged = parts[0] if len(parts) == 1 else [each for part in parts for each in part]
+    if last is not None and _same(last.judged, judged):
+        return last
+    endpoints = _sorted(fold_actions(_sorted(judged)))
+    return NodeEndpoints(
+        judged=tuple(judged),
+        endpoints=endpoints,
+        seen=() if declared else tuple(_seen_endpoint(each, None) for each in _topical(endpoints)),
+    )
 
 
 def _place(endpoint: ObservedEndpoint) -> tuple[EndpointKind, str]:
@@ -208,19 +303,76 @@ def _place(endpoint: ObservedEndpoint) -> tuple[EndpointKind, str]:
 
 def _tools(
     observation: Observation,
-    endpoints: Iterable[ObservedEndpoint],
+    groups: Iterable[str],
     planned: dict[str, PlannedNode],
     owners: Owners,
     patterns: Sequence[str],
 ) -> dict[str, str]:
     """Return the undeclared nodes that are tolerated by their name, and the pattern, sorted."""
-    seen = {each.full_name for each in observation.nodes} | {each.node for each in endpoints}
+    seen = {each.full_name for each in observation.nodes}.union(groups)
     found = {
         name: tolerating_pattern(name, patterns)
-        for name in sorted(seen)
-        if known_node(name) and name not in planned and not owners.of(name)
+        for name in sorted(seen - planned.keys())
+        if known_node(name) and not owners.of(name)
     }
     return {name: pattern for name, pattern in found.items() if pattern}
+
+
+def _facts(  # noqa: PLR0917 - all that is known of one node
+    frame: Frame,
+    node: PlannedNode,
+    configuration: NodeConfiguration | None,
+    observed: ObservedNode | None,
+    parameters: NodeParameters | None,
+    endpoints: tuple[ObservedEndpoint, ...],
+    last: NodeFacts | None,
+) -> NodeFacts:
+    """Match one node's declarations to what is seen of it."""
+    if (
+        last is not None
+        and last.node is node
+        and last.configuration is configuration
+        and last.observed is observed
+        and last.parameters is parameters
+        and last.endpoints is endpoints
+    ):
+        return last
+    places: _Pools = {}
+    for endpoint in endpoints:
+        places.setdefault((endpoint.kind, endpoint.name), []).append(endpoint)
+    matched, rest = _match_node(node, configuration, places, beyond=frame.is_beyond(node))
+    ends: dict[tuple[EndpointKind, str], tuple[Actual, ...]] = {}
+    for each in matched:
+        place = (each.planned.kind, each.planned.resolved)
+        ends[place] = (*ends.get(place, ()), each)
+    by_observed = {id(each.observed): each for each in matched if each.observed is not None}
+    unseen = [each.observed for each in matched if each.unseen and each.observed is not None]
+    return NodeFacts(
+        frame=frame,
+        node=node,
+        observed=observed,
+        configuration=configuration,
+        parameters=parameters,
+        endpoints=endpoints,
+        actual=tuple(matched),
+        ends=ends,
+        rest=tuple(rest),
+        seen=tuple(_seen_endpoint(each, by_observed.get(id(each))) for each in _topical(endpoints)),
+        beyond=tuple(
+            _planned_endpoint(each) for each in matched if each.beyond and _is_topic(each)
+        ),
+        unseen=tuple(_seen_endpoint(each, by_observed[id(each)]) for each in _topical(unseen)),
+        absent=observed is None and not by_observed,
+        may_hide=any(each.unseen for each in matched),
+    )
+
+
+def _topical(endpoints: Iterable[ObservedEndpoint]) -> Iterator[ObservedEndpoint]:
+    return (each for each in endpoints if each.kind.is_topic)
+
+
+def _is_topic(actual: Actual) -> bool:
+    return actual.planned.kind.is_topic
 
 
 def _match_node(
@@ -251,7 +403,7 @@ def _match_node(
             elif observed is not None:
                 used.add(place)  # found by name only: it represents any number of them
             elif unseen and report is not None and _is_there(report, planned.resolved):
-                observed = _as_observed(node, report, report.resolved)
+                observed = _as_observed(node, report, planned.resolved)
             reports.take(picked)
             matched[index] = Actual(
                 node=node,
@@ -355,6 +507,24 @@ def _as_observed(node: PlannedNode, report: EndpointReport, name: str) -> Observ
     )
 
 
+def _undeclared(
+    left_over: Sequence[ObservedEndpoint],
+    groups: Mapping[str, NodeEndpoints],
+    actual: Iterable[Actual],
+    tools: Collection[str],
+) -> tuple[ObservedEndpoint, ...]:
+    """Leave out of what no declaration covers the hidden parts of actions that are there."""
+    if not any(action_part(each.kind, each.name) for each in left_over):
+        return _sorted(left_over)
+    known_actions = {
+        (each.node, each.kind, each.name)
+        for name, group in groups.items()
+        if name not in tools
+        for each in group.endpoints
+    } | {(each.node.full_name, each.planned.kind, each.planned.resolved) for each in actual}
+    return _sorted(each for each in left_over if not _is_part_of(each, known_actions))
+
+
 def _is_part_of(endpoint: ObservedEndpoint, actions: set[tuple[str, EndpointKind, str]]) -> bool:
     """Return whether an endpoint is a hidden part of an action that is declared or seen."""
     action = action_part(endpoint.kind, endpoint.name)
@@ -383,43 +553,84 @@ def _graph_nodes(
 
 
 def _seen(
-    endpoints: Iterable[ObservedEndpoint],
-    actual: Sequence[Actual],
+    groups: Mapping[str, NodeEndpoints], nodes: Mapping[str, NodeFacts], tools: Collection[str]
 ) -> tuple[SeenEndpoint, ...]:
     """Collect publishers and subscriptions with all that is known of them."""
-    known = {id(each.observed): each for each in actual if each.observed is not None}
     # Not visible here, but the endpoints that match them count them.
-    found = [
-        SeenEndpoint(
-            kind=each.planned.kind,
-            node=each.node.full_name,
-            name=each.planned.resolved,
-            type=each.planned.type,
-            qos=each.planned.qos,
-            report=None,
-            planned=each.planned,
-        )
-        for each in actual
-        if each.beyond and each.planned.kind.is_topic
-    ]
-    for endpoint in endpoints:
-        if not endpoint.kind.is_topic:
-            continue
-        match = known.get(id(endpoint))
-        report = match.report if match else None
-        found.append(
-            SeenEndpoint(
-                kind=endpoint.kind,
-                node=endpoint.node,
-                name=endpoint.name,
-                type=endpoint.type,
-                qos=actual_qos(endpoint.qos, report.qos if report else None),
-                report=report,
-                planned=match.planned if match else None,
-                type_hash=_type_hash(endpoint, report),
-            )
-        )
+    found = [each for facts in nodes.values() for each in facts.beyond]
+    for name, group in groups.items():
+        facts = nodes.get(name)
+        if facts is not None:
+            found += facts.seen
+        elif name not in tools:
+            found += group.seen
+    found += [each for facts in nodes.values() for each in facts.unseen]
     return tuple(found)
+
+
+def _planned_endpoint(actual: Actual) -> SeenEndpoint:
+    return SeenEndpoint(
+        kind=actual.planned.kind,
+        node=actual.node.full_name,
+        name=actual.planned.resolved,
+        type=actual.planned.type,
+        qos=actual.planned.qos,
+        report=None,
+        planned=actual.planned,
+    )
+
+
+def _seen_endpoint(endpoint: ObservedEndpoint, match: Actual | None) -> SeenEndpoint:
+    report = match.report if match else None
+    return SeenEndpoint(
+        kind=endpoint.kind,
+        node=endpoint.node,
+        name=endpoint.name,
+        type=endpoint.type,
+        qos=actual_qos(endpoint.qos, report.qos if report else None),
+        report=report,
+        planned=match.planned if match else None,
+        type_hash=_type_hash(endpoint, report),
+    )
+
+
+def _topics(
+    frame: Frame,
+    seen: Iterable[SeenEndpoint],
+    of_tools: Iterable[ObservedEndpoint],
+    last: View | None,
+) -> tuple[dict[str, TopicFacts], Collection[str]]:
+    """Return what is seen of every topic, and of which of them another thing than last."""
+    tools: dict[str, list[SeenEndpoint]] = {}
+    for endpoint in _topical(of_tools):
+        tools.setdefault(endpoint.name, []).append(_seen_endpoint(endpoint, None))
+    ends: dict[str, list[SeenEndpoint]] = {}
+    if last is None:
+        for each in seen:
+            ends.setdefault(each.name, []).append(each)
+        found: dict[str, TopicFacts] = {}
+        touched: Collection[str] = ends.keys() | tools.keys()
+    else:
+        # Ends that are there in both moments are in the same order: nodes have theirs.
+        now, before = set(map(id, seen)), set(map(id, last.seen))
+        touched = {each.name for each in seen if id(each) not in before}
+        touched |= {each.name for each in last.seen if id(each) not in now}
+        touched |= tools.keys() | {each.name for each in last.of_tools}
+        for each in seen:
+            if each.name in touched:
+                ends.setdefault(each.name, []).append(each)
+        found = dict(last.topics)
+    changed: set[str] = set()
+    for name in touched:
+        here, beside = tuple(ends.get(name, ())), tuple(tools.get(name, ()))
+        known = found.get(name)
+        if not here and not beside:
+            if found.pop(name, None) is not None:
+                changed.add(name)
+        elif known is None or not _same(known.ends, here) or known.of_tools != beside:
+            found[name] = TopicFacts(frame=frame, ends=here, of_tools=beside)
+            changed.add(name)
+    return found, changed
 
 
 def _type_hash(endpoint: ObservedEndpoint, report: EndpointReport | None) -> str | None:
@@ -429,28 +640,56 @@ def _type_hash(endpoint: ObservedEndpoint, report: EndpointReport | None) -> str
     return report.type_hash
 
 
-def _flows(plan: Plan, actual: Iterable[Actual]) -> tuple[FlowView, ...]:
-    names = {node.key: node.full_name for node in reversed(plan.nodes)}
-    ends: dict[_End, tuple[Actual, ...]] = {}
-    for each in actual:
-        place = (each.node.full_name, each.planned.kind, each.planned.resolved)
-        ends[place] = (*ends.get(place, ()), each)
-    return tuple(_flow(each, names, ends) for each in plan.flows)
+def _flows(
+    frame: Frame,
+    nodes: Mapping[str, NodeFacts],
+    topics: Mapping[str, TopicFacts],
+    last: View | None,
+    changed: Iterable[str],
+) -> tuple[tuple[FlowView, ...], Collection[int]]:
+    """Return every flow, and the indices of those that have another node or topic than last."""
+
+    def flow(planned: PlannedFlow) -> FlowView:
+        return _flow(
+            planned,
+            nodes[frame.by_key[planned.publisher]],
+            nodes[frame.by_key[planned.subscription]],
+            topics.get(planned.topic),
+        )
+
+    if last is None:
+        return tuple(map(flow, frame.plan.flows)), ()
+    (concerned,) = once(frame, _flows_by_name)
+    moved = {index for name in changed for index in concerned.get(name, ())}
+    found = list(last.flows)
+    for index in moved:
+        found[index] = flow(frame.plan.flows[index])
+    return tuple(found), moved
+
+
+def _flows_by_name(frame: Frame) -> Iterator[dict[str, list[int]]]:
+    """Yield the indices of the flows that a node or a topic is of; names may be of both."""
+    found: dict[str, list[int]] = {}
+    for index, each in enumerate(frame.plan.flows):
+        for name in {frame.by_key[each.publisher], frame.by_key[each.subscription], each.topic}:
+            found.setdefault(name, []).append(index)
+    yield found
 
 
 def _flow(
-    planned: PlannedFlow, names: Mapping[str, str], ends: Mapping[_End, tuple[Actual, ...]]
+    planned: PlannedFlow, source: NodeFacts, destination: NodeFacts, topic: TopicFacts | None
 ) -> FlowView:
-    publisher, subscription = names[planned.publisher], names[planned.subscription]
-    publishers = ends.get((publisher, EndpointKind.PUBLISHER, planned.topic), ())
-    subscriptions = ends.get((subscription, EndpointKind.SUBSCRIPTION, planned.topic), ())
+    publishers = source.ends.get((EndpointKind.PUBLISHER, planned.topic), ())
+    subscriptions = destination.ends.get((EndpointKind.SUBSCRIPTION, planned.topic), ())
     return FlowView(
         planned=planned,
-        publisher=publisher,
-        subscription=subscription,
+        publisher=source.name,
+        subscription=destination.name,
         publishers=publishers,
         subscriptions=subscriptions,
         at=next((each.planned.at for each in (*subscriptions, *publishers)), None),
+        nodes=(source, destination),
+        ends_of_topic=topic,
     )
 
 

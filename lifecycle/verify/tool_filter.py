@@ -12,6 +12,7 @@ article (https://design.ros2.org/articles/actions.html), names of nodes as the t
 from __future__ import annotations
 
 import dataclasses
+import functools
 import re
 from collections.abc import Collection, Iterable, Mapping
 
@@ -140,14 +141,19 @@ def tolerating_pattern(full_name: str, patterns: Collection[str] = TOLERATED_NOD
     return ""
 
 
+@functools.lru_cache(maxsize=1 << 12)
 def is_noise_node(full_name: str) -> bool:
     """Return whether a node is named as a tool that any user may be expected to run."""
     return bool(tolerating_pattern(full_name))
 
 
 def _matches(name: str, pattern: str) -> bool:
-    spelled = re.escape(pattern).replace(r"\*", ".*").replace(r"\?", ".")
-    return re.fullmatch(spelled, name) is not None
+    return _compiled(pattern).fullmatch(name) is not None
+
+
+@functools.lru_cache(maxsize=256)
+def _compiled(pattern: str) -> re.Pattern[str]:
+    return re.compile(re.escape(pattern).replace(r"\*", ".*").replace(r"\?", "."))
 
 
 _NAMESPACES: Mapping[EndpointKind, EndpointKind] = {

@@ -25,8 +25,8 @@ from lifecycle.network import (
     is_multicast,
     parse,
 )
-from lifecycle.verify.observation import Identity
-from lifecycle.verify.view import Actual, FlowView, View
+from lifecycle.verify.observation import Identity, NodeConfiguration
+from lifecycle.verify.view import Actual, FlowView, once
 
 NONE = "none"
 UNKNOWN = "unknown"
@@ -35,22 +35,31 @@ _ANY_PORT = 0
 """Of the NFE made from a URL: no port distinguishes one transport from another."""
 
 
-def effective_transport(view: View, flow: FlowView) -> str:
+def effective_transport(flow: FlowView) -> str:
     """Return what carries a planned flow, as `carrier` says."""
-    return carrier(
-        _ways(view, flow.publisher, flow.publishers),
-        _ways(view, flow.subscription, flow.subscriptions),
-        view.identity(flow.publisher),
-        view.identity(flow.subscription),
+    (found,) = once(flow, _effective)
+    return found
+
+
+def _effective(flow: FlowView) -> tuple[str]:
+    source, destination = flow.nodes
+    return (
+        carrier(
+            _ways(source.configuration, flow.publishers),
+            _ways(destination.configuration, flow.subscriptions),
+            None if source.configuration is None else source.configuration.identity,
+            None if destination.configuration is None else destination.configuration.identity,
+        ),
     )
 
 
-def _ways(view: View, node: str, ends: Sequence[Actual]) -> tuple[NetworkFlowEndpoint, ...]:
+def _ways(
+    configuration: NodeConfiguration | None, ends: Sequence[Actual]
+) -> tuple[NetworkFlowEndpoint, ...]:
     """Return the NFEs of one side, and what it was connected to where they do not show it.
 
     rmw_fastrtps lists no NFE of a TCP transport at a publisher.
     """
-    configuration = view.configurations.get(node)
     connections = (
         {each.name: each.urls for each in configuration.connections} if configuration else {}
     )

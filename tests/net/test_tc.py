@@ -240,7 +240,7 @@ def test_a_root_qdisc_of_somebody_else_is_refused_and_stays(bench: Bench) -> Non
         bench.target().apply([bench.rule()])
 
     assert str(caught.value) == (
-        "cannot use tc on e0: it has a root qdisc of somebody else, htb 7:; "
+        "cannot use tc on e0: it has a root qdisc of another owner, htb 7:; "
         "use another device, or remove it: tc qdisc del dev e0 root"
     )
     assert kinds(bench.target().remove()) == []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import os
 import socket
 import threading
@@ -346,3 +347,19 @@ def test_a_record_that_is_no_file_is_none(tmp_path: Path) -> None:
     (tmp_path / "record.json").unlink()
     (tmp_path / "record.json").symlink_to("/dev/zero")
     assert read_record(tmp_path) is None
+
+
+def test_a_full_disk_is_said_before_anything_is_started(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def record(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(RunDirectory, "record", record)
+    with pytest.raises(UsageError) as refused:
+        RunDirectory.acquire(tmp_path / "lifecycle", "arm@7", "id")
+    assert str(refused.value) == (
+        f"cannot write in run directory '{tmp_path}/lifecycle/arm@7': No space left on device; "
+        "make room there, or set XDG_RUNTIME_DIR to another directory"
+    )
+    assert not (tmp_path / "lifecycle/arm@7").exists()

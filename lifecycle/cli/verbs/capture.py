@@ -73,6 +73,7 @@ def command(
     The result passes `lifecycle check`, and `lifecycle verify` of the same system is ok. Exits with
     4 if no node is there.
     """
+    from lifecycle.cli.verbs.init import schema_reference
     from lifecycle.export import to_manifest
     from lifecycle.manifest import Discovery
     from lifecycle.plan import effective_domain, effective_range
@@ -101,7 +102,8 @@ def command(
         _say_gaps(captured)
         return ExitCode.VIOLATED
     references = {} if nodl_dir is None else _write_nodl(captured, nodl_dir, output)
-    text = to_manifest(captured, references=references)
+    schema = schema_reference(Path.cwd() if output is None else output.parent)
+    text = to_manifest(captured, references=references, schema=schema)
     if output is None:
         click.echo(text, nl=False)
     else:

@@ -17,7 +17,13 @@ from urllib.parse import quote
 
 import click
 
-from lifecycle.cli.common import format_option, manifest_arguments, parse_assignments, resolve
+from lifecycle.cli.common import (
+    format_option,
+    machine_option,
+    manifest_arguments,
+    parse_assignments,
+    resolve,
+)
 from lifecycle.cli.report import (
     annotation,
     report_format,
@@ -240,12 +246,7 @@ def _legal(text: str) -> str:
 @click.option(
     "--strict", is_flag=True, help="Let warnings and what could not be resolved fail it, too."
 )
-@click.option(
-    "--machine",
-    default="",
-    metavar="NAME",
-    help="The machine that this host is; default: all whose address is this host's.",
-)
+@machine_option("The machine that this host is; default: all whose address is this host's.")
 @click.option(
     "--arguments", "lists", is_flag=True, help="List the arguments that it takes, and end."
 )

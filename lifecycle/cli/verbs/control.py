@@ -12,9 +12,14 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from lifecycle.cli.common import (
+    asking,
+    assignments_argument,
+    completing,
     format_option,
     load_manifest,
+    machine_option,
     say_differences,
+    target_argument,
     target_arguments,
     target_plan,
     target_run,
@@ -24,6 +29,8 @@ from lifecycle.errors import ExitCode, UsageError
 from lifecycle.printable import json_text, lines, one_line
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from lifecycle.supervisor import NodeStatus, SystemStatus
     from lifecycle.verify import ConnectionReport
 
@@ -91,10 +98,16 @@ def _history(node: NodeStatus) -> str:
 
 
 @click.command("status")
-@click.argument("target", required=False, metavar="[TARGET]")
-@click.argument("assignments", nargs=-1, metavar="[NAME:=VALUE]...")
-@click.option("--machine", default="", metavar="NAME", help="As it was given to `lifecycle up`.")
+@click.argument(
+    "target",
+    required=False,
+    metavar="[TARGET]",
+    shell_complete=completing("manifests systems"),
+)
+@assignments_argument
+@machine_option("As it was given to `lifecycle up`.")
 @format_option("text", "json")
+@click.option("--watch", is_flag=True, help="Show it again at every change; Ctrl-C ends.")
 @click.option(
     "--probe",
     type=click.Choice(["live", "ready"]),
@@ -102,24 +115,34 @@ def _history(node: NodeStatus) -> str:
     "while the system is active and not violated (ready), else with 6.",
 )
 def status_command(
-    target: str | None, assignments: tuple[str, ...], machine: str, format_: str, probe: str | None
+    *,
+    target: str | None,
+    assignments: tuple[str, ...],
+    machine: str,
+    format_: str,
+    watch: bool,
+    probe: str | None,
 ) -> int:
     """Show a running system: its nodes, their processes and states, and the last verdict.
 
     TARGET is a manifest or the name of a system; without one, all that run are listed. Exits with
     4 if the last verdict is violated.
     """
+    if watch and probe is not None:
+        raise UsageError("cannot probe and watch at once; a probe prints nothing")
     if target is None:
+        if watch:
+            raise UsageError("cannot watch without a TARGET", hint="lifecycle status lists them")
         return _list_running(format_)
     path = target_run(os.environ, target, assignments, machine)
+    if watch:
+        return _watch(path, format_)
     from lifecycle.codec import to_json
     from lifecycle.supervisor import status  # takes long to import, and a wrong name needs none
     from lifecycle.verify import Outcome
 
-    try:
+    with asking(path):
         seen = status(path)
-    except TimeoutError as error:
-        raise UsageError(f"cannot ask {path.name!r}: its supervisor does not answer") from error
     if probe is not None:
         ready = seen.phase == "active" and seen.verdict is not Outcome.VIOLATED
         return ExitCode.OK if ready or probe == "live" else ExitCode.BRING_UP_FAILED
@@ -128,6 +151,26 @@ def status_command(
     else:
         click.echo(status_text(seen))
     return ExitCode.VIOLATED if seen.verdict is Outcome.VIOLATED else ExitCode.OK
+
+
+def _watch(path: Path, format_: str) -> int:
+    from lifecycle.cli.screen import Screen
+    from lifecycle.codec import to_json
+    from lifecycle.supervisor import follow
+    from lifecycle.verify import Outcome
+
+    verdict = None
+    last = ""
+    with Screen(whole=format_ == "text") as screen, asking(path):
+        for seen in follow(path / "control"):
+            verdict, is_json = seen.status.verdict, format_ == "json"
+            text = json_text(to_json(seen.status).decode()) if is_json else ""
+            text = text or status_text(seen.status)
+            if text != last:
+                screen.show(last := text)
+    if not screen.quit:
+        click.echo(f"{path.name}: its supervisor has ended", err=True)
+    return ExitCode.VIOLATED if verdict is Outcome.VIOLATED else ExitCode.OK
 
 
 def _list_running(format_: str) -> int:
@@ -246,9 +289,14 @@ def resume_command(target: str, assignments: tuple[str, ...], machine: str, time
 
 
 @click.command("restart")
-@click.argument("target", metavar="TARGET")
-@click.argument("words", nargs=-1, metavar="[NODE] [NAME:=VALUE]...")
-@click.option("--machine", default="", metavar="NAME", help="As it was given to `lifecycle up`.")
+@target_argument
+@click.argument(
+    "words",
+    nargs=-1,
+    metavar="[NODE] [NAME:=VALUE]...",
+    shell_complete=completing("nodes arguments"),
+)
+@machine_option("As it was given to `lifecycle up`.")
 @click.option(
     "--reload", is_flag=True, help="Take the manifest as it is now, where it has changed."
 )

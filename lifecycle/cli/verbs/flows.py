@@ -16,16 +16,18 @@ import click
 
 from lifecycle.cli.common import (
     NetworkCommand,
+    assignments_argument,
     format_option,
     is_manifest,
     load_manifest,
     manifest_arguments,
+    target_argument,
     target_plan,
     targets_option,
     timeout_option,
     treatment_options,
 )
-from lifecycle.cli.standard_streams import echo_while_read
+from lifecycle.cli.screen import Screen
 from lifecycle.cli.verbs.verify import exit_code
 from lifecycle.codec import to_json
 from lifecycle.errors import ExitCode, UsageError
@@ -185,8 +187,8 @@ _EMPTY_GRAPH_S = 1.5
 
 
 @click.command("flows", cls=NetworkCommand)
-@click.argument("target", metavar="TARGET")
-@click.argument("assignments", nargs=-1, metavar="[NAME:=VALUE]...")
+@target_argument
+@assignments_argument
 @format_option("text", "json", "csv")
 @click.option("--watch", is_flag=True, help="Show them again whenever they change; Ctrl-C ends.")
 @timeout_option(5.0, "How long flows that are not complete may still become so.")
@@ -231,13 +233,15 @@ def _show(
         click.echo(render_flows(verdict.flows, format_))
 
     if watch:
-        follow_running(plan, lambda seen: echo_while_read(render_flows(seen.flows, format_)))
+        with Screen(whole=format_ == "text") as screen:
+            follow_running(plan, lambda seen: screen.show(render_flows(seen.flows, format_)))
+        return ExitCode.OK  # `q`: only a key ends it
     asked = click.get_current_context().get_parameter_source("timeout")
     waits = asked is not click.core.ParameterSource.DEFAULT or supervisor_of(os.environ, plan, "")
     empty_graph_s = None if waits else _EMPTY_GRAPH_S
     seen = judge_running(plan, timeout_s=timeout, strict=False, empty_graph_s=empty_graph_s)
-    if seen.where:
-        click.echo(lines(seen.where), err=True)
+    for each in seen.notices:
+        click.echo(lines(each), err=True)
     if exporter is not None:
         exporter.write(seen.plan, seen.verdict.flows)
     else:
@@ -396,8 +400,8 @@ def _judged(manifest: str, assignments: tuple[str, ...], timeout_s: float) -> tu
     from lifecycle.supervisor import judge_running
 
     seen = judge_running(_plan(manifest, assignments), timeout_s=timeout_s, strict=False)
-    if seen.where:
-        click.echo(lines(seen.where), err=True)
+    for each in seen.notices:
+        click.echo(lines(each), err=True)
     return seen.plan, seen.verdict
 
 

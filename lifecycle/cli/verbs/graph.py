@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -12,21 +11,20 @@ from typing import TYPE_CHECKING
 import click
 
 from lifecycle.cli.common import (
+    asking,
     format_option,
     is_manifest,
     target_arguments,
     target_run,
     timeout_option,
 )
-from lifecycle.cli.standard_streams import echo_while_read
+from lifecycle.cli.screen import Screen
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.printable import json_text
 
 if TYPE_CHECKING:
     from lifecycle.export import Picture
     from lifecycle.plan import Plan
-
-_CLEAR = "\x1b[H\x1b[2J"
 
 
 @click.command("graph")
@@ -61,19 +59,23 @@ def command(
     there but not declared dotted and orange; findings stand at what they name. With --watch, text
     is drawn again on the terminal, and a file is replaced in one piece.
     """
-    draw = _drawing(format_, output, watch=watch)
+    _check_watched(format_, output, watch=watch)
     path, plan = _found(target, assignments, machine)
-    if path is not None:
-        _supervised(path, draw, watch=watch)
-    elif plan is not None:
-        from lifecycle.supervisor import attached_picture, attached_pictures
+    with Screen(whole=watch and output is None and format_ == "text") as screen:
+        draw = _drawing(format_, output, screen)
+        if path is not None:
+            _supervised(path, draw, watch=watch)
+        elif plan is not None:
+            from lifecycle.supervisor import attached_picture, attached_pictures
 
-        if watch:
-            attached_pictures(plan, draw)
-        else:
-            picture = attached_picture(plan, timeout_s=timeout)
-            draw(picture)
-            _say_if_empty(picture, plan)
+            if watch:
+                attached_pictures(plan, draw)
+            else:
+                picture = attached_picture(plan, timeout_s=timeout)
+                draw(picture)
+                _say_if_empty(picture, plan)
+    if path is not None and watch and not screen.quit:
+        click.echo(f"{path.name}: its supervisor has ended", err=True)
     return ExitCode.OK
 
 
@@ -105,40 +107,31 @@ def _found(
 def _supervised(path: Path, draw: Callable[[Picture], None], *, watch: bool) -> None:
     from lifecycle.supervisor import supervised_picture, supervised_pictures
 
-    try:
+    with asking(path):
         if not watch:
             draw(supervised_picture(path))
             return
         for picture in supervised_pictures(path):
             draw(picture)
-    except TimeoutError as error:
-        raise UsageError(f"cannot ask {path.name!r}: its supervisor does not answer") from error
-    except (FileNotFoundError, ConnectionRefusedError) as error:
-        raise UsageError(
-            f"cannot ask {path.name!r}: its supervisor was killed",
-            hint=f"clean up after it: lifecycle down {path.name}",
-        ) from error
-    click.echo(f"{path.name}: its supervisor has ended", err=True)
 
 
-def _drawing(format_: str, output: Path | None, *, watch: bool) -> Callable[[Picture], None]:
-    """Return what shows or writes one picture.
-
-    Raises:
-        UsageError: a picture that is no text would be drawn over and over on one stream.
-    """
+def _check_watched(format_: str, output: Path | None, *, watch: bool) -> None:
+    """Refuse a picture that is no text and would be drawn over and over on one stream."""
     if watch and output is None and format_ not in ("text", "json"):
         raise UsageError(
             f"cannot print one {format_} picture after another", hint="give --output FILE"
         )
-    clear = _CLEAR if watch and format_ == "text" and sys.stdout.isatty() else ""
+
+
+def _drawing(format_: str, output: Path | None, screen: Screen) -> Callable[[Picture], None]:
+    """Return what shows or writes one picture."""
 
     def draw(picture: Picture) -> None:
         text = render(picture, format_)
         if output is not None:
             _replace(output, text)
         else:
-            echo_while_read(clear + text.rstrip("\n"))
+            screen.show(text)
 
     return draw
 

@@ -33,6 +33,8 @@ _RENAMED = {
 """Names in cli/template/ that are others in a package."""
 
 _MANIFEST_SCHEMA = "manifest.v1.schema.json"
+_PACKAGE_DEPTH = 3
+"""Folders above a manifest that may be its package's."""
 
 
 @click.command("init")
@@ -166,6 +168,19 @@ def schema_command(name: str, *, url: bool, to: str | None) -> int:
     else:
         click.echo(_schema_text(schemas[name]).rstrip("\n"))
     return ExitCode.OK
+
+
+def schema_reference(folder: Path) -> str:
+    """Return where a manifest in a folder finds its schema, as the first line of it says.
+
+    That is the `schemas/` folder of its package, if there is one, else where `lifecycle schema
+    --install` puts it.
+    """
+    here = folder.absolute()
+    for base in (here, *here.parents[:_PACKAGE_DEPTH]):
+        if (base / "schemas" / _MANIFEST_SCHEMA).is_file():
+            return Path(os.path.relpath(base / "schemas" / _MANIFEST_SCHEMA, here)).as_posix()
+    return (_data_directory() / _MANIFEST_SCHEMA).as_uri()
 
 
 def _data_directory() -> Path:

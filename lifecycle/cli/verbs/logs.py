@@ -6,25 +6,38 @@ the file system and survives rotation).
 
 from __future__ import annotations
 
+import contextlib
 import os
+import queue
 import re
 import subprocess
+import threading
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import click
 
+from lifecycle.cli.common import completing
 from lifecycle.cli.standard_streams import echo_while_read
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.printable import log_line
+
+_LOOK_S = 0.5
+"""So often files are looked for that have begun since."""
 
 _HEAD = re.compile(r"==> (.*) <==\n")
 
 
 @click.command("logs")
-@click.argument("node", required=False, metavar="[NODE]")
+@click.argument("node", required=False, metavar="[NODE]", shell_complete=completing("logged"))
 @click.option("-f", "--follow", is_flag=True, help="Go on with what is written, until Ctrl-C.")
-@click.option("--system", default="", metavar="NAME", help="Of this system; default: of any.")
+@click.option(
+    "--system",
+    default="",
+    metavar="NAME",
+    shell_complete=completing("logged_systems"),
+    help="Of this system; default: of any.",
+)
 @click.option(
     "-n",
     "--lines",
@@ -36,8 +49,9 @@ _HEAD = re.compile(r"==> (.*) <==\n")
 def command(*, node: str | None, follow: bool, system: str, count: int | None) -> int:
     """Show what the processes of the latest run have written; of NODE, or of all.
 
-    NODE is a node, or a process of several. The files are in ROS_LOG_DIR, else ~/.ros/log, where
-    `latest` leads to those of the run that began last.
+    NODE is a node, or a process of several; while its run lasts, --follow waits for its first line.
+    The files are in ROS_LOG_DIR, else ~/.ros/log, where `latest` leads to those of the run that
+    began last.
     """
     from lifecycle.supervisor import ros_log_root, runs_of
 
@@ -48,8 +62,8 @@ def command(*, node: str | None, follow: bool, system: str, count: int | None) -
         raise UsageError(
             f"cannot find a run{of} in {str(root)!r}", hint="its logs are where ROS_LOG_DIR says"
         )
-    files = _files(runs[0], node)
-    for line in _lines(files, count=count, follow=follow):
+    shown = _followed if follow else _written
+    for line in shown(runs[0], node, count):
         echo_while_read(line)
     return ExitCode.OK
 
@@ -69,38 +83,80 @@ def _files(run: Path, node: str | None) -> list[Path]:
     return found
 
 
-def _lines(files: Sequence[Path], *, count: int | None, follow: bool) -> Iterator[str]:
-    """Yield lines, with the process before each where there are several."""
-    if not files:
-        return
+def _written(run: Path, node: str | None, count: int | None) -> Iterator[str]:
+    """Yield the lines that are there."""
+    if files := _files(run, node):
+        with _tail(files, count) as reading:
+            yield from _lines(reading, several=len(files) > 1)
+
+
+def _followed(run: Path, node: str | None, count: int | None) -> Iterator[str]:
+    """Yield the lines that are there and those to come, of files that begin later, too.
+
+    Raises:
+        UsageError: nothing is there, and the run is over.
+    """
+    from lifecycle.supervisor import is_running
+
+    lines: queue.SimpleQueue[str] = queue.SimpleQueue()
+    followed: set[Path] = set()
+    with contextlib.ExitStack() as tails:
+        while True:
+            runs = is_running(run)
+            try:
+                files = [each for each in _files(run, node) if each not in followed]
+            except UsageError:
+                if not runs:
+                    raise
+                files = []
+            if files:
+                last = None if followed else count
+                reading = tails.enter_context(_tail(files, last, "-F"))
+                tails.callback(reading.terminate)
+                several = node is None or len(files) > 1
+                threading.Thread(
+                    target=_put, args=(lines, reading), kwargs={"several": several}, daemon=True
+                ).start()
+                followed.update(files)
+            elif not runs and not followed:
+                return
+            with contextlib.suppress(queue.Empty):
+                yield lines.get(timeout=_LOOK_S)
+
+
+def _put(lines: queue.SimpleQueue[str], reading: subprocess.Popen[str], *, several: bool) -> None:
+    for line in _lines(reading, several=several):
+        lines.put(line)
+
+
+def _tail(files: Sequence[Path], count: int | None, *options: str) -> subprocess.Popen[str]:
     last = "+1" if count is None else str(count)
-    tail = ["tail", "-v", "-n", last, *(["-F"] if follow else []), "--"]
-    name = ""
-    with subprocess.Popen(
-        [*tail, *map(str, files)],
+    return subprocess.Popen(
+        ["tail", "-v", "-n", last, *options, "--", *map(str, files)],
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         encoding="utf-8",
         errors="replace",
-    ) as reading:
-        assert reading.stdout is not None
-        blank = False
-        try:
-            for line in reading.stdout:
-                if head := _HEAD.fullmatch(line):
-                    name, blank = Path(head[1]).stem, False
-                    continue
-                if blank:
-                    yield _shown(name, "", len(files))
-                blank = line == "\n"  # tail puts one before each head but the first
-                if not blank:
-                    yield _shown(name, line.rstrip("\n"), len(files))
-            if blank:
-                yield _shown(name, "", len(files))
-        finally:
-            reading.terminate()
+    )
 
 
-def _shown(name: str, line: str, files: int) -> str:
+def _lines(reading: subprocess.Popen[str], *, several: bool) -> Iterator[str]:
+    """Yield lines of a tail, with the process before each where there are several."""
+    assert reading.stdout is not None
+    name, blank = "", False
+    for line in reading.stdout:
+        if head := _HEAD.fullmatch(line):
+            name, blank = Path(head[1]).stem, False
+            continue
+        if blank:
+            yield _shown(name, "", several=several)
+        blank = line == "\n"  # tail puts one before each head but the first
+        if not blank:
+            yield _shown(name, line.rstrip("\n"), several=several)
+    if blank:
+        yield _shown(name, "", several=several)
+
+
+def _shown(name: str, line: str, *, several: bool) -> str:
     text = log_line(line)
-    return text if files == 1 else f"{name} | {text}"
+    return f"{name} | {text}" if several else text

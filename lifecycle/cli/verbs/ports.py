@@ -11,7 +11,12 @@ from pathlib import Path
 
 import click
 
-from lifecycle.cli.common import format_option, load_manifest
+from lifecycle.cli.common import (
+    assignments_argument,
+    completing,
+    format_option,
+    load_manifest,
+)
 from lifecycle.codec import to_json
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest import Discovery
@@ -82,8 +87,10 @@ class PortsReport:
 
 
 @click.command("ports")
-@click.argument("manifest", metavar="[MANIFEST]", required=False)
-@click.argument("assignments", nargs=-1, metavar="[NAME:=VALUE]...")
+@click.argument(
+    "manifest", metavar="[MANIFEST]", required=False, shell_complete=completing("manifests")
+)
+@assignments_argument
 @click.option("--domain", type=int, help="Domain id, 0-232; else the manifest's or ROS_DOMAIN_ID.")
 @click.option("--participant", type=int, default=0, show_default=True, help="Counts from 0.")
 @click.option("--participants", type=int, help="Ask whether so many fit on one host.")

@@ -11,7 +11,7 @@ from typing import NoReturn
 
 import click
 
-from lifecycle.cli.common import load_manifest
+from lifecycle.cli.common import completing, load_manifest
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest import DiscoveryRange, RunKind
 from lifecycle.middleware import peers_environment
@@ -21,12 +21,13 @@ _ROS_ARGUMENTS = "--ros-args"
 
 
 @click.command("run", context_settings={"ignore_unknown_options": True})
-@click.argument("manifest", metavar="MANIFEST")
-@click.argument("node", metavar="NODE")
+@click.argument("manifest", metavar="MANIFEST", shell_complete=completing("manifests"))
+@click.argument("node", metavar="NODE", shell_complete=completing("nodes"))
 @click.argument(
     "words",
     nargs=-1,
     type=click.UNPROCESSED,
+    shell_complete=completing("arguments"),
     metavar=f"[NAME:=VALUE]... [{_ROS_ARGUMENTS} ...]",
 )
 @click.option(
@@ -51,7 +52,7 @@ def command(manifest: str, node: str, words: tuple[str, ...], *, auto: bool) -> 
     os.environ.update({**environment, **dict(planned.run.environment)})
     if planned.run.kind is RunKind.ATTACH:
         raise UsageError(
-            f"cannot run {planned.full_name}: the manifest attaches to it, somebody else starts it"
+            f"cannot run {planned.full_name}: it is attached, and started outside of the manifest"
         )
     if planned.run.kind is RunKind.COMMAND:
         _replace_process(plan, planned, words[split:])
@@ -74,6 +75,9 @@ def find_node(plan: Plan, name: str) -> PlannedNode:
 def _run_class(plan: Plan, planned: PlannedNode, arguments: list[str], *, lifecycle: str) -> int:
     # Late: everything before this works without ROS, and says what is wrong without it.
     from lifecycle.node import load_nodes, run
+    from lifecycle.supervisor import check_log_root
+
+    check_log_root(os.environ)
 
     beside = str(Path(planned.at.file).absolute().parent)
     if planned.run.working_directory:

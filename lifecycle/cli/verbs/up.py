@@ -10,8 +10,10 @@ import click
 
 from lifecycle.cli.common import (
     NetworkCommand,
+    completing,
     format_option,
     load_manifest,
+    machine_option,
     manifest_arguments,
     targets_option,
     timeout_option,
@@ -52,12 +54,7 @@ if TYPE_CHECKING:
 )
 @report_option
 @click.option("--strict", is_flag=True, help="What cannot be verified keeps the gate closed.")
-@click.option(
-    "--machine",
-    default="",
-    metavar="NAME",
-    help="Run only this machine's nodes; default: all whose address is this host's.",
-)
+@machine_option("Run only this machine's nodes; default: all whose address is this host's.")
 @click.option(
     "--keep-going",
     is_flag=True,
@@ -73,8 +70,15 @@ if TYPE_CHECKING:
     "without",
     multiple=True,
     metavar="NODE",
+    shell_complete=completing("nodes"),
     help="Do not start it, but wait for it: `lifecycle run MANIFEST NODE --manual`, in a debugger. "
     "May be given several times.",
+)
+@click.option(
+    "--adopt",
+    is_flag=True,
+    help="Nodes that run already are verified in place and not started; found active, they stay so "
+    "in the end, too.",
 )
 @click.option(
     "--domain",
@@ -101,6 +105,7 @@ def command(
     keep_going: bool,
     timings: bool,
     without: tuple[str, ...],
+    adopt: bool,
     domain: int | None,
     targets: tuple[str, ...],
     mapping: str,
@@ -147,6 +152,7 @@ def command(
                     strict=strict,
                     machine=machine,
                     keep_going=keep_going,
+                    adopt=adopt,
                     program=program,
                     treatment=_treatment(targets, mapping=mapping, flow_labels=flow_labels),
                 )

@@ -48,8 +48,8 @@ def command(  # noqa: PLR0917 - click passes options by name
         click.echo(f"ended before it was judged: {ended.reason}", err=True)
         return ended.exit_code
     # From here on a signal ends what waits for a reader.
-    if seen.where:
-        click.echo(lines(seen.where), err=True)
+    for each in seen.notices:
+        click.echo(lines(each), err=True)
     colour = format_ == "text" and sys.stdout.isatty()
     text = format_verdict(seen.verdict, plan, format_, colour=colour, strict=strict)
     click.echo(text.rstrip("\n"))

@@ -4,7 +4,7 @@ Owns: check.unknown-machine, check.process-machine, check.process-run, check.pro
 check.process-name, check.ros-args, check.container, check.may-end, check.state,
 check.restart, check.start-limit,
 check.domain, check.ports, check.localhost, check.after-unknown,
-check.after-self, check.after-cycle, check.after-unmanaged. Port arithmetic is in
+check.after-self, check.after-cycle, check.after-unmanaged, check.after-state. Port arithmetic is in
 `lifecycle.network`. Pure.
 """
 
@@ -219,6 +219,17 @@ def check_programs(system: DeclaredSystem) -> Iterator[Diagnostic]:
         if node.state is not TargetState.ACTIVE and not node.managed:
             message = f"cannot keep {node.key!r} {node.state.value}: it is not managed"
             yield error("check.state", node.where("state"), message, "remove 'state:'")
+        if (
+            node.state is TargetState.UNCONFIGURED
+            and node.run.kind is RunKind.PYTHON
+            and node.interface.endpoints
+        ):
+            message = (
+                f"cannot keep {node.key!r} unconfigured with an interface: a Python node makes its "
+                "endpoints when it connects"
+            )
+            hint = "write 'state: inactive', or 'endpoints: open' and no interface"
+            yield error("check.state", node.where("state"), message, hint)
 
 
 def _not_given(node: Node) -> Iterator[Diagnostic]:
@@ -413,6 +424,7 @@ def check_order(system: DeclaredSystem) -> Iterator[Diagnostic]:
                 yield error("check.after-self", after.at, message, "remove it")
             else:
                 yield from _unmanaged(node, after, system.nodes[after.node])
+                yield from _kept_lower(after, system.nodes[after.node])
     yield from cycles(system)
 
 
@@ -430,6 +442,27 @@ def _unmanaged(node: Node, after: After, other: Node) -> Iterator[Diagnostic]:
             f"cannot wait until {key!r} is {condition.value}: it is not managed and only starts"
         )
         yield warning("check.after-unmanaged", after.at, message, f"write '{key}: started'")
+
+
+_FURTHEST = {
+    TargetState.UNCONFIGURED: Condition.STARTED,
+    TargetState.INACTIVE: Condition.CONNECTED,
+    TargetState.ACTIVE: Condition.ACTIVE,
+}
+"""How far the supervisor brings a node that is kept in a state."""
+
+
+def _kept_lower(after: After, other: Node) -> Iterator[Diagnostic]:
+    """Judge conditions that the supervisor keeps from ever holding."""
+    if not other.managed:
+        return
+    order = list(Condition)
+    furthest = _FURTHEST[other.state]
+    if order.index(after.condition) > order.index(furthest):
+        key, kept = after.node, other.state.value
+        message = f"cannot wait until {key!r} is {after.condition.value}: it is kept {kept}"
+        hint = f"write '{key}: {furthest.value}', or remove its 'state: {kept}'"
+        yield error("check.after-state", after.at, message, hint)
 
 
 def cycles(system: DeclaredSystem) -> Iterator[Diagnostic]:

@@ -226,7 +226,7 @@ def _foreign_rmws(discovery: Discovery, node: Node) -> Iterator[Diagnostic]:
         return
     what = f"{_mode(discovery)}{'' if transport is FlowTransport.ANY else f' by {transport.value}'}"
     if node.run.kind is RunKind.ATTACH:
-        why = "somebody else starts it, with a participant that nobody here can configure"
+        why = "it is attached, and its participant configured where it is started"
     elif discovery.mode is DiscoveryMode.STATIC_ENDPOINTS:
         why = "its endpoints are its own code's, and no table of ours has them"
     else:

@@ -66,6 +66,11 @@ def parse(text: str, *, file: str, found: list[Diagnostic] | None = None) -> Doc
     return document
 
 
+_READ = os.O_RDONLY
+for _flag in ("O_NONBLOCK", "O_CLOEXEC", "O_BINARY"):  # a platform has those that it needs
+    # O_NONBLOCK: opening a FIFO without a writer must not wait for one.
+    _READ |= getattr(os, _flag, 0)
+
 _START = "start with 'manifest_version: 1'"
 
 
@@ -76,8 +81,7 @@ def read_bytes(path: str | Path, *, file: str) -> bytes:
         ManifestError: missing, unreadable, not a regular file, or too large.
     """
     try:
-        # O_NONBLOCK: opening a FIFO without a writer must not wait for one.
-        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        descriptor = os.open(path, _READ)
     except (OSError, ValueError) as problem:
         reason = problem.strerror if isinstance(problem, OSError) else str(problem)
         raise _refuse(file, f"cannot open {quote(str(path), limit=200)}: {reason}") from problem

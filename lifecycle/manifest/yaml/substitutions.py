@@ -253,6 +253,8 @@ class Programs:
 
     def _run(self, words: list[str], folder: str) -> str:
         name = words[0]
+        if not hasattr(os, "killpg"):
+            raise LifecycleError(f"cannot run {quote(name)}: $(command …) needs Linux or macOS")
         # With a slash it is a path, else it is looked for on PATH: as execvp does.
         path = os.path.join(folder, name) if "/" in name else name  # noqa: PTH118
         program = shutil.which(path, path=self._environment.get("PATH"))

@@ -93,7 +93,7 @@ def _program() -> str:
             return found
     raise MiddlewareError(
         f"cannot find {PROGRAM!r}",
-        hint="it comes with Fast DDS: install ros-jazzy-rclpy[fastrtps], or set PATH",
+        hint="it comes with Fast DDS: pip install 'ros-lifecycle-manifests[ros]', or set PATH",
     )
 
 

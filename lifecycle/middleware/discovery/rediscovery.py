@@ -140,8 +140,9 @@ def introduce(
     """Make participants that have been there for long announce themselves to new ones at once.
 
     They answered the first announcement of a new one before it listened, and else announce
-    themselves once in 3 s (see probe.py). Nothing is sent where a plan fixes the port that this
-    process sends by, nor over shared memory and TCP.
+    themselves once in 3 s (see probe.py). Nothing is sent where the system's own discovery finds
+    only listed peers (they announce themselves each 0.5 s, url_profile.py) or nobody, behind a
+    discovery server, nor over shared memory and TCP.
 
     Args:
         newcomers: pids of the new processes of this host, whose participants listen by now.
@@ -151,10 +152,10 @@ def introduce(
         pids: of this host's processes whose participants are to answer, besides all that the
             observer could find.
     """
-    if any(url.output_port for url in urls):
+    asked = dict(probe_targets(domain_id, urls, environment))
+    if not asked or (urls and not leaves_discovery_open(urls)):
         return
     new = frozenset(newcomers)
-    asked = dict(probe_targets(domain_id, urls, environment))
     for kind, found in listening((*new, *pids)).items():
         family = kind.socket_family
         answered_at = [(each.address, each.port) for each, pid in found.items() if pid in new]

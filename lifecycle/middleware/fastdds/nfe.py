@@ -198,8 +198,9 @@ def create_subscription(
 ) -> Subscription:
     """Create a subscription on `node`, with network flow endpoints of its own where asked.
 
-    NOT_REQUIRED is plain rclpy. The others pass the option to the RMW; STRICTLY_REQUIRED then also
-    demands proof, because some RMWs accept the option and ignore it. Fast DDS takes the first free
+    NOT_REQUIRED is plain rclpy, and so is OPTIONALLY_REQUIRED with an rcl that is not known. The
+    others pass the option to the RMW; STRICTLY_REQUIRED then also demands proof, because some RMWs
+    accept the option and ignore it. Fast DDS takes the first free
     UDP port of 7000–7399. Destroy it as any other, with `node.destroy_subscription`.
 
     Fast DDS 2.14 gives the port (with its socket, two threads and about 170 kB) back only when the
@@ -224,7 +225,9 @@ def create_subscription(
         MiddlewareError: the endpoint could not be made at all.
     """
     profile = to_rclpy(qos)
-    if unique is UniqueRequirement.NOT_REQUIRED:
+    if content_filter is not None:
+        abi.load()  # before anything is made
+    if _is_plain(node, "subscription", topic, unique):
         plain = node.create_subscription(
             type_,
             topic,
@@ -328,7 +331,7 @@ def create_publisher(
         MiddlewareError: the endpoint could not be made at all.
     """
     profile = to_rclpy(qos)
-    if unique is UniqueRequirement.NOT_REQUIRED:
+    if _is_plain(node, "publisher", topic, unique):
         return node.create_publisher(
             type_,
             topic,
@@ -355,6 +358,28 @@ def create_publisher(
     node._publishers.append(publisher)  # noqa: SLF001 - what Node.create_publisher does
     _register(node, publisher)
     return publisher
+
+
+def _is_plain(node: Node, kind: str, topic: str, unique: UniqueRequirement) -> bool:
+    """Return whether rclpy makes it: nothing else is wanted, or can be had.
+
+    Raises:
+        UniqueFlowNotFeasible: STRICTLY_REQUIRED, with an rcl that is not known.
+    """
+    if unique is UniqueRequirement.NOT_REQUIRED:
+        return True
+    if abi.is_known():
+        return False
+    if unique is UniqueRequirement.OPTIONALLY_REQUIRED:
+        return True
+    resolved = node.resolve_topic_name(topic)
+    reason = f"rcl {abi.rcl_version() or '(version unknown)'} is not known; known: {abi.KNOWN}"
+    raise UniqueFlowNotFeasible(
+        f"cannot create {kind} {resolved!r} with network flow endpoints {unique.value}: {reason}",
+        topic=resolved,
+        reason=reason,
+        hint=f"ask for optionally_required, or {abi.INSTALL}",
+    )
 
 
 class _RefusedError(Exception):

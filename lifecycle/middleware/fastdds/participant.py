@@ -42,6 +42,7 @@ from lifecycle.middleware.fastdds.participant_profile import (
 from lifecycle.middleware.fastdds.settings import with_endpoint_profiles
 from lifecycle.middleware.fastdds.url_check import open_sockets
 from lifecycle.middleware.rcl import hidden_node
+from lifecycle.middleware.rcl.abi import is_known
 from lifecycle.middleware.rcl.hidden_node import forget_hidden, hidden_nodes, quiet_node
 from lifecycle.middleware.rcl.qos import to_rclpy
 from lifecycle.network import ConnectionUrl, Medium, NetworkFlowEndpoint, UniqueRequirement
@@ -175,19 +176,22 @@ class FlowParticipant:
             # Every publisher of a participant lists the same sender sockets; rclpy's parameter
             # event publisher lists them before there is any publisher of the user's.
             probe = next(iter(self.node.publishers))
-            self._nfes = get_network_flow_endpoints(probe)
+            self.has_shared_memory: bool | None = None
+            if dscp is not None or is_known():
+                self._nfes = get_network_flow_endpoints(probe)
             if dscp is not None:
                 marks.set_dscp(self._nfes, dscp)
             # It would share the sockets that are to be unique.
             self.node.destroy_publisher(probe)
-            self.has_shared_memory = uses_shared_memory(self.node, settings)
+            if is_known():
+                self.has_shared_memory = uses_shared_memory(self.node, settings)
         except BaseException:
             self.destroy()
             raise
 
     @property
     def network_flow_endpoints(self) -> tuple[NetworkFlowEndpoint, ...]:
-        """The NFEs of every publisher on this participant, as rmw lists them.
+        """The NFEs of every publisher on this participant, as rmw lists them; none if it cannot.
 
         rmw lists no shared memory for publishers; `has_shared_memory` says whether it is there.
         """
@@ -375,7 +379,7 @@ class FlowParticipant:
     def _look_at_sockets(self) -> bool:
         """List the sender sockets anew, as far as a publisher lists them; whether they changed."""
         publisher = next(iter(self.node.publishers), None)
-        if self._context is None or publisher is None:
+        if self._context is None or publisher is None or not is_known():
             return False  # those that were there when it was made
         nfes = get_network_flow_endpoints(publisher)
         changed = nfes != self._nfes

@@ -50,6 +50,7 @@ from lifecycle.middleware.process.shared_memory import has_shared_memory_open
 from lifecycle.middleware.rcl import abi
 
 _LIBRARY = "libfastrtps.so.2.14"
+_KNOWN = "Fast DDS 2.14 (ROS 2 Jazzy)"
 _DDS = "8eprosima7fastdds3dds"
 _FACTORY = f"{_DDS}24DomainParticipantFactory"
 _QOS = f"{_DDS}20DomainParticipantQos"
@@ -78,7 +79,7 @@ class _FastDds:
             library = ctypes.CDLL(_LIBRARY)
         except OSError as error:
             raise MiddlewareError(
-                f"cannot load Fast DDS: {error}", hint="install ros-jazzy-rclpy[fastrtps]"
+                f"cannot use Fast DDS, only {_KNOWN} is known: {error}", hint=abi.INSTALL
             ) from error
         pointer = ctypes.c_void_p
         code = ctypes.c_uint32  # ReturnCode_t is a trivially copyable class of one uint32_t
@@ -88,9 +89,8 @@ class _FastDds:
                 function = getattr(library, symbol)
             except AttributeError as error:
                 raise MiddlewareError(
-                    f"cannot find {symbol!r} in {_LIBRARY}: it is not the Fast DDS 2.14 that ROS 2 "
-                    "Jazzy comes with",
-                    hint="install ros-jazzy-rclpy[fastrtps]",
+                    f"cannot find {symbol!r} in {_LIBRARY}: only {_KNOWN} is known",
+                    hint=abi.INSTALL,
                 ) from error
             function.restype, function.argtypes = result, arguments
             return function
@@ -133,6 +133,31 @@ class _FastDds:
 @functools.lru_cache(maxsize=1)
 def _library() -> _FastDds:
     return _FastDds()
+
+
+def unknown_versions() -> str:
+    """Return which of the libraries here are not known, and what that costs; empty if all are.
+
+    It needs rclpy, and loads nothing that rclpy has not loaded.
+    """
+    unknown = []
+    if not abi.is_known():
+        version = abi.rcl_version() or "of unknown version"
+        unknown.append(
+            f"rcl {version} is not known (known: {abi.KNOWN}): nodes, endpoints and states are "
+            "verified; network flow endpoints cannot be read or made unique, so that what requires "
+            "them is unverifiable or refused"
+        )
+    if get_rmw_implementation_identifier() == _RMW:
+        try:
+            _library()
+        except MiddlewareError:
+            unknown.append(
+                f"the loaded Fast DDS is not known (known: {_KNOWN}): participants get no "
+                "connections, transports or DSCP of their own, and which endpoints are matched is "
+                "counted only"
+            )
+    return "; ".join(unknown)
 
 
 def load_profile(name: str, xml: str) -> None:
@@ -338,7 +363,7 @@ def _discovery(context: Context) -> Any:
         raise MiddlewareError(
             f"cannot use the installed rcl {abi.rcl_version() or '(version unknown)'}: its "
             f"rmw_context_t is not laid out as rcl {abi.SUPPORTED_RCL_MAJOR}'s",
-            hint="install ros-jazzy-rclpy[fastrtps]",
+            hint=abi.INSTALL,
         )
     return options.discovery
 

@@ -1,9 +1,10 @@
 """The C ABI of rcl, rmw and rcutils that rclpy does not expose, through ctypes.
 
 Owns: the struct layouts, the function signatures, and the check that the loaded libraries are the
-ones these layouts were written for. Layouts are those of rcl 9 and rmw 7 (ROS 2 Jazzy); headers
-rcl/{publisher,subscription,wait,guard_condition}.h, rmw/{types,network_flow_endpoint}.h,
-rcutils/{allocator,error_handling}.h.
+ones these layouts were written for. Layouts are those of rcl 9 and rmw 7 (ROS 2 Jazzy), on any
+64-bit Linux; headers rcl/{publisher,subscription,wait,guard_condition}.h,
+rmw/{types,network_flow_endpoint}.h, rcutils/{allocator,error_handling}.h. With other libraries
+nothing is called: `is_known` says so, and what can be had from rclpy is taken from there.
 """
 
 from __future__ import annotations
@@ -23,6 +24,9 @@ RCL_RET_UNSUPPORTED = 3
 RCL_RET_TIMEOUT = 2
 SUPPORTED_RCL_MAJOR = 9
 """rcl 9 is ROS 2 Jazzy; another major may lay its structs out differently."""
+
+KNOWN = f"rcl {SUPPORTED_RCL_MAJOR} (ROS 2 Jazzy)"
+INSTALL = "pip install 'ros-lifecycle-manifests[ros]', or source /opt/ros/jazzy/setup.bash"
 
 _ERROR_LOCATION = re.compile(r", at [^,]+?:\d+(?=,|$)")
 
@@ -162,9 +166,8 @@ class Rcl:
         version = rcl_version()
         if version and version.partition(".")[0] != str(SUPPORTED_RCL_MAJOR):
             raise MiddlewareError(
-                f"cannot reach network flows through rcl {version!r}: only rcl "
-                f"{SUPPORTED_RCL_MAJOR} (ROS 2 Jazzy) is known",
-                hint="install ros-jazzy-rclpy[fastrtps]",
+                f"cannot reach network flows through rcl {version!r}: only {KNOWN} is known",
+                hint=INSTALL,
             )
         pointer, size, integer = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int
         rcutils, rmw, rcl = (_open(f"lib{name}.so") for name in ("rcutils", "rmw", "rcl"))
@@ -253,20 +256,35 @@ class Rcl:
             raise _layout_error("rmw_network_flow_endpoint_t", version)
 
 
-@functools.lru_cache(maxsize=1)
 def load() -> Rcl:
     """Load and check the libraries once.
 
     Raises:
         MiddlewareError: a library or symbol is missing, or is not laid out as rcl 9.
     """
-    return Rcl()
+    loaded = _loaded()
+    if isinstance(loaded, MiddlewareError):
+        raise MiddlewareError(loaded.message, hint=loaded.hint)
+    return loaded
+
+
+def is_known() -> bool:
+    """Return whether the installed libraries are those that the layouts here are of."""
+    return isinstance(_loaded(), Rcl)
+
+
+@functools.lru_cache(maxsize=1)
+def _loaded() -> Rcl | MiddlewareError:
+    try:
+        return Rcl()
+    except MiddlewareError as error:
+        return error
 
 
 def rcl_version() -> str:
     """Return the version of rcl: of its wheel, else of its ament package; empty if unknown."""
     # By the name that an installed wheel's directory has; importing importlib.metadata and reading
-    # what it reads takes 20 ms, in the supervisor and in each node that is started alone.
+    # what it reads takes 12 ms and more, in the supervisor and in each node that is started alone.
     for entry in sys.path:
         found = [*Path(entry or ".").glob("ros_rcl-*.dist-info")]
         if len(found) == 1:
@@ -326,15 +344,11 @@ def _open(library: str) -> ctypes.CDLL:
     try:
         from rclpy.impl.implementation_singleton import rclpy_implementation  # noqa: F401
     except ImportError as error:
-        raise MiddlewareError(
-            f"cannot import rclpy: {error}", hint="install ros-jazzy-rclpy[fastrtps]"
-        ) from error
+        raise MiddlewareError(f"cannot import rclpy: {error}", hint=INSTALL) from error
     try:
         return ctypes.CDLL(library)
     except OSError as error:
-        raise MiddlewareError(
-            f"cannot load {library!r}: {error}", hint="install ros-jazzy-rclpy[fastrtps]"
-        ) from error
+        raise MiddlewareError(f"cannot load {library!r}: {error}", hint=INSTALL) from error
 
 
 def _bind(library: ctypes.CDLL, symbol: str, result: Any, arguments: Sequence[Any] = ()) -> Any:
@@ -343,7 +357,7 @@ def _bind(library: ctypes.CDLL, symbol: str, result: Any, arguments: Sequence[An
     except AttributeError as error:
         raise MiddlewareError(
             f"cannot find {symbol!r} in the installed ROS libraries (rcl {rcl_version() or '?'})",
-            hint="install ros-jazzy-rclpy[fastrtps]",
+            hint=INSTALL,
         ) from error
     function.restype, function.argtypes = result, tuple(arguments)
     return function
@@ -353,5 +367,5 @@ def _layout_error(struct: str, version: str) -> MiddlewareError:
     return MiddlewareError(
         f"cannot use the installed rcl {version or '(version unknown)'}: its {struct} is not laid "
         f"out as rcl {SUPPORTED_RCL_MAJOR}'s",
-        hint="install ros-jazzy-rclpy[fastrtps]",
+        hint=INSTALL,
     )

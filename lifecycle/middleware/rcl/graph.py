@@ -9,11 +9,12 @@ rmw_cyclonedds announce hashes since Iron.
 from __future__ import annotations
 
 import dataclasses
+import operator
 import os
 import threading
 import time
 import typing
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 
 import rclpy
 from rclpy.node import Node
@@ -53,30 +54,6 @@ from lifecycle.verify import (
 )
 
 
-def with_service_hashes(
-    node: Node, endpoints: Iterable[ObservedEndpoint]
-) -> tuple[ObservedEndpoint, ...]:
-    """Return `endpoints` with the type hashes of services filled in, in the same order.
-
-    The graph lists services by name and type only; their requests and replies are DDS topics like
-    all others, `rq/NAMERequest` and `rr/NAMEReply`, whose endpoints announce the hashes.
-
-    Args:
-        node: that queries.
-        endpoints: topics, servers and clients; the parts of actions not yet folded.
-    """
-    seen: dict[str, _Service] = {}
-    found = []
-    for each in endpoints:
-        if each.kind in (EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT):
-            if each.name not in seen:
-                seen[each.name] = _Service.of(node, each.name)
-            found.append(dataclasses.replace(each, type_hash=seen[each.name].hash_of(each)))
-        else:
-            found.append(each)
-    return tuple(found)
-
-
 @dataclasses.dataclass(frozen=True, slots=True)
 class _Service:
     """Endpoints of one service: writers and readers of its requests, then of its replies."""
@@ -112,6 +89,54 @@ class _Service:
             # A node with several servers or clients of one name is one end: all of them count.
             hashes.append("" if "" in own else "|".join(sorted(own)))
         return join(hashes) if seen else None
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class _ShownNode:
+    """What one snapshot made of the endpoints of one node.
+
+    Attributes:
+        shown: all of them.
+        meant: without what client libraries bring along.
+        hashed: the same with the type hashes of services.
+        endpoints: the same with the parts of actions folded, in the order of a snapshot.
+    """
+
+    shown: Sequence[ObservedEndpoint]
+    meant: tuple[ObservedEndpoint, ...]
+    hashed: Sequence[ObservedEndpoint]
+    endpoints: tuple[ObservedEndpoint, ...]
+
+
+class _Kept:
+    """The parts of one snapshot, which the next one takes over where rcl gives the same.
+
+    rcl does not say what changed, so all is asked each time; what is made of the answers is not
+    made again, and is the same object.
+
+    Attributes:
+        topical: by kind, topic and identity of the info that they come from, which is kept with
+            them; None for an endpoint that is left out.
+        services: of each node, by what rcl listed.
+        hashed: services by the identity of what they had no hash as, which is kept with them.
+        nodes: of the graph, by name.
+        shown: by node name.
+    """
+
+    def __init__(self, declared: frozenset[str], names: DeclaredNames) -> None:
+        self.declared = declared
+        self.names = names
+        self.topical: dict[
+            tuple[EndpointKind, str, int], tuple[EndpointInfo, ObservedEndpoint | None]
+        ] = {}
+        self.services: dict[str, tuple[_Listed, tuple[ObservedEndpoint, ...], bool]] = {}
+        self.hashed: dict[tuple[int, str | None], tuple[ObservedEndpoint, ObservedEndpoint]] = {}
+        self.nodes: dict[str, ObservedNode] = {}
+        self.shown: dict[str, _ShownNode] = {}
+
+
+_Listed = tuple[tuple[EndpointKind, tuple[tuple[str, str], ...]], ...]
+"""Name and type of what rcl lists of a node, by kind."""
 
 
 ANSWER_S = 0.15
@@ -184,6 +209,7 @@ class GraphObserver:
         self._callbacks: tuple[Callable[[], None], ...] = ()
         self._destroyed = False
         self._known: frozenset[str] = frozenset()
+        self._last: _Kept | None = None
         self._asked_for: set[str] = set()
         self._context: rclpy.Context | None = None
         self._guard: GraphGuard | None = None
@@ -241,6 +267,8 @@ class GraphObserver:
     ) -> Snapshot:
         """Return the nodes and the endpoints that discovery shows now, in a stable order.
 
+        A part that is shown as in the last snapshot for the same names is the same object.
+
         All but its own node. The housekeeping of client libraries is left out. Services are known
         by their nodes, so those of no known node are looked for by name.
 
@@ -254,26 +282,36 @@ class GraphObserver:
         """
         if self._guard is not None and self._guard.failure is not None:
             raise self._guard.failure
-        self._known = frozenset()
+        last, self._last = self._last, None
+        if last is None or last.declared != frozenset(declared) or last.names is not names:
+            last = _Kept(frozenset(declared), names)
+        kept = _Kept(last.declared, names)
         counts = self._stale_node_filter.count()
-        ourselves = {self._name} if self.owns_node and counts[self._name] == 1 else ()
-        endpoints = [
-            each for each in self._topic_endpoints(declared, names) if each.node not in ourselves
-        ]
-        nodes, unreported = [], {""}
-        for name in sorted(name for name in counts if known_node(name) and name not in ourselves):
-            services = self._services(name)
-            nodes.append(
-                ObservedNode(full_name=name, count=counts[name], managed=_managed(name, services))
-            )
+        ourselves = self._name if self.owns_node and counts[self._name] == 1 else None
+        shown: dict[str, list[ObservedEndpoint]] = {}
+        for each in self._topic_endpoints(kept, last):
+            shown.setdefault(each.node, []).append(each)
+        if ourselves is not None:
+            shown.pop(ourselves, None)
+        unreported = {""}
+        for name in sorted(name for name in counts if known_node(name) and name != ourselves):
+            services, managed = self._services_of(name, kept, last)
+            known = last.nodes.get(name)
+            if known is None or (known.count, known.managed) != (counts[name], managed):
+                known = ObservedNode(full_name=name, count=counts[name], managed=managed)
+            kept.nodes[name] = known
             if services is None:
                 unreported.add(name)
-            endpoints += services or ()
-        endpoints += self._services_of_others(names, unreported)
-        wanted = without_noise(each for each in endpoints if each.node in declared)
-        others = without_noise((each for each in endpoints if each.node not in declared), but=names)
-        kept = self._located(fold_actions(with_service_hashes(self.node, (*wanted, *others))))
-        return tuple(nodes), tuple(sorted(kept, key=_order))
+            elif services:
+                shown.setdefault(name, []).extend(services)
+        for each in self._services_of_others(names, unreported):
+            shown.setdefault(each.node, []).append(each)
+        queried: dict[str, _Service] = {}
+        for name in sorted(shown):
+            kept.shown[name] = self._shown(name, shown[name], queried, kept, last)
+        self._last = kept
+        endpoints = tuple(each for node in kept.shown.values() for each in node.endpoints)
+        return tuple(kept.nodes.values()), endpoints
 
     def settling_s(self) -> float:
         """Return for how many seconds a snapshot may still miss nodes; 0 once it cannot.
@@ -313,9 +351,10 @@ class GraphObserver:
     def services_of(self, node: str) -> frozenset[str]:
         """Return the fully qualified names of the services that discovery shows on `node`."""
         return frozenset(
-            each.name
-            for each in self._services(node) or ()
-            if each.kind is EndpointKind.SERVICE_SERVER
+            name
+            for kind, listed in self._services(node) or ()
+            if kind is EndpointKind.SERVICE_SERVER
+            for name, _ in listed
         )
 
     def reaches_servers(self) -> bool:
@@ -420,27 +459,59 @@ class GraphObserver:
         for callback in self._callbacks:
             callback()
 
-    def _topic_endpoints(
-        self, declared: Collection[str], names: DeclaredNames
-    ) -> Iterator[ObservedEndpoint]:
+    def _topic_endpoints(self, kept: _Kept, last: _Kept) -> Iterator[ObservedEndpoint]:
+        known: set[str] = set()
         for kind, topic, info in topic_endpoints(self.node):
             if self._stale_node_filter.ignores(info.gid):
                 continue
             if info.node:
-                self._known |= {info.gid[:_PREFIX_DIGITS]}
-            node = known_node(info.node)
-            feeds = node not in declared and names.fed_by(kind, topic)
-            if not feeds and is_noise_endpoint(kind, node, topic, info.type, ours=False):
+                known.add(info.gid[:_PREFIX_DIGITS])
+            place = (kind, topic, id(info))
+            made = last.topical.get(place)
+            if made is None or made[0] is not info:
+                made = info, _topic_endpoint(kind, topic, info, kept.declared, kept.names)
+            kept.topical[place] = made
+            if made[1] is not None:
+                yield made[1]
+        self._known = frozenset(known)
+
+    def _shown(
+        self,
+        name: str,
+        shown: Sequence[ObservedEndpoint],
+        queried: dict[str, _Service],
+        kept: _Kept,
+        last: _Kept,
+    ) -> _ShownNode:
+        """Return what is judged of one node's endpoints; `queried` are services asked for so far.
+
+        The graph lists services by name and type only; their requests and replies are DDS topics
+        like all others, `rq/NAMERequest` and `rr/NAMEReply`, whose endpoints announce the hashes.
+        """
+        known = last.shown.get(name)
+        if known is not None and _same(known.shown, shown):
+            meant = known.meant
+        else:
+            meant = without_noise(shown, but=NO_NAMES if name in kept.declared else kept.names)
+        hashed: list[ObservedEndpoint] = []
+        for each in meant:
+            if each.kind not in (EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT):
+                hashed.append(each)
                 continue
-            yield ObservedEndpoint(
-                kind=kind,
-                node=node,
-                name=topic,
-                type=info.type,
-                qos=info.qos,
-                gid=info.gid,
-                type_hash=info.type_hash,
-            )
+            if each.name not in queried:
+                queried[each.name] = _Service.of(self.node, each.name)
+            place = (id(each), queried[each.name].hash_of(each))
+            made = last.hashed.get(place)
+            if made is None or made[0] is not each:
+                made = each, dataclasses.replace(each, type_hash=place[1])
+            kept.hashed[place] = made
+            hashed.append(made[1])
+        if name and known is not None and _same(known.hashed, hashed):
+            endpoints = known.endpoints
+        else:
+            folded = fold_actions(hashed)
+            endpoints = tuple(sorted(folded if name else self._located(folded), key=_order))
+        return _ShownNode(shown, meant, hashed, endpoints)
 
     def _services_of_others(
         self, names: DeclaredNames, unreported: Collection[str]
@@ -480,7 +551,7 @@ class GraphObserver:
                     )
 
     def _located(self, endpoints: Iterable[ObservedEndpoint]) -> Iterator[ObservedEndpoint]:
-        """Add the addresses of endpoints' participants that belong to no known node.
+        """Add their participants' addresses to endpoints of no known node.
 
         One whose address is not known is asked for it: it answers within a moment, and the next
         look has it.
@@ -490,7 +561,7 @@ class GraphObserver:
             known.update(probe.addresses())
         for endpoint in endpoints:
             prefix = endpoint.gid[:_PREFIX_DIGITS]
-            if endpoint.node or not prefix:
+            if not prefix:
                 yield endpoint
                 continue
             if prefix not in known and prefix not in self._asked_for:
@@ -499,24 +570,65 @@ class GraphObserver:
                     probe.ask_again(to_count=True)
             yield dataclasses.replace(endpoint, address=known.get(prefix, ""))
 
-    def _services(self, full_name: str) -> tuple[ObservedEndpoint, ...] | None:
-        """Return the service endpoints of a node; None if rcl does not show them."""
-        found: list[ObservedEndpoint] = []
+    def _services(self, full_name: str) -> _Listed | None:
+        """Return the services and clients of a node; None if rcl does not show them."""
+        found = []
         for kind in (EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT):
             listed = endpoints_of_node(self.node, kind, full_name)
             if listed is None:
                 return None
-            found += (
-                ObservedEndpoint(kind=kind, node=full_name, name=service, type=type_)
-                for service, type_ in listed
-            )
+            found.append((kind, listed))
         return tuple(found)
 
+    def _services_of(
+        self, full_name: str, kept: _Kept, last: _Kept
+    ) -> tuple[tuple[ObservedEndpoint, ...] | None, bool | None]:
+        """Return the service endpoints of a node, and whether it is driven by such services."""
+        listed = self._services(full_name)
+        if listed is None:
+            return None, None
+        made = last.services.get(full_name)
+        if made is None or made[0] != listed:
+            endpoints = tuple(
+                ObservedEndpoint(kind=kind, node=full_name, name=service, type=type_)
+                for kind, services in listed
+                for service, type_ in services
+            )
+            made = listed, endpoints, _managed(full_name, endpoints)
+        kept.services[full_name] = made
+        return made[1], made[2]
 
-def _managed(node: str, services: Iterable[ObservedEndpoint] | None) -> bool | None:
-    """Return whether a node offers the services by which a managed node is driven."""
-    if services is None:
+
+def _same(one: Sequence[object], other: Sequence[object]) -> bool:
+    """Return whether two sequences hold the same objects."""
+    return len(one) == len(other) and all(map(operator.is_, one, other))
+
+
+def _topic_endpoint(
+    kind: EndpointKind,
+    topic: str,
+    info: EndpointInfo,
+    declared: Collection[str],
+    names: DeclaredNames,
+) -> ObservedEndpoint | None:
+    """Return a publisher or subscription; None if it is the housekeeping of a client library."""
+    node = known_node(info.node)
+    feeds = node not in declared and names.fed_by(kind, topic)
+    if not feeds and is_noise_endpoint(kind, node, topic, info.type, ours=False):
         return None
+    return ObservedEndpoint(
+        kind=kind,
+        node=node,
+        name=topic,
+        type=info.type,
+        qos=info.qos,
+        gid=info.gid,
+        type_hash=info.type_hash,
+    )
+
+
+def _managed(node: str, services: Iterable[ObservedEndpoint]) -> bool:
+    """Return whether a node offers the services by which a managed node is driven."""
     offered = {
         (each.name, each.type) for each in services if each.kind is EndpointKind.SERVICE_SERVER
     }

@@ -2,7 +2,8 @@
 
 Owns: a thread that sleeps on rcl's graph guard condition, which rclpy does not expose, and on one
 guard condition of its own by which it is stopped: a change wakes it within a millisecond; and the
-one guard of each participant, which exists only while it is followed.
+one guard of each participant, which exists only while it is followed. Where the installed rcl is
+not one whose layouts are known, the thread compares what rclpy shows four times a second instead.
 
 What may be taken for a match of a client: rmw_fastrtps counts its server only while its request
 writer has matched as many readers as its response reader has matched writers, at least one, and the
@@ -13,9 +14,11 @@ that for all three services, and a publisher of feedback (rcl_action_server_is_a
 from __future__ import annotations
 
 import atexit
+import contextlib
 import ctypes
 import logging
 import threading
+import time
 import typing
 import weakref
 from collections.abc import Callable, Iterator
@@ -30,6 +33,7 @@ from rclpy.utilities import get_rmw_implementation_identifier
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.rcl import abi
+from lifecycle.middleware.rcl.graph_queries import fingerprint
 
 if TYPE_CHECKING:
     from rclpy.action import ActionClient
@@ -44,6 +48,7 @@ _AGAIN_NS = tuple(round(each * 1e9) for each in (0.001, 0.003, 0.01, 0.03, 0.1, 
 an endpoint a moment before it is matched (measured: 0.4 ms), and no event reports the match."""
 _STOP = 1
 _GUARDS = 2
+_COMPARE_S = 0.25
 
 
 class GraphGuard:
@@ -60,20 +65,8 @@ class GraphGuard:
     """
 
     def __init__(self, node: Node, on_change: Callable[[], bool | None]) -> None:
-        self._rcl = abi.load()
-        self._node = node
         self._on_change = on_change
-        with node.context.handle:
-            self._stop_guard = rclpy_implementation.GuardCondition(node.context.handle)
-        self._wait_set = self._rcl.zero_wait_set()
-        self._check(
-            self._rcl.wait_set_init(
-                ctypes.byref(self._wait_set),
-                *(0, _GUARDS, 0, 0, 0, 0),
-                node.context.handle.pointer,
-                self._rcl.default_allocator,
-            )
-        )
+        self._source = _GuardCondition(node) if abi.is_known() else _Comparison(node)
         self._stopping = False
         self.failure: MiddlewareError | None = None
         """Why the thread gave up; None while it works."""
@@ -85,19 +78,15 @@ class GraphGuard:
         if self._stopping:
             return
         self._stopping = True
-        with self._stop_guard:
-            self._stop_guard.trigger_guard_condition()
+        self._source.stop()
         self._thread.join()
-        self._rcl.wait_set_fini(ctypes.byref(self._wait_set))
-        self._stop_guard.destroy_when_not_in_use()
+        self._source.free()
 
     def _run(self) -> None:
-        # Holding the handles keeps rclpy from freeing what the C code below points at.
-        with self._node.context.handle, self._node.handle, self._stop_guard:
-            graph = self._rcl.graph_guard(self._node.handle.pointer)
-            pauses: Iterator[int] = iter(())
+        pauses: Iterator[int] = iter(())
+        with self._source.held():
             try:
-                while (changed := self._wait(graph, next(pauses, _FOR_EVER))) is not None:
+                while (changed := self._source.wait(next(pauses, _FOR_EVER))) is not None:
                     if changed:
                         pauses = iter(_AGAIN_NS)
                     if not self._notify():
@@ -107,12 +96,47 @@ class GraphGuard:
                 self.failure = error
                 self._notify()
 
-    def _wait(self, graph: int, pause_ns: int) -> bool | None:
+    def _notify(self) -> bool:
+        try:
+            return bool(self._on_change())
+        except Exception:
+            _logger.exception("cannot handle a graph change")
+            return False
+
+
+class _GuardCondition:
+    """Waits on rcl's graph guard condition, and on one of its own by which it is stopped."""
+
+    def __init__(self, node: Node) -> None:
+        self._rcl = abi.load()
+        self._node = node
+        with node.context.handle:
+            self._stop_guard = rclpy_implementation.GuardCondition(node.context.handle)
+        self._graph = 0
+        self._stopping = False
+        self._wait_set = self._rcl.zero_wait_set()
+        self._check(
+            self._rcl.wait_set_init(
+                ctypes.byref(self._wait_set),
+                *(0, _GUARDS, 0, 0, 0, 0),
+                node.context.handle.pointer,
+                self._rcl.default_allocator,
+            )
+        )
+
+    @contextlib.contextmanager
+    def held(self) -> Iterator[None]:
+        """Keep rclpy from freeing what the C code of `wait` points at."""
+        with self._node.context.handle, self._node.handle, self._stop_guard:
+            self._graph = self._rcl.graph_guard(self._node.handle.pointer)
+            yield
+
+    def wait(self, pause_ns: int) -> bool | None:
         """Block until the graph changed (True), a pause is over (False) or `stop` came (None)."""
         wait_set = ctypes.byref(self._wait_set)
         while True:
             self._check(self._rcl.wait_set_clear(wait_set))
-            self._check(self._rcl.wait_set_add_guard(wait_set, graph, None))
+            self._check(self._rcl.wait_set_add_guard(wait_set, self._graph, None))
             self._check(self._rcl.wait_set_add_guard(wait_set, self._stop_guard.pointer, None))
             result = self._rcl.wait(wait_set, pause_ns)
             if self._stopping or self._wait_set.guard_conditions[_STOP]:
@@ -124,16 +148,58 @@ class GraphGuard:
             elif pause_ns != _FOR_EVER:
                 return False
 
-    def _notify(self) -> bool:
-        try:
-            return bool(self._on_change())
-        except Exception:
-            _logger.exception("cannot handle a graph change")
-            return False
+    def stop(self) -> None:
+        """Have `wait` return None, now and later."""
+        self._stopping = True
+        with self._stop_guard:
+            self._stop_guard.trigger_guard_condition()
+
+    def free(self) -> None:
+        """Free the wait set; nothing waits any more."""
+        self._rcl.wait_set_fini(ctypes.byref(self._wait_set))
+        self._stop_guard.destroy_when_not_in_use()
 
     def _check(self, result: int) -> None:
         if result != abi.RCL_RET_OK:
             raise MiddlewareError(f"cannot wait for graph changes: {self._rcl.take_error()}")
+
+
+class _Comparison:
+    """Reads the graph four times a second: all that is left with an rcl that is not known."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._stopped = threading.Event()
+        self._last: object = None
+
+    @contextlib.contextmanager
+    def held(self) -> Iterator[None]:
+        """Hold nothing: rclpy does that in each of its functions."""
+        yield
+
+    def wait(self, pause_ns: int) -> bool | None:
+        """As that of `_GuardCondition`."""
+        until_s = None if pause_ns == _FOR_EVER else time.monotonic() + pause_ns / 1e9
+        while True:
+            left_s = _COMPARE_S if until_s is None else until_s - time.monotonic()
+            if self._stopped.wait(max(0.0, min(_COMPARE_S, left_s))):
+                return None
+            try:
+                found = fingerprint(self._node)
+            except InvalidHandle:
+                return None  # it is being destroyed
+            changed, self._last = found != self._last, found
+            if changed:
+                return True
+            if until_s is not None and time.monotonic() >= until_s:
+                return False
+
+    def stop(self) -> None:
+        """Have `wait` return None, now and later."""
+        self._stopped.set()
+
+    def free(self) -> None:
+        """Nothing is kept."""
 
 
 def on_graph_change(node: Node, callback: Callable[[], bool | None]) -> Callable[[], None]:

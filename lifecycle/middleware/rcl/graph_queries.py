@@ -6,17 +6,22 @@ UTF-8 (UnicodeDecodeError, for all names together), a node name that rcl cannot 
 an empty one (RCLError of rcl_get_node_names, for all nodes together). Any participant of the domain
 can announce such names, so none may hide what else is there.
 
-Bytes that are no UTF-8 are written as `\xff`; everything else is left as it is announced.
+Bytes that are no UTF-8 are written as `\xff`; everything else is left as it is announced. With an
+rcl that is not known (`abi.is_known`) rclpy's own queries are all there is: what they raise at is
+left out then.
 """
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from rclpy.exceptions import NameValidationException
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, LivelinessPolicy, ReliabilityPolicy
 
@@ -30,6 +35,7 @@ from lifecycle.manifest import (
     Reliability,
 )
 from lifecycle.middleware.rcl import abi
+from lifecycle.middleware.rcl.qos import from_rclpy
 
 _UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"
 """How rmw_dds_common names the node of an endpoint that it does not know (yet)."""
@@ -56,13 +62,25 @@ class _Strings(ctypes.Structure):
     )
 
     def all(self) -> tuple[bytes, ...]:
-        return tuple(self.data[index] or b"" for index in range(self.size))
+        return tuple([each or b"" for each in self.data[: self.size]])
 
 
 class _NamesAndTypes(ctypes.Structure):
     """rmw_names_and_types_t."""
 
     _fields_ = (("names", _Strings), ("types", ctypes.POINTER(_Strings)))
+
+
+class _Announced(ctypes.Structure):
+    """The part of rmw_topic_endpoint_info_t that is no pointer: it comes last."""
+
+    _fields_ = (
+        ("hash_version", ctypes.c_uint8),
+        ("hash_value", ctypes.c_uint8 * _HASH_BYTES),
+        ("endpoint_type", ctypes.c_int),
+        ("gid", ctypes.c_uint8 * _GID_BYTES),
+        ("qos", abi.Qos),
+    )
 
 
 class _Info(ctypes.Structure):
@@ -72,12 +90,12 @@ class _Info(ctypes.Structure):
         ("node_name", ctypes.c_char_p),
         ("node_namespace", ctypes.c_char_p),
         ("topic_type", ctypes.c_char_p),
-        ("hash_version", ctypes.c_uint8),
-        ("hash_value", ctypes.c_uint8 * _HASH_BYTES),
-        ("endpoint_type", ctypes.c_int),
-        ("gid", ctypes.c_uint8 * _GID_BYTES),
-        ("qos", abi.Qos),
+        ("announced", _Announced),
     )
+
+
+_Named = tuple[tuple[bytes, tuple[bytes, ...]], ...]
+"""Names, and the types of each."""
 
 
 class _Infos(ctypes.Structure):
@@ -89,6 +107,8 @@ class _Infos(ctypes.Structure):
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class EndpointInfo:
     """A DDS endpoint as discovery shows it.
+
+    Queries return the same object for as long as discovery shows the same.
 
     Attributes:
         node: fully qualified name of its node; empty while that is not known.
@@ -113,6 +133,9 @@ def node_names(node: Node) -> list[str]:
     Raises:
         MiddlewareError: the graph cannot be read; all functions here.
     """
+    if not abi.is_known():
+        with _read("nodes"):
+            return [full_name(*each) for each in node.get_node_names_and_namespaces()]
     library = _library()
     names, spaces = _Strings(), _Strings()
     with node.handle:
@@ -132,19 +155,29 @@ def node_names(node: Node) -> list[str]:
 
 def topic_endpoints(node: Node) -> Iterator[tuple[EndpointKind, str, EndpointInfo]]:
     """Yield kind, topic and endpoint of all publishers and subscriptions that `node` sees."""
-    library = _library()
-
-    def query(handle: int, result: object) -> int:
-        return int(library.topics(handle, library.allocator, False, result))
-
-    for topic, _ in _names_and_types(node, query, "topics") or ():
+    for topic in _topics(node):
         for kind in (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION):
             for info in _endpoints(node, kind, topic, no_mangle=False):
                 yield kind, _text(topic), info
 
 
+def _topics(node: Node) -> list[bytes]:
+    if not abi.is_known():
+        with _read("topics"):
+            return [name.encode() for name, _ in node.get_topic_names_and_types()]
+    library = _library()
+
+    def query(handle: int, result: object) -> int:
+        return int(library.topics(handle, library.allocator, False, result))
+
+    return [topic for topic, _ in _names_and_types(node, query, "topics") or ()]
+
+
 def service_names(node: Node) -> frozenset[str]:
     """Return the fully qualified names of all services that have a server or a client."""
+    if not abi.is_known():
+        with _read("services"):
+            return frozenset(name for name, _ in node.get_service_names_and_types())
     library = _library()
 
     def query(handle: int, result: object) -> int:
@@ -169,14 +202,16 @@ def endpoints_of(
 
 def endpoints_of_node(
     node: Node, kind: EndpointKind, full_name: str
-) -> list[tuple[str, str]] | None:
+) -> tuple[tuple[str, str], ...] | None:
     """Return name and type of a node's publishers, subscriptions, servers or clients.
 
     Returns:
         None where rcl shows no such node: it has left, or has a name that no rcl would give it.
     """
-    library = _library()
     namespace, _, name = full_name.rpartition("/")
+    if not abi.is_known():
+        return _shown_of_node(node, kind, name, namespace or "/")
+    library = _library()
     arguments = (name.encode(errors="replace"), (namespace or "/").encode(errors="replace"))
     function = library.by_node[kind]
 
@@ -186,9 +221,13 @@ def endpoints_of_node(
         return int(function(handle, library.allocator, *arguments, result))
 
     found = _names_and_types(node, query, "")
-    if found is None:
-        return None
-    return [(_text(each), _text(type_)) for each, types in found for type_ in types]
+    return None if found is None else _as_text(found)
+
+
+@functools.lru_cache(maxsize=1 << 10)
+def _as_text(found: _Named) -> tuple[tuple[str, str], ...]:
+    """Return name and type as text; the same object for the same bytes."""
+    return tuple((_text(each), _text(type_)) for each, types in found for type_ in types)
 
 
 def full_name(name: str, namespace: str) -> str:
@@ -196,9 +235,23 @@ def full_name(name: str, namespace: str) -> str:
     return f"{namespace.rstrip('/')}/{name}"
 
 
+def fingerprint(node: Node) -> object:
+    """Return what differs whenever the graph that `node` sees has changed; None if unreadable."""
+    try:
+        return (
+            sorted(node_names(node)),
+            sorted((kind.value, topic, info.gid) for kind, topic, info in topic_endpoints(node)),
+            service_names(node),
+        )
+    except MiddlewareError:
+        return None
+
+
 def _endpoints(
     node: Node, kind: EndpointKind, topic: bytes, *, no_mangle: bool
 ) -> list[EndpointInfo]:
+    if not abi.is_known():
+        return _shown(node, kind, _text(topic), no_mangle=no_mangle)
     library = _library()
     infos = _Infos()
     with node.handle:
@@ -210,17 +263,36 @@ def _endpoints(
                 ),
                 "endpoints",
             )
-            return [_endpoint(infos.items[index]) for index in range(infos.size)]
+            if not infos.size:
+                return []
+            raw = ctypes.string_at(infos.items, infos.size * _INFO_BYTES)
+            return [
+                _endpoint(
+                    info.node_name or b"",
+                    info.node_namespace or b"",
+                    info.topic_type or b"",
+                    raw[index * _INFO_BYTES + _ANNOUNCED_AT : (index + 1) * _INFO_BYTES],
+                )
+                for index, info in enumerate(infos.items[: infos.size])
+            ]
         finally:
             library.infos_fini(ctypes.byref(infos), library.allocator)
 
 
-def _endpoint(info: Any) -> EndpointInfo:
-    name = _text(info.node_name or b"")
-    version = info.hash_version
+_INFO_BYTES = ctypes.sizeof(_Info)
+_ANNOUNCED_AT = _Info.announced.offset
+_MOST_KEPT = 1 << 14
+"""Endpoints whose infos are kept, 0.8 kB each; the graph of 200 nodes has about 4,000."""
+
+
+@functools.lru_cache(maxsize=_MOST_KEPT)
+def _endpoint(name: bytes, namespace: bytes, type_: bytes, announced: bytes) -> EndpointInfo:
+    """Read an info; the same object for the same bytes, so that what has not changed is known."""
+    info = _Announced.from_buffer_copy(announced)
+    base, version = _text(name), info.hash_version
     return EndpointInfo(
-        node="" if name == _UNKNOWN_NODE else full_name(name, _text(info.node_namespace or b"")),
-        type=_text(info.topic_type or b""),
+        node="" if base == _UNKNOWN_NODE else full_name(base, _text(namespace)),
+        type=_text(type_),
         gid=bytes(info.gid).hex(),
         qos=QosProfile(
             history=_HISTORIES.get(info.qos.history, History.UNKNOWN),
@@ -236,14 +308,68 @@ def _endpoint(info: Any) -> EndpointInfo:
     )
 
 
+_REFUSED = (ValueError, rclpy_implementation.RCLError, NameValidationException)
+"""What rclpy's graph queries raise at names that are not ROS's; UnicodeDecodeError is one."""
+
+
+@contextlib.contextmanager
+def _read(what: str) -> Iterator[None]:
+    try:
+        yield
+    except _REFUSED as error:
+        raise MiddlewareError(f"cannot read the {what} of the graph: {error}") from error
+
+
+def _shown(node: Node, kind: EndpointKind, topic: str, *, no_mangle: bool) -> list[EndpointInfo]:
+    """As `endpoints_of`, by rclpy's own query; nothing for a topic that it refuses."""
+    is_publisher = kind is EndpointKind.PUBLISHER
+    ask = (
+        node.get_publishers_info_by_topic if is_publisher else node.get_subscriptions_info_by_topic
+    )
+    try:
+        infos = ask(topic, no_mangle)
+    except _REFUSED:
+        return []
+    return [
+        EndpointInfo(
+            node=""
+            if info.node_name == _UNKNOWN_NODE
+            else full_name(info.node_name, info.node_namespace),
+            type=info.topic_type,
+            gid=bytes(info.endpoint_gid[:_GID_BYTES]).hex(),
+            qos=from_rclpy(info.qos_profile),
+            type_hash=_spelled(getattr(info, "topic_type_hash", None)),
+        )
+        for info in infos
+    ]
+
+
+def _spelled(type_hash: Any) -> str:
+    return str(type_hash) if type_hash is not None and type_hash.version > 0 else ""
+
+
+def _shown_of_node(
+    node: Node, kind: EndpointKind, name: str, namespace: str
+) -> tuple[tuple[str, str], ...] | None:
+    """As `endpoints_of_node`, by rclpy's own queries."""
+    ask = {
+        EndpointKind.PUBLISHER: node.get_publisher_names_and_types_by_node,
+        EndpointKind.SUBSCRIPTION: node.get_subscriber_names_and_types_by_node,
+        EndpointKind.SERVICE_SERVER: node.get_service_names_and_types_by_node,
+        EndpointKind.SERVICE_CLIENT: node.get_client_names_and_types_by_node,
+    }[kind]
+    try:
+        return tuple((each, type_) for each, types in ask(name, namespace) for type_ in types)
+    except (*_REFUSED, rclpy_implementation.NodeNameNonExistentError):
+        return None
+
+
 def _nanoseconds(duration: Any) -> int | None:
     value = duration.sec * 10**9 + duration.nsec
     return value if 0 < value < _INFINITE_NS else None
 
 
-def _names_and_types(
-    node: Node, query: Callable[[int, object], int], what: str
-) -> list[tuple[bytes, tuple[bytes, ...]]] | None:
+def _names_and_types(node: Node, query: Callable[[int, object], int], what: str) -> _Named | None:
     """Return what `query` fills in; None if it fails and `what` does not say what of."""
     library = _library()
     found = _NamesAndTypes()
@@ -254,9 +380,11 @@ def _names_and_types(
                 library.take_error()
                 return None
             library.check(status, what)
-            return [
-                (name, found.types[index].all()) for index, name in enumerate(found.names.all())
-            ]
+            size = found.names.size
+            types = found.types[:size] if size else []
+            return tuple(
+                [(n, each.all()) for n, each in zip(found.names.all(), types, strict=True)]
+            )
         finally:
             library.names_and_types_fini(ctypes.byref(found))
 

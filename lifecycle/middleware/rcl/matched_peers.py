@@ -9,7 +9,6 @@ name through ctypes, on objects that are found by GUID and recognised by GUID an
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import functools
 from collections.abc import Iterable
@@ -18,7 +17,6 @@ from typing import Any
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 
-from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.rcl import abi
 
 _FASTDDS = "libfastrtps.so.2.14"
@@ -178,15 +176,14 @@ class _MatchLibrary:
 
 def load_libraries() -> None:
     """Load what every node asks rcl and Fast DDS through, for a process that forks hosts."""
-    # What is wrong with them is said where they are used.
-    with contextlib.suppress(MiddlewareError):
-        _library()
+    _library()
 
 
 @functools.lru_cache(maxsize=1)
 def _library() -> _MatchLibrary | None:
     """Return the functions; None where the libraries are others."""
-    abi.load()
+    if not abi.is_known():
+        return None
     try:
         return _MatchLibrary()
     except (OSError, AttributeError, ValueError):

@@ -68,8 +68,17 @@ class NodeHooks(Protocol):
         """A node is about to be destroyed."""
 
 
-def follow_nodes(hooks: NodeHooks) -> None:
-    """Notify `hooks` of every node of this process from now on, whatever class it is of."""
+def follow_nodes(hooks: NodeHooks) -> Callable[[], None]:
+    """Notify `hooks` of every node of this process from now on, whatever class it is of.
+
+    Returns:
+        What ends that.
+    """
+    names = [name for name, _ in _FACTORIES]
+    before = {
+        name: getattr(Node, name)
+        for name in ("__init__", *names, *_REMOVERS, "add_waitable", "destroy_node")
+    }
     initialise = Node.__init__
 
     @functools.wraps(initialise)
@@ -91,6 +100,12 @@ def follow_nodes(hooks: NodeHooks) -> None:
         destroy(self)
 
     Node.destroy_node = destroy_node
+
+    def undo() -> None:
+        for name, method in before.items():
+            setattr(Node, name, method)
+
+    return undo
 
 
 def _noting(make: Callable[..., Any], kind: EndpointKind, hooks: NodeHooks) -> Callable[..., Any]:
@@ -192,6 +207,10 @@ class RclpyStateMachine:
     def label(self) -> str:
         """Of the state, as lifecycle_msgs/State has it."""
         return str(self._node._state_machine.current_state[1])  # noqa: SLF001
+
+    def destroy(self) -> None:
+        """Let go of the node, after it was destroyed: rclpy keeps its participant for this else."""
+        self._node._state_machine.destroy_when_not_in_use()  # noqa: SLF001
 
     def change(self, transition: str) -> Any:
         """Run a transition, callbacks included, and return what its callback returned.

@@ -454,6 +454,11 @@ class ForeignNode:
         self._watching.drop_services(self._services)
         self._connections.close_all()
 
+    def destroyed(self) -> None:
+        """The node was destroyed, in a process that goes on."""
+        if self._machine is not None:
+            self._machine.destroy()
+
     def serve_interface(self) -> None:
         """Do nothing: it has no node interface."""
 

@@ -7,11 +7,13 @@ out. Nothing is supervised or verified; pytest's fixture `lifecycle_node` makes 
 from __future__ import annotations
 
 import collections
+import contextlib
+import functools
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, ShutdownException
@@ -22,17 +24,21 @@ from lifecycle.manifest import EndpointKind, RunKind
 from lifecycle.middleware import (
     NodeExecutor,
     ParticipantSettings,
+    Watching,
+    follow_nodes,
     import_interface,
     participant_settings,
     to_rclpy,
 )
-from lifecycle.node.author.node import LifecycleNode
-from lifecycle.node.author.spec import Construction, Mode, constructing
-from lifecycle.node.host.foreign import keywords
+from lifecycle.node.author.spec import Mode
+from lifecycle.node.host.foreign import Adoption, ForeignNode, Hosted
 from lifecycle.node.host.hosting import maker_of
 from lifecycle.node.lifecycle.execution import Result
 from lifecycle.node.lifecycle.machine import CallbackOutcome
 from lifecycle.plan import PlannedNode
+
+if TYPE_CHECKING:
+    from lifecycle.node.author.node import LifecycleNode
 
 WAIT_S = 10.0
 """For a message, an answer or a log line; it ends with what is waited for."""
@@ -46,34 +52,33 @@ _ROSOUT = "/rosout"
 
 
 class NodeInProcess:
-    """A managed node of a manifest in this process, spun by a thread until `close`.
+    """A node of a manifest in this process, spun by a thread until `close`.
 
-    Its methods may be called from any thread but that one. An exception that a callback of the
-    node raises is raised by whichever of them is called next.
+    Any class or function of `run: {python: …}`: of rclpy.lifecycle too, or a plain node, which has
+    no states. One callback runs at a time, whatever `executor` says. Its methods may be called from
+    any thread but that one. An exception that a callback of the node raises is raised by whichever
+    of them is called next.
 
     Args:
-        planned: a managed node that is a Python class.
+        planned: a node that is a Python class, or made by a function.
         domain_id: 0–232.
+        group: what else the same class or function makes.
 
     Attributes:
         node: the user's own object.
         peer: an ordinary rclpy node beside it, spun by the same thread.
     """
 
-    def __init__(self, planned: PlannedNode, *, domain_id: int) -> None:
+    def __init__(
+        self, planned: PlannedNode, *, domain_id: int, group: Sequence[PlannedNode] = ()
+    ) -> None:
         if planned.run.kind is not RunKind.PYTHON:
             raise UsageError(
                 f"cannot run {planned.full_name} in this process: it is no Python class",
                 hint="bring the system up instead: the fixture lifecycle_system",
             )
         folder = str(Path(planned.at.file).absolute().parent)
-        node_class = maker_of(planned, (folder,))
-        if not (isinstance(node_class, type) and issubclass(node_class, LifecycleNode)):
-            raise UsageError(
-                f"cannot run {planned.full_name} in this process: {planned.run.python!r} is no "
-                "class of lifecycle.LifecycleNode",
-                hint="bring the system up instead: the fixture lifecycle_system",
-            )
+        maker = maker_of(planned, (folder,))
         self._planned = planned
         self._changed = threading.Condition()
         self._error: BaseException | None = None
@@ -85,25 +90,73 @@ class NodeInProcess:
         self._context = Context()
         self._context.init(args=[], domain_id=domain_id)
         self._executor = NodeExecutor(context=self._context)
-        construction = Construction(spec=planned, mode=Mode.MANUAL, context=self._context)
-        settings = ParticipantSettings.of(
-            planned.connections,
-            transports=planned.transports,
-            max_datagram_bytes=planned.max_datagram_bytes,
-        )
+        self._watching = Watching()
+        self._executor.add_node(self._watching)
         try:
-            with participant_settings(self._context, settings), constructing(construction):
-                self.node: LifecycleNode = node_class(**keywords(planned, node_class))
+            self.node, self._hosted, self._all = self._construct(planned, group, maker)
         except BaseException:
             self._executor.shutdown()
             self._context.try_shutdown()
             raise
         self.peer = Node("lifecycle_test_peer", context=self._context, enable_rosout=False)
         self._make_peers()
-        for each in (self.node, self.peer):
-            self._executor.add_node(each)
+        for node, hosted in self._all:
+            if not isinstance(hosted, ForeignNode):
+                self._executor.add_node(node)
+        self._executor.add_node(self.peer)
         self._thread = threading.Thread(target=self._spin, name=planned.full_name, daemon=True)
         self._thread.start()
+
+    def _construct(
+        self, planned: PlannedNode, group: Sequence[PlannedNode], maker: Callable[..., Any]
+    ) -> tuple[Any, Hosted, tuple[tuple[Node, Hosted], ...]]:
+        """Make the nodes as a host does; return the one asked for, and all."""
+
+        @contextlib.contextmanager
+        def carrying(each: PlannedNode) -> Iterator[Context]:
+            settings = ParticipantSettings.of(
+                each.connections,
+                transports=each.transports,
+                max_datagram_bytes=each.max_datagram_bytes,
+            )
+            with participant_settings(self._context, settings):
+                yield self._context
+
+        def host(node: Node, each: PlannedNode) -> ForeignNode:
+            return ForeignNode(
+                node,
+                each,
+                supervisor="",
+                spinner=self,
+                later=self._executor.create_task,
+                watching=self._watching,
+            )
+
+        adoption = Adoption(carrying, host, mode=Mode.MANUAL)
+        follow_no_more = follow_nodes(adoption)
+        try:
+            adoption.make(planned, group or (planned,), maker)
+        finally:
+            follow_no_more()
+        made: dict[str, tuple[Any, Hosted]] = {
+            key: (node, foreign or cast("LifecycleNode", node).lifecycle)
+            for key, (node, foreign) in adoption.made.items()
+        }
+        return (*made[planned.key], tuple(made.values()))
+
+    # What runs the callbacks of nodes that are not ours.
+
+    def spin(self, node: Node) -> None:
+        """Run a node's callbacks from now on."""
+        self._executor.add_node(node)
+
+    def rest(self, node: Node) -> None:
+        """Run no callback of a node that begins from now on."""
+        self._executor.remove_node(node)
+
+    def call_soon(self, task: Callable[..., Any], *arguments: object) -> None:
+        """Run a function, sync or async, where callbacks of nodes run."""
+        self._executor.create_task(task, *arguments)
 
     def _make_peers(self) -> None:
         from rcl_interfaces.msg import Log
@@ -154,8 +207,8 @@ class NodeInProcess:
 
     @property
     def state(self) -> str:
-        """lifecycle_msgs/State label."""
-        return self.node.lifecycle.state.seen.label
+        """lifecycle_msgs/State label; empty of a plain node."""
+        return self._hosted.reported.label
 
     @property
     def logs(self) -> tuple[str, ...]:
@@ -166,13 +219,20 @@ class NodeInProcess:
     def bring_to(self, state: str) -> None:
         """Bring an unconfigured node to "inactive" (connected) or "active", matched with its peer.
 
+        A plain node has no states: "active" is to be matched.
+
         Raises:
             UsageError: no such state.
             BringUpError: a transition failed, or took longer than its deadline.
         """
         if state not in _WAYS:
             raise UsageError(f"cannot bring a node to {state!r}; allowed: {', '.join(_WAYS)}")
-        for transition in _WAYS[state]:
+        if state != "active" and not self._planned.managed:
+            raise UsageError(
+                f"cannot bring {self._planned.full_name} to {state!r}: a plain node has no states",
+                hint="say to='active', or leave it out",
+            )
+        for transition in _WAYS[state] if self._planned.managed else ():
             self.change(transition)
         if _WAYS[state]:
             self._wait(self._is_matched, "cannot match every endpoint with the test's peer")
@@ -195,7 +255,17 @@ class NodeInProcess:
             BringUpError: a callback returned FAILURE or ERROR, raised, or took too long.
             LifecycleError: it is not allowed in this state, or there is none of this name.
         """
-        result: Result = self.run(lambda: self.node.lifecycle.change(transition), self._limit_s)
+        hosted = self._hosted
+        if not self._planned.managed:
+            raise UsageError(
+                f"cannot {transition} {self._planned.full_name}: a plain node has no states"
+            )
+        if isinstance(hosted, ForeignNode):
+            result: Result = self.run(
+                lambda: hosted.change_for_supervisor(transition), self._limit_s
+            )
+        else:
+            result = self.run(lambda: hosted.change(transition), self._limit_s)
         if result.outcome is not CallbackOutcome.SUCCESS:
             raise BringUpError(f"cannot {transition} {self._planned.full_name}: {result.error}")
 
@@ -298,12 +368,19 @@ class NodeInProcess:
         try:
             if not self._closed:
                 self._closed = True
-                self.run(lambda: self.node.lifecycle.shut_down("the test is over"), self._limit_s)
+                for _, hosted in self._all:
+                    self.run(functools.partial(hosted.shut_down, "the test is over"), self._limit_s)
         finally:
             self._executor.shutdown()
             self._thread.join(WAIT_S)
-            for each in (self.peer, self.node):
+            for _, hosted in self._all:
+                if isinstance(hosted, ForeignNode):
+                    hosted.close()
+            for each in (self.peer, *(node for node, _ in self._all)):
                 each.destroy_node()
+            for _, hosted in self._all:
+                if isinstance(hosted, ForeignNode):
+                    hosted.destroyed()
             self._context.try_shutdown()
             self._context.destroy()
 

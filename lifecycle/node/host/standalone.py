@@ -27,7 +27,7 @@ import rclpy
 from rclpy.signals import SignalHandlerOptions
 
 from lifecycle.errors import ExitCode
-from lifecycle.manifest import Run, RunKind, Timeouts
+from lifecycle.manifest import Executor, Run, RunKind, Timeouts
 from lifecycle.middleware import (
     AlivePublisher,
     BusySign,
@@ -40,7 +40,7 @@ from lifecycle.middleware import (
 from lifecycle.node.author.node import LifecycleNode
 from lifecycle.node.author.spec import Construction, Mode, constructing, parse_mode
 from lifecycle.node.host.foreign import Adoption, ForeignNode, Hosted, keywords
-from lifecycle.node.host.loop import NodeLoop, Watchdog, on_signal
+from lifecycle.node.host.loop import NodeLoop, Prober, Watchdog, on_signal
 from lifecycle.node.lifecycle.machine import CallbackOutcome
 from lifecycle.plan import PlannedNode
 
@@ -58,18 +58,20 @@ class OwnLiveliness:
 
     Args:
         limit_s: seconds, > 0, that a callback may take.
+        executor: what runs the callbacks.
 
     Attributes:
         watchdog: for the loop that spins the node.
     """
 
-    def __init__(self, limit_s: float) -> None:
+    def __init__(self, limit_s: float, executor: Executor = Executor.SINGLE) -> None:
         self._sign = BusySign.make(limit_s)
         self._lock = threading.Lock()
         self._silent: dict[str, str] = {}
         self._publisher: AlivePublisher | None = None
         self._name = ""
-        self.watchdog = Watchdog(self._sign, lambda _: self._announce(""))
+        kind = Watchdog if executor is Executor.SINGLE else Prober
+        self.watchdog = kind(self._sign, lambda _: self._announce(""))
 
     def open(self, node: LifecycleNode, republish_names: Callable[[], None]) -> None:
         """Assert its liveliness from now on.
@@ -151,8 +153,9 @@ def run(
         signal_handler_options=SignalHandlerOptions.NO,
     )
     context = rclpy.get_default_context()
-    liveliness = OwnLiveliness((spec.timeouts if spec is not None else Timeouts()).silent_s)
     planned = Run(kind=RunKind.PYTHON) if spec is None else spec.run
+    limit_s = (spec.timeouts if spec is not None else Timeouts()).silent_s
+    liveliness = OwnLiveliness(limit_s, planned.executor)
     loop = NodeLoop(
         context, liveliness.watchdog, executor=planned.executor, threads=planned.threads
     )

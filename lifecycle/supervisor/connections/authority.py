@@ -329,6 +329,8 @@ class ConnectionAuthority:
                 configuration = node.configuration
                 if node.driver is None or node.stuck or name in dead or configuration is None:
                     continue
+                if node.found == ACTIVE:
+                    continue  # it is verified as it was found
                 if configuration.connected and configuration.state in (INACTIVE, ACTIVE):
                     yield name, node.driver, node, configuration
             elif name in self._others and name not in self._remote():

@@ -114,7 +114,9 @@ def node_of(order: Order, system: System) -> NodeRun:
     for node in system.nodes.values():
         if order.node in (node.planned.key, node.name):
             if node.process is None and node.unload is None:
-                raise UsageError(f"cannot restart {node.name!r}: somebody else runs it")
+                raise UsageError(
+                    f"cannot restart {node.name!r}: it is attached, no process of this supervisor"
+                )
             return node
     known = ", ".join(
         sorted(node.name for node in system.nodes.values() if node.process or node.unload)

@@ -79,6 +79,7 @@ class NodeStatus(msgspec.Struct, frozen=True, kw_only=True):
         node: fully qualified name.
         process: name of its process; empty if this supervisor does not run it.
         process_state: None if this supervisor does not run it.
+        pid: also of an adopted node's process; 0 where it is not known.
         state: lifecycle_msgs/State label; empty for a node that is not managed.
         doing: what it does or waits for; empty when nothing.
         matched: publishers and subscriptions that report at least one match.

@@ -41,7 +41,7 @@ def node_status(
         node=node.name,
         process="" if external else node.planned.process,
         process_state=None if node.process is None else node.process.state,
-        pid=0 if node.process is None else node.process.pid,
+        pid=node.pid,
         managed=node.planned.managed,
         reach=node.reach,
         state="" if died else node.state,

@@ -49,8 +49,8 @@ class ActivationGuard:
                 Outcome.VIOLATED,
                 node.planned,
                 expected="inactive",
-                observed="activated by somebody else",
-                message=f"cannot accept node {node.name}: somebody else activated it while the "
+                observed="activated by another client",
+                message=f"cannot accept node {node.name}: another client activated it while the "
                 "gate is closed; it is being deactivated",
             )
             for node in self._system.nodes.values()
@@ -76,7 +76,7 @@ class ActivationGuard:
         if node.name in self._deactivating or tries >= TRIES:
             return
         self._tries[node.name] = tries + 1
-        text = f"{node.name!r} was activated by somebody else while the gate is closed: "
+        text = f"{node.name!r} was activated by another client while the gate is closed: "
         if tries + 1 < TRIES:
             text += "it is deactivated"
         else:

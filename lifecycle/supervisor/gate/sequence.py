@@ -298,7 +298,7 @@ class GateSequence:
             node.renew(node.process)
             if node.process is not None:
                 node.process.back_off()
-        self._judge.ahead = self._active()
+        self._judge.ahead = self.active()
         self._system.touched.set()
         self._schedule.announce(keys)
         if self.phase == HELD and not self._inactive():
@@ -443,7 +443,7 @@ class GateSequence:
             if key not in held and not each.is_up and not _is_written_off(each)
         ]
         self.phase = "connecting"
-        self._judge.ahead = self._active()
+        self._judge.ahead = self.active()
         await self._alive(self._bring_up.connect(timeout_s, nodes))
 
     async def until_clear(self, timeout_s: float) -> None:
@@ -531,7 +531,7 @@ class GateSequence:
         await self._take_down(nodes)
         nodes = await self._begin_again(nodes, plan)
         self.phase = "connecting"
-        self._judge.ahead = self._active()
+        self._judge.ahead = self.active()
         await self._alive(self._bring_up.connect(timeout_s, nodes))
 
     async def _take_down(self, nodes: tuple[NodeRun, ...]) -> None:
@@ -600,7 +600,7 @@ class GateSequence:
         """
         self._gate.close()
         self.phase = "verifying"
-        self._judge.ahead = self._active()
+        self._judge.ahead = self.active()
         await self.until_clear(timeout_s)
         assert self._judge.latest is not None
         permit = self._gate.judge(self._judge.latest)
@@ -674,7 +674,7 @@ class GateSequence:
             names = ", ".join(each.name for each in begun)
             self._emit(Notice(message=f"the gate closed again: {names} is deactivated"))
         await self._alive(self._bring_up.deactivate(begun))
-        self._judge.ahead = self._active()
+        self._judge.ahead = self.active()
 
     async def _program_flows(self, permit: Permit, deadline: float) -> None:
         """Program networks with the flows of the verdict that nodes are activated on."""
@@ -692,7 +692,8 @@ class GateSequence:
             if each.is_to_be_active and each.is_up and each.reach is not Reach.ACTIVE
         )
 
-    def _active(self) -> frozenset[str]:
+    def active(self) -> frozenset[str]:
+        """Return the names of the nodes that are active, let through or found so."""
         return frozenset(
             each.name
             for each in self._system.nodes.values()

@@ -1,6 +1,6 @@
 """Verifies the running system at every change: level-triggered, debounced, with a grace period.
 
-Owns: when `verify` is called again, how long a verdict that closes the gate is waited out, and
+Owns: when the system is judged again, how long a verdict that closes the gate is waited out, and
 `GracePeriod`: which findings may pass by themselves while a system is watched, because the facts of
 one change arrive one by one, and for how long a verdict that is worse by these alone is kept back.
 The gate itself has no grace period. Nothing is polled: the graph, or a node over its control
@@ -28,6 +28,7 @@ from lifecycle.supervisor.run.failure import ended
 from lifecycle.verify import (
     DEFINITION_DIFFERS,
     MISSING_REPORT,
+    NOT_JUDGED,
     SERVER_OF,
     UNATTRIBUTED_ENDPOINT,
     About,
@@ -37,6 +38,7 @@ from lifecycle.verify import (
     Outcome,
     Stage,
     Verdict,
+    Verifier,
     rule,
     verify,
 )
@@ -60,6 +62,7 @@ class GracePeriod:
     def __init__(self) -> None:
         self._plan: Plan | None = None
         self._demanded: dict[tuple[_Place, str], float] = {}
+        self._latest: dict[_Place, float] = {}
         self._unknown: dict[_Key, float] = {}
 
     def after(
@@ -97,6 +100,9 @@ class GracePeriod:
         since = float("-inf") if self._plan is None else now_s
         self._plan = expected
         self._demanded = {each: self._demanded.get(each, since) for each in _demands(expected)}
+        self._latest = {}
+        for (place, _), since in self._demanded.items():
+            self._latest[place] = max(since, self._latest.get(place, since))
 
     def _since(self, finding: Finding) -> float:
         """Return since when a finding may pass; -inf if it may not."""
@@ -108,10 +114,7 @@ class GracePeriod:
         }
         if rule(finding.rule).about is About.CONNECTION:
             places.add(("connection", finding.node))
-        return max(
-            (since for (place, _), since in self._demanded.items() if place in places),
-            default=float("-inf"),
-        )
+        return max(self._latest.get(place, float("-inf")) for place in places)
 
 
 def _is_of_unknown_node(finding: Finding) -> bool:
@@ -275,7 +278,7 @@ class VerificationLoop:
         emit: Emitter,
         *,
         strict: bool,
-        verify_: Callable[..., Verdict] = verify,
+        verify_: Callable[..., Verdict] | None = None,
         looker: Looker | None = None,
         agreement: Agreement | None = None,
         guard: ActivationGuard | None = None,
@@ -287,7 +290,8 @@ class VerificationLoop:
         self._changes = changes
         self._emit = emit
         self._strict = strict
-        self._verify = verify_
+        self._verify = verify_ or verify
+        self._watch = verify_ or Verifier().verify
         self._looker = looker
         self._agreement = agreement
         self._guard = guard
@@ -296,6 +300,7 @@ class VerificationLoop:
         self.seen = Observation()
         self._presence = NodeArrivals(emit)
         self._grace_period = GracePeriod()
+        self._asked_of: tuple[Plan, frozenset[str], Plan] | None = None
         self.ahead: frozenset[str] = frozenset()
         self.scope: Scope | None = None
 
@@ -340,6 +345,12 @@ class VerificationLoop:
         self._stands(stage, verdict)
         return verdict, again_s
 
+    def refuse(self, findings: tuple[Finding, ...]) -> Verdict:
+        """Judge by what was found before anything was started; return the verdict."""
+        verdict = with_findings(NOT_JUDGED, findings)
+        self._stands(Stage.CONNECTED, verdict)
+        return verdict
+
     def _stands(self, stage: Stage, verdict: Verdict) -> None:
         if verdict != self.latest:
             self.latest = verdict
@@ -347,7 +358,7 @@ class VerificationLoop:
 
     async def _look(self, stage: Stage) -> Verdict:
         await self._system.refresh(self._observer)
-        asked = without_nodes(self._system.plan, self._system.liveliness.silent)
+        asked = self._asked()
         observation = without(await self._observer.observe(asked), self._system.dead())
         self.seen = observation
         self._presence.see(observation)
@@ -358,7 +369,9 @@ class VerificationLoop:
             self._guard.look(observation)
         expected, machines = self._system.expected, self._system.machines
         ahead, over = self.ahead, self._system.over()
-        verdict = self._verify(
+        # What opens the gate is judged from scratch; what is watched, where it has changed.
+        judge = self._watch if stage is Stage.ACTIVE else self._verify
+        verdict = judge(
             expected, observation, stage=stage, machines=machines, ahead=ahead, over=over
         )
         if self._recorder is not None:
@@ -380,6 +393,13 @@ class VerificationLoop:
             verdict = self._agreement.explained(verdict)
             verdict = with_findings(verdict, self._agreement.findings(observation))
         return with_findings(verdict, discovery_server.findings(self._system))
+
+    def _asked(self) -> Plan:
+        """Return the plan without silent nodes; the same object while that is the same."""
+        of = self._system.plan, frozenset(self._system.liveliness.silent)
+        if self._asked_of is None or self._asked_of[0] is not of[0] or self._asked_of[1] != of[1]:
+            self._asked_of = (*of, without_nodes(*of))
+        return self._asked_of[2]
 
     async def until_clear(
         self, stage: Stage, timeout_s: float, *, unchanged_s: float | None = None

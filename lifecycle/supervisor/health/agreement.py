@@ -104,6 +104,7 @@ class Agreement:
         self._known: list[PlanNotice] = []
         self._compared: dict[PlanNotice, tuple[str, ...]] = {}
         self._since: dict[str, float] = {}
+        self._checksum: tuple[Plan, str] | None = None
         self._again: asyncio.TimerHandle | None = None
 
     def open(self) -> None:
@@ -206,7 +207,11 @@ class Agreement:
         self._system.touched.set()
 
     def _different(self) -> Iterator[Finding]:
-        ours = plan_checksum(self._plan)
+        if not self._known:
+            return
+        if self._checksum is None or self._checksum[0] is not self._plan:
+            self._checksum = self._plan, plan_checksum(self._plan)
+        ours = self._checksum[1]
         for notice in self._known:
             found = self._compare(notice, ours)
             if not found:

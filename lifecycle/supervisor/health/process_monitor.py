@@ -10,13 +10,14 @@ import rclpy.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Coroutine, Iterable
+from collections.abc import Coroutine, Iterable, Sequence
 from typing import Any, Protocol
 
 from lifecycle.supervisor.control.protocol import ProcessState, Reach
 from lifecycle.supervisor.gate.verification_loop import ChangeCounter
 from lifecycle.supervisor.nodes.bring_up import ALSO_S, died
 from lifecycle.supervisor.nodes.system import NodeRun, ObservedGraph, System
+from lifecycle.supervisor.processes.adopted_process import AdoptedProcess
 from lifecycle.supervisor.processes.process import ManagedProcess
 from lifecycle.supervisor.run.events import Event, NodeChanged, ProcessChanged
 from lifecycle.supervisor.run.failure import StepFailedError, ended
@@ -25,7 +26,7 @@ _SPEAK_S = 0.7 + ALSO_S
 """A step notices its node's death itself within this, and knows what the node was doing."""
 
 
-async def first_death(system: System, known: set[str]) -> ManagedProcess:
+async def first_death(system: System, known: set[str]) -> ManagedProcess | AdoptedProcess:
     """Wait until a process ends that was not asked to.
 
     Args:
@@ -34,10 +35,13 @@ async def first_death(system: System, known: set[str]) -> ManagedProcess:
     """
     servers: tuple[ManagedProcess, ...] = () if system.server is None else (system.server,)
     while True:
-        living = {
-            process.ended: process
-            for process in (*system.processes.values(), *servers)
-            if process.name not in known
+        every: tuple[ManagedProcess | AdoptedProcess, ...] = (
+            *system.processes.values(),
+            *system.adopted,
+            *servers,
+        )
+        living: dict[asyncio.Future[Any], ManagedProcess | AdoptedProcess] = {
+            process.ended: process for process in every if process.name not in known
         }
         if not living:
             await asyncio.get_running_loop().create_future()  # for ever: until cancelled
@@ -45,7 +49,10 @@ async def first_death(system: System, known: set[str]) -> ManagedProcess:
         for exited in done:
             process = living[exited]
             known.add(process.name)
-            if process.state is ProcessState.EXITED and not process.is_over:
+            if isinstance(process, AdoptedProcess):
+                if process.died:
+                    return process
+            elif process.state is ProcessState.EXITED and not process.is_over:
                 return process
 
 
@@ -88,14 +95,17 @@ class ProcessMonitor:
     def deaths(self) -> tuple[StepFailedError, ...]:
         """Return the failure of every process that has ended although it was to run."""
         server = self._system.server
-        every = (*self._system.processes.values(), *(() if server is None else (server,)))
+        servers = () if server is None else (server,)
+        every = (*self._system.processes.values(), *self._system.adopted, *servers)
         return tuple(self._failure(each) for each in every if each.died)
 
     async def next_death(self) -> StepFailedError:
         """Wait for the next process that ends unasked; return the failure that this is."""
         return self._failure(await first_death(self._system, self.dead))
 
-    def _failure(self, process: ManagedProcess) -> StepFailedError:
+    def _failure(self, process: ManagedProcess | AdoptedProcess) -> StepFailedError:
+        if isinstance(process, AdoptedProcess):
+            return process.failure()
         keys = process.planned.nodes
         node = self._system.nodes[keys[0]] if len(keys) == 1 else None
         return died(process, node)
@@ -132,7 +142,8 @@ class ParticipantRegistry(Protocol):
 class StaleNodes:
     """Removes what processes of one system leave in the graph when they die.
 
-    Only processes that this supervisor started count, once the kernel says that they ended. Of each
+    Only processes that this supervisor started or adopted count, once the kernel says that they
+    ended. Of each
     only those participants count that bear its pid and that its nodes reported, or were seen on.
 
     Args:
@@ -184,20 +195,29 @@ class StaleNodes:
         self._later.clear()
 
     def _ended(self, process: ManagedProcess) -> None:
+        self.forget(process.pid, [self._system.nodes[key] for key in process.planned.nodes])
+
+    def forget(self, pid: int, nodes: Sequence[NodeRun]) -> None:
+        """Remove what a process left that is known to have ended.
+
+        Args:
+            pid: of the process.
+            nodes: that it ran.
+        """
         if self._closed:
             return
-        nodes = [self._system.nodes[key] for key in process.planned.nodes]
         names = [node.name for node in nodes]
         reported = frozenset(prefix for node in nodes for prefix in _reported(node))
-        prefixes = self._graph.participants_of(process.pid, nodes=names, reported=reported)
+        prefixes = self._graph.participants_of(pid, nodes=names, reported=reported)
         if prefixes:
-            self._remove(process.pid, prefixes, prefixes, 0)
+            self._remove(pid, prefixes, prefixes, 0)
 
     def _remove(
         self, pid: int, every: frozenset[str], shown: frozenset[str], repetition: int
     ) -> None:
         if repetition < _ALWAYS or shown:
             pids = [each.pid for each in self._system.living]
+            pids += [each.pid for each in self._system.adopted if not each.ended.done()]
             self._graph.remove_participants(every, pids)
         if repetition == len(AGAIN_S) or self._closed:
             return

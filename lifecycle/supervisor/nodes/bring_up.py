@@ -21,7 +21,7 @@ from lifecycle.node import HostSpec, Operation
 from lifecycle.plan import PlannedNode
 from lifecycle.supervisor.control.protocol import ProcessState, Reach
 from lifecycle.supervisor.gate.gate import Permit
-from lifecycle.supervisor.nodes.driver import ControlDriver, NodeCondition, NodeDriver
+from lifecycle.supervisor.nodes.driver import ACTIVE, ControlDriver, NodeCondition, NodeDriver
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.processes.control_channel import (
     ChannelClosedError,
@@ -141,6 +141,8 @@ class BringUp:
         spawner_of: the spawner for a process.
         services: makes the driver of a managed node that is not ours.
         appears: waits until a node of this name is in the graph.
+        alone: makes sure, as well as it can be known, that a node of ours which is driven by its
+            services is the only one of its name, or raises VerificationError.
         recorded: called after each spawn, to keep the record of children true.
         gives: sets the parameters of a running node that its command line does not give it.
         loads: has the container of this full name load a node, and returns what unloads it.
@@ -157,9 +159,11 @@ class BringUp:
         recorded: Callable[[], None],
         wirer: Wirer | None = None,
         gives: Callable[[PlannedNode], Awaitable[None]] | None = None,
+        alone: Callable[[NodeRun], None] | None = None,
         loads: Callable[[PlannedNode, str], Awaitable[Callable[[], Awaitable[None]]]] | None = None,
     ) -> None:
         self._gives = gives
+        self._alone = alone
         self._loads = loads
         self._system = system
         self._spawner_of = spawner_of
@@ -344,10 +348,16 @@ class BringUp:
             node.doing = _APPEARING
             if self._is_to_be_given(node) and not node.planned.may_end:
                 # What it is judged by must be there before it is.
-                limit_s = node.planned.timeouts.start_s
-                await self._step(node, self._appears(node.name), limit_s, rule=START_FAILED)
+                await self._appear_alone(node)
                 await self._give(node)
             self._appearing.append(asyncio.ensure_future(self._appear(node)))
+
+    async def _appear_alone(self, node: NodeRun) -> None:
+        """Wait, bounded, for a node that its services are asked of: nobody else may get that."""
+        limit_s = node.planned.timeouts.start_s
+        await self._step(node, self._appears(node.name), limit_s, rule=START_FAILED)
+        if self._alone is not None and node.process is not None:
+            self._alone(node)
 
     async def _appear(self, node: NodeRun) -> None:
         process = node.process
@@ -406,9 +416,20 @@ class BringUp:
 
     def _started(self, node: NodeRun, standing: NodeCondition | None = None) -> None:
         node.doing = ""
+        self._note_found(node, "running" if standing is None else standing.state)
         node.advance(Reach.STARTED, standing)
         if node.process is not None:
             node.process.running()
+
+    def _note_found(self, node: NodeRun, state: str) -> None:
+        """Note, and say, how a node was found that others started and that is adopted."""
+        others = node.process is None and not node.planned.run.component
+        if not self._system.adopts or not others or node.found:
+            return
+        node.found = state
+        where = "" if node.running is None else node.running.where
+        message = f"{node.name!r} is adopted, found {state}" + (f": {where}" if where else "")
+        self._system.emit(Notice(message=message))
 
     async def _connect(self, node: NodeRun) -> None:
         assert node.driver is not None
@@ -417,6 +438,10 @@ class BringUp:
             limit_s = node.planned.timeouts.start_s
             standing = await self._step(node, node.driver.start(), limit_s, rule=START_FAILED)
             self._started(node, standing)
+            if node.found and standing.state == ACTIVE:
+                # It is verified as it is: nothing is asked of it, and the gate lets nothing in.
+                node.advance(Reach.ACTIVE, standing)
+                return
             await self._give(node)
         if node.planned.state is TargetState.UNCONFIGURED:
             return
@@ -468,6 +493,8 @@ class BringUp:
             node, node.perform(operation, permit), limit_s, rule=TRANSITION_FAILED
         )
         node.doing = ""
+        if standing.already and node.process is None and operation in _TO_UNDO:
+            node.undo.remove(operation)
         node.advance(reach, standing)
 
     async def _start(self, node: NodeRun) -> None:
@@ -483,14 +510,13 @@ class BringUp:
             if process.name not in self._starts:
                 self._starts[process.name] = asyncio.ensure_future(self._start_process(process))
             await asyncio.shield(self._starts[process.name])
-        limit_s = node.planned.timeouts.start_s
         node.doing = "starting"
         if process is not None and process.channel is not None:
             if node.planned.holds:
                 node.driver = ControlDriver(process.channel, node.name)
         elif node.planned.managed:
             node.doing = _APPEARING
-            await self._step(node, self._appears(node.name), limit_s, rule=START_FAILED)
+            await self._appear_alone(node)
             node.driver = self._services(node.planned)
 
     async def _start_process(self, process: ManagedProcess) -> None:

@@ -6,6 +6,7 @@ rclpy; the services come from middleware/ behind a Protocol.
 
 from __future__ import annotations
 
+import asyncio
 import dataclasses
 import functools
 from collections.abc import Awaitable, Callable, Sequence
@@ -25,6 +26,11 @@ UNCONFIGURED = "unconfigured"
 FINALIZED = "finalized"
 """lifecycle_msgs/State labels."""
 
+_PRIMARY = (ACTIVE, INACTIVE, UNCONFIGURED, FINALIZED)
+
+_PASSING_S = 0.1
+"""Who drives a node that is in the middle of a transition is somebody else: it is asked again."""
+
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class NodeCondition:
@@ -34,11 +40,13 @@ class NodeCondition:
         state: lifecycle_msgs/State label.
         connected: the data layer is made.
         configuration: as the node reports it; None where it does not.
+        already: nothing was asked of it: it was there before.
     """
 
     state: str
     connected: bool = False
     configuration: NodeConfiguration | None = None
+    already: bool = False
 
 
 class NodeDriver(Protocol):
@@ -203,25 +211,31 @@ class ServiceDriver:
         return await self._interface.wire(step)
 
     async def _start(self) -> NodeCondition:
-        return _standing(await self._state(self._timeouts.start_s))
+        while True:
+            state = await self._state(self._timeouts.start_s)
+            if state in _PRIMARY:
+                return _standing(state)
+            await asyncio.sleep(_PASSING_S)
 
     async def _perform(self, operation: Operation, permit: Permit | None) -> NodeCondition:
         limit_s = self._limit_s(operation)
         state = await self._state(limit_s)
         if operation in _NESTED:
             offered = await self._services.get_available_transitions(self._node, timeout_s=limit_s)
-            if operation.value in offered and not await self._change(operation, limit_s):
+            asked = operation.value in offered
+            if asked and not await self._change(operation, limit_s):
                 raise BringUpError(f"cannot {operation.value} {self._node!r}: it refused")
-            return _standing(state)
+            return _standing(state, already=not asked)
         wanted = _REACHED[operation]
         if state == wanted:
             if operation is Operation.ACTIVATE and permit is not None:
                 await permit.use(self._node)
-            return _standing(state)
+            return _standing(state, already=True)
         if operation is Operation.CONFIGURE and state == ACTIVE:
             raise BringUpError(
-                f"cannot configure {self._node!r}: it is active already, and nobody verified it",
-                hint=f"deactivate it first: ros2 lifecycle set {self._node} deactivate",
+                f"cannot configure {self._node!r}: it is active already, and nobody verified it; "
+                f"have it adopted as it is with 'lifecycle up --adopt', or deactivate it first: "
+                f"ros2 lifecycle set {self._node} deactivate"
             )
         if operation is Operation.ACTIVATE:
             if permit is None:
@@ -312,5 +326,5 @@ class NodeInterfaceClient:
         return await self.interface()
 
 
-def _standing(state: str) -> NodeCondition:
-    return NodeCondition(state=state, connected=state in {INACTIVE, ACTIVE})
+def _standing(state: str, *, already: bool = False) -> NodeCondition:
+    return NodeCondition(state=state, connected=state in {INACTIVE, ACTIVE}, already=already)

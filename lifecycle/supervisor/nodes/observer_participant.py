@@ -6,19 +6,35 @@ and nowhere else in this room.
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import os
-from collections.abc import Awaitable, Callable, Iterable
+import shlex
+from collections.abc import Awaitable, Callable, Collection, Iterable
 from typing import TYPE_CHECKING
 
+from lifecycle.graph import set_within
 from lifecycle.plan import ParticipantConnections, Plan, PlannedNode
 from lifecycle.supervisor.control.ros_interface import Answer, Offer
 from lifecycle.supervisor.health.peer_supervisors import Listener
 from lifecycle.supervisor.nodes.driver import NodeDriver, NodeInterfaceClient, ServiceDriver
-from lifecycle.verify import NodeConfiguration, Observation
+from lifecycle.supervisor.processes.adopted_process import RunningNode
+from lifecycle.verify import (
+    NodeConfiguration,
+    Observation,
+    ObservedEndpoint,
+    ObservedNode,
+    known_node,
+)
 
 if TYPE_CHECKING:
     from lifecycle.graph import Graph
-    from lifecycle.middleware import AlivePublisher, AliveSubscription, PlanNotices
+    from lifecycle.middleware import (
+        AlivePublisher,
+        AliveSubscription,
+        GraphObserver,
+        PlanNotices,
+    )
 
 _QUIET_S = 0.005
 _BURST_S = 0.05
@@ -73,6 +89,13 @@ class ObserverParticipant:
 
         return str(rclpy.get_rmw_implementation_identifier())
 
+    @property
+    def unknown_versions(self) -> str:
+        """Which installed libraries are not known, and what that costs; empty if all are."""
+        from lifecycle.middleware import unknown_versions
+
+        return unknown_versions()
+
     def reaches_servers(self) -> bool:
         """Wait, bounded, until a TCP discovery server can be asked; False if it never will be."""
         return self._graph.discovery.reaches_servers()
@@ -92,6 +115,30 @@ class ObserverParticipant:
             MiddlewareError: it does not answer, or refuses.
         """
         await self._graph.clients.give_parameters(node)
+
+    async def running(self, wait_s: float) -> tuple[tuple[RunningNode, ...], str]:
+        """Return the nodes in the graph once discovery has settled, and what it lacked in the end.
+
+        Args:
+            wait_s: seconds, > 0, that it may take.
+        """
+        (nodes, _), unsettled = await settled(self._graph.discovery, wait_s)
+        processes = self.processes()
+        return tuple(
+            RunningNode(
+                name=each.full_name,
+                count=each.count,
+                processes=processes.get(each.full_name, {}),
+            )
+            for each in nodes
+        ), unsettled
+
+    def processes(self) -> dict[str, dict[int, str]]:
+        """Return the command lines of this host's processes by full node name and pid."""
+        return {
+            name: {each.process_id: shlex.join(each.argv) for each in programs.values()}
+            for name, programs in self._graph.discovery.programs(os.environ).items()
+        }
 
     async def load(self, node: PlannedNode, container: str) -> Callable[[], Awaitable[None]]:
         """Have a component container load a node; return what unloads it.
@@ -216,3 +263,52 @@ class ObserverParticipant:
 
     def __exit__(self, *_: object) -> None:
         self.destroy()
+
+
+_SETTLED_S = 0.5
+"""Discovery has settled once nothing changed for so long and everything has a node."""
+
+Snapshot = tuple[tuple[ObservedNode, ...], tuple[ObservedEndpoint, ...]]
+
+
+async def settled(graph: GraphObserver, wait_s: float) -> tuple[Snapshot, str]:
+    """Wait until the graph changes no more; return it, and what it still lacked in the end.
+
+    Args:
+        graph: to look at.
+        wait_s: seconds, > 0, that it may take.
+    """
+    loop = asyncio.get_running_loop()
+    deadline = loop.time() + wait_s
+    changed = asyncio.Event()
+
+    def wake() -> None:
+        with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
+            loop.call_soon_threadsafe(changed.set)
+
+    remove = graph.on_change(wake)
+    try:
+        while True:
+            changed.clear()
+            snapshot = graph.snapshot()
+            pending = _pending(snapshot, settling_s=graph.settling_s())
+            left_s = deadline - loop.time()
+            if left_s <= 0:
+                what = ", ".join(pending) or "it still changed"
+                return snapshot, f"discovery had not settled after {wait_s:g} s: {what}"
+            stirred = await set_within(changed, min(_SETTLED_S, left_s))
+            if not stirred and not pending and left_s >= _SETTLED_S:
+                return snapshot, ""
+    finally:
+        remove()
+
+
+def _pending(snapshot: Snapshot, *, settling_s: float) -> Collection[str]:
+    """Say what discovery still has to show."""
+    _, endpoints = snapshot
+    pending = dict.fromkeys(
+        f"nobody tells whose {each.name} is" for each in endpoints if not known_node(each.node)
+    )
+    if settling_s > 0:
+        pending["a participant answered whose node is not known"] = None
+    return tuple(pending)

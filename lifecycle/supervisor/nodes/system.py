@@ -11,7 +11,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import dataclasses
-from collections.abc import Awaitable, Callable, Collection, Iterable
+from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Protocol
 
@@ -19,11 +19,12 @@ from lifecycle.errors import BringUpError
 from lifecycle.manifest import Condition, RunKind, TargetState
 from lifecycle.node import INTERFACE_ON_DEMAND, Operation
 from lifecycle.node import Event as HostEvent
-from lifecycle.plan import Plan, PlannedNode, PlannedProcess
+from lifecycle.plan import Plan, PlannedNode, PlannedProcess, attached_to
 from lifecycle.supervisor.control.protocol import ProcessState, Reach
 from lifecycle.supervisor.gate.gate import Permit
 from lifecycle.supervisor.health.liveliness import SilenceMonitor
 from lifecycle.supervisor.nodes.driver import ACTIVE, INACTIVE, NodeCondition, NodeDriver
+from lifecycle.supervisor.processes.adopted_process import AdoptedProcess, RunningNode
 from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.supervisor.processes.logs import LogDirectory
 from lifecycle.supervisor.processes.process import ManagedProcess, own_run_delay_s
@@ -251,6 +252,10 @@ class NodeRun:
         undo: what has to be undone, oldest first.
         stuck: an operation on it was given up: a polite request would wait behind it.
         connections: names of what the authority connected it to, oldest first.
+        found: state in which it was adopted, `running` for one that is not managed; empty for one
+            that is not adopted.
+        running: as it ran before this supervisor did; None if it did not.
+        adopted: the process that others started it in, where that is known.
         reports_changes: its host reports unasked when its configuration changes.
         unload: has its container unload a component; None for what is not loaded into one.
         is_up: it was started and brought as far as its gate; cleared when it goes down.
@@ -268,6 +273,9 @@ class NodeRun:
         self.undo: list[Operation] = []
         self.stuck = False
         self.connections: tuple[str, ...] = ()
+        self.found = ""
+        self.running: RunningNode | None = None
+        self.adopted: AdoptedProcess | None = None
         self.reports_changes = False
         self.unload: Callable[[], Awaitable[None]] | None = None
         self.is_up = False
@@ -299,6 +307,20 @@ class NodeRun:
     def is_to_be_active(self) -> bool:
         """Whether the gate is to activate it."""
         return self.planned.holds and self.planned.state is TargetState.ACTIVE
+
+    @property
+    def pid(self) -> int:
+        """Its process; 0 if that was not started, or is not known."""
+        if self.process is not None:
+            return self.process.pid
+        return 0 if self.adopted is None else self.adopted.pid
+
+    @property
+    def is_gone(self) -> bool:
+        """Whether its process has ended, as far as that is noticed."""
+        if self.process is not None:
+            return self.process.state is ProcessState.EXITED
+        return self.adopted is not None and self.adopted.ended.done()
 
     def run_delay_s(self) -> float:
         """Return the run delay of its process and ours, seconds: ready to run, but without CPU."""
@@ -377,6 +399,8 @@ class System:
         logs: likewise, with what could not be written there.
         machines: those whose nodes it brings up; None if that is all of them.
         remote: the plan's other nodes, which another supervisor brings up.
+        adopts: takes nodes that others started as they are found, active ones too.
+        adopted: processes that others started and that run nodes of it, where they are known.
         touched: set whenever a node reported something of itself: time to judge again.
         liveliness: which nodes are silent.
         present: names of the nodes that are in the graph; None before it was first looked at.
@@ -417,6 +441,8 @@ class System:
         }
         self.machines = frozenset(each.machine for each in own) if self.remote else None
         self._by_name = {node.name: node for node in self.nodes.values()}
+        self.adopts = False
+        self.adopted: tuple[AdoptedProcess, ...] = ()
         self.touched = asyncio.Event()
         self.present: frozenset[str] | None = None
         self.liveliness = SilenceMonitor(emit, self.touched.set, self._is_there)
@@ -434,10 +460,11 @@ class System:
 
     def over(self) -> dict[str, str]:
         """Return how the process ended of each node that has ended by itself as it may."""
+        processes = {node.name: node.process or node.adopted for node in self.nodes.values()}
         return {
-            node.name: str(node.process.ended.result())
-            for node in self.nodes.values()
-            if node.process is not None and node.process.is_over
+            name: str(process.ended.result())
+            for name, process in processes.items()
+            if process is not None and process.is_over
         }
 
     def _is_there(self, name: str) -> bool:
@@ -450,6 +477,21 @@ class System:
     def node_named(self, name: str) -> NodeRun | None:
         """Return the node with this fully qualified name."""
         return self._by_name.get(name)
+
+    def adopt(self, running: Mapping[str, RunningNode]) -> None:
+        """Leave nodes to who started them: none of them is started, nor ended.
+
+        Args:
+            running: by key; of the processes that would have been started for them, all nodes.
+        """
+        self.adopts = True
+        for key, each in running.items():
+            node = self.nodes[key]
+            node.running = each
+            if node.process is not None:
+                self.processes.pop(node.process.name, None)
+                node.process = None
+        self.replan(attached_to(self.plan, running))
 
     def replan(self, plan: Plan) -> None:
         """Take a plan whose participants are connected otherwise; running nodes do not notice."""
@@ -470,24 +512,38 @@ class System:
         Returns:
             The nodes to bring up in their place.
         """
-        self.first = self.plan = self.expected = plan
+        names = {each.key: each.full_name for each in plan.nodes}
+        adopted = {
+            key: node
+            for key, node in self.nodes.items()
+            if node.running is not None and names.get(key) == node.name
+        }
+        self.first = plan
+        self.plan = self.expected = attached_to(plan, adopted)
         down = {each.planned.key: each for each in nodes}
         stay = {key: each for key, each in self.nodes.items() if key not in down}
         kept = {each.process.name: each.process for each in stay.values() if each.process}
         self.nodes, self.processes = {}, {}
         for process in processes:
             managed = kept.get(process.name)
-            if managed is None and process.run.kind is not RunKind.ATTACH:
+            others = process.run.kind is RunKind.ATTACH or not adopted.keys().isdisjoint(
+                process.nodes
+            )
+            if managed is None and not others:
                 managed = self._process(process)
             if managed is not None:
                 self.processes[process.name] = managed
             for key in process.nodes:
                 if key in stay:
                     self.nodes[key] = stay[key]
-                    stay[key].planned = plan.node(key)
+                    stay[key].planned = self.plan.node(key)
                     continue
-                node = self.nodes[key] = NodeRun(plan.node(key), self.emit)
+                node = self.nodes[key] = NodeRun(self.plan.node(key), self.emit)
                 node.process = managed
+                if key in adopted:
+                    before = adopted[key]
+                    node.running, node.adopted = before.running, before.adopted
+                    node.found = before.found
                 node.advance(Reach.WAITING)
         self._by_name = {node.name: node for node in self.nodes.values()}
         return tuple(each for key, each in self.nodes.items() if key not in stay)

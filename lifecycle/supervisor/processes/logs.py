@@ -20,6 +20,7 @@ from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 
 from lifecycle.errors import UsageError
+from lifecycle.run_directory import home_directory
 
 LONGEST_LINE = 64 * 1024
 """Bytes; a longer line is cut into pieces, so that a process cannot fill our memory."""
@@ -42,12 +43,21 @@ def ros_log_root(environment: Mapping[str, str]) -> Path:
     """Return the ROS log directory: ROS_LOG_DIR, else ROS_HOME/log, else ~/.ros/log.
 
     Source: rcl_logging_get_logging_directory in rcl_logging_interface.
+
+    Raises:
+        UsageError: there is no home directory.
     """
     if environment.get("ROS_LOG_DIR"):
         return Path(environment["ROS_LOG_DIR"]).expanduser()
     if environment.get("ROS_HOME"):
         return Path(environment["ROS_HOME"]).expanduser() / "log"
-    return Path("~/.ros/log").expanduser()
+    home = home_directory(environment)
+    if not home:
+        raise UsageError(
+            "cannot find a home directory for ROS's logs: HOME is not set, and this user has none",
+            hint="set ROS_LOG_DIR to a directory",
+        )
+    return Path(home) / ".ros" / "log"
 
 
 def check_log_root(environment: Mapping[str, str]) -> None:
@@ -59,11 +69,13 @@ def check_log_root(environment: Mapping[str, str]) -> None:
     root = ros_log_root(environment)
     try:
         root.mkdir(parents=True, exist_ok=True)
+        if not os.access(root, os.W_OK | os.X_OK):
+            raise PermissionError(errno.EACCES, "it cannot be written")
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
             raise UsageError(
                 f"cannot use {str(root)!r} as ROS log directory: {error.strerror}",
-                hint="set ROS_LOG_DIR to a directory, or to one that can be made",
+                hint="set ROS_LOG_DIR to a directory that can be made and written",
             ) from error
 
 
@@ -99,6 +111,12 @@ def runs_of(root: Path, system: str = "") -> list[Path]:
         entries = list(root.iterdir())
     found = (each for each in entries if named.fullmatch(each.name) and not each.is_symlink())
     return sorted((each for each in found if each.is_dir()), reverse=True)
+
+
+def is_running(run: Path) -> bool:
+    """Return whether the supervisor lives whose run a log directory is of."""
+    named = _named("").fullmatch(run.name)
+    return named is not None and Path(f"/proc/{named['pid']}").exists()
 
 
 def begin_logs(path: Path, system: str, environment: Mapping[str, str]) -> Path:

@@ -14,7 +14,7 @@ import contextlib
 import dataclasses
 import logging
 import os
-from collections.abc import Awaitable, Callable, Collection, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -28,7 +28,7 @@ from lifecycle.export import (
     build_picture,
     capture,
 )
-from lifecycle.graph import Look, set_within
+from lifecycle.graph import Look
 from lifecycle.manifest import DiscoveryRange, EndpointPolicy
 from lifecycle.middleware import note_ended, peers_environment
 from lifecycle.plan import Plan, reached_hosts
@@ -39,18 +39,16 @@ from lifecycle.supervisor.control.protocol import ProcessState, Reach, SystemSta
 from lifecycle.supervisor.control.server import SupervisorSnapshot, follow
 from lifecycle.supervisor.gate.gate import closes
 from lifecycle.supervisor.gate.verification_loop import GracePeriod, with_findings
-from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
+from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant, settled
 from lifecycle.supervisor.run.options import onlooker_connections, own_machines
 from lifecycle.verify import (
     Heals,
     NodeConfiguration,
     Observation,
-    ObservedEndpoint,
     ObservedNode,
     Outcome,
     Stage,
     Verdict,
-    known_node,
     rule,
     tolerating_pattern,
     verify,
@@ -58,7 +56,7 @@ from lifecycle.verify import (
 
 if TYPE_CHECKING:
     from lifecycle.graph import Graph
-    from lifecycle.middleware import GraphObserver, NodeClients
+    from lifecycle.middleware import NodeClients
 
 
 _ASK_AGAIN_S = 0.5
@@ -78,12 +76,14 @@ class JudgedSystem:
         observation: what was there.
         verdict: of an active system.
         rmw: name of the RMW implementation it was looked at with.
+        limits: which installed libraries are not known, and what that costs; empty if all are.
     """
 
     plan: Plan
     observation: Observation
     verdict: Verdict
     rmw: str = ""
+    limits: str = ""
 
     @property
     def where(self) -> str:
@@ -92,6 +92,11 @@ class JudgedSystem:
         names = (each.full_name for each in self.observation.nodes)
         foreign = any(not tolerating_pattern(each, tools) for each in names)
         return "" if foreign else where(self.plan, self.rmw)
+
+    @property
+    def notices(self) -> tuple[str, ...]:
+        """What has to be known beside the verdict."""
+        return tuple(each for each in (self.limits, self.where) if each)
 
 
 def judge_running(
@@ -202,11 +207,15 @@ def _reported_to_supervisors(plan: Plan) -> tuple[NodeConfiguration, ...]:
 
 async def _see(plan: Plan, observer_participant: ObserverParticipant) -> JudgedSystem:
     observation = await observer_participant.observe(plan)
-    return _judged(plan, observation, observer_participant.rmw)
+    return _judged(plan, observation, observer_participant)
 
 
 def _judged(
-    plan: Plan, observation: Observation, rmw: str, *, may_be_over: bool = True
+    plan: Plan,
+    observation: Observation,
+    observer_participant: ObserverParticipant,
+    *,
+    may_be_over: bool = True,
 ) -> JudgedSystem:
     """Judge what was seen; of a node that may end by itself and is not there, it may have ended."""
     expected = Expectation.of(plan, observation)
@@ -216,7 +225,8 @@ def _judged(
         plan=expected.plan,
         observation=observation,
         verdict=with_findings(verdict, expected.findings),
-        rmw=rmw,
+        rmw=observer_participant.rmw,
+        limits=observer_participant.unknown_versions,
     )
 
 
@@ -233,13 +243,13 @@ async def _judge(
     while True:
         observation = await observer_participant.observe(plan)
         # One that is not there may be yet to come.
-        seen = _judged(plan, observation, observer_participant.rmw, may_be_over=False)
+        seen = _judged(plan, observation, observer_participant, may_be_over=False)
         limit_s = timeout_s
         if empty_graph_s is not None and seen.where:
             limit_s = min(empty_graph_s, timeout_s)
         left_s = began + limit_s - loop.time()
         if left_s <= 0 or not _worth_waiting(seen.verdict, strict=strict):
-            return _judged(plan, observation, observer_participant.rmw)
+            return _judged(plan, observation, observer_participant)
         await _change(observer_participant, min(left_s, _ASK_AGAIN_S))
 
 
@@ -344,13 +354,8 @@ def _supervised(status: SystemStatus) -> dict[str, Supervised]:
 T = TypeVar("T")
 
 _logger = logging.getLogger(__name__)
-_QUIET_S = 0.5
-"""Discovery has settled once nothing changed for so long and everything has a node."""
-
 _ASK_S = 2.0
 """A node that answers at all answers within milliseconds."""
-
-Snapshot = tuple[tuple[ObservedNode, ...], tuple[ObservedEndpoint, ...]]
 
 
 def capture_running(
@@ -403,7 +408,7 @@ _Parameters = dict[str, "tuple[CapturedParameter, ...] | None"]
 async def _look(
     graph: Graph, wait_s: float, environment: Mapping[str, str] | None
 ) -> tuple[Observation, _Parameters, str, Programs]:
-    (nodes, endpoints), unsettled = await _settled(graph.discovery, wait_s)
+    (nodes, endpoints), unsettled = await settled(graph.discovery, wait_s)
     # Before anything is asked: a program may end meanwhile.
     programs = {} if environment is None else graph.discovery.programs(environment)
     serving = {
@@ -429,44 +434,6 @@ async def _look(
         name: each for name, (_, _, each) in zip(names, answers, strict=True) if name in serving
     }
     return graph.state.observation(), parameters, unsettled, note_ended(programs)
-
-
-async def _settled(graph: GraphObserver, wait_s: float) -> tuple[Snapshot, str]:
-    """Wait until the graph changes no more; return it, and what it still lacked in the end."""
-    loop = asyncio.get_running_loop()
-    deadline = loop.time() + wait_s
-    changed = asyncio.Event()
-
-    def wake() -> None:
-        with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
-            loop.call_soon_threadsafe(changed.set)
-
-    remove = graph.on_change(wake)
-    try:
-        while True:
-            changed.clear()
-            snapshot = graph.snapshot()
-            pending = _pending(snapshot, settling_s=graph.settling_s())
-            left_s = deadline - loop.time()
-            if left_s <= 0:
-                what = ", ".join(pending) or "it still changed"
-                return snapshot, f"discovery had not settled after {wait_s:g} s: {what}"
-            stirred = await set_within(changed, min(_QUIET_S, left_s))
-            if not stirred and not pending and left_s >= _QUIET_S:
-                return snapshot, ""
-    finally:
-        remove()
-
-
-def _pending(snapshot: Snapshot, *, settling_s: float) -> Collection[str]:
-    """Say what discovery still has to show."""
-    _, endpoints = snapshot
-    pending = dict.fromkeys(
-        f"nobody tells whose {each.name} is" for each in endpoints if not known_node(each.node)
-    )
-    if settling_s > 0:
-        pending["a participant answered whose node is not known"] = None
-    return tuple(pending)
 
 
 async def _ask(

@@ -54,6 +54,7 @@ class UpOptions:
         keep_going: report a dead process, but do not take the others down.
         program: networks to program with the verified flows for as long as the system is active.
         treatment: what their flows get beyond what the manifest says.
+        adopt: take nodes that run already as they are found, and start only the others.
     """
 
     until: Until = Until.ACTIVE
@@ -64,6 +65,7 @@ class UpOptions:
     keep_going: bool = False
     program: tuple[TargetOptions, ...] = ()
     treatment: Treatment | None = None
+    adopt: bool = False
 
     def bring_up_s(self, processes: int) -> float:
         """Return the seconds for all of a bring-up that starts so many processes."""

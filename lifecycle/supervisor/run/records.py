@@ -23,11 +23,14 @@ from lifecycle.supervisor.run.failure import Worker
 _AGAIN_S = 2.0
 """How often a record is tried that could not be written."""
 
-_BURST_S = 0.02
-"""Shared memory is made in bursts, and locked a moment after it was made."""
+_LOCKED_S = 0.02
+"""Shared memory is locked a moment after it was made."""
 
 _QUIET_S = 0.2
-"""After a burst one sure look at every process follows, which takes a millisecond for each."""
+"""Shared memory is made in bursts. After one it is looked whose it is, a millisecond for each."""
+
+_BURST_S = 2.0
+"""How long a burst lasts at most; until then all of it counts as what may be ours."""
 
 
 class Records:
@@ -112,7 +115,7 @@ class Records:
         """
         self.unattributed = still_there(self.unattributed)
         if self.unattributed:
-            time.sleep(max(0.0, self._made_s + _BURST_S - time.monotonic()))
+            time.sleep(max(0.0, self._made_s + _LOCKED_S - time.monotonic()))
         return self.segments | self.unattributed
 
     def made(self, groups: frozenset[str]) -> None:
@@ -166,15 +169,16 @@ class Records:
 
     async def note_each(self, created: asyncio.Event) -> None:
         """Note the shared memory of our processes each time that the event is set, for ever."""
+        loop = asyncio.get_running_loop()
         while True:
             await created.wait()
-            while created.is_set():
+            until_s = loop.time() + _BURST_S
+            while created.is_set() and loop.time() < until_s:
                 created.clear()
-                await asyncio.sleep(_BURST_S)
-                living = (each.pid for each in self._system.living)
-                ours = frozenset((os.getpid(), self._fork_server.pid, *living))
-                self._add(*await self._worker.run(self._locked, ours))
                 await set_within(created, _QUIET_S)
+            living = (each.pid for each in self._system.living)
+            ours = frozenset((os.getpid(), self._fork_server.pid, *living))
+            self._add(*await self._worker.run(self._locked, ours))
             await self.note_segments()
             self._add(frozenset(), self.unattributed - still_there(self.unattributed))
 

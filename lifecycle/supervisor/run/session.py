@@ -39,16 +39,19 @@ from lifecycle.supervisor.health.process_monitor import (
     Sightings,
     StaleNodes,
 )
+from lifecycle.supervisor.nodes.adoption import SETTLE_S, Adoption, Census, ran_before
 from lifecycle.supervisor.nodes.bring_up import BringUp
 from lifecycle.supervisor.nodes.driver import NodeDriver
 from lifecycle.supervisor.nodes.system import (
     InterfaceOnDemand,
+    NodeRun,
     ObservedGraph,
     RemoteNodes,
     ServiceNames,
     System,
 )
 from lifecycle.supervisor.policy.schedule import RestartSchedule
+from lifecycle.supervisor.processes.adopted_process import AdoptedProcess
 from lifecycle.supervisor.processes.orphans import ProcessFamily, end_strays, reap_adopted
 from lifecycle.supervisor.processes.process import Spawner
 from lifecycle.supervisor.run.events import (
@@ -106,6 +109,7 @@ class SessionParticipant(
     ParticipantRegistry,
     ServiceNames,
     Offering,
+    Census,
     Protocol,
 ):
     """What a session needs of its participant in the graph, see nodes/observer_participant.py.
@@ -222,6 +226,7 @@ class Session:
             wirer=self._authority,
             gives=observer_participant.give,
             loads=observer_participant.load,
+            alone=self._alone,
         )
         self._remote_nodes = RemoteNodes(
             system.plan, system.awaited(), observer_participant, self._changes
@@ -334,6 +339,8 @@ class Session:
                     result = _hurried(result)
         finally:
             await ended(offering)
+            for each in self._system.adopted:
+                each.close()
             self._stale.close()
             await self._changes.close()
             self._ros_interface.close()
@@ -453,8 +460,11 @@ class Session:
         loop = asyncio.get_running_loop()
         timeout_s = self._options.bring_up_s(len(self._system.processes))
         deadline = loop.time() + timeout_s
+        if self._options.adopt:
+            await self._adopt()
         async with self._following():
             await self._gate_sequence.connect(timeout_s)
+        self._judge.ahead = self._gate_sequence.active()
         self._furthest = "connected"
         self._emit(SystemReached(reached="connected", elapsed_s=self._emit.elapsed_s))
         if self._options.until is Until.CONNECTED:
@@ -476,6 +486,34 @@ class Session:
         return await self._hold(
             Stage.CONNECTED if self._options.until is Until.VERIFIED else Stage.ACTIVE
         )
+
+    async def _adopt(self) -> None:
+        """Take what runs already as it is found, before anything is started.
+
+        Raises:
+            VerificationError: a node runs more than once.
+            StepFailedError: of a process with several nodes only some run.
+        """
+        running, unsettled = await self._observer_participant.running(SETTLE_S)
+        if unsettled:
+            self._emit(Notice(message=f"what runs may not be all that is adopted: {unsettled}"))
+        adoption = Adoption(self._system, running)
+        if findings := adoption.findings():
+            raise VerificationError(self._judge.refuse(findings))
+        names = adoption.adopt(self._adopted_ended)
+        if not names:
+            self._emit(Notice(message="nothing is adopted: no node of the manifest runs yet"))
+        self._replanned(names)
+
+    def _alone(self, node: NodeRun) -> None:
+        ours = self._fork_server.family()
+        if findings := ran_before(node, self._observer_participant, ours):
+            raise VerificationError(self._judge.refuse(findings))
+
+    def _adopted_ended(self, process: AdoptedProcess) -> None:
+        nodes = [each for each in self._system.nodes.values() if each.adopted is process]
+        self._stale.forget(process.pid, nodes)
+        self._system.touched.set()
 
     @contextlib.asynccontextmanager
     async def _following(self) -> AsyncIterator[None]:

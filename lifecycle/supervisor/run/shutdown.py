@@ -109,13 +109,15 @@ class TakeDown:
         if self._system.liveliness.is_out_of_reach(node.name):
             node.stuck = True
         operations = [_UNDO[each] for each in reversed(node.undo)]
+        if node.found == ACTIVE:
+            operations = []  # it is left active
         # A node that others started is theirs to end.
         if node.process is not None and node.reach is not Reach.WAITING:
             operations.append(Operation.SHUTDOWN)
         for operation in operations:
             if operation is Operation.DISCONNECT:
                 await self._unwire(node)
-            if self._hurry.is_set() or node.stuck or _gone(node) or node.driver is None:
+            if self._hurry.is_set() or node.stuck or node.is_gone or node.driver is None:
                 return
             if _applies(operation, node):
                 # Also after one that failed: a node that refuses to clean up may still shut down.
@@ -124,7 +126,7 @@ class TakeDown:
     async def _unwire(self, node: NodeRun) -> None:
         """Unmake what the authority connected the node to, the last connection first."""
         for name in reversed(node.connections):
-            if self._hurry.is_set() or node.stuck or _gone(node) or node.driver is None:
+            if self._hurry.is_set() or node.stuck or node.is_gone or node.driver is None:
                 return
             step = Step(node=node.name, operation=Operation.DISCONNECT_FROM, connection=name)
             limit_s = node.planned.timeouts.cleanup_s
@@ -167,7 +169,7 @@ class TakeDown:
                 return False
             request.result()
         except BringUpError as error:
-            if not _gone(node):
+            if not node.is_gone:
                 self._emit(Notice(message=error.message))
             return False
         else:
@@ -205,7 +207,3 @@ def _applies(operation: Operation, node: NodeRun) -> bool:
         Operation.CLEANUP: node.state == INACTIVE,
         Operation.SHUTDOWN: node.state != FINALIZED,
     }[operation]
-
-
-def _gone(node: NodeRun) -> bool:
-    return node.process is not None and node.process.is_gone

@@ -354,6 +354,8 @@ def _observer_participant(plan: Plan, options: UpOptions, emit: Emitter) -> Obse
                 f"try {number + 1} of {OBSERVER_TRIES - 1}"
             )
         )
+    if limits := observer_participant.unknown_versions:
+        emit(Notice(message=limits))
     return observer_participant
 
 

@@ -9,11 +9,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from lifecycle.network import ConnectionUrl, ConnectionUrlError, parse
-from lifecycle.plan import ParticipantConnections, PlannedNode, is_restarted_url
+from lifecycle.plan import ParticipantConnections, is_restarted_url
 from lifecycle.verify.outcome import ConnectionReport, Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.verdict import Finding
-from lifecycle.verify.view import Actual, View, connection_of
+from lifecycle.verify.view import Actual, NodeFacts, View, connection_of
 
 MISSING = Rule(
     id="connection.missing",
@@ -56,31 +56,32 @@ RULES = (MISSING, FAILED, DIFFERS, WRONG_MAPPING)
 
 def check(view: View) -> Iterator[Finding]:
     """Judge every planned connection and mapping."""
-    for name, node in view.planned.items():
-        if view.is_absent(node):
-            continue
-        yield from _own(view, node)
-        for participant in node.participants:
-            if participant.connection:
-                yield from _connection(view, node, participant.connection, participant.connections)
-        for actual in view.actual_by_node[name]:
-            yield from _mapping(actual)
+    yield from view.by_node.each(_judge)
 
 
-def _own(view: View, node: PlannedNode) -> Iterator[Finding]:
+def _judge(facts: NodeFacts) -> Iterator[Finding]:
+    if facts.absent:
+        return
+    yield from _own(facts)
+    for participant in facts.node.participants:
+        if participant.connection:
+            yield from _connection(facts, participant.connection, participant.connections)
+    for actual in facts.actual:
+        yield from _mapping(actual)
+
+
+def _own(facts: NodeFacts) -> Iterator[Finding]:
     """The node's own participant: it is always there, but may be connected otherwise."""
-    configuration = view.configurations.get(node.full_name)
+    node, configuration = facts.node, facts.configuration
     for report in configuration.connections if configuration else ():
         if not report.name and report.urls and node.connections.urls:
-            yield from _urls(view, node, report, node.connections)
+            yield from _urls(facts, report, node.connections)
 
 
-def _connection(
-    view: View, node: PlannedNode, name: str, planned: ParticipantConnections
-) -> Iterator[Finding]:
-    configuration = view.configurations.get(node.full_name)
+def _connection(facts: NodeFacts, name: str, planned: ParticipantConnections) -> Iterator[Finding]:
+    node, configuration = facts.node, facts.configuration
     if configuration is None:
-        if view.ours(node):
+        if facts.frame.ours(node):
             return  # that it does not report is said
         yield MISSING.on_node(
             Outcome.UNVERIFIABLE,
@@ -111,14 +112,16 @@ def _connection(
             f" ({', '.join(report.urls or planned.urls)}): {report.error}",
         )
     else:
-        yield from _urls(view, node, report, planned)
+        yield from _urls(facts, report, planned)
 
 
 def _urls(
-    view: View, node: PlannedNode, report: ConnectionReport, planned: ParticipantConnections
+    facts: NodeFacts, report: ConnectionReport, planned: ParticipantConnections
 ) -> Iterator[Finding]:
-    if _as_planned(view, report.urls, planned.urls):
+    first_port = facts.frame.plan.discovery.first_port
+    if _as_planned(report.urls, planned.urls, first_port=first_port):
         return
+    node = facts.node
     what = f"connection {report.name!r}" if report.name else "the own participant"
     yield DIFFERS.on_node(
         Outcome.VIOLATED,
@@ -149,12 +152,11 @@ def _mapping(actual: Actual) -> Iterator[Finding]:
     )
 
 
-def _as_planned(view: View, reported: Sequence[str], planned: Sequence[str]) -> bool:
+def _as_planned(reported: Sequence[str], planned: Sequence[str], *, first_port: int) -> bool:
     """Whether URLs mean the same, or what a node has after a restart."""
     was, now = _meant(planned), _meant(reported)
     if len(was) != len(now):
         return False
-    first_port = view.plan.discovery.first_port
     return all(
         old == new
         or (

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 from lifecycle.manifest import EndpointKind, EndpointPolicy, Position
 from lifecycle.verify.observation import ObservedEndpoint
@@ -16,7 +16,15 @@ from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.tool_filter import OFFERS
 from lifecycle.verify.verdict import Finding
-from lifecycle.verify.view import Actual, SeenEndpoint, View
+from lifecycle.verify.view import (
+    Actual,
+    Frame,
+    NodeFacts,
+    SeenEndpoint,
+    TopicFacts,
+    View,
+    once,
+)
 
 MISSING_ENDPOINT = Rule(
     id="graph.missing-endpoint",
@@ -89,16 +97,30 @@ RULES = (
 def check(view: View) -> Iterator[Finding]:
     """Judge the existence and the type of endpoints."""
     known: Counter[tuple[str, EndpointKind | None]] = Counter()
-    if any(actual.unseen for actual in view.actual):
+    hiding = view.by_node.found(_hiding)
+    if hiding:
         known.update((seen.name, seen.kind) for seen in (*view.seen, *view.seen_of_tools))
-    for name, node in view.planned.items():
-        absent = view.is_absent(node)
-        for actual in view.actual_by_node[name]:
-            yield from _declared(actual, absent=absent)
-            if actual.unseen and not absent:
+    declared = view.by_node.found(_all_declared)
+    for name, facts in view.nodes.items():
+        if name not in hiding or facts.absent:
+            yield from declared.get(name, ())
+            continue
+        for actual in facts.actual:
+            yield from _declared(actual, absent=False)
+            if actual.unseen:
                 yield from _unseen(view, actual, known)
     yield from _undeclared(view)
     yield from _conflicts(view)
+
+
+def _hiding(facts: NodeFacts) -> Iterator[NodeFacts]:
+    if facts.may_hide:
+        yield facts
+
+
+def _all_declared(facts: NodeFacts) -> Iterator[Finding]:
+    for actual in facts.actual:
+        yield from _declared(actual, absent=facts.absent)
 
 
 def _declared(actual: Actual, *, absent: bool) -> Iterator[Finding]:
@@ -140,8 +162,8 @@ def _remapped(actual: Actual) -> str:
     if report is None or report.resolved == planned.resolved:
         return ""
     return (
-        f"{report.kind.value}/{report.name} is {report.resolved} now: is a remap wrong, or did "
-        f"somebody call {actual.node.full_name}/remap? the name '' gives back the declared one"
+        f"{report.kind.value}/{report.name} is {report.resolved} now: is a remap wrong, or was "
+        f"{actual.node.full_name}/remap called? the name '' gives back the declared one"
     )
 
 
@@ -218,18 +240,15 @@ def _given_name(view: View, endpoint: ObservedEndpoint) -> str:
             return f"it is an alias of {declared}: see who called {endpoint.node}/alias"
         if endpoint.name == report.resolved != actual.planned.resolved:
             return (
-                f"it is {declared} under another name: is a remap wrong, or did somebody call "
-                f"{endpoint.node}/remap?"
+                f"it is {declared} under another name: is a remap wrong, or was "
+                f"{endpoint.node}/remap called?"
             )
     return ""
 
 
 def _conflicts(view: View) -> Iterator[Finding]:
     """A topic, service or action of ours that an undeclared node uses with another type."""
-    types: dict[tuple[str, str], dict[str, None]] = {}
-    for actual in view.actual:
-        place = (MEETS[actual.planned.kind], actual.planned.resolved)
-        types.setdefault(place, {})[actual.planned.type] = None
+    (types,) = once(view.frame, _declared_types)
     others = (*view.undeclared, *view.foreign, *view.unattributed)
     undeclared: tuple[SeenEndpoint | ObservedEndpoint, ...] = (
         *(each for each in view.seen if each.planned is None),
@@ -253,6 +272,15 @@ def _conflicts(view: View) -> Iterator[Finding]:
             node=seen.node,
             endpoint=seen.kind,
         )
+
+
+def _declared_types(frame: Frame) -> Iterator[dict[tuple[str, str], dict[str, None]]]:
+    """Yield the types of every declared topic, service and action, in plan order."""
+    types: dict[tuple[str, str], dict[str, None]] = {}
+    for node in frame.planned.values():
+        for each in node.endpoints:
+            types.setdefault((MEETS[each.kind], each.resolved), {})[each.type] = None
+    yield types
 
 
 DEFINITION_DIFFERS = Rule(
@@ -286,12 +314,48 @@ _Place = tuple[str, str, str]
 
 def check_definitions(view: View) -> Iterator[Finding]:
     """Compare the ends of everything that is declared, with what is installed or each other."""
-    installed = {
-        _place(each.planned.kind, each.planned.resolved, each.planned.type): each.planned.type_hash
-        for each in view.actual
-    }
     unknown: dict[str, list[tuple[_Place, _TypedEnd]]] = {}
-    for place, ends in _ends(view).items():
+    for judged in _judged_places(view):
+        yield from judged.differing
+        for end in judged.unknown:
+            unknown.setdefault(end.node, []).append((judged.place, end))
+    for node in sorted(unknown):
+        yield _unverifiable(node, unknown[node])
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class _JudgedPlace:
+    """What is wrong where ends of one type meet, and the ends that announce no hash."""
+
+    place: _Place
+    differing: tuple[Finding, ...]
+    unknown: tuple[_TypedEnd, ...]
+
+
+def _judged_places(view: View) -> Iterator[_JudgedPlace]:
+    """Yield the places of which there is something to report, in the order of what is seen."""
+    found = list(view.by_topic.each(_of_topic))
+    if len(found) > 1:
+        order: dict[_Place, int] = {}
+        for seen in view.seen:
+            order.setdefault(_place(seen.kind, seen.name, seen.type), len(order))
+        found.sort(key=lambda each: order[each.place])
+    yield from found
+    yield from _judge_places(view.frame, _other_ends(view))
+
+
+def _of_topic(topic: TopicFacts) -> Iterator[_JudgedPlace]:
+    ends: dict[_Place, list[_TypedEnd]] = {}
+    for seen in topic.ends:
+        at = seen.planned.at if seen.planned else None
+        end = _TypedEnd(kind=seen.kind, node=seen.node, type_hash=seen.type_hash, at=at)
+        ends.setdefault(_place(seen.kind, seen.name, seen.type), []).append(end)
+    return _judge_places(topic.frame, ends)
+
+
+def _judge_places(frame: Frame, places: Mapping[_Place, list[_TypedEnd]]) -> Iterator[_JudgedPlace]:
+    (installed,) = once(frame, _installed)
+    for place, ends in places.items():
         if place not in installed:
             continue  # nothing of the plan meets there, or its type is wrong: that is said
         expected = installed[place]
@@ -303,13 +367,24 @@ def check_definitions(view: View) -> Iterator[Finding]:
             if first is None:
                 continue  # nothing to compare with
             expected, source = first[0], first[1] or "an unknown node"
+        differing: list[Finding] = []
+        unknown: list[_TypedEnd] = []
         for end in dict.fromkeys(ends):
             if end.type_hash == "":
-                unknown.setdefault(end.node, []).append((place, end))
+                unknown.append(end)
             elif end.type_hash is not None and differ(end.type_hash, expected):
-                yield _differs(place, end, expected, source)
-    for node in sorted(unknown):
-        yield _unverifiable(node, unknown[node])
+                differing.append(_differs(place, end, expected, source))
+        if differing or unknown:
+            yield _JudgedPlace(place, tuple(differing), tuple(unknown))
+
+
+def _installed(frame: Frame) -> Iterator[dict[_Place, str]]:
+    """Yield the hashes of the declared types as they are installed, by place."""
+    yield {
+        _place(each.kind, each.resolved, each.type): each.type_hash
+        for node in frame.planned.values()
+        for each in node.endpoints
+    }
 
 
 def differ(one: str, other: str) -> bool:
@@ -325,24 +400,31 @@ def differ(one: str, other: str) -> bool:
     )
 
 
-def _ends(view: View) -> dict[_Place, list[_TypedEnd]]:
+def _other_ends(view: View) -> dict[_Place, list[_TypedEnd]]:
+    """Return the ends of services and actions."""
     found: dict[_Place, list[_TypedEnd]] = {}
-    for seen in view.seen:
-        at = seen.planned.at if seen.planned else None
-        end = _TypedEnd(kind=seen.kind, node=seen.node, type_hash=seen.type_hash, at=at)
-        found.setdefault(_place(seen.kind, seen.name, seen.type), []).append(end)
-    outsiders = (*view.undeclared, *view.foreign, *view.of_tools, *view.unattributed)
-    others: list[tuple[ObservedEndpoint, Position | None]] = [
-        (actual.observed, actual.planned.at)
-        for actual in view.actual
-        if actual.observed is not None
-    ]
-    others += [(each, None) for each in outsiders]
-    for each, at in others:
+    for place, end in view.by_node.each(_declared_ends):
+        found.setdefault(place, []).append(end)
+    for each in (*view.undeclared, *view.foreign, *view.of_tools, *view.unattributed):
         if not each.kind.is_topic:
-            end = _TypedEnd(kind=each.kind, node=each.node, type_hash=each.type_hash, at=at)
+            end = _TypedEnd(kind=each.kind, node=each.node, type_hash=each.type_hash, at=None)
             found.setdefault(_place(each.kind, each.name, each.type), []).append(end)
     return found
+
+
+def _declared_ends(facts: NodeFacts) -> Iterator[tuple[_Place, _TypedEnd]]:
+    for actual in facts.actual:
+        each = actual.observed
+        if each is not None and not each.kind.is_topic:
+            yield (
+                _place(each.kind, each.name, each.type),
+                _TypedEnd(
+                    kind=each.kind,
+                    node=each.node,
+                    type_hash=each.type_hash,
+                    at=actual.planned.at,
+                ),
+            )
 
 
 def _place(kind: EndpointKind, name: str, type_: str) -> _Place:

@@ -17,14 +17,24 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 from lifecycle.manifest import Certainty, EndpointKind, QosProfile, incompatibilities
 from lifecycle.verify.observation import EndpointReport, ObservedEndpoint
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.verdict import Finding
-from lifecycle.verify.view import UNKNOWN_QOS, Actual, FlowView, SeenEndpoint, View, actual_qos
+from lifecycle.verify.view import (
+    UNKNOWN_QOS,
+    Actual,
+    FlowView,
+    NodeFacts,
+    SeenEndpoint,
+    TopicFacts,
+    View,
+    actual_qos,
+    once,
+)
 
 UNMATCHED_LINK = Rule(
     id="graph.unmatched-link",
@@ -116,30 +126,30 @@ def match(
 
 def check(view: View) -> Iterator[Finding]:
     """Judge every planned flow."""
-    topics: dict[tuple[str, EndpointKind], list[MatchEnd]] = {}
-    for seen in (*view.seen, *view.seen_of_tools):
-        topics.setdefault((seen.name, seen.kind), []).append(_end_of_graph(seen))
-    for flow in view.flows:
-        cause = _cause(flow)
-        if cause and not flow.planned.linked:
-            continue  # the cause has its own finding already
-        outcome, reason = (Outcome.VIOLATED, cause) if cause else _judge(flow, topics)
-        if outcome is Outcome.OK:
-            continue
-        rule = UNMATCHED_LINK if flow.planned.linked else UNMATCHED_FLOW
-        violated = outcome is Outcome.VIOLATED
-        pair = f"{flow.publisher} → {flow.subscription}"
-        yield rule.finding(
-            outcome,
-            subject=flow.subject,
-            ends=flow.ends,
-            expected="matched",
-            observed=reason,
-            message=f"cannot see {pair} matched on {flow.planned.topic}: {reason}"
-            if violated
-            else f"cannot verify that {pair} are matched on {flow.planned.topic}: {reason}",
-            at=flow.at,
-        )
+    yield from view.by_flow.each(_judge_flow)
+
+
+def _judge_flow(flow: FlowView) -> Iterator[Finding]:
+    cause = _cause(flow)
+    if cause and not flow.planned.linked:
+        return  # the cause has its own finding already
+    outcome, reason = (Outcome.VIOLATED, cause) if cause else _judge(flow)
+    if outcome is Outcome.OK:
+        return
+    rule = UNMATCHED_LINK if flow.planned.linked else UNMATCHED_FLOW
+    violated = outcome is Outcome.VIOLATED
+    pair = f"{flow.publisher} → {flow.subscription}"
+    yield rule.finding(
+        outcome,
+        subject=flow.subject,
+        ends=flow.ends,
+        expected="matched",
+        observed=reason,
+        message=f"cannot see {pair} matched on {flow.planned.topic}: {reason}"
+        if violated
+        else f"cannot verify that {pair} are matched on {flow.planned.topic}: {reason}",
+        at=flow.at,
+    )
 
 
 def _cause(flow: FlowView) -> str:
@@ -159,15 +169,12 @@ def _cause(flow: FlowView) -> str:
     return ""
 
 
-def _judge(flow: FlowView, topics: Mapping[tuple[str, EndpointKind], Sequence[MatchEnd]]) -> Match:
+def _judge(flow: FlowView) -> Match:
     """Return the worst that is known of any of the flow's pairs, whose ends are all seen."""
+    assert flow.ends_of_topic is not None
+    publishers, subscriptions = once(flow.ends_of_topic, _ends_of_graph)
     answers = [
-        match(
-            _end(publisher),
-            _end(subscription),
-            topics[flow.planned.topic, EndpointKind.PUBLISHER],
-            topics[flow.planned.topic, EndpointKind.SUBSCRIPTION],
-        )
+        match(_end(publisher), _end(subscription), publishers, subscriptions)
         for publisher in flow.publishers
         for subscription in flow.subscriptions
     ]
@@ -240,6 +247,15 @@ def _end(actual: Actual) -> MatchEnd:
     )
 
 
+def _ends_of_graph(topic: TopicFacts) -> tuple[list[MatchEnd], list[MatchEnd]]:
+    """Return all publishers and all subscriptions of a topic, tools' included."""
+    ends = (*topic.ends, *topic.of_tools)
+    return (
+        [_end_of_graph(each) for each in ends if each.kind is EndpointKind.PUBLISHER],
+        [_end_of_graph(each) for each in ends if each.kind is EndpointKind.SUBSCRIPTION],
+    )
+
+
 def _end_of_graph(seen: SeenEndpoint) -> MatchEnd:
     """Return an end as one of all that others can match: it is not asked whom it matches."""
     return MatchEnd(
@@ -269,29 +285,39 @@ SERVER_OF = {
     EndpointKind.SERVICE_CLIENT: EndpointKind.SERVICE_SERVER,
     EndpointKind.ACTION_CLIENT: EndpointKind.ACTION_SERVER,
 }
+_SERVERS = frozenset(SERVER_OF.values())
 
 
 def check_clients(view: View) -> Iterator[Finding]:
     """Judge every declared client that reports and of which declared servers are there."""
     servers: dict[_Place, list[str]] = {}
-    for actual in view.actual:
-        if actual.observed is not None:
-            servers.setdefault(_place(actual.observed), []).append(actual.node.full_name)
+    for name, places in view.by_node.items(_servers):
+        for place in places:
+            servers.setdefault(place, []).append(name)
+    if not servers:
+        return
     others = Counter(
         map(_place, (*view.undeclared, *view.foreign, *view.of_tools, *view.unattributed))
     )
-    for client in view.actual:
-        kind = SERVER_OF.get(client.planned.kind)
-        if kind is None or client.observed is None:
-            continue
-        if client.report is None:
-            # Of ours that has its own finding; of others no more can be seen than that both ends
-            # are there and of one type, as of their topics.
-            continue
-        place = kind, client.observed.name, client.observed.type
+    for client, place in view.by_node.each(_clients):
         found = servers.get(place, ())
         for server in dict.fromkeys(found):
             yield from _judge_client(client, server, count=len(found) + others[place])
+
+
+def _servers(facts: NodeFacts) -> Iterator[_Place]:
+    for actual in facts.actual:
+        if actual.observed is not None and actual.observed.kind in _SERVERS:
+            yield _place(actual.observed)
+
+
+def _clients(facts: NodeFacts) -> Iterator[tuple[Actual, _Place]]:
+    for client in facts.actual:
+        kind = SERVER_OF.get(client.planned.kind)
+        # A client without a report has its own finding if it is ours; of others no more can be seen
+        # than that both ends are there and of one type, as of their topics.
+        if kind is not None and client.observed is not None and client.report is not None:
+            yield client, (kind, client.observed.name, client.observed.type)
 
 
 def _place(seen: ObservedEndpoint) -> _Place:

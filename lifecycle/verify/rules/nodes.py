@@ -111,6 +111,10 @@ def _duplicate(view: View) -> Iterator[Finding]:
         if count < 2:
             continue
         node = view.planned.get(name)
+        # Before the gate one of them may have run before the supervisor did.
+        started = node is not None and node.run.kind is not RunKind.ATTACH
+        takes = started and view.stage is Stage.CONNECTED
+        hint = f"{DUPLICATE_NODE.fix}; have one that ran before adopted: lifecycle up --adopt"
         yield DUPLICATE_NODE.finding(
             Outcome.VIOLATED,
             subject=name,
@@ -119,6 +123,7 @@ def _duplicate(view: View) -> Iterator[Finding]:
             message=f"cannot tell {count} nodes named {name} apart",
             at=node.at if node else None,
             node=name,
+            hint=hint if takes else "",
         )
 
 

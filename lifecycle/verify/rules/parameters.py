@@ -10,7 +10,7 @@ from lifecycle.verify.observation import SERVES_NONE, ParameterReport, digest_of
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import Heals, Rule
 from lifecycle.verify.verdict import Finding
-from lifecycle.verify.view import View
+from lifecycle.verify.view import NodeFacts, View
 
 MISSING = Rule(
     id="param.missing",
@@ -58,32 +58,35 @@ _SHOWN_TEXT = 60
 
 def check(view: View) -> Iterator[Finding]:
     """Judge the parameters of every node that is there."""
-    for name, node in view.planned.items():
-        if view.is_absent(node):
-            continue
-        for file in node.unread_parameter_files:
-            yield _unread(node, file)
-        if not node.expected_parameters and not node.has_all_parameters:
-            continue
-        known = _known(view, name)
-        if not isinstance(known, str):
-            for expected in node.expected_parameters:
-                yield from _judge(node, expected, known.get(expected.name))
-            if node.has_all_parameters:
-                yield from _undeclared(node, known)
-        elif not node.expected_parameters and known == f"it {SERVES_NONE}":
-            continue  # it has none that anybody could know of, and none are declared
-        elif known or name in view.configurations or not view.ours(node):
-            # Of a node of ours without a report config.missing-report says it all.
-            yield _unknown(node, known or "they were not read")
+    yield from view.by_node.each(_judge_node)
 
 
-def _known(view: View, name: str) -> dict[str, ParameterReport] | str:
+def _judge_node(facts: NodeFacts) -> Iterator[Finding]:
+    node = facts.node
+    if facts.absent:
+        return
+    for file in node.unread_parameter_files:
+        yield _unread(node, file)
+    if not node.expected_parameters and not node.has_all_parameters:
+        return
+    known = _known(facts)
+    if not isinstance(known, str):
+        for expected in node.expected_parameters:
+            yield from _judge(node, expected, known.get(expected.name))
+        if node.has_all_parameters:
+            yield from _undeclared(node, known)
+    elif not node.expected_parameters and known == f"it {SERVES_NONE}":
+        return  # it has none that anybody could know of, and none are declared
+    elif known or facts.configuration is not None or not facts.frame.ours(node):
+        # Of a node of ours without a report config.missing-report says it all.
+        yield _unknown(node, known or "they were not read")
+
+
+def _known(facts: NodeFacts) -> dict[str, ParameterReport] | str:
     """Return a node's parameters by name; why not if they are not known, empty if not asked."""
-    report = view.configurations.get(name)
+    report, read = facts.configuration, facts.parameters
     if report is not None and report.parameters is not None:
         return {each.name: each for each in report.parameters}
-    read = view.parameters.get(name)
     if read is None:
         return ""
     if read.parameters is None:

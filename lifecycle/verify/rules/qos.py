@@ -20,7 +20,15 @@ from lifecycle.plan import PlannedEndpoint, PlannedNode
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import Rule
 from lifecycle.verify.verdict import Finding
-from lifecycle.verify.view import UNKNOWN_QOS, Actual, SeenEndpoint, View, actual_qos
+from lifecycle.verify.view import (
+    UNKNOWN_QOS,
+    Actual,
+    NodeFacts,
+    SeenEndpoint,
+    TopicFacts,
+    View,
+    actual_qos,
+)
 
 QOS_DIFFERS = Rule(
     id="graph.qos-differs",
@@ -54,14 +62,17 @@ _Unknown = list[tuple[Actual, list[tuple[str, str]]]]
 
 def check(view: View) -> Iterator[Finding]:
     """Judge the QoS of every declared endpoint as far as it is written, then of every pair."""
-    for name, node in view.planned.items():
-        unknown: _Unknown = []
-        for actual in view.actual_by_node[name]:
-            if actual.observed is not None or actual.report is not None:
-                yield from _against_declaration(actual, unknown)
-        if unknown:
-            yield _unverifiable(node, unknown)
-    yield from _pairs(view)
+    yield from view.by_node.each(_of_node)
+    yield from view.by_topic.each(_pairs)
+
+
+def _of_node(facts: NodeFacts) -> Iterator[Finding]:
+    unknown: _Unknown = []
+    for actual in facts.actual:
+        if actual.observed is not None or actual.report is not None:
+            yield from _against_declaration(actual, unknown)
+    if unknown:
+        yield _unverifiable(facts.node, unknown)
 
 
 def _against_declaration(actual: Actual, unknown: _Unknown) -> Iterator[Finding]:
@@ -164,34 +175,30 @@ def spell(profile: QosProfile, policy: str) -> str:
     return "infinite" if value in (None, 0, INFINITE_NS) else f"{value} ns"
 
 
-def _pairs(view: View) -> Iterator[Finding]:
+def _pairs(topic: TopicFacts) -> Iterator[Finding]:
     """Every publisher against every subscription of a topic, at least one of them ours."""
-    publishers: dict[str, list[SeenEndpoint]] = {}
-    subscriptions: dict[str, list[SeenEndpoint]] = {}
-    for seen in view.seen:
-        side = publishers if seen.kind is EndpointKind.PUBLISHER else subscriptions
-        side.setdefault(seen.name, []).append(seen)
-    done: set[tuple[str, str, str, str, str, str]] = set()
-    for topic in sorted(publishers.keys() & subscriptions.keys()):
-        for publisher in publishers[topic]:
-            for subscription in subscriptions[topic]:
-                if publisher.node not in view.planned and subscription.node not in view.planned:
-                    continue
-                if publisher.type != subscription.type:
-                    continue
-                offered, requested = publisher.qos or UNKNOWN_QOS, subscription.qos or UNKNOWN_QOS
-                for each in incompatibilities(offered, requested):
-                    key = (
-                        topic,
-                        publisher.node,
-                        subscription.node,
-                        each.policy,
-                        each.offered,
-                        each.requested,
-                    )
-                    if key not in done:
-                        done.add(key)
-                        yield _incompatible(publisher, subscription, each)
+    planned = topic.frame.planned
+    publishers = [each for each in topic.ends if each.kind is EndpointKind.PUBLISHER]
+    subscriptions = [each for each in topic.ends if each.kind is not EndpointKind.PUBLISHER]
+    done: set[tuple[str, str, str, str, str]] = set()
+    for publisher in publishers:
+        for subscription in subscriptions:
+            if publisher.node not in planned and subscription.node not in planned:
+                continue
+            if publisher.type != subscription.type:
+                continue
+            offered, requested = publisher.qos or UNKNOWN_QOS, subscription.qos or UNKNOWN_QOS
+            for each in incompatibilities(offered, requested):
+                key = (
+                    publisher.node,
+                    subscription.node,
+                    each.policy,
+                    each.offered,
+                    each.requested,
+                )
+                if key not in done:
+                    done.add(key)
+                    yield _incompatible(publisher, subscription, each)
 
 
 def _incompatible(

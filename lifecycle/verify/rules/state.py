@@ -6,11 +6,10 @@ from collections.abc import Iterator
 
 from lifecycle.manifest import TargetState
 from lifecycle.plan import PlannedNode
-from lifecycle.verify.observation import NodeConfiguration
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.verdict import Finding, Stage
-from lifecycle.verify.view import View
+from lifecycle.verify.view import NodeFacts, View
 
 WRONG_STATE = Rule(
     id="state.wrong-state",
@@ -32,7 +31,7 @@ STATE_UNVERIFIABLE = Rule(
 )
 ACTIVATED_AT_CLOSED_GATE = Rule(
     id="state.activated-at-closed-gate",
-    meaning="somebody else activated a managed node while the gate is closed",
+    meaning="another client activated a managed node while the gate is closed",
     outcomes=(Outcome.VIOLATED,),
     fix="find out who drives the node beside the supervisor, and let the gate activate it",
     about=About.PROGRESS,
@@ -53,21 +52,21 @@ def _wanted(stage: Stage, node: PlannedNode) -> str:
 
 def check(view: View) -> Iterator[Finding]:
     """Judge the state of every managed node that is there."""
-    for name, node in view.planned.items():
-        if node.managed and not view.is_absent(node):
-            yield from _judge(view, name, node)
+    yield from view.by_node.each(_judge)
 
 
-def _judge(view: View, name: str, node: PlannedNode) -> Iterator[Finding]:
-    wanted = _wanted(view.stage, node)
+def _judge(facts: NodeFacts) -> Iterator[Finding]:
+    frame, node, name = facts.frame, facts.node, facts.name
+    if not node.managed or facts.absent:
+        return
+    wanted = _wanted(frame.stage, node)
     allowed = {wanted}
-    ahead = view.stage is Stage.CONNECTED and name in view.ahead
-    if ahead or (view.stage is Stage.CONNECTED and not view.brings_up(node)):
+    ahead = frame.stage is Stage.CONNECTED and name in frame.ahead
+    if ahead or (frame.stage is Stage.CONNECTED and not frame.brings_up(node)):
         # Another supervisor brings it up, and its gate opens on the same proof, maybe before ours;
         # or an earlier gate let it through, and only others have to pass again.
         allowed.add(node.state.value)
-    observed = view.observed.get(name)
-    report = view.configurations.get(name)
+    observed, report = facts.observed, facts.configuration
     # Both sources count: if they disagree one of them is late, and nothing is proven yet.
     states = dict.fromkeys(
         state
@@ -78,7 +77,7 @@ def _judge(view: View, name: str, node: PlannedNode) -> Iterator[Finding]:
     passing = {"activating"} if ahead else set()
     wrong = [state for state in states if state not in allowed | passing]
     expected = wanted
-    if view.stage is Stage.CONNECTED and view.ours(node) and wanted == _INACTIVE:
+    if frame.stage is Stage.CONNECTED and frame.ours(node) and wanted == _INACTIVE:
         expected = "inactive, connected"
         if not wrong and report is not None and not report.connected:
             wrong = ["inactive, disconnected"]
@@ -91,11 +90,7 @@ def _judge(view: View, name: str, node: PlannedNode) -> Iterator[Finding]:
             observed=wrong[0],
             message=f"cannot accept node {name}: it is {wrong[0]} and must be {expected}",
         )
-    elif (
-        observed is not None
-        and observed.managed is False
-        and not _reports_state(view, node, report)
-    ):
+    elif observed is not None and observed.managed is False and not _reports_state(facts):
         yield WRONG_STATE.on_node(
             Outcome.VIOLATED,
             node,
@@ -114,13 +109,14 @@ def _judge(view: View, name: str, node: PlannedNode) -> Iterator[Finding]:
         )
 
 
-def _reports_state(view: View, node: PlannedNode, report: NodeConfiguration | None) -> bool:
+def _reports_state(facts: NodeFacts) -> bool:
     """Return whether one of our nodes itself reports that it is managed, by its state.
 
     It is driven by its host and not by the services, which discovery may show late: the graph
     shows a node before all of its endpoints.
     """
-    return view.ours(node) and report is not None and bool(report.state)
+    report = facts.configuration
+    return facts.frame.ours(facts.node) and report is not None and bool(report.state)
 
 
 MISSING_REPORT = Rule(
@@ -148,27 +144,31 @@ REPORT_RULES = (MISSING_REPORT, INCOMPLETE_REPORT)
 
 def check_reports(view: View) -> Iterator[Finding]:
     """Judge that our own nodes report all that only they can report."""
-    for name, node in view.planned.items():
-        if not view.ours(node) or view.is_absent(node):
+    yield from view.by_node.each(_judge_report)
+
+
+def _judge_report(facts: NodeFacts) -> Iterator[Finding]:
+    name = facts.name
+    if not facts.frame.ours(facts.node) or facts.absent:
+        return
+    if facts.configuration is None:
+        yield MISSING_REPORT.on_node(
+            Outcome.VIOLATED,
+            facts.node,
+            expected="node configuration",
+            observed="no report",
+            message=f"cannot judge node {name}: it did not report its configuration",
+        )
+        return
+    for actual in facts.actual:
+        if actual.report is not None:
             continue
-        if name not in view.configurations:
-            yield MISSING_REPORT.on_node(
-                Outcome.VIOLATED,
-                node,
-                expected="node configuration",
-                observed="no report",
-                message=f"cannot judge node {name}: it did not report its configuration",
-            )
-            continue
-        for actual in view.actual_by_node[name]:
-            if actual.report is not None:
-                continue
-            planned = actual.planned
-            word = planned.kind.noun
-            yield INCOMPLETE_REPORT.on_endpoint(
-                Outcome.VIOLATED,
-                actual,
-                expected=f"{word} in the report of {name}",
-                observed="not mentioned",
-                message=f"cannot judge the {word} of {planned.resolved}: {name} does not report it",
-            )
+        planned = actual.planned
+        word = planned.kind.noun
+        yield INCOMPLETE_REPORT.on_endpoint(
+            Outcome.VIOLATED,
+            actual,
+            expected=f"{word} in the report of {name}",
+            observed="not mentioned",
+            message=f"cannot judge the {word} of {planned.resolved}: {name} does not report it",
+        )

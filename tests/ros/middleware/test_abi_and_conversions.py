@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 
 import pytest
@@ -25,11 +25,11 @@ from lifecycle.middleware import (
     to_rclpy,
 )
 from lifecycle.middleware.fastdds.nfe import NetworkFlowEndpointsUnsupported
-from lifecycle.middleware.rcl import abi
+from lifecycle.middleware.rcl import abi, graph_queries
 from lifecycle.network.nfe import UniqueRequirement
 
 MakeNode = Callable[..., Node]
-INSTALL = "install ros-jazzy-rclpy[fastrtps]"
+INSTALL = abi.INSTALL
 
 
 def ignore(_: String) -> None:
@@ -71,6 +71,58 @@ def test_a_missing_symbol_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     assert str(refused.value) == (
         "cannot find 'rcl_of_the_future' in the installed ROS libraries (rcl ?); " + INSTALL
     )
+
+
+@pytest.fixture
+def unknown(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """An rcl whose layouts nobody wrote down."""
+    monkeypatch.setattr(abi, "rcl_version", lambda: "10.1.0")
+    abi._loaded.cache_clear()
+    yield
+    abi._loaded.cache_clear()
+
+
+@pytest.mark.usefixtures("unknown")
+def test_with_an_unknown_rcl_only_what_strictly_requires_a_unique_flow_is_refused(
+    make_node: MakeNode,
+) -> None:
+    node = make_node("node")
+    optionally = UniqueRequirement.OPTIONALLY_REQUIRED
+    create_subscription(node, String, "/a", ignore, QosProfile(), unique=optionally)
+    assert node.count_subscribers("/a") == 1
+    strictly = UniqueRequirement.STRICTLY_REQUIRED
+    with pytest.raises(UniqueFlowNotFeasible) as refused:
+        create_subscription(node, String, "/b", ignore, QosProfile(), unique=strictly)
+    assert str(refused.value) == (
+        "cannot create subscription '/b' with network flow endpoints strictly_required: rcl 10.1.0 "
+        "is not known; known: rcl 9 (ROS 2 Jazzy); ask for optionally_required, or " + INSTALL
+    )
+    assert node.count_subscribers("/b") == 0
+
+
+def test_an_unknown_rcl_shows_the_same_graph(
+    make_node: MakeNode, request: pytest.FixtureRequest
+) -> None:
+    node = make_node("node")
+    node.create_publisher(String, "/a", 10)
+    node.create_service(Trigger, "/reset", lambda _, response: response)
+
+    def seen() -> tuple[object, ...]:
+        return (
+            graph_queries.node_names(node),
+            sorted(map(repr, graph_queries.topic_endpoints(node))),
+            graph_queries.service_names(node),
+            [
+                sorted(graph_queries.endpoints_of_node(node, kind, "/node") or ())
+                for kind in graph_queries.EndpointKind
+                if "action" not in kind.value
+            ],
+            graph_queries.endpoints_of_node(node, graph_queries.EndpointKind.PUBLISHER, "/gone"),
+        )
+
+    known = seen()
+    request.getfixturevalue("unknown")
+    assert seen() == known
 
 
 @pytest.mark.parametrize("kind", ["publisher", "subscription"])

@@ -103,6 +103,40 @@ def test_endpoints_show_with_node_type_and_qos_and_without_the_noise(
     assert len(bytes.fromhex(publisher.gid)) == 16
 
 
+def test_what_has_not_changed_is_the_same_object_and_what_has_is_shown(
+    observer: GraphObserver, make_node: MakeNode, wait_until: WaitUntil
+) -> None:
+    camera, viewer = make_node("camera"), make_node("viewer")
+    camera.create_publisher(String, "/still", 10)
+    camera.create_service(Trigger, "~/reset", lambda _, response: response)
+    first = viewer.create_publisher(String, "/video", 10)
+
+    def shown(node: str) -> dict[tuple[EndpointKind, str], object]:
+        found = observer.snapshot()[1]
+        return {(each.kind, each.name): each for each in found if each.node == node}
+
+    wait_until(lambda: (len(shown("/camera")), len(shown("/viewer"))) == (2, 1))
+    wait_until(lambda: all(each.managed is False for each in nodes(observer).values()))
+    before, of_camera, of_viewer = nodes(observer), shown("/camera"), shown("/viewer")
+    # Made anew at once, with the name and type it had: no count differs, but its QoS does.
+    viewer.destroy_publisher(first)
+    viewer.create_publisher(String, "/video", to_rclpy(QosProfile(depth=1)))
+    viewer.create_publisher(
+        String, "/video", to_rclpy(QosProfile(depth=1, reliability=Reliability.BEST_EFFORT))
+    )
+    reliabilities = {Reliability.RELIABLE, Reliability.BEST_EFFORT}
+    wait_until(
+        lambda: (
+            {each.qos.reliability for each in observer.snapshot()[1] if each.name == "/video"}
+            == reliabilities
+        )
+    )
+    assert of_viewer[EndpointKind.PUBLISHER, "/video"] not in observer.snapshot()[1]
+    after = shown("/camera")
+    assert all(after[place] is each for place, each in of_camera.items())
+    assert all(nodes(observer)[name] is each for name, each in before.items())
+
+
 def test_two_nodes_of_one_name_count_twice(
     observer: GraphObserver, make_node: MakeNode, wait_until: WaitUntil
 ) -> None:

@@ -380,7 +380,10 @@ def test_a_node_of_somebody_else_is_not_restarted(
         run.until("system", reached="active")
         refused = verb("restart", "pair", "intruder", runtime=tmp_path)
         assert refused.returncode == ExitCode.USAGE
-        assert refused.stderr == "cannot restart '/intruder': somebody else runs it\n"
+        assert (
+            refused.stderr
+            == "cannot restart '/intruder': it is attached, no process of this supervisor\n"
+        )
 
 
 @pytest.mark.thorough

@@ -158,22 +158,27 @@ def test_followers_that_stop_reading_do_not_keep_a_run_from_ending(
                 with short_path(path) as name:
                     client.connect(name)
                 client.sendall(question)
-            watch = followers.enter_context(
-                subprocess.Popen(
-                    [*command("graph"), "pair", "--watch"],
-                    cwd=ROOT,
-                    env=environment(tmp_path, run.mark),
-                    stdout=subprocess.PIPE,
+            watches = [
+                followers.enter_context(
+                    subprocess.Popen(
+                        [*command(each), "pair", "--watch"],
+                        cwd=ROOT,
+                        env=environment(tmp_path, run.mark),
+                        stdout=subprocess.PIPE,
+                    )
                 )
-            )
-            assert watch.stdout is not None
-            assert watch.stdout.readline()
-            watch.send_signal(signal.SIGSTOP)
+                for each in ("graph", "status")
+            ]
+            for watch in watches:
+                assert watch.stdout is not None
+                assert watch.stdout.readline().startswith(b"pair")
+                watch.send_signal(signal.SIGSTOP)
             began = time.monotonic()
             run.signal(signal.SIGTERM)
             assert run.finish() == ExitCode.OK
             assert time.monotonic() - began < _ENDS_S
-            watch.kill()
+            for watch in watches:
+                watch.kill()
         run.assert_nothing_left()
 
 

@@ -5,9 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import pytest
+import rclpy_nodes
 import running
 import yaml
 from running import Up, verb
+
+from lifecycle.errors import UsageError
 
 _NODES = "tests.ros.supervisor.rclpy_nodes"
 _STRING = "std_msgs/msg/String"
@@ -213,6 +217,7 @@ def test_callbacks_run_in_several_threads_where_the_executor_has_them(
 _SERVICES = ("inner", "outer")
 
 
+@pytest.mark.thorough
 def test_a_hung_callback_is_noticed_whatever_the_executor_unless_others_go_on_beside_it(
     fresh_domain: int, tmp_path: Path, wait_until: Any
 ) -> None:
@@ -292,3 +297,45 @@ def test_flows_of_plain_nodes_are_unique_and_marked_as_the_manifest_asks(
         assert verb("down", str(manifest), runtime=tmp_path).returncode == 0
         assert up.finish() == 0
         up.assert_nothing_left()
+
+
+def test_nodes_of_rclpy_run_in_a_test_as_ours_do(lifecycle_node: Any, tmp_path: Path) -> None:
+    says = [{"name": "words", "type": _STRING, "qos": {"depth": 7}}]
+    shared = {"managed": False, "process": "both", "arguments": {"word": "pair"}}
+    manifest = write(
+        tmp_path,
+        0,
+        {
+            "managed": node(
+                "Managed",
+                name="other",
+                remap={"words": "other_words"},
+                interface={"publishers": says},
+            ),
+            "talker": node("pair", interface=TALKS, **shared),
+            "ears": node("pair", interface=HEARS, **shared),
+            "loud": node(
+                "Talker",
+                managed=False,
+                parameters={"loud": True},
+                remap={"words": "loud_words", "name": "loud_name", "reset": "loud_reset"},
+                interface=TALKS,
+            ),
+        },
+    )
+    ears = lifecycle_node(manifest, "ears")
+    ears.publish("words", rclpy_nodes.String(data="from the test"))
+    assert ears.wait_for_log("heard from the test")
+    ears.wait_for_log("heard pair")  # by the talker, which the same function makes
+
+    managed = lifecycle_node(manifest, "managed", to="inactive")
+    assert (managed.state, managed.node.get_name()) == ("inactive", "other")
+    managed.change("activate")
+    assert managed.received("words").data == "managed"
+
+    loud = lifecycle_node(manifest, "loud")
+    assert "HELLO" in {loud.received("words").data for _ in range(2)}
+    assert loud.call("reset", rclpy_nodes.Trigger.Request()) is not None
+    assert loud.state == ""
+    with pytest.raises(UsageError, match="a plain node has no states"):
+        loud.change("activate")

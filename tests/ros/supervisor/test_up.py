@@ -65,6 +65,47 @@ def test_a_healthy_system_is_connected_verified_activated_held_and_taken_down(
         assert (logs / "listener.log").read_text() == "heard hello\n"
 
 
+OTHER_VERSIONS = """
+import ctypes, importlib.metadata
+
+version, library = importlib.metadata.version, ctypes.CDLL
+
+
+class Library(library):
+    def __init__(self, name, *arguments, **options):
+        if name and "libfastrtps.so" in name:
+            raise OSError(f"{name}: cannot open shared object file: No such file or directory")
+        super().__init__(name, *arguments, **options)
+
+
+importlib.metadata.version = lambda name: "10.1.0" if name == "ros-rcl" else version(name)
+ctypes.CDLL = Library
+"""
+
+
+def test_with_libraries_that_are_not_known_all_but_unique_flows_is_verified(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    (tmp_path / "sitecustomize.py").write_text(OTHER_VERSIONS)
+    other = ("env", f"PYTHONPATH={tmp_path}")
+    optionally = {"chatter": {"unique": "optionally_required"}}
+    edit = {
+        "nodes/talker/flows": {"publishers": optionally},
+        "nodes/listener/flows": {"subscriptions": optionally},
+    }
+    manifest = pair(tmp_path, fresh_domain, edit=edit)
+    with up(manifest, "--stop-after", "0.5", runtime=tmp_path, through=other) as run:
+        notice = run.met("notice")["message"]
+        assert "rcl 10.1.0 is not known (known: rcl 9 (ROS 2 Jazzy))" in notice
+        assert "Fast DDS is not known (known: Fast DDS 2.14 (ROS 2 Jazzy))" in notice
+        run.until("system", reached="active")
+        assert run.finish() == ExitCode.OK
+        assert run.verdict["verdict"] == "ok"
+        assert run.verdict["flows"][0]["unique"] is None
+        run.assert_gate_held()
+        run.assert_nothing_left()
+
+
 def test_nodes_that_keep_each_other_from_the_processor_are_not_too_late(
     tmp_path: Path, fresh_domain: int
 ) -> None:

@@ -13,7 +13,7 @@ import yaml
 
 from lifecycle.cli import main
 from lifecycle.cli.report import annotation
-from lifecycle.cli.verbs.init import package_files
+from lifecycle.cli.verbs.init import package_files, schema_reference
 
 
 def test_a_new_package_has_what_pip_pytest_colcon_and_ci_read(
@@ -116,3 +116,15 @@ def test_an_annotation_is_one_line_whatever_is_in_it() -> None:
     text = annotation("error", "a:b", "100% wrong\nfix it", at="dir,x/a.yaml:3:7")
     assert text == "::error file=dir%2Cx/a.yaml,line=3,col=7,title=a%3Ab::100%25 wrong%0Afix it"
     assert annotation("warning", "r", "m", at="") == "::warning title=r::m"
+
+
+def test_a_captured_manifest_names_the_schema_that_is_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    (tmp_path / "alone").mkdir()
+    assert main(["schema", "--install"]) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert said[1] == f"# yaml-language-server: $schema={schema_reference(tmp_path / 'alone')}"
+    assert main(["init", "arm", "--directory", str(tmp_path / "arm")]) == 0
+    assert schema_reference(tmp_path / "arm/manifests") == "../schemas/manifest.v1.schema.json"

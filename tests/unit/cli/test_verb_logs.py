@@ -12,6 +12,7 @@ import pytest
 from click.testing import CliRunner
 
 from lifecycle.cli.verbs.logs import command
+from lifecycle.errors import UsageError
 from lifecycle.supervisor.processes.logs import begin_logs, runs_of
 
 GONE = 2**22 + 1
@@ -88,6 +89,28 @@ def test_what_is_written_is_followed(root: Path) -> None:
         assert following.stdout.readline() == "two\n"
         following.send_signal(signal.SIGINT)
         assert following.wait(30) == 130
+
+
+def test_a_log_that_does_not_exist_yet_is_waited_for_while_its_run_lasts(root: Path) -> None:
+    folder = run(root, 1, pid=os.getpid())
+    for words, line in ((["talker"], "one\n"), ([], "talker | one\n")):
+        with subprocess.Popen(
+            [sys.executable, "-m", "lifecycle", "logs", *words, "-f"],
+            stdout=subprocess.PIPE,
+            text=True,
+        ) as following:
+            assert following.stdout is not None
+            with pytest.raises(subprocess.TimeoutExpired):
+                following.wait(1.5 if words else 0.1)
+            (folder / "talker.log").write_text("one\n")
+            assert following.stdout.readline() == line
+            following.send_signal(signal.SIGINT)
+            assert following.wait(30) == 130
+    over = run(root, 2)
+    assert shown("-f") == []
+    with pytest.raises(UsageError, match="cannot find the log of 'talker'"):
+        shown("talker", "-f")
+    assert over.is_dir()
 
 
 def test_the_latest_run_is_linked_and_old_ones_of_its_system_go(root: Path) -> None:

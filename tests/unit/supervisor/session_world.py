@@ -31,6 +31,7 @@ from lifecycle.supervisor.control.ros_interface import Entry
 from lifecycle.supervisor.health.peer_supervisors import Listener
 from lifecycle.supervisor.nodes.driver import NodeDriver, NodeInterfaceClient, ServiceDriver
 from lifecycle.supervisor.nodes.system import System
+from lifecycle.supervisor.processes.adopted_process import RunningNode
 from lifecycle.supervisor.processes.orphans import end_strays
 from lifecycle.supervisor.processes.process import ProcessExit
 from lifecycle.supervisor.run.events import (
@@ -166,6 +167,8 @@ class FakeParticipant:
         others: nodes that no host of ours runs, and their states, "" for a plain one.
         unseen: nodes that discovery does not show.
         mute: nodes whose state cannot be learnt from the graph.
+        pids: of the processes that `others` run in, where they are known.
+        twice: names that several nodes carry.
         services: of the nodes in `others`.
         changes: so far.
         dropped: nodes whose reports were forgotten.
@@ -176,6 +179,8 @@ class FakeParticipant:
 
     def __init__(self, hosts: FakeForkServer) -> None:
         self.others: dict[str, str] = {}
+        self.pids: dict[str, int] = {}
+        self.twice: set[str] = set()
         self.unseen: set[str] = set()
         self.mute: set[str] = set()
         self.services = FakeServices(self, hosts.log)
@@ -213,6 +218,21 @@ class FakeParticipant:
             self.while_looking = None
             happens()
         return seen
+
+    async def running(self, wait_s: float) -> tuple[tuple[RunningNode, ...], str]:
+        del wait_s
+        found = tuple(
+            RunningNode(
+                name=name,
+                count=2 if name in self.twice else 1,
+                processes=self.processes().get(name, {}),
+            )
+            for name in self.others
+        )
+        return found, ""
+
+    def processes(self) -> dict[str, dict[int, str]]:
+        return {name: {pid: "by hand"} for name, pid in self.pids.items()}
 
     def put_configuration(self, configuration: NodeConfiguration) -> None:
         self._reports[configuration.name] = configuration

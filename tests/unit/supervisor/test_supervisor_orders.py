@@ -70,7 +70,7 @@ def test_an_order_fits_some_phases_and_no_others(
             "camrea",
             "cannot restart 'camrea': this supervisor runs no such node; it runs: /camera, /viewer",
         ),
-        ("/base", "cannot restart '/base': somebody else runs it"),
+        ("/base", "cannot restart '/base': it is attached, no process of this supervisor"),
     ],
 )
 def test_a_node_that_is_not_ours_is_not_restarted(tmp_path: Path, node: str, message: str) -> None:

@@ -6,6 +6,7 @@ import csv
 import dataclasses
 import io
 import json
+import re
 
 import msgspec
 import pytest
@@ -349,6 +350,25 @@ def test_the_live_table_shows_each_node_and_scrolls_what_it_prints() -> None:
     row = next(line for line in shown.splitlines() if line.strip().startswith("/camera "))
     assert row.split() == ["/camera", "running", "7", "active", "1/2", "1/3"]
     assert "verdict: ok" in shown
+
+
+@pytest.mark.parametrize("count", [3, 60])
+def test_the_live_table_fits_the_terminal(count: int) -> None:
+    (node,) = STATUS.nodes
+    nodes = [msgspec.structs.replace(node, node=f"/{'n' * 90}_{number}") for number in range(count)]
+    nodes[-1] = msgspec.structs.replace(node, node="/late", state="inactive")
+    status = msgspec.structs.replace(STATUS, nodes=tuple(nodes))
+    stream = io.StringIO()
+    console = Console(file=stream, force_terminal=True, width=80, height=24, color_system=None)
+    with Live(console) as live:
+        live.watch(lambda: status)
+    rows = [re.sub(r"\x1b\[[?\d]*[a-zA-Z]", "", row) for row in stream.getvalue().split("\n")]
+    assert len(rows) <= 24 * 2  # drawn twice: at the start and in the end
+    assert max(map(len, rows)) <= 81
+    late = next(row for row in rows if row.strip().startswith("/late "))
+    assert late.split()[1:] == ["running", "7", "inactive", "·", "connected", "1/2", "1/3"]
+    more = [row for row in rows if "more nodes: lifecycle status robot --watch" in row]
+    assert bool(more) == (count > 24)
 
 
 def test_a_status_is_a_head_and_a_line_for_each_node() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
+import pwd
 import signal
 import subprocess
 import sys
@@ -17,7 +18,7 @@ from typing import Any
 import psutil
 import pytest
 
-from lifecycle.errors import BringUpError
+from lifecycle.errors import BringUpError, UsageError
 from lifecycle.manifest.model import Run, RunKind
 from lifecycle.node.host.control import HostSpec
 from lifecycle.plan import build_plan
@@ -32,6 +33,7 @@ from lifecycle.supervisor.processes.logs import (
     LineReader,
     LogDirectory,
     ProcessLog,
+    check_log_root,
     ros_log_root,
 )
 from lifecycle.supervisor.processes.orphans import Lineage, descendants, end_run
@@ -414,11 +416,44 @@ def test_every_state_change_is_legal_or_refused_with_the_legal_ones() -> None:
     [
         ({"ROS_LOG_DIR": "/logs", "ROS_HOME": "/home"}, Path("/logs")),
         ({"ROS_HOME": "/home"}, Path("/home/log")),
-        ({}, Path("~/.ros/log").expanduser()),
+        ({"HOME": "/home/robot"}, Path("/home/robot/.ros/log")),
+        ({}, Path(pwd.getpwuid(os.getuid()).pw_dir) / ".ros/log"),
     ],
 )
 def test_logs_go_where_ros_puts_them(environment: dict[str, str], expected: Path) -> None:
     assert ros_log_root(environment) == expected
+
+
+def test_a_user_without_a_home_is_asked_for_a_log_directory(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(pwd, "getpwuid", lambda _: {}["robot"])
+    with pytest.raises(UsageError) as refused:
+        check_log_root({})
+    assert str(refused.value) == (
+        "cannot find a home directory for ROS's logs: HOME is not set, and this user has none; set "
+        "ROS_LOG_DIR to a directory"
+    )
+
+
+@pytest.mark.parametrize(
+    ("access", "home", "why"),
+    [
+        (True, "/proc/nowhere", "No such file or directory"),
+        (False, "/tmp", "it cannot be written"),
+    ],
+)
+def test_a_log_directory_that_cannot_be_used_is_said(
+    access: bool, home: str, why: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    home = str(tmp_path) if home == "/tmp" else home
+    monkeypatch.setattr(os, "access", lambda *_: access)
+    with pytest.raises(UsageError) as refused:
+        check_log_root({"HOME": home})
+    assert str(refused.value) == (
+        f"cannot use '{home}/.ros/log' as ROS log directory: {why}; set ROS_LOG_DIR to a directory "
+        "that can be made and written"
+    )
 
 
 @pytest.fixture

@@ -225,7 +225,8 @@ cannot tell 3 nodes named /robot/camera apart
 expected: 1 node of this name
 observed: 3 nodes
 at: robot.lifecycle.yaml:3:3, on /robot/camera
-to do: stop the other one, or give each its own name or namespace
+to do: stop the other one, or give each its own name or namespace; have one that ran before
+  adopted: lifecycle up --adopt
 """,
     ),
     "one name is that of two nodes that nobody declared": (
@@ -305,8 +306,8 @@ cannot find the service server of /robot/camera/calibrate that /robot/camera dec
 expected: service server of /robot/camera
 observed: no such service server
 at: robot.lifecycle.yaml:14:9, on /robot/camera (service server)
-to do: service_servers/~/calibrate is /other now: is a remap wrong, or did somebody call
-  /robot/camera/remap? the name '' gives back the declared one
+to do: service_servers/~/calibrate is /other now: is a remap wrong, or was /robot/camera/remap
+  called? the name '' gives back the declared one
 """,
     ),
     "an endpoint has another type": (
@@ -532,8 +533,8 @@ cannot allow the publisher of /else in /robot/camera: the manifest does not decl
 expected: no such publisher of /robot/camera
 observed: publisher of type std_msgs/msg/String
 at: robot.lifecycle.yaml:3:3, on /robot/camera (publisher)
-to do: it is publishers/status under another name: is a remap wrong, or did somebody call
-  /robot/camera/remap?
+to do: it is publishers/status under another name: is a remap wrong, or was /robot/camera/remap
+  called?
 """,
     ),
     "a tool publishes on a declared topic": (

@@ -582,12 +582,12 @@ def test_what_was_remapped_is_told_apart_from_what_was_never_made():
     )
     assert [each.hint for each in verdict.findings] == [
         (
-            "publishers/video is /stage/video now: is a remap wrong, or did somebody call "
-            "/camera/remap? the name '' gives back the declared one"
+            "publishers/video is /stage/video now: is a remap wrong, or was "
+            "/camera/remap called? the name '' gives back the declared one"
         ),
         (
-            "it is publishers/video under another name: is a remap wrong, or did somebody call "
-            "/camera/remap?"
+            "it is publishers/video under another name: is a remap wrong, or was "
+            "/camera/remap called?"
         ),
     ]
 

@@ -1142,8 +1142,8 @@ def test_a_wrong_remap_shows_as_one_missing_and_one_undeclared_endpoint_that_hin
         ("graph.undeclared-publisher", "/robot/stauts"),
     ]
     assert verdict.findings[1].hint == (
-        "it is publishers/status under another name: is a remap wrong, or did somebody call "
-        "/robot/camera/remap?"
+        "it is publishers/status under another name: is a remap wrong, or was "
+        "/robot/camera/remap called?"
     )
 
 

@@ -16,7 +16,7 @@ from lifecycle.plan.model import (
     StaticParticipant,
 )
 from lifecycle.verify import Observation, ObservedEndpoint, Stage
-from lifecycle.verify.matcher import declared_addresses, lay_out
+from lifecycle.verify.matcher import lay_out
 from lifecycle.verify.view import (
     UNKNOWN_QOS,
     SeenEndpoint,
@@ -99,7 +99,7 @@ def test_a_node_that_has_only_memory_of_another_host_is_beyond_reach(
 
 def test_nodes_have_the_declared_addresses_of_their_machines_and_the_reported_identities() -> None:
     view = view_of()
-    assert declared_addresses(view.plan) == {"/one": "10.0.0.1"}
+    assert view.frame.addresses == {"/one": "10.0.0.1"}
     assert view.identity("/one") == view.configurations["/one"].identity
     assert view.identity("/two") is None
 

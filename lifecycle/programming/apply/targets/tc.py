@@ -400,7 +400,7 @@ class TcTarget:
                 hint=f"if nothing uses it any more: tc qdisc del dev {device} root handle {handle}",
             )
         raise NotOursError(
-            f"cannot use {self.name}: it has a root qdisc of somebody else, {kind} {handle}",
+            f"cannot use {self.name}: it has a root qdisc of another owner, {kind} {handle}",
             hint=f"use another device, or remove it: tc qdisc del dev {device} root",
         )
 

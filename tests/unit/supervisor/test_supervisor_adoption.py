@@ -1,0 +1,329 @@
+"""`up --adopt`: what ran before is verified in place, activated or left active, and left running.
+
+Each test prepares a world in which others run nodes of the plan, and compares what became of them.
+What must hold in every run is checked by `SessionWorld.run` each time.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from lifecycle.errors import ExitCode
+from lifecycle.manifest.model import Condition, RunKind, TargetState
+from lifecycle.plan.model import Plan
+from lifecycle.supervisor.control.server import ControlRequest
+from lifecycle.supervisor.processes.adopted_process import RunningNode
+from lifecycle.supervisor.run.options import Until
+from tests.builders import plan_of, planned_node
+from tests.unit.supervisor.fakes import World, run
+from tests.unit.supervisor.session_world import CAMERA_DOWN, INTRUDED, SessionWorld, over
+
+ROBOT = plan_of(
+    planned_node("camera", after={"lidar": Condition.ACTIVE}),
+    planned_node("new"),
+    planned_node("arm"),
+    planned_node("lidar"),
+    planned_node("logger", managed=False),
+)
+"""Somebody runs all of it but the camera."""
+
+FOUND = {"/new": "unconfigured", "/arm": "inactive", "/lidar": "active", "/logger": ""}
+
+ADOPTED = [
+    "[notice] '/arm' is adopted, found inactive",
+    "[notice] '/lidar' is adopted, found active: pid {pid}, by hand",
+    "[notice] '/logger' is adopted, found running",
+    "[notice] '/new' is adopted, found unconfigured",
+]
+
+
+@pytest.fixture
+def somebodys() -> Iterator[subprocess.Popen[bytes]]:
+    """A process of somebody else."""
+    with subprocess.Popen(["sleep", "60"]) as process:
+        yield process
+        process.kill()
+
+
+def world_of(tmp_path: Path, plan: Plan = ROBOT, **options: object) -> SessionWorld:
+    world = SessionWorld(plan, tmp_path, adopt=True, **options)
+    names = {each.full_name for each in plan.nodes}
+    world.graph.others.update({name: state for name, state in FOUND.items() if name in names})
+    return world
+
+
+def requests(world: SessionWorld, node: str) -> list[str]:
+    """What was asked of a node."""
+    return [line.split()[1] for line in world.story if line.startswith(f"{node} ")]
+
+
+def notices(world: SessionWorld) -> list[str]:
+    return sorted(line for line in world.story if line.startswith("[notice]"))
+
+
+def test_what_runs_is_verified_in_place_and_in_the_end_as_it_was_found(
+    tmp_path: Path, somebodys: subprocess.Popen[bytes]
+) -> None:
+    async def main() -> None:
+        world = world_of(tmp_path, stop_after_s=3.0)
+        world.graph.pids["/lidar"] = somebodys.pid
+        await world.run()
+        assert world.result is not None
+        assert world.result.exit_code == ExitCode.OK
+        assert notices(world) == [each.format(pid=somebodys.pid) for each in ADOPTED]
+        assert [each for each in world.outline if each.endswith("start")] == ["camera start"]
+        assert "[gate] ok: /camera, /new, /arm" in world.outline
+        assert requests(world, "/lidar") == requests(world, "/logger") == []
+        assert requests(world, "/arm") == ["activate", "deactivate"]
+        assert requests(world, "/new") == ["configure", "activate", "deactivate", "cleanup"]
+        assert world.graph.others == FOUND
+        assert somebodys.poll() is None
+
+    run(main())
+
+
+def test_on_a_violated_verdict_nothing_is_activated_and_all_is_left_as_it_was_found(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        world = world_of(tmp_path)
+        world.intrude()
+        await world.run()
+        assert world.result is not None
+        assert world.result.exit_code == ExitCode.VIOLATED
+        assert f"[verdict] connected violated {INTRUDED}" in world.outline
+        assert not [each for each in world.outline if each.endswith(" activate")]
+        assert world.graph.others == {**FOUND, "/intruder": ""}
+
+    run(main())
+
+
+def test_a_node_that_runs_twice_is_violated_before_anything_is_started_or_asked(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        world = world_of(tmp_path)
+        world.graph.twice = {"/new"}
+        await world.run()
+        assert world.outline == [
+            "[verdict] connected violated graph.duplicate-node /new",
+            "[stopping] at 0.0 s: the verdict keeps the gate closed",
+            *over(4),
+        ]
+        assert world.messages == ["cannot adopt /new: 2 nodes are named so"]
+        assert world.report == (
+            "ended before it was connected, exit code 4: the verdict keeps the gate closed; "
+            "wrong: /new (graph.duplicate-node)"
+        )
+
+    run(main())
+
+
+def test_a_process_of_which_some_nodes_run_is_not_started_beside_them(tmp_path: Path) -> None:
+    async def main() -> None:
+        plan = plan_of(planned_node("lidar", process="both"), planned_node("new", process="both"))
+        world = world_of(tmp_path, plan)
+        del world.graph.others["/new"]
+        await world.run()
+        assert world.outline == [
+            "[failure] run.start-failed /new",
+            "[stopping] at 0.0 s: rolling back",
+            *over(6),
+        ]
+        assert world.messages == [
+            (
+                "cannot start '/new': the manifest has it in one process with '/lidar', which runs "
+                "already; end that one, and both are started, or start them together, and both are "
+                "adopted"
+            )
+        ]
+
+    run(main())
+
+
+def test_a_node_in_a_transition_is_adopted_as_what_it_becomes(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = world_of(tmp_path, plan_of(planned_node("lidar")), stop_after_s=0.0)
+        world.graph.others["/lidar"] = "activating"
+
+        async def arrive() -> None:
+            await asyncio.sleep(1.0)
+            world.graph.others["/lidar"] = "active"
+
+        await world.run(arrive())
+        assert notices(world) == ["[notice] '/lidar' is adopted, found active"]
+        assert world.outline[-1] == "[stopped] 0"
+
+    run(main())
+
+
+def test_what_is_found_active_and_must_not_be_is_violated_and_left_active(tmp_path: Path) -> None:
+    async def main() -> None:
+        lidar = dataclasses.replace(planned_node("lidar"), state=TargetState.INACTIVE)
+        world = world_of(tmp_path, plan_of(lidar))
+        await world.run()
+        assert "[verdict] connected violated state.wrong-state /lidar" in world.outline
+        assert world.outline[-1] == "[stopped] 4"
+        assert world.graph.others == {"/lidar": "active"}
+        assert requests(world, "/lidar") == []
+
+    run(main())
+
+
+def test_an_attached_node_that_is_active_is_refused_but_for_adopt(tmp_path: Path) -> None:
+    async def main(folder: Path, *, adopt: bool) -> None:
+        plan = plan_of(planned_node("lidar", kind=RunKind.ATTACH))
+        world = SessionWorld(plan, folder, adopt=adopt, stop_after_s=0.0)
+        world.graph.others["/lidar"] = "active"
+        await world.run()
+        assert world.graph.others == {"/lidar": "active"}
+        assert world.messages == (
+            []
+            if adopt
+            else [
+                (
+                    "cannot configure '/lidar': it is active already, and nobody verified it; "
+                    "have it adopted as it is with 'lifecycle up --adopt', or deactivate it first: "
+                    "ros2 lifecycle set /lidar deactivate"
+                )
+            ]
+        )
+
+    for adopt in (False, True):
+        folder = tmp_path / str(adopt)
+        folder.mkdir()
+        run(main(folder, adopt=adopt))
+
+
+@pytest.mark.parametrize("keep_going", [False, True])
+def test_the_end_of_an_adopted_process_is_noticed_like_that_of_one_of_ours(
+    tmp_path: Path, somebodys: subprocess.Popen[bytes], keep_going: bool
+) -> None:
+    async def main() -> None:
+        world = world_of(tmp_path, keep_going=keep_going, stop_after_s=60.0)
+        world.graph.pids = {"/arm": somebodys.pid, "/lidar": somebodys.pid}
+
+        async def end() -> None:
+            await world.story.until("[system] active")
+            somebodys.kill()
+            somebodys.wait()
+            for name in world.graph.pids:
+                world.graph.others.pop(name)
+            world.graph.note()
+
+        await world.run(end())
+        goes_on = ", and the run goes on" if keep_going else ""
+        assert f"[failure] run.process-died /arm{goes_on}" in world.outline
+        assert world.outline[-len(CAMERA_DOWN) - 2 :] == [*CAMERA_DOWN, *over(6)]
+        assert world.messages[0] == (
+            f"cannot keep '/arm' and '/lidar' running: pid {somebodys.pid}, which was adopted, has "
+            "ended; how it ended is known to who started it"
+        )
+        assert requests(world, "/arm") == ["activate"]
+
+    run(main())
+
+
+def test_an_adopted_node_that_may_end_may_end(
+    tmp_path: Path, somebodys: subprocess.Popen[bytes]
+) -> None:
+    async def main() -> None:
+        client = planned_node("logger", kind=RunKind.COMMAND, managed=False)
+        plan = plan_of(planned_node("camera"), dataclasses.replace(client, may_end=True))
+        world = world_of(tmp_path, plan, stop_after_s=60.0)
+        world.graph.pids["/logger"] = somebodys.pid
+
+        async def end() -> None:
+            await world.story.until("[system] active")
+            somebodys.kill()
+            somebodys.wait()
+            world.graph.others.clear()
+            world.graph.note()
+
+        await world.run(end())
+        assert "[verdict] active unverifiable graph.ended-node /logger" in world.outline
+        assert world.outline[-1] == "[stopped] 0"
+
+    run(main())
+
+
+def test_a_pause_deactivates_what_was_found_active_and_a_resume_leaves_it_so(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        world = world_of(tmp_path, plan_of(planned_node("lidar")))
+
+        async def orders() -> None:
+            await world.story.until("[system] active")
+            for ask in (ControlRequest.PAUSE, ControlRequest.RESUME, ControlRequest.RESTART):
+                assert await world.order(ask) == "0"
+            assert await world.order(ControlRequest.RESTART, "lidar") == (
+                "2 cannot restart '/lidar': somebody else runs it"
+            )
+            await world.order(ControlRequest.DOWN)
+
+        await world.run(orders())
+        assert requests(world, "/lidar") == ["deactivate", "activate"]
+        assert world.graph.others == {"/lidar": "active"}
+        assert world.outline[-1] == "[stopped] 0"
+
+    run(main())
+
+
+def test_what_is_adopted_is_judged_also_where_nothing_is_to_be_activated(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = world_of(tmp_path, until=Until.CONNECTED)
+        await world.run()
+        assert [each for each in world.outline if each.startswith("[verdict]")] == [
+            "[verdict] connected ok"
+        ]
+        assert world.graph.others == FOUND
+
+    run(main())
+
+
+def test_nothing_is_asked_of_a_node_that_ran_before_one_of_ours(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both have the services by which ours is driven."""
+    older = "lifecycle.supervisor.nodes.adoption.start_ticks"
+    monkeypatch.setattr(older, lambda pid: 1 if pid == 7 else 2)
+
+    async def main() -> None:
+        world = SessionWorld(plan_of(planned_node("new", kind=RunKind.COMMAND)), tmp_path)
+        world.graph.others["/new"] = "unconfigured"
+        world.graph.pids["/new"] = 7
+        await world.run()
+        assert world.outline == [
+            "[verdict] connected violated graph.duplicate-node /new",
+            "[stopping] at 0.0 s: the verdict keeps the gate closed",
+            "new SIGTERM",
+            *over(4),
+        ]
+        assert world.messages == [
+            (
+                "cannot drive /new: a node of this name ran before (pid 7, by hand), and would "
+                "obey, too"
+            )
+        ]
+
+    run(main())
+
+
+def test_another_manifest_starts_nothing_beside_what_is_adopted(tmp_path: Path) -> None:
+    async def main() -> None:
+        system = World(ROBOT, tmp_path).system
+        system.adopt({"lidar": RunningNode(name="/lidar")})
+        system.reload(ROBOT, ROBOT.processes, tuple(system.nodes.values()))
+        assert sorted(system.processes) == ["arm", "camera", "logger", "new"]
+        lidar = system.nodes["lidar"]
+        assert (lidar.process, lidar.planned.run.kind) == (None, RunKind.ATTACH)
+        assert system.first == ROBOT
+
+    run(main())
