@@ -39,6 +39,7 @@ from .model import FlowNeed as FlowNeed
 from .model import FlowTerms as FlowTerms
 from .model import FlowTransport as FlowTransport
 from .model import Interface as Interface
+from .model import Limits as Limits
 from .model import Link as Link
 from .model import Machine as Machine
 from .model import Manifest as Manifest

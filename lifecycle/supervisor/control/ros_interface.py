@@ -173,7 +173,10 @@ def _timeless(status: SystemStatus) -> SystemStatus:
     return replace(
         status,
         elapsed_s=0.0,
-        nodes=tuple(replace(each, uptime_s=None, next_try_s=None) for each in status.nodes),
+        nodes=tuple(
+            replace(each, uptime_s=None, next_try_s=None, cpu_s=None, rss_bytes=None, threads=None)
+            for each in status.nodes
+        ),
     )
 
 
@@ -242,6 +245,8 @@ def _of_node(node: NodeStatus, status: SystemStatus, outcome: Outcome) -> Entry:
     ]
     if node.uptime_s is not None:
         values.append(("uptime_s", f"{node.uptime_s:.1f}"))
+    if node.rss_bytes is not None:
+        values += [("cpu_s", f"{node.cpu_s:.2f}"), ("rss_bytes", str(node.rss_bytes))]
     if node.last_failure is not None:
         values.append(("last_failure", f"{node.last_failure.at}: {node.last_failure.message}"))
     return level, f"{status.system}: {node.node}", message, status.system, tuple(values)

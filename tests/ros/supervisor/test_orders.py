@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import json
+import re
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -151,7 +152,12 @@ def test_a_panel_on_the_network_sees_the_system_and_pauses_it_without_a_shell(
             until(answer.done)
             return answer.result().success, answer.result().message
 
-        manifest = pair(tmp_path, fresh_domain, edit={"policy/ros_interface": "full"})
+        edit = {
+            "policy/ros_interface": "full",
+            "nodes/talker/run/no_new_privileges": True,
+            "nodes/talker/run/limits": {"nofile": 200},
+        }
+        manifest = pair(tmp_path, fresh_domain, edit=edit)
         with up(manifest, runtime=tmp_path) as run:
             run.until("system", reached="active")
             assert call("pause") == (True, "paused")
@@ -168,6 +174,13 @@ def test_a_panel_on_the_network_sees_the_system_and_pauses_it_without_a_shell(
             assert call("resume") == (True, "active")
             success, status = call("get_status")
             assert (success, json.loads(status)["verdict"]) == (True, "ok")
+            assert all(each["rss_bytes"] > 2**20 for each in json.loads(status)["nodes"])
+            talker, listener = (
+                Path(f"/proc/{run.pid_of(each)}") for each in ("talker", "listener")
+            )
+            assert "NoNewPrivs:\t1" in (talker / "status").read_text()
+            assert "NoNewPrivs:\t0" in (listener / "status").read_text()
+            assert re.search(r"Max open files +200 +200 ", (talker / "limits").read_text())
             assert call("down")[0]
             assert run.finish() == ExitCode.OK
             run.assert_gate_held()
