@@ -129,7 +129,7 @@ def _drawing(format_: str, output: Path | None, screen: Screen) -> Callable[[Pic
     def draw(picture: Picture) -> None:
         text = render(picture, format_)
         if output is not None:
-            _replace(output, text)
+            write_picture(output, text)
         else:
             screen.show(text)
 
@@ -147,16 +147,22 @@ def render(picture: Picture, format_: str) -> str:
     return WRITERS[format_](picture)
 
 
-def _replace(path: Path, text: str) -> None:
-    """Write a file so that a reader sees the old one or the new one, whole."""
+def write_picture(path: Path, text: str) -> None:
+    """Write a file so that a reader sees the old one or the new one, whole.
+
+    What is no regular file, `/dev/null` or a pipe, is written to and stays what it is.
+    """
     part = None
     try:
+        if path.exists() and not path.is_file():
+            path.write_text(text.rstrip("\n") + "\n", encoding="utf-8")
+            return
         with tempfile.NamedTemporaryFile(
             "w", dir=path.parent, prefix=f".{path.name}.", encoding="utf-8", delete=False
         ) as part:
             part.write(text.rstrip("\n") + "\n")
         Path(part.name).chmod(0o644)
-        Path(part.name).replace(path)
+        Path(part.name).replace(path.resolve())
     except OSError as error:
         if part is not None:
             Path(part.name).unlink(missing_ok=True)

@@ -9,11 +9,10 @@ It dies with the gate: once anything goes wrong, nodes not yet activated stay in
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 from typing import Protocol
 
 from lifecycle.errors import BringUpError, ExitCode, LifecycleError
-from lifecycle.verify import Finding, Outcome, Verdict, rule
+from lifecycle.verify import Outcome, Verdict
 
 
 class VerificationError(LifecycleError):
@@ -57,40 +56,6 @@ def closes(verdict: Verdict, *, strict: bool) -> bool:
     if verdict.verdict is Outcome.VIOLATED or verdict.blocking:
         return True
     return strict and verdict.verdict is Outcome.UNVERIFIABLE
-
-
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Scope:
-    """Whose gate it is, where only some nodes come again and the rest stays active.
-
-    Attributes:
-        others: full names of all other nodes of the system: what concerns these alone keeps nobody
-            else at the gate. What cannot be attributed does, and so does what no manifest declares.
-        unverifiable_blocks: as in the manifest's policy.
-    """
-
-    others: frozenset[str]
-    unverifiable_blocks: bool
-
-    def of(self, verdict: Verdict) -> Verdict:
-        """Return the part of a verdict that this gate is judged by."""
-        findings = tuple(each for each in verdict.findings if not self._is_others(each))
-        if len(findings) == len(verdict.findings):
-            return verdict
-        return dataclasses.replace(
-            verdict,
-            verdict=Outcome.worst(each.outcome for each in findings),
-            blocking=any(
-                each.outcome is Outcome.VIOLATED
-                or (self.unverifiable_blocks and rule(each.rule).may_block)
-                for each in findings
-            ),
-            findings=findings,
-        )
-
-    def _is_others(self, finding: Finding) -> bool:
-        names = finding.nodes or (finding.subject,)
-        return all(name in self.others for name in names)
 
 
 class Judging(Protocol):
@@ -189,22 +154,16 @@ class Gate:
     Attributes:
         strict: refuse an unverifiable verdict even where the manifest's policy lets it pass.
         permit: the one that holds at this moment; None while the gate is closed.
-        scope: whose gate it is; None: of the whole system.
     """
 
     def __init__(self, *, strict: bool, judging: Judging | None = None) -> None:
         self.strict = strict
         self.permit: Permit | None = None
-        self.scope: Scope | None = None
         self._judging = judging
 
-    def concerning(self, verdict: Verdict) -> Verdict:
-        """Return the part of a verdict that this gate is judged by."""
-        return verdict if self.scope is None else self.scope.of(verdict)
-
     def closes(self, verdict: Verdict) -> bool:
-        """Whether what concerns this gate keeps it closed."""
-        return closes(self.concerning(verdict), strict=self.strict)
+        """Whether a verdict keeps this gate closed."""
+        return closes(verdict, strict=self.strict)
 
     def judge(self, verdict: Verdict) -> Permit:
         """Open on a verdict that allows it.
@@ -214,7 +173,7 @@ class Gate:
         """
         self.permit = None
         if self.closes(verdict):
-            raise VerificationError(self.concerning(verdict))
+            raise VerificationError(verdict)
         self.permit = Permit(self, verdict)
         return self.permit
 

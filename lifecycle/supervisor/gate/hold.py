@@ -290,7 +290,8 @@ class Holding:
                     return failure
                 if not self._keep_going:
                     raise failure
-                self._schedule.write_off(failure.process)
+                if failure.process:
+                    self._schedule.write_off(failure.process)
                 self._emit(failure.event(ends_run=False))
                 self._violated = self._violated or failure.reason
                 self._system.touched.set()

@@ -38,7 +38,6 @@ from lifecycle.supervisor.control.protocol import ProcessState, Reach
 from lifecycle.supervisor.gate.gate import (
     Gate,
     Permit,
-    Scope,
     VerificationError,
     behind_s,
     closes,
@@ -344,7 +343,7 @@ class GateSequence:
             self._schedule.returned(self._keys(self._schedule.returning))
 
     async def let_through(self) -> None:
-        """Judge what concerns the nodes that were started again by policy, and activate these.
+        """Judge the system, and activate the nodes that were started again by policy.
 
         Raises:
             OutrunError: something else is to be done before their gate opens.
@@ -353,11 +352,6 @@ class GateSequence:
         """
         names = self._schedule.returning
         deadline = asyncio.get_running_loop().time() + self._timeout_s
-        scope = Scope(
-            others=frozenset(each.full_name for each in self._system.plan.nodes) - names,
-            unverifiable_blocks=self._system.plan.policy.unverifiable_blocks,
-        )
-        self._gate.scope = self._judge.scope = scope
         try:
             permit = await self._unless_outrun(self.verify(self._timeout_s))
             waiting = tuple(each for each in self._inactive() if each.name in names)
@@ -369,7 +363,6 @@ class GateSequence:
                 await self._withdraw(permit)
             raise
         finally:
-            self._gate.scope = self._judge.scope = None
             if self.phase != ACTIVE:
                 self.phase = HELD
         self._schedule.returned(self._keys(names))
@@ -379,10 +372,7 @@ class GateSequence:
         names = self._schedule.returning
         if self.phase != HELD or not names or names & self._schedule.down:
             return False
-        others = frozenset(each.full_name for each in self._system.plan.nodes) - names
-        blocks = self._system.plan.policy.unverifiable_blocks
-        scope = Scope(others=others, unverifiable_blocks=blocks)
-        return not closes(scope.of(verdict), strict=self._gate.strict)
+        return not self._gate.closes(verdict)
 
     def _not_started(self, keys: Collection[str], why: str) -> StepFailedError:
         failures = [
@@ -630,7 +620,7 @@ class GateSequence:
         waiting = self._inactive() if nodes is None else nodes
         self._emit(
             GateOpened(
-                outcome=self._gate.concerning(permit.verdict).verdict.value,
+                outcome=permit.verdict.verdict.value,
                 nodes=tuple(each.name for each in waiting),
                 trusted=self.trusted,
             )

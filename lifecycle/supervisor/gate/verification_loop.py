@@ -19,7 +19,7 @@ from lifecycle.manifest import EndpointKind
 from lifecycle.plan import Plan
 from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.gate.activation_guard import ActivationGuard
-from lifecycle.supervisor.gate.gate import Scope, closes
+from lifecycle.supervisor.gate.gate import closes
 from lifecycle.supervisor.health.agreement import Agreement
 from lifecycle.supervisor.health.liveliness import NodeArrivals
 from lifecycle.supervisor.nodes.system import ObservedGraph, System
@@ -267,7 +267,6 @@ class VerificationLoop:
         latest: the verdict that holds; None before the first.
         seen: what was seen last.
         ahead: names of the nodes that an earlier gate let through, which are active before it.
-        scope: whose gate is waited for; None: that of the whole system.
     """
 
     def __init__(
@@ -302,7 +301,6 @@ class VerificationLoop:
         self._grace_period = GracePeriod()
         self._asked_of: tuple[Plan, frozenset[str], Plan] | None = None
         self.ahead: frozenset[str] = frozenset()
-        self.scope: Scope | None = None
 
     async def once(self, stage: Stage) -> Verdict:
         """Look and judge now."""
@@ -422,10 +420,9 @@ class VerificationLoop:
         again = ASK_AGAIN_S
         while True:
             count = self._changes.count
-            whole = await self.once(stage)
-            verdict = whole if self.scope is None else self.scope.of(whole)
+            verdict = await self.once(stage)
             if not closes(verdict, strict=self._strict):
-                return whole
+                return verdict
             now = loop.time()
             found = frozenset((each.rule, each.subject) for each in verdict.findings)
             if found != stable:
@@ -435,7 +432,7 @@ class VerificationLoop:
                 patience = unchanged_s if patience is None else min(patience, unchanged_s)
             until = deadline if patience is None else min(deadline, since + patience)
             if now >= until:
-                return whole
+                return verdict
             wait_s = until - now
             if self._waits_for_match(verdict) or self._waits_for_others(verdict):
                 wait_s, again = min(wait_s, again), min(again * 2, ASK_AGAIN_AT_MOST_S)

@@ -356,7 +356,8 @@ class BringUp:
         """Wait, bounded, for a node that its services are asked of: nobody else may get that."""
         limit_s = node.planned.timeouts.start_s
         await self._step(node, self._appears(node.name), limit_s, rule=START_FAILED)
-        if self._alone is not None and node.process is not None:
+        process = node.process
+        if self._alone is not None and process is not None and not process.is_restarted:
             self._alone(node)
 
     async def _appear(self, node: NodeRun) -> None:
@@ -439,7 +440,7 @@ class BringUp:
             standing = await self._step(node, node.driver.start(), limit_s, rule=START_FAILED)
             self._started(node, standing)
             if node.found and standing.state == ACTIVE:
-                # It is verified as it is: nothing is asked of it, and the gate lets nothing in.
+                # It is verified as it is: nothing is asked of it, and no gate has to let it in.
                 node.advance(Reach.ACTIVE, standing)
                 return
             await self._give(node)

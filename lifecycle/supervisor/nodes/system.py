@@ -319,7 +319,7 @@ class NodeRun:
     def is_gone(self) -> bool:
         """Whether its process has ended, as far as that is noticed."""
         if self.process is not None:
-            return self.process.state is ProcessState.EXITED
+            return self.process.is_gone
         return self.adopted is not None and self.adopted.ended.done()
 
     def run_delay_s(self) -> float:

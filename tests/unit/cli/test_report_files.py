@@ -16,6 +16,7 @@ import pytest
 
 from lifecycle.cli.report import ReportFile, open_report
 from lifecycle.cli.up_output import output
+from lifecycle.cli.verbs.graph import write_picture
 from lifecycle.cli.verbs.up import _finished
 from lifecycle.errors import ExitCode, MiddlewareError, UsageError
 from lifecycle.manifest import Diagnostic, ManifestError, Position, Severity
@@ -258,3 +259,21 @@ def test_a_run_that_took_another_manifest_is_reported_by_that_one(tmp_path: Path
         failed.append(sum(1 for _ in ET.parse(path).iter("failure")))
     assert failed[0] == 0
     assert failed[1] > 0
+
+
+def test_a_picture_goes_into_what_is_no_file_and_through_a_link_and_leaves_both(
+    tmp_path: Path,
+) -> None:
+    pipe, link, file = tmp_path / "pipe", tmp_path / "link", tmp_path / "file"
+    os.mkfifo(pipe)
+    link.symlink_to(file)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        for each in (pipe, link):
+            write_picture(each, "graph {}")
+        assert os.read(reader, 100) == b"graph {}\n"
+    finally:
+        os.close(reader)
+    assert pipe.is_fifo()
+    assert link.is_symlink()
+    assert file.read_text() == "graph {}\n"

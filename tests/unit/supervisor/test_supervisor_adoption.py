@@ -264,7 +264,7 @@ def test_a_pause_deactivates_what_was_found_active_and_a_resume_leaves_it_so(
             for ask in (ControlRequest.PAUSE, ControlRequest.RESUME, ControlRequest.RESTART):
                 assert await world.order(ask) == "0"
             assert await world.order(ControlRequest.RESTART, "lidar") == (
-                "2 cannot restart '/lidar': somebody else runs it"
+                "2 cannot restart '/lidar': it is attached, no process of this supervisor"
             )
             await world.order(ControlRequest.DOWN)
 
