@@ -20,7 +20,7 @@ from collections.abc import Iterable, Mapping
 
 from lifecycle.manifest import EndpointKind, RunKind
 from lifecycle.plan import Plan, PlannedNode, PlannedProcess
-from lifecycle.verify import GRAPH_TOPIC, NODE_SERVICES, OUR_SERVICES
+from lifecycle.verify import GRAPH_TOPIC, NODE_SERVICES, OUR_SERVICES, supervisor_endpoints
 
 OVERRIDE = "ROS_SECURITY_ENCLAVE_OVERRIDE"
 """The variable by which rcl takes an enclave for every context of a process."""
@@ -248,6 +248,10 @@ def _supervisor_profile(plan: Plan, machine: str) -> Profile:
         kind = EndpointKind.PUBLISHER if other.name == machine else EndpointKind.SUBSCRIPTION
         topic = f"/_lifecycle/{plan.system.replace('-', '_')}/{other.name}/alive"
         allowed |= {(kind, topic), (kind, f"{topic}_pulse")}
+    several = len({each.machine for each in plan.nodes}) > 1
+    allowed |= supervisor_endpoints(
+        plan.system, machine if several else "", plan.policy.ros_interface
+    )
     return Profile(namespace="/", name="_lifecycle_observer", allowed=frozenset(allowed))
 
 

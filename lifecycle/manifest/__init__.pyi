@@ -41,6 +41,7 @@ from .model import FlowNeed as FlowNeed
 from .model import FlowTerms as FlowTerms
 from .model import FlowTransport as FlowTransport
 from .model import Interface as Interface
+from .model import Limits as Limits
 from .model import Link as Link
 from .model import Machine as Machine
 from .model import Manifest as Manifest
@@ -55,6 +56,7 @@ from .model import Policy as Policy
 from .model import Quantity as Quantity
 from .model import Restart as Restart
 from .model import RosArguments as RosArguments
+from .model import RosInterfaceAccess as RosInterfaceAccess
 from .model import Run as Run
 from .model import RunKind as RunKind
 from .model import Supervision as Supervision

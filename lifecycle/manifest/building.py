@@ -29,6 +29,7 @@ from lifecycle.manifest.model import (
     Executor,
     FlowNeed,
     Interface,
+    Limits,
     Node,
     OnViolation,
     ParameterDeclaration,
@@ -456,6 +457,7 @@ def _run(node: Cursor, base: Path, found: Findings) -> Run:
     arguments = (
         (name, _parameter(name, each, found)) for name, each in cursor.entries("arguments")
     )
+    limits = cursor.get("limits")
     return cursor.build(
         Run,
         kind=kind,
@@ -463,10 +465,14 @@ def _run(node: Cursor, base: Path, found: Findings) -> Run:
         environment=tuple((name, each.value.text) for name, each in cursor.entries("environment")),
         working_directory=absolute(base, folder) if folder else "",
         prefix=_words(cursor, "prefix", found),
+        limits=None if limits is None else limits.build(Limits),
     )
 
 
-_OF_A_PROCESS = ("environment", "working_directory", "ros_args", "prefix", "output")
+_OF_A_PROCESS = (
+    *("environment", "working_directory", "ros_args", "prefix", "output"),
+    *("no_new_privileges", "limits"),
+)
 
 
 def _refuse(run: Cursor, names: tuple[str, ...], what: str, found: Findings) -> None:

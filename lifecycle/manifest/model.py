@@ -143,6 +143,14 @@ class EndpointPolicy(enum.Enum):
     OPEN = "open"
 
 
+class RosInterfaceAccess(enum.Enum):
+    """What a supervisor offers over ROS topics and services."""
+
+    OFF = "off"
+    READ_ONLY = "read_only"
+    FULL = "full"
+
+
 class UniqueHow(enum.Enum):
     """What a link demands of its flow."""
 
@@ -163,6 +171,33 @@ ParameterValue = bool | int | float | str | tuple[bool | int | float | str, ...]
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Limits:
+    """Resource limits of a process, after LimitAS= and the like of systemd.exec(5); None: as ours.
+
+    Attributes:
+        as_mib: address space, MiB (RLIMIT_AS).
+        cpu_sec: processor time, seconds; the process is ended by SIGXCPU then (RLIMIT_CPU).
+        nofile: open files (RLIMIT_NOFILE).
+        nproc: processes and threads of its user, all together (RLIMIT_NPROC).
+    """
+
+    as_mib: Positive | None = None
+    cpu_sec: Positive | None = None
+    nofile: Positive | None = None
+    nproc: Positive | None = None
+
+    def resources(self) -> tuple[tuple[str, int], ...]:
+        """Return name and value for setrlimit(2) of those that are set."""
+        found = (
+            ("RLIMIT_AS", self.as_mib and self.as_mib * 2**20),
+            ("RLIMIT_CPU", self.cpu_sec),
+            ("RLIMIT_NOFILE", self.nofile),
+            ("RLIMIT_NPROC", self.nproc),
+        )
+        return tuple((name, value) for name, value in found if value is not None)
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Run:
     """How to start a node. Exactly one of the forms is set, as `kind` says.
 
@@ -179,6 +214,9 @@ class Run:
         ros_args: of a COMMAND.
         prefix: words before the command line of the process.
         output: where goes what the process prints.
+        no_new_privileges: the process, and what it starts, can gain none by execve(2), as
+            NoNewPrivileges= of systemd.exec(5).
+        limits: None for those of the supervisor.
     """
 
     kind: RunKind
@@ -196,6 +234,8 @@ class Run:
     ros_args: RosArguments = RosArguments.AUTO
     prefix: tuple[str, ...] = ()
     output: Output = Output.BOTH
+    no_new_privileges: bool = False
+    limits: Limits | None = None
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -533,6 +573,7 @@ __all__ = [
     "FlowNeed",
     "FlowTransport",
     "Interface",
+    "Limits",
     "Link",
     "Machine",
     "Manifest",
@@ -547,6 +588,7 @@ __all__ = [
     "Quantity",
     "Restart",
     "RosArguments",
+    "RosInterfaceAccess",
     "Run",
     "RunKind",
     "Supervision",
@@ -650,6 +692,7 @@ class Policy:
         unverifiable_blocks: an unverifiable finding closes the gate.
         unpublished: severity of a subscription without publisher; None ignores it.
         unheard: severity of a publisher without subscription; None ignores it.
+        ros_interface: what the supervisor publishes, and may be asked, in ROS.
     """
 
     undeclared_nodes: EndpointPolicy = EndpointPolicy.DECLARED
@@ -657,6 +700,7 @@ class Policy:
     unverifiable_blocks: bool = False
     unpublished: Severity | None = Severity.ERROR
     unheard: Severity | None = Severity.WARNING
+    ros_interface: RosInterfaceAccess = RosInterfaceAccess.OFF
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

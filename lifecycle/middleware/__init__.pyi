@@ -32,6 +32,7 @@ from .process.control import check_threads as check_threads
 from .process.control import exit_after as exit_after
 from .process.control import machine_id as machine_id
 from .process.control import no_room_for_threads as no_room_for_threads
+from .process.control import refuse_new_privileges as refuse_new_privileges
 from .process.process_table import note_ended as note_ended
 from .process.shared_memory import Creations as Creations
 from .process.shared_memory import check_room as check_room
@@ -68,4 +69,5 @@ from .services.actions import GoalServer as GoalServer
 from .services.clients import NodeClients as NodeClients
 from .services.parameters import parameter_value as parameter_value
 from .services.parameters import type_word as type_word
+from .services.ros_interface import RosInterface as RosInterface
 from .services.service_calls import ServiceUnansweredError as ServiceUnansweredError

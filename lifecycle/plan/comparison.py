@@ -24,6 +24,7 @@ from collections.abc import Iterator, Mapping
 from lifecycle.codec import from_json, to_json, to_plain
 from lifecycle.manifest import OnViolation, Position, RunKind
 from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedNode
+from lifecycle.plan.secrets import REDACTED, is_secret, without_secrets
 
 _VALUE_CHARACTERS = 80
 _MOST = 20
@@ -104,8 +105,12 @@ def differences(old: Plan, new: Plan, *, words: tuple[str, str] = ("was", "is"))
 
 
 def plan_checksum(plan: Plan) -> str:
-    """Return 16 hexadecimal digits (SHA-256) that are the same for plans without differences."""
-    text = json.dumps(_document(plan), sort_keys=True, ensure_ascii=True)
+    """Return 16 hexadecimal digits (SHA-256) that are the same for plans without differences.
+
+    Values of environment variables that are secret by their names do not count.
+    """
+    # It is announced to the network: short secrets could be found out by it.
+    text = json.dumps(_document(without_secrets(plan)), sort_keys=True, ensure_ascii=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
@@ -242,6 +247,8 @@ def _compared(path: _Path, old: object, new: object) -> Iterator[tuple[_Path, st
         for key in {**old, **new}:
             yield from _compared((*path, key), old.get(key), new.get(key))
     else:
+        if path[-2:-1] == ("environment",) and is_secret(path[-1]):
+            old, new = (REDACTED if each else each for each in (old, new))
         absent = "not declared" if isinstance(old or new, Mapping) else "not set"
         yield path, _shown(old, absent), _shown(new, absent)
 
@@ -335,7 +342,7 @@ def notice_of(plan: Plan, *, run: str, host: str, machines: tuple[str, ...]) -> 
         nodes=tuple(each.full_name for each in plan.nodes),
         checksum=plan_checksum(plan),
     )
-    packed = base64.b64encode(zlib.compress(to_json(plan))).decode()
+    packed = base64.b64encode(zlib.compress(to_json(without_secrets(plan)))).decode()
     whole = dataclasses.replace(notice, plan=packed)
     return whole if len(encode(whole)) <= MAX_TEXT else notice
 

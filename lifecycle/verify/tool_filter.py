@@ -16,7 +16,7 @@ import functools
 import re
 from collections.abc import Collection, Iterable, Mapping
 
-from lifecycle.manifest import TOLERATED_NODES, EndpointKind, join
+from lifecycle.manifest import TOLERATED_NODES, EndpointKind, RosInterfaceAccess, join
 from lifecycle.plan import Plan, PlannedNode, owner_of
 from lifecycle.verify.observation import NodeConfiguration, ObservedEndpoint
 
@@ -26,6 +26,14 @@ whatever the policy: a name proves nothing, so they may do no more than those.""
 
 _OUR_TOPICS = "/_lifecycle/"
 """Where the supervisors of several machines notice each other."""
+
+DIAGNOSTICS_TOPIC = "/diagnostics"
+_DIAGNOSTICS = DIAGNOSTICS_TOPIC, "diagnostic_msgs/msg/DiagnosticArray"
+_SUPERVISORS = "/lifecycle/"
+_SUPERVISOR_TOPIC = "status", "std_msgs/msg/String"
+_READING = ("get_status",)
+_ORDERING = ("pause", "resume", "restart", "down")
+_SUPERVISOR_SERVICE_TYPE = "std_srvs/srv/Trigger"
 
 PLACEHOLDER_NAMES = frozenset({"_NODE_NAME_UNKNOWN_", "_CREATED_BY_BARE_DDS_APP_"})
 """What rmw_dds_common calls the node of an endpoint whose node it does not know (yet)."""
@@ -240,6 +248,54 @@ def _is_service_event(kind: EndpointKind, name: str, type_: str) -> bool:
     return publishes and "/srv/" in type_ and type_.endswith("_Event")
 
 
+def supervisor_prefix(system: str, machine: str = "") -> str:
+    """Return what the names of a supervisor's status topic and services begin with.
+
+    Args:
+        system: its name.
+        machine: of the supervisor, where nodes of the system run on several; else empty.
+    """
+    names = (system, machine) if machine else (system,)
+    return _SUPERVISORS + "/".join(each.replace("-", "_") for each in names)
+
+
+def supervisor_services(access: RosInterfaceAccess) -> tuple[str, ...]:
+    """Return the base names of the services that a supervisor offers."""
+    if access is RosInterfaceAccess.OFF:
+        return ()
+    return _READING if access is RosInterfaceAccess.READ_ONLY else (*_READING, *_ORDERING)
+
+
+def supervisor_endpoints(
+    system: str, machine: str, access: RosInterfaceAccess
+) -> frozenset[tuple[EndpointKind, str]]:
+    """Return what a supervisor makes by `policy.ros_interface`; see `supervisor_prefix`."""
+    if access is RosInterfaceAccess.OFF:
+        return frozenset()
+    prefix = supervisor_prefix(system, machine)
+    return frozenset(
+        (
+            (EndpointKind.PUBLISHER, DIAGNOSTICS_TOPIC),
+            (EndpointKind.PUBLISHER, f"{prefix}/{_SUPERVISOR_TOPIC[0]}"),
+            *(
+                (EndpointKind.SERVICE_SERVER, f"{prefix}/{name}")
+                for name in supervisor_services(access)
+            ),
+        )
+    )
+
+
+def is_supervisor_endpoint(kind: EndpointKind, node: str, name: str, type_: str) -> bool:
+    """Return whether an endpoint is one that `policy.ros_interface` has a supervisor make."""
+    if not _matches(node.rpartition("/")[2], OUR_NODES):
+        return False
+    base = name.rpartition("/")[2] if name.startswith(_SUPERVISORS) else ""
+    if kind is EndpointKind.PUBLISHER:
+        return (name, type_) == _DIAGNOSTICS or (base, type_) == _SUPERVISOR_TOPIC
+    serves = kind is EndpointKind.SERVICE_SERVER and base in (*_READING, *_ORDERING)
+    return serves and type_ == _SUPERVISOR_SERVICE_TYPE
+
+
 def is_noise_endpoint(kind: EndpointKind, node: str, name: str, type_: str, *, ours: bool) -> bool:
     """Return whether an endpoint is one that client libraries make without being asked.
 
@@ -259,6 +315,7 @@ def is_noise_endpoint(kind: EndpointKind, node: str, name: str, type_: str, *, o
     if not node:
         return False
     of_observers = name.startswith(_OUR_TOPICS) and bool(tolerating_pattern(node, ()))
+    of_observers = of_observers or is_supervisor_endpoint(kind, node, name, type_)
     if of_observers or (kind, name) in NOISE_TOPICS or _is_service_event(kind, name, type_):
         return True
     owner, _, base = name.rpartition("/")

@@ -9,7 +9,7 @@ import click
 from lifecycle import codec
 from lifecycle.cli.common import format_option, load_manifest, manifest_arguments
 from lifecycle.errors import ExitCode
-from lifecycle.plan import Plan, build_plan, render_text
+from lifecycle.plan import Plan, build_plan, render_text, without_secrets
 
 
 @click.command("plan")
@@ -32,7 +32,7 @@ def render(plan: Plan, format_: str) -> str:
     if format_ == "text":
         return render_text(plan, width=shutil.get_terminal_size((100, 24)).columns)
     if format_ == "json":
-        return codec.to_json(plan).decode()
+        return codec.to_json(without_secrets(plan)).decode()
     from lifecycle.export import WRITERS, planned_picture
 
     return WRITERS[format_](planned_picture(plan))

@@ -117,6 +117,8 @@ def _apart(node: Node, other: Node, at: Position) -> Iterator[Diagnostic]:
             ("prefix", one.prefix, two.prefix),
             ("output", one.output, two.output),
             ("ros_args", one.ros_args, two.ros_args),
+            ("no_new_privileges", one.no_new_privileges, two.no_new_privileges),
+            ("limits", one.limits, two.limits),
             ("executor", _executor(one), _executor(two)),
         )
         if mine != its

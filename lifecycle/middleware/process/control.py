@@ -50,6 +50,7 @@ def libc() -> ctypes.CDLL:
 
 
 _PR_SET_CHILD_SUBREAPER = 36
+_PR_SET_NO_NEW_PRIVS = 38
 _SIGEV_SIGNAL = 0
 _SIGEV_THREAD = 2
 
@@ -78,6 +79,15 @@ def adopt_orphans() -> None:
         MiddlewareError: the kernel refused.
     """
     _prctl(_PR_SET_CHILD_SUBREAPER, 1)
+
+
+def refuse_new_privileges() -> None:
+    """Keep this process, and all that it starts, from gaining privileges by execve(2).
+
+    Raises:
+        MiddlewareError: the kernel refused.
+    """
+    _prctl(_PR_SET_NO_NEW_PRIVS, 1)
 
 
 def exit_after(seconds: float, code: int) -> Callable[[], None]:

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from lifecycle.export import CapturedProgram
 from lifecycle.middleware.discovery.dead_peers import is_of_process
+from lifecycle.plan import is_secret
 
 _LONGEST_VALUE = 8192
 
@@ -27,10 +28,6 @@ _OF_A_SESSION = re.compile(
     "|PYTEST_.*|ROS_DOMAIN_ID|ROS_AUTOMATIC_DISCOVERY_RANGE|ROS_LOG_DIR"
 )
 """Variables of a login, of who started it, or that a manifest says otherwise."""
-
-_SECRET = re.compile(
-    "TOKEN|SECRET|PASSW|CREDENTIAL|PRIVATE|(API|ACCESS)_?KEY|AUTH(?!OR)", re.IGNORECASE
-)
 
 _PATHS = ("PATH", "MANPATH", "INFOPATH")
 """Lists of folders that matter only by what they have and we have not."""
@@ -84,9 +81,7 @@ def read_program(pid: int, environment: Mapping[str, str]) -> CapturedProgram | 
     }
     withheld = tuple(
         sorted(
-            each
-            for each in differing
-            if _SECRET.search(each) or len(differing[each]) > _LONGEST_VALUE
+            each for each in differing if is_secret(each) or len(differing[each]) > _LONGEST_VALUE
         )
     )
     program = _program(argv[0], directory, variables.get("PATH", os.defpath), executable)

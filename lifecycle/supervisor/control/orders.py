@@ -182,6 +182,7 @@ _MOST = 20
 _RELOADED = ("nodes.", "links.", "policy.", "on_violation.")
 """Parts of a manifest that a running supervisor can reload: the rest made the supervisor's own
 participant, its authority and the networks that it programs."""
+_NOT_RELOADED = ("policy.ros_interface",)
 
 
 class Revisions:
@@ -252,7 +253,11 @@ class Revisions:
                 hint="end it and start it anew: lifecycle down, then lifecycle up",
             )
 
-        fixed = [each for each in found if not f"{each.path}.".startswith(_RELOADED)]
+        fixed = [
+            each
+            for each in found
+            if not f"{each.path}.".startswith(_RELOADED) or each.path in _NOT_RELOADED
+        ]
         if fixed:
             raise refuse("a running supervisor cannot change this:", _lines(fixed))
         if (running.observers, running.server) != (plan.observers, plan.server):

@@ -96,6 +96,10 @@ class NodeStatus(msgspec.Struct, frozen=True, kw_only=True):
         last_failure: of its process, that it was, or is to be, started again after; None if there
             was none.
         next_try_s: seconds until its process is started again; None if that is not planned.
+        cpu_s: user and system time that its process has used; None where none of ours runs. The
+            nodes of one process have the same, also of what follows.
+        rss_bytes: resident memory of its process, what it shares with others included.
+        threads: how many its process has.
     """
 
     node: str
@@ -118,6 +122,9 @@ class NodeStatus(msgspec.Struct, frozen=True, kw_only=True):
     restarts: int = 0
     last_failure: Failed | None = None
     next_try_s: float | None = None
+    cpu_s: float | None = None
+    rss_bytes: int | None = None
+    threads: int | None = None
 
 
 class SystemStatus(msgspec.Struct, frozen=True, kw_only=True):

@@ -5,10 +5,13 @@ Owns: how a status is drawn from the running system and its last verdict. Must n
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from lifecycle.manifest import RunKind, UniqueHow
 from lifecycle.supervisor.control.protocol import NodeStatus, SystemStatus
+from lifecycle.supervisor.processes.usage import ResourceUse, resource_use
 from lifecycle.verify import Verdict, not_ok
 
 if TYPE_CHECKING:
@@ -23,8 +26,18 @@ def node_status(
     *,
     elapsed_s: float = 0.0,
     schedule: RestartSchedule | None = None,
+    uses: Mapping[int, ResourceUse | None] = MappingProxyType({}),
 ) -> NodeStatus:
-    """Return what is known of one node."""
+    """Return what is known of one node.
+
+    Args:
+        node: which.
+        verdict: the last one; None before the first.
+        silent: why nothing can be expected of it.
+        elapsed_s: seconds since the supervisor started.
+        schedule: knows of restarts.
+        uses: what processes use, by pid.
+    """
     process = node.process
     runs = process is not None and process.pid != 0 and not process.is_gone
     known = None if process is None else schedule
@@ -36,6 +49,7 @@ def node_status(
         for flow in (() if verdict is None else verdict.flows)
         if node.name in (flow.publisher, flow.subscription)
     ]
+    use = None if process is None else uses.get(process.pid)
     external = node.planned.run.kind is RunKind.ATTACH
     return NodeStatus(
         node=node.name,
@@ -65,6 +79,9 @@ def node_status(
         restarts=0 if known is None else known.restarts(node.planned.process),
         last_failure=None if known is None else known.last_failure(node.planned.process),
         next_try_s=None if known is None else known.next_try_s(node.planned.process),
+        cpu_s=None if use is None else use.cpu_s,
+        rss_bytes=None if use is None else use.rss_bytes,
+        threads=None if use is None else use.threads,
     )
 
 
@@ -85,8 +102,10 @@ def system_status(
     elapsed_s: float,
     schedule: RestartSchedule | None = None,
 ) -> SystemStatus:
-    """Return what is known of the whole system."""
+    """Return what is known of the whole system, with what its processes use now."""
     silent = system.liveliness.silent
+    processes = {node.process for node in system.nodes.values() if node.process is not None}
+    uses = {each.pid: resource_use(each.pid) for each in processes if each.pid and not each.is_gone}
     return SystemStatus(
         system=system.plan.system,
         domain_id=system.plan.domain_id,
@@ -96,7 +115,12 @@ def system_status(
         elapsed_s=elapsed_s,
         nodes=tuple(
             node_status(
-                node, verdict, silent.get(node.name, ""), elapsed_s=elapsed_s, schedule=schedule
+                node,
+                verdict,
+                silent.get(node.name, ""),
+                elapsed_s=elapsed_s,
+                schedule=schedule,
+                uses=uses,
             )
             for node in system.nodes.values()
         ),

@@ -28,6 +28,7 @@ from lifecycle.plan import (
     encode,
     notice_of,
     plan_checksum,
+    without_secrets,
 )
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.verify import (
@@ -237,7 +238,8 @@ class Agreement:
         if notice.checksum == ours:
             return ()
         plan = announced_plan(notice)
-        found = () if plan is None else differences(self._plan, plan, words=("here", "there"))
+        own = without_secrets(self._plan)  # as the other's comes
+        found = () if plan is None else differences(own, plan, words=("here", "there"))
         if found:
             return found
         return ("in what cannot be read here; compare 'lifecycle plan MANIFEST' of both",)

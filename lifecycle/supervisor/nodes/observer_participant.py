@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 from lifecycle.graph import set_within
 from lifecycle.plan import ParticipantConnections, Plan, PlannedNode
+from lifecycle.supervisor.control.ros_interface import Answer, Offer
 from lifecycle.supervisor.health.peer_supervisors import Listener
 from lifecycle.supervisor.nodes.driver import NodeDriver, NodeInterfaceClient, ServiceDriver
 from lifecycle.supervisor.processes.adopted_process import RunningNode
@@ -206,6 +207,14 @@ class ObserverParticipant:
         from lifecycle.middleware import PlanNotices
 
         return PlanNotices(self._node, on_notice)
+
+    def ros_interface(
+        self, prefix: str, services: Iterable[str], on_call: Callable[[str, Answer], None]
+    ) -> Offer:
+        """Make the topics and services by which ROS programs reach the supervisor."""
+        from lifecycle.middleware import RosInterface
+
+        return RosInterface(self._node, prefix, services, on_call)
 
     def call_out(self, addresses: Iterable[str]) -> None:
         """Make all participants announce themselves, as far as the system's discovery allows."""

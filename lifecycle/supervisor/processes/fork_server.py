@@ -231,6 +231,8 @@ class ForkServer:
             environment=request.environment,
             working_directory=request.working_directory,
             control=request.control is not None,
+            limits=request.limits,
+            no_new_privileges=request.no_new_privileges,
         )
         born: asyncio.Future[ForkServerChild] = self._loop.create_future()
         self._pending[message.id] = born, request

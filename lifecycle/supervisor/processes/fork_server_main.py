@@ -15,6 +15,7 @@ import contextlib
 import dataclasses
 import gc
 import os
+import resource
 import selectors
 import signal
 import socket
@@ -26,7 +27,7 @@ from collections.abc import Iterable
 from typing import NoReturn
 
 from lifecycle.codec import from_json, to_json
-from lifecycle.middleware import adopt_orphans
+from lifecycle.middleware import adopt_orphans, refuse_new_privileges
 from lifecycle.supervisor.processes.forerunner import PRELOAD
 
 LARGEST_MESSAGE = 1 << 18
@@ -42,6 +43,8 @@ class ForkRequest:
 
     Attributes:
         id: ≥ 1; 0 only asks whether the fork server serves, which answers with the same id.
+        limits: see SpawnRequest.
+        no_new_privileges: likewise.
     """
 
     id: int
@@ -49,6 +52,8 @@ class ForkRequest:
     environment: tuple[tuple[str, str], ...]
     working_directory: str
     control: bool
+    limits: tuple[tuple[str, int], ...] = ()
+    no_new_privileges: bool = False
 
 
 SERVES = ForkRequest(id=0, argv=(), environment=(), working_directory="", control=False)
@@ -227,6 +232,9 @@ class _ForkServer:
             os.environ.update(dict(request.environment))
             if request.working_directory:
                 os.chdir(request.working_directory)
+            _confine(request.limits)
+            if request.no_new_privileges:
+                refuse_new_privileges()
             control = descriptors[2] if request.control else None
             code = _run(request.argv, control)
         except SystemExit as error:
@@ -251,6 +259,20 @@ def _take_streams(stdout: int, stderr: int) -> None:
         os.close(descriptor)
     for stream in (sys.stdout, sys.stderr):
         stream.reconfigure(line_buffering=True)  # type: ignore[union-attr]
+
+
+def _confine(limits: Iterable[tuple[str, int]]) -> None:
+    """Limit what this process may use, and all that it starts."""
+    for name, value in limits:
+        number = getattr(resource, name)
+        # At its soft limit a signal ends it that says why, at the hard one SIGKILL.
+        hard = value + 1 if number == resource.RLIMIT_CPU else value
+        try:
+            resource.setrlimit(number, (value, hard))
+        except (OSError, ValueError) as error:
+            most = resource.getrlimit(number)[1]
+            print(f"cannot set {name} to {value}: {error}; allowed: {most}", file=sys.stderr)
+            raise SystemExit(1) from error
 
 
 def _run(argv: tuple[str, ...], control: int | None) -> int:

@@ -106,6 +106,8 @@ class SpawnRequest:
         control: descriptor of the host's end of the control channel; None for a foreign command.
         on_stop: called with True when a signal stopped the process (signal(7), Stop), False when it
             continues.
+        limits: (name, value) of setrlimit(2), `RLIMIT_NOFILE`.
+        no_new_privileges: see prctl(2), PR_SET_NO_NEW_PRIVS.
     """
 
     name: str
@@ -117,6 +119,8 @@ class SpawnRequest:
     control: int | None = None
     on_stop: Callable[[bool], None] = _ignore
     prefix: tuple[str, ...] = ()
+    limits: tuple[tuple[str, int], ...] = ()
+    no_new_privileges: bool = False
 
 
 class Child(Protocol):
@@ -270,6 +274,7 @@ class ManagedProcess:
         ends: list[int] = []
         control = None
         own = dict(self.planned.environment)
+        limits = self.planned.run.limits
         try:
             for stream in ("stdout", "stderr"):
                 read, write = os.pipe()
@@ -289,6 +294,8 @@ class ManagedProcess:
                     control=None if control is None else control.fileno(),
                     on_stop=self.on_stop,
                     prefix=() if channel is None else self.planned.run.prefix,
+                    limits=() if limits is None else limits.resources(),
+                    no_new_privileges=self.planned.run.no_new_privileges,
                 )
             )
         finally:

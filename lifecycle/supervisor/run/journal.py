@@ -13,7 +13,6 @@ import asyncio
 import contextlib
 import dataclasses
 import os
-import re
 import time
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -21,7 +20,7 @@ from typing import Annotated, Any, TypeVar
 
 from lifecycle import codec
 from lifecycle.codec import Count, says
-from lifecycle.plan import Plan
+from lifecycle.plan import Plan, without_secrets
 from lifecycle.supervisor.processes.logs import JOURNAL_NAME
 from lifecycle.supervisor.processes.usage import ResourceUse, resource_use
 from lifecycle.supervisor.run.events import Event, LogLine, VerdictChanged
@@ -47,9 +46,6 @@ USE_S = 60.0
 
 _TRIED_AGAIN_S = 1.0
 """How often a journal is tried that could not be written."""
-
-_SECRET = re.compile(r"token|secret|passw|credential|api_?key|private_?key", re.IGNORECASE)
-REDACTED = "(redacted)"
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -477,29 +473,3 @@ def restored(
             raise ValueError("the line before is missing")
         values.insert(index, value)
     return tuple(values)
-
-
-def without_secrets(plan: Plan) -> Plan:
-    """Return `plan` without values of environment variables whose names say they are secret."""
-    nodes = tuple(
-        dataclasses.replace(
-            node,
-            run=dataclasses.replace(node.run, environment=_redacted(node.run.environment)),
-        )
-        if any(_SECRET.search(name) for name, _ in node.run.environment)
-        else node
-        for node in plan.nodes
-    )
-    processes = tuple(
-        dataclasses.replace(
-            process,
-            environment=_redacted(process.environment),
-            run=dataclasses.replace(process.run, environment=_redacted(process.run.environment)),
-        )
-        for process in plan.processes
-    )
-    return dataclasses.replace(plan, nodes=nodes, processes=processes)
-
-
-def _redacted(variables: Iterable[tuple[str, str]]) -> tuple[tuple[str, str], ...]:
-    return tuple((name, REDACTED if _SECRET.search(name) else value) for name, value in variables)

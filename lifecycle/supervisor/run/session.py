@@ -22,6 +22,7 @@ from lifecycle.supervisor.connections.authority import Reaching, authority_of
 from lifecycle.supervisor.connections.networks import Networks
 from lifecycle.supervisor.control.orders import ACTIVE, HELD, PAUSED, Revisions
 from lifecycle.supervisor.control.protocol import SystemStatus
+from lifecycle.supervisor.control.ros_interface import Offering, RosInterface
 from lifecycle.supervisor.control.server import ControlServer, SupervisorSnapshot
 from lifecycle.supervisor.control.status import system_status
 from lifecycle.supervisor.gate.activation_guard import ActivationGuard
@@ -107,6 +108,7 @@ class SessionParticipant(
     Reaching,
     ParticipantRegistry,
     ServiceNames,
+    Offering,
     Census,
     Protocol,
 ):
@@ -265,6 +267,16 @@ class Session:
             stop=self.stop,
         )
 
+        self._ros_interface = RosInterface(
+            system.plan.policy.ros_interface,
+            min(system.machines or ("",)),
+            observer_participant,
+            status=self.status,
+            verdict=lambda: self._judge.latest,
+            order=self._holding.ordered,
+            down=lambda: self._down("the down service"),
+        )
+
     def status(self) -> SystemStatus:
         """Return what is known now."""
         return system_status(
@@ -298,12 +310,15 @@ class Session:
             return
         self._stop.set_exception(_Stop(reason, exit_code))
 
+    def _down(self, reason: str) -> None:
+        self.stop(reason, ExitCode.BRING_UP_FAILED)
+
     async def run(self) -> UpResult:
         """Bring the system up, hold it, and take it down; never leaves anything running."""
         server = ControlServer(
             self._directory.socket_path,
             self.status,
-            lambda: self.stop("lifecycle down", ExitCode.BRING_UP_FAILED),
+            lambda: self._down("lifecycle down"),
             look=self.look,
             order=self._holding.ordered,
             differences=self._revisions.differences,
@@ -312,6 +327,7 @@ class Session:
         self._peer_supervisors.open()
         self._agreement.open()
         self._emit.listen(lambda event: None if isinstance(event, LogLine) else server.changed())
+        self._emit.listen(self._ros_interface.on_event)
         result = UpResult(exit_code=ExitCode.INTERNAL, verdict=NOT_JUDGED)
         offering = asyncio.ensure_future(self._interfaces.follow())
         try:
@@ -328,6 +344,7 @@ class Session:
                 each.close()
             self._stale.close()
             await self._changes.close()
+            self._ros_interface.close()
             self._emit(Stopped(exit_code=result.exit_code, elapsed_s=self._emit.elapsed_s))
             await server.close(result.exit_code)
         return result

@@ -8,13 +8,15 @@ policy names it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Collection, Iterator
 
-from lifecycle.manifest import EndpointPolicy, RunKind
+from lifecycle.manifest import EndpointPolicy, RosInterfaceAccess, RunKind
 from lifecycle.verify.observation import ObservedEndpoint
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.rules.endpoints import UNDECLARED
+from lifecycle.verify.tool_filter import is_supervisor_endpoint
 from lifecycle.verify.verdict import Finding, Stage
 from lifecycle.verify.view import View
 
@@ -181,8 +183,9 @@ def check_outsiders(view: View) -> Iterator[Finding]:
 
 
 def _offered_by_tools(view: View) -> Iterator[Finding]:
+    supervisors = _of_supervisors(view)
     for endpoint in view.of_tools:
-        if not view.names.fed_by(endpoint.kind, endpoint.name):
+        if not view.names.fed_by(endpoint.kind, endpoint.name) or endpoint in supervisors:
             continue
         word = endpoint.kind.noun
         verb = "feeds" if endpoint.kind.is_topic else "serves"
@@ -198,6 +201,23 @@ def _offered_by_tools(view: View) -> Iterator[Finding]:
             hint=f"policy.tolerated_nodes ({view.tools[endpoint.node]}) lets it listen only: stop"
             " it, or declare its node",
         )
+
+
+def _of_supervisors(view: View) -> Collection[ObservedEndpoint]:
+    """Return what supervisors offer under declared names, as the policy has them.
+
+    A name proves nothing: where there are more of one than machines, none is taken for theirs.
+    """
+    if view.plan.policy.ros_interface is RosInterfaceAccess.OFF:
+        return ()
+    found = [
+        each
+        for each in view.of_tools
+        if is_supervisor_endpoint(each.kind, each.node, each.name, each.type)
+    ]
+    count = Counter((each.kind, each.name) for each in found)
+    most = max(1, len(view.plan.machines))
+    return [each for each in found if count[each.kind, each.name] <= most]
 
 
 def _unattributed(view: View) -> Iterator[Finding]:

@@ -5,15 +5,22 @@ from __future__ import annotations
 import contextlib
 import gc
 import json
+import re
 import signal
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import rclpy
 import yaml
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
 
 from lifecycle.errors import ExitCode
 from tests.ros.middleware.free_ports import free_ports
@@ -113,6 +120,70 @@ def test_a_paused_system_that_is_not_ok_stays_paused(
         intruder()
         resume(tmp_path)
         assert phases(tmp_path)[0] == "active"
+
+
+def test_a_panel_on_the_network_sees_the_system_and_pauses_it_without_a_shell(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    heard: dict[str, list[Any]] = {"status": [], "diagnostics": []}
+    with contextlib.ExitStack() as whole:
+        context = rclpy.Context()
+        context.init(args=[], domain_id=fresh_domain)
+        whole.callback(gc.collect)
+        whole.callback(context.destroy)
+        whole.callback(context.try_shutdown)
+        panel = Node("rqt_panel", context=context, enable_rosout=False)
+        whole.callback(panel.destroy_node)
+        executor = SingleThreadedExecutor(context=context)
+        executor.add_node(panel)
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        panel.create_subscription(DiagnosticArray, "/diagnostics", heard["diagnostics"].append, 10)
+
+        def until(holds: Callable[[], object]) -> None:
+            deadline = time.monotonic() + BOUND_S
+            while not holds():
+                assert time.monotonic() < deadline, heard
+                executor.spin_once(timeout_sec=0.1)
+
+        def call(name: str) -> tuple[bool, str]:
+            client = panel.create_client(Trigger, f"/lifecycle/pair/{name}")
+            until(client.service_is_ready)
+            answer = client.call_async(Trigger.Request())
+            until(answer.done)
+            return answer.result().success, answer.result().message
+
+        edit = {
+            "policy/ros_interface": "full",
+            "nodes/talker/run/no_new_privileges": True,
+            "nodes/talker/run/limits": {"nofile": 200},
+        }
+        manifest = pair(tmp_path, fresh_domain, edit=edit)
+        with up(manifest, runtime=tmp_path) as run:
+            run.until("system", reached="active")
+            assert call("pause") == (True, "paused")
+            # Who comes later gets what was published last.
+            panel.create_subscription(
+                String, "/lifecycle/pair/status", heard["status"].append, latched
+            )
+            until(lambda: heard["status"] and '"phase":"paused"' in heard["status"][-1].data)
+            until(lambda: heard["diagnostics"])
+            assert [each.name for each in heard["diagnostics"][-1].status] == [
+                "pair: /listener",
+                "pair: /talker",
+            ]
+            assert call("resume") == (True, "active")
+            success, status = call("get_status")
+            assert (success, json.loads(status)["verdict"]) == (True, "ok")
+            assert all(each["rss_bytes"] > 2**20 for each in json.loads(status)["nodes"])
+            talker, listener = (
+                Path(f"/proc/{run.pid_of(each)}") for each in ("talker", "listener")
+            )
+            assert "NoNewPrivs:\t1" in (talker / "status").read_text()
+            assert "NoNewPrivs:\t0" in (listener / "status").read_text()
+            assert re.search(r"Max open files +200 +200 ", (talker / "limits").read_text())
+            assert call("down")[0]
+            assert run.finish() == ExitCode.OK
+            run.assert_gate_held()
 
 
 @pytest.fixture

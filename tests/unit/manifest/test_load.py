@@ -17,6 +17,7 @@ from lifecycle.manifest import (
     EndpointKind,
     EndpointPolicy,
     History,
+    Limits,
     Liveliness,
     Machine,
     Manifest,
@@ -106,6 +107,8 @@ def test_ways_to_run(every_key: Manifest) -> None:
         python="demo.nodes:Talker",
         environment=(("LANG", "C"), ("LEVEL", "3"), ("VERSION", "1.10")),
         working_directory=str(VALID),
+        no_new_privileges=True,
+        limits=Limits(as_mib=4096, cpu_sec=3600, nofile=1024, nproc=4096),
     )
     assert _node(every_key, "orders").run == Run(
         kind=RunKind.COMMAND, command=("orders_node", "--fast", "3")

@@ -8,8 +8,18 @@ from pathlib import Path
 import pytest
 
 from lifecycle import codec
+from lifecycle.cli.verbs.plan import command as plan_command
 from lifecycle.manifest import load
-from lifecycle.plan import Plan, build_plan, changes, differences, plan_checksum
+from lifecycle.plan import (
+    Plan,
+    announced_plan,
+    build_plan,
+    changes,
+    differences,
+    notice_of,
+    plan_checksum,
+    without_secrets,
+)
 
 MANIFEST = """
 manifest_version: 1
@@ -198,3 +208,34 @@ def test_many_and_long_differences_are_cut(tmp_path: Path):
     assert len(lines) == 21
     assert lines[-1] == "and 12 more"
     assert max(map(len, lines)) < 200
+
+
+def test_secrets_of_the_environment_are_in_nothing_that_is_shown_written_or_announced(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def made(folder: str, secret: str, level: str) -> Plan:
+        said = f"{{LEVEL: {level}, CAMERA_TOKEN: {secret}, AUTHOR: me}}"
+        return plan_of(tmp_path / folder, MANIFEST.replace("{LEVEL: low}", said))
+
+    old, new = made("old", "hunter2", "low"), made("new", "hunter3", "high")
+    assert dict(old.node("talker").run.environment)["CAMERA_TOKEN"] == "hunter2"
+    kept = without_secrets(old)
+    redacted = (("LEVEL", "low"), ("CAMERA_TOKEN", "(redacted)"), ("AUTHOR", "me"))
+    assert kept.node("talker").run.environment == redacted
+    assert "hunter" not in repr(kept)
+    assert without_secrets(kept) is kept
+    # That they differ is said, not how; who hears of a plan from elsewhere is told neither.
+    assert differences(old, new) == (
+        'nodes.talker.run.environment.CAMERA_TOKEN: was "(redacted)", is "(redacted)"',
+        'nodes.talker.run.environment.LEVEL: was "low", is "high"',
+    )
+    assert plan_checksum(old) == plan_checksum(made("old", "hunter3", "low"))
+    announced = announced_plan(notice_of(old, run="1", host="h", machines=("base",)))
+    assert announced == kept
+    assert plan_command.main(
+        [str(tmp_path / "old" / "robot.lifecycle.yaml"), "--format", "json"],
+        standalone_mode=False,
+    ) in (0, None)
+    shown = capsys.readouterr().out
+    assert "CAMERA_TOKEN" in shown
+    assert "hunter" not in shown

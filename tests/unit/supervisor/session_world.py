@@ -27,6 +27,7 @@ from lifecycle.supervisor.control.protocol import (
     Question,
     SystemStatus,
 )
+from lifecycle.supervisor.control.ros_interface import Entry
 from lifecycle.supervisor.health.peer_supervisors import Listener
 from lifecycle.supervisor.nodes.driver import NodeDriver, NodeInterfaceClient, ServiceDriver
 from lifecycle.supervisor.nodes.system import System
@@ -121,6 +122,45 @@ class _Connection:
         """Nobody reads it."""
 
 
+class FakeRosInterface:
+    """What ROS programs see of a supervisor.
+
+    Attributes:
+        statuses: published so far.
+        diagnostics: published so far; each a list of entries.
+    """
+
+    def __init__(
+        self,
+        prefix: str,
+        services: tuple[str, ...],
+        on_call: Callable[[str, Callable[[bool, str], None]], None],
+    ) -> None:
+        self.prefix = prefix
+        self.services = services
+        self.statuses: list[str] = []
+        self.diagnostics: list[tuple[Entry, ...]] = []
+        self.destroyed = False
+        self._on_call = on_call
+
+    async def call(self, name: str) -> tuple[bool, str]:
+        assert name in self.services
+        answered: asyncio.Future[tuple[bool, str]] = asyncio.get_running_loop().create_future()
+        self._on_call(name, lambda success, message: answered.set_result((success, message)))
+        return await answered
+
+    def publish_status(self, text: str) -> None:
+        assert not self.destroyed
+        self.statuses.append(text)
+
+    def publish_diagnostics(self, entries: Iterable[Entry]) -> None:
+        assert not self.destroyed
+        self.diagnostics.append(tuple(entries))
+
+    def destroy(self) -> None:
+        self.destroyed = True
+
+
 class FakeParticipant:
     """Sees the nodes of the fake hosts, and those that others run; reaches the latter.
 
@@ -135,6 +175,7 @@ class FakeParticipant:
         dropped: nodes whose reports were forgotten.
         asked_for: services that have a client.
         while_looking: done once, when the next look has seen everything and is not over yet.
+        ros: what ROS programs see of the supervisor; None before it is made.
     """
 
     def __init__(self, hosts: FakeForkServer) -> None:
@@ -148,6 +189,7 @@ class FakeParticipant:
         self.dropped: list[str] = []
         self.asked_for: set[str] = set()
         self.while_looking: Callable[[], None] | None = None
+        self.ros: FakeRosInterface | None = None
         self._hosts = hosts
         self._reports: dict[str, NodeConfiguration] = {}
         self._changed = asyncio.Event()
@@ -244,6 +286,16 @@ class FakeParticipant:
     def plan_notices(self, on_notice: Callable[[str], None]) -> _Connection:
         del on_notice
         return _Connection()
+
+    def ros_interface(
+        self,
+        prefix: str,
+        services: Iterable[str],
+        on_call: Callable[[str, Callable[[bool, str], None]], None],
+    ) -> FakeRosInterface:
+        assert self.ros is None
+        self.ros = FakeRosInterface(prefix, tuple(services), on_call)
+        return self.ros
 
     def call_out(self, addresses: Iterable[str]) -> None:
         """Nobody is far away."""

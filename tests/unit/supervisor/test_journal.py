@@ -31,9 +31,8 @@ from lifecycle.supervisor.run.history import (
     read_run,
     replayed,
 )
-from lifecycle.supervisor.run.journal import Journal, changed, restored, without_secrets
+from lifecycle.supervisor.run.journal import Journal, changed, restored
 from lifecycle.verify import Observation, ObservedNode, Stage, verify
-from tests.builders import plan_of, planned_node
 from tests.unit.supervisor.fakes import run
 from tests.unit.supervisor.session_world import CHAIN, SessionWorld
 
@@ -186,21 +185,6 @@ def test_a_torn_line_and_a_foreign_one_are_passed_over_and_named(kept: Kept) -> 
     ]
     assert recorded.unreadable[-1][1] == "it is incomplete"
     assert len(recorded.moments) == 3
-
-
-def test_secrets_of_the_environment_are_not_written() -> None:
-    plan = plan_of(planned_node("camera"))
-    secret = (("CAMERA_TOKEN", "hunter2"), ("DISPLAY", ":0"))
-    (node,) = plan.nodes
-    (process,) = plan.processes
-    plan = dataclasses.replace(
-        plan,
-        nodes=(dataclasses.replace(node, run=dataclasses.replace(node.run, environment=secret)),),
-        processes=(dataclasses.replace(process, environment=secret),),
-    )
-    told = without_secrets(plan)
-    assert told.processes[0].environment == (("CAMERA_TOKEN", "(redacted)"), ("DISPLAY", ":0"))
-    assert told.nodes[0].run.environment == told.processes[0].environment
 
 
 def test_an_explanation_names_what_was_seen_to_change_and_what_happened_before(

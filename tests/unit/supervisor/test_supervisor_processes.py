@@ -504,3 +504,28 @@ def test_a_process_of_another_run_boot_or_start_time_is_left_alone(stray: psutil
     assert end_run(_record("abc", same, boot="another boot")) == ((), frozenset())
     assert stray.poll() is None
     assert end_run(_record("other", same)) == ((stray.pid,), frozenset())
+
+
+_CONFINED = """
+import os, subprocess, sys
+from lifecycle.middleware import refuse_new_privileges
+from lifecycle.supervisor.processes.fork_server_main import _confine
+_confine([("RLIMIT_NOFILE", 77), ("RLIMIT_CPU", 60), ("RLIMIT_AS", 4096 * 2**20)])
+refuse_new_privileges()
+assert "rclpy" not in sys.modules
+status = "grep NoNewPrivs /proc/self/status; ulimit -n; ulimit -St; ulimit -Ht; ulimit -v"
+print(subprocess.run(["bash", "-c", status], check=True, capture_output=True, text=True).stdout)
+sys.stdout.flush()
+os.setuid(65534) if os.getuid() == 0 else None
+_confine([("RLIMIT_NOFILE", 78)])
+"""
+
+
+def test_a_process_is_confined_with_all_that_it_starts_and_a_limit_too_high_fails() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", _CONFINED], capture_output=True, text=True, check=False, timeout=60
+    )
+    assert done.stdout.split() == ["NoNewPrivs:", "1", "77", "60", "61", str(4096 * 1024)]
+    assert done.returncode == 1
+    assert done.stderr.startswith("cannot set RLIMIT_NOFILE to 78: ")
+    assert done.stderr.endswith("; allowed: 77\n")

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 
-from lifecycle.manifest.model import EndpointKind, EndpointPolicy, Policy
+from lifecycle.manifest.model import EndpointKind, EndpointPolicy, Policy, RosInterfaceAccess
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.plan import Plan
 from lifecycle.verify import Outcome, Stage, Verdict, verify
@@ -14,7 +16,8 @@ from tests.unit.verify.edits import Edit, add_endpoint, add_node, both, change_r
 from tests.unit.verify.perfect import perfect
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
-CLIENT = EndpointKind.SERVICE_CLIENT
+CLIENT, SERVER = EndpointKind.SERVICE_CLIENT, EndpointKind.SERVICE_SERVER
+READ_ONLY = RosInterfaceAccess.READ_ONLY
 STRING = "std_msgs/msg/String"
 
 
@@ -86,6 +89,34 @@ def test_observers_are_listed_only_where_they_do_more_than_observe() -> None:
             node=name, because="tolerated_nodes: _lifecycle_*", endpoints=(has(SUB, name, "/a"),)
         ),
     )
+
+
+def test_what_supervisors_offer_in_ros_is_theirs_but_of_no_more_than_there_are_machines() -> None:
+    ours, other = "/_lifecycle_observer_1", "/_lifecycle_observer_2"
+    array, trigger = "diagnostic_msgs/msg/DiagnosticArray", "std_srvs/srv/Trigger"
+
+    def offers(name: str, gid: str) -> Edit:
+        return both(
+            add_node(name),
+            add_endpoint(PUB, name, "/diagnostics", gid=gid, type=array, qos=QosProfile()),
+            add_endpoint(PUB, name, "/lifecycle/robot/status", gid=gid * 2, qos=QosProfile()),
+            add_endpoint(SERVER, name, "/lifecycle/robot/pause", type=trigger),
+        )
+
+    assert judged(plan_of(), offers(ours, "1"), offers(other, "2")).tolerated == ()
+    # The manifest declares what reads it.
+    reads = node("one", publisher("a"), subscription("/diagnostics", array))
+    on = planned(reads, node("two", subscription("a")), policy=Policy(ros_interface=READ_ONLY))
+    assert judged(on, offers(ours, "1")).verdict is Outcome.OK
+    strangers = judged(on, offers(ours, "1"), offers(other, "2")).findings
+    assert [(each.rule, each.node) for each in strangers] == [
+        ("graph.undeclared-publisher", ours),
+        ("graph.undeclared-publisher", other),
+    ]
+    as_rviz = judged(on, offers("/rviz2", "1")).findings
+    assert [each.rule for each in as_rviz] == ["graph.undeclared-publisher"]
+    off = dataclasses.replace(on, policy=Policy())
+    assert judged(off, offers(ours, "1")).verdict is Outcome.VIOLATED
 
 
 def test_who_else_is_there_is_listed_in_an_open_system_and_nobody_else() -> None:

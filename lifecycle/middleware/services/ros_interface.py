@@ -1,0 +1,125 @@
+"""What a supervisor offers in ROS: /diagnostics, a latched status topic, Trigger services.
+
+Owns: the entities and their QoS. What is published is text and numbers here, see
+lifecycle.supervisor.control.ros_interface, which also answers what is asked.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import typing
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.event_handler import PublisherEventCallbacks
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.task import Future
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from lifecycle.verify import DIAGNOSTICS_TOPIC
+
+_LATCHED = QoSProfile(
+    depth=1,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+_DIAGNOSTICS = QoSProfile(
+    depth=10,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.VOLATILE,
+)
+Entry = tuple[int, str, str, str, Sequence[tuple[str, str]]]
+"""Level, name, message, hardware id and values of a diagnostic_msgs/DiagnosticStatus."""
+
+
+@typing.final
+class RosInterface:
+    """The topics and services of one supervisor; `destroy` it before its node.
+
+    Args:
+        node: an executor spins it.
+        prefix: under which the status topic and the services are, `/lifecycle/patrol`.
+        services: names of the services.
+        on_call: called in the executor's thread with the name of a service that is called and with
+            what answers the call (success, message), which may be called once from any thread.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        prefix: str,
+        services: Iterable[str],
+        on_call: Callable[[str, Callable[[bool, str], None]], None],
+    ) -> None:
+        self._node = node
+        self._on_call = on_call
+        # Others are served while one call waits for its answer.
+        group = ReentrantCallbackGroup()
+        quiet = PublisherEventCallbacks(use_default_callbacks=False)
+        # rclpy's own methods, as everywhere on an observer's node.
+        self._status = Node.create_publisher(
+            node, String, f"{prefix}/status", _LATCHED, event_callbacks=quiet
+        )
+        self._diagnostics = Node.create_publisher(
+            node, DiagnosticArray, DIAGNOSTICS_TOPIC, _DIAGNOSTICS, event_callbacks=quiet
+        )
+        self._services = tuple(
+            Node.create_service(
+                node, Trigger, f"{prefix}/{name}", self._served(name), callback_group=group
+            )
+            for name in services
+        )
+        if node.executor is not None:
+            node.executor.wake()
+
+    def publish_status(self, text: str) -> None:
+        """Publish the status to present and later subscribers."""
+        self._status.publish(String(data=text))
+
+    def publish_diagnostics(self, entries: Iterable[Entry]) -> None:
+        """Publish diagnostics, if anything subscribes to them."""
+        if not self._diagnostics.get_subscription_count():
+            return
+        message = DiagnosticArray()
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        message.status = [
+            DiagnosticStatus(
+                level=bytes([level]),
+                name=name,
+                message=text,
+                hardware_id=hardware_id,
+                values=[KeyValue(key=key, value=value) for key, value in values],
+            )
+            for level, name, text, hardware_id, values in entries
+        ]
+        self._diagnostics.publish(message)
+
+    def destroy(self) -> None:
+        """Offer and publish nothing any more."""
+        for service in self._services:
+            Node.destroy_service(self._node, service)
+        for publisher in (self._status, self._diagnostics):
+            Node.destroy_publisher(self._node, publisher)
+
+    def _served(self, name: str) -> Callable[[Any, Any], Any]:
+        async def serve(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+            del request
+            answered: Future = Future()
+
+            def answer(success: bool, message: str) -> None:
+                response.success, response.message = success, message
+                answered.set_result(None)
+                with contextlib.suppress(rclpy_implementation.InvalidHandle):
+                    if self._node.executor is not None:
+                        self._node.executor.wake()
+
+            self._on_call(name, answer)
+            await answered
+            return response
+
+        return serve

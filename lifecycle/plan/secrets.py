@@ -1,0 +1,54 @@
+"""Redacts environment variables that hold secrets, by their names, from what is shown or recorded.
+
+Owns: which names those are, and what is written in place of a value. Whatever leaves the supervisor
+and the processes that it starts, on a terminal, on disk or on the network, goes through here. Pure.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Iterable
+
+from lifecycle.plan.model import Plan
+
+REDACTED = "(redacted)"
+
+_SECRET = re.compile(
+    "TOKEN|SECRET|PASSW|CREDENTIAL|PRIVATE|(API|ACCESS)_?KEY|AUTH(?!OR)", re.IGNORECASE
+)
+
+
+def is_secret(variable: str) -> bool:
+    """Return whether the name of an environment variable says that its value is secret."""
+    return _SECRET.search(variable) is not None
+
+
+def without_secrets(plan: Plan) -> Plan:
+    """Return `plan` without values of environment variables whose names say they are secret."""
+    nodes = tuple(
+        dataclasses.replace(
+            node,
+            run=dataclasses.replace(node.run, environment=_redacted(node.run.environment)),
+        )
+        if any(is_secret(name) for name, _ in node.run.environment)
+        else node
+        for node in plan.nodes
+    )
+    processes = tuple(
+        dataclasses.replace(
+            process,
+            environment=_redacted(process.environment),
+            run=dataclasses.replace(process.run, environment=_redacted(process.run.environment)),
+        )
+        if any(is_secret(name) for name, _ in (*process.environment, *process.run.environment))
+        else process
+        for process in plan.processes
+    )
+    if nodes == plan.nodes and processes == plan.processes:
+        return plan
+    return dataclasses.replace(plan, nodes=nodes, processes=processes)
+
+
+def _redacted(variables: Iterable[tuple[str, str]]) -> tuple[tuple[str, str], ...]:
+    return tuple((name, REDACTED if is_secret(name) else value) for name, value in variables)
