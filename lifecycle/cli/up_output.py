@@ -22,6 +22,7 @@ from lifecycle.cli.standard_streams import Writer
 from lifecycle.node import Operation
 from lifecycle.printable import json_text, log_line, one_line
 from lifecycle.supervisor import (
+    ConsequenceTaken,
     Event,
     Failure,
     GateOpened,
@@ -437,6 +438,12 @@ def _(event: Restarted) -> str:
 @_describe.register
 def _(event: GaveUp) -> str:
     return f"gave up {event.process} after {_count(len(event.history), 'failure')}"
+
+
+@_describe.register
+def _(event: ConsequenceTaken) -> str:
+    whom = f" {', '.join(event.nodes)}" if event.nodes else ""
+    return f"on_violation: {event.action}{whom} for {event.rule} of {event.subject}"
 
 
 @_describe.register

@@ -20,11 +20,13 @@ from .loading import ArgumentDeclaration as ArgumentDeclaration
 from .loading import Loaded as Loaded
 from .loading import declared_arguments as declared_arguments
 from .loading import load as load
+from .model import BY_DEFAULT as BY_DEFAULT
 from .model import TOLERATED_NODES as TOLERATED_NODES
 from .model import After as After
 from .model import Authority as Authority
 from .model import Condition as Condition
 from .model import ConnectionDeclaration as ConnectionDeclaration
+from .model import Consequence as Consequence
 from .model import DataLayer as DataLayer
 from .model import DataLayerSource as DataLayerSource
 from .model import Discovery as Discovery
@@ -46,6 +48,7 @@ from .model import Manifest as Manifest
 from .model import Node as Node
 from .model import NodeDeclaration as NodeDeclaration
 from .model import OnFailure as OnFailure
+from .model import OnViolation as OnViolation
 from .model import Output as Output
 from .model import ParameterDeclaration as ParameterDeclaration
 from .model import ParameterValue as ParameterValue

@@ -16,10 +16,12 @@ from pathlib import Path
 
 from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.model import (
+    BY_DEFAULT,
     SUPERVISION_KEYS,
     After,
     Condition,
     ConnectionDeclaration,
+    Consequence,
     DataLayer,
     Discovery,
     Endpoint,
@@ -29,6 +31,7 @@ from lifecycle.manifest.model import (
     Interface,
     Limits,
     Node,
+    OnViolation,
     ParameterDeclaration,
     ParameterValue,
     Quantity,
@@ -76,6 +79,22 @@ def build_data_layer(root: Cursor, found: list[Diagnostic]) -> DataLayer:
         found.append(error("manifest.multicast-group", at, message, hint))
         group = default.multicast_group
     return cursor.build(DataLayer, multicast_group=group, at=cursor.key_at)
+
+
+def build_on_violation(cursor: Cursor) -> OnViolation:
+    """Build `on_violation` of a document, a node or a link."""
+    return tuple((name, Consequence(each.scalar)) for name, each in _consequences(cursor))
+
+
+def _consequences(cursor: Cursor) -> Iterator[tuple[str, Cursor]]:
+    """Yield the entries of `on_violation`; a single word is for every rule."""
+    written = cursor.get("on_violation")
+    if written is None:
+        return
+    if isinstance(written.value.data, Mapping):
+        yield from written.entries()
+    else:
+        yield BY_DEFAULT, written
 
 
 def section_positions(root: Cursor) -> tuple[tuple[str, Position], ...]:
@@ -398,11 +417,13 @@ def build_node(
         ),
         timeouts=_timeouts(cursor),
         supervision=cursor.build(Supervision),
+        on_violation=build_on_violation(cursor),
         interface=interface,
         flows=tuple(_flows(cursor)),
         connections=build_connections(cursor, interface, found),
         positions=(
             *_positions(cursor),
+            *((f"on_violation.{name}", each.key_at) for name, each in _consequences(cursor)),
             *connection_positions(cursor),
             *((f"parameters.{name}", at) for name, (_, at) in parameters.items()),
         ),

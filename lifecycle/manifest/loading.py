@@ -23,6 +23,7 @@ from lifecycle.manifest.building import (
     build_data_layer,
     build_discovery,
     build_node,
+    build_on_violation,
     quantities,
     section_positions,
 )
@@ -151,6 +152,7 @@ def build_manifest(
         network=build_network(root, base=base, found=found),
         data_layer=build_data_layer(root, found),
         policy=_policy(root),
+        on_violation=build_on_violation(root),
         nodes=nodes,
         links=tuple(_link(each) for each in root.items("links") if each.place not in unsound),
         positions=section_positions(root),
@@ -200,6 +202,7 @@ def _link(cursor: Cursor) -> Link:
         from_node=cursor.text("from"),
         to_node=cursor.text("to"),
         quantities=quantities(cursor),
+        on_violation=build_on_violation(cursor),
         at=cursor.at,
     )
 
@@ -727,9 +730,9 @@ class _Loading:
             self._outermost = manifest
             return
         outer = self._outermost
-        for key in ("discovery", "network", "data_layer", "policy"):
+        for key in ("discovery", "network", "data_layer", "policy", "on_violation"):
             mine, holds = getattr(manifest, key), getattr(outer, key)
-            if key != "policy":
+            if key not in ("policy", "on_violation"):
                 mine = dataclasses.replace(mine, at=holds.at)
             if key in root and mine != holds:
                 message = f"cannot use the {key} of an included manifest; the including one's holds"

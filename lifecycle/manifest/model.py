@@ -316,6 +316,22 @@ class Supervision:
 SUPERVISION_KEYS = tuple(each.name for each in dataclasses.fields(Supervision))
 
 
+class Consequence(enum.Enum):
+    """What is done about a violation of an active system; each is stronger than the one before."""
+
+    REPORT = "report"  # nothing but the verdict
+    DEACTIVATE = "deactivate"  # the nodes it is about; all where it is about none of the system
+    PAUSE = "pause"  # all nodes, as `lifecycle pause`
+    STOP = "stop"  # the run ends
+
+
+BY_DEFAULT = "default"
+"""Key of `on_violation` for every rule that it does not name."""
+
+OnViolation = tuple[tuple[str, Consequence], ...]
+"""By id of a rule, family of rules (the id's part before the dot) or BY_DEFAULT; may be empty."""
+
+
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Endpoint:
     """One declared endpoint.
@@ -470,6 +486,7 @@ class NodeDeclaration:
         state: where a managed node is brought to, and kept.
         may_end: its process may end by itself with exit status 0.
         supervision: what is done when its process fails.
+        on_violation: what is done about violations that concern it; before that of the system.
     """
 
     key: str
@@ -487,6 +504,7 @@ class NodeDeclaration:
     state: TargetState = TargetState.ACTIVE
     may_end: bool = False
     supervision: Supervision = Supervision()
+    on_violation: OnViolation = ()
     at: Position
 
     @property
@@ -502,8 +520,8 @@ class Node(NodeDeclaration):
     Attributes:
         process: nodes with the same non-empty process name share one process.
         positions: where parts of the node are, by path below it: `machine`, `namespace`, `name`,
-            `process`, `restart_sec`, `remap.scan`, `parameters.rate`, `parameter_files.0`; sorted,
-            read with `where`.
+            `process`, `restart_sec`, `on_violation.param`, `remap.scan`, `parameters.rate`,
+            `parameter_files.0`; sorted, read with `where`.
         written_paths: paths as the manifest writes them, by place: `parameter_files.0`,
             `run.working_directory`; what other fields have of them is absolute.
         shared: parts that are written for several nodes, by path as in `positions`.
@@ -534,12 +552,14 @@ def _path(entry: tuple[str, Position]) -> str:
 
 
 __all__ = [
+    "BY_DEFAULT",
     "SUPERVISION_KEYS",
     "TOLERATED_NODES",
     "After",
     "Authority",
     "Condition",
     "ConnectionDeclaration",
+    "Consequence",
     "DataLayer",
     "DataLayerSource",
     "Discovery",
@@ -560,6 +580,7 @@ __all__ = [
     "Network",
     "Node",
     "OnFailure",
+    "OnViolation",
     "Output",
     "ParameterDeclaration",
     "ParameterValue",
@@ -693,6 +714,7 @@ class Link:
         max_delay_ms: > 0; None if not asked for.
         transport: overrides what would be negotiated for this pair.
         quantities: each of its numbers that only a measurement could prove, as it is written.
+        on_violation: what is done about violations that concern it; before that of its nodes.
     """
 
     topic: str
@@ -702,12 +724,17 @@ class Link:
     max_delay_ms: float | None = None
     transport: FlowTransport = FlowTransport.ANY
     quantities: tuple[Quantity, ...] = ()
+    on_violation: OnViolation = ()
     at: Position
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class SystemDeclaration:
-    """What a manifest declares of its system that the plan takes over as it is."""
+    """What a manifest declares of its system that the plan takes over as it is.
+
+    Attributes:
+        on_violation: what is done about violations for which nothing nearer says it.
+    """
 
     system: str
     machines: tuple[Machine, ...] = ()
@@ -715,6 +742,7 @@ class SystemDeclaration:
     network: Network = Network()
     data_layer: DataLayer = DataLayer()
     policy: Policy = Policy()
+    on_violation: OnViolation = ()
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

@@ -157,7 +157,8 @@ def missing_key(key: str, schema: Mapping[str, Any]) -> tuple[str, str]:
 
 def bad_key(each: Violation) -> tuple[str, str]:
     """Return message and hint for a key whose spelling is not allowed."""
-    return f"cannot use {quote(each.value)} as a key here", _pattern(each.schema)
+    meant = _closest(each.value, each.operand) if each.keyword == "enum" else ""
+    return f"cannot use {quote(each.value)} as a key here", meant or _pattern(each.schema)
 
 
 def bad_value(each: Violation) -> tuple[str, str]:

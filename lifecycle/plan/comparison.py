@@ -22,7 +22,7 @@ import zlib
 from collections.abc import Iterator, Mapping
 
 from lifecycle.codec import from_json, to_json, to_plain
-from lifecycle.manifest import Position, RunKind
+from lifecycle.manifest import OnViolation, Position, RunKind
 from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedNode
 from lifecycle.plan.secrets import REDACTED, is_secret, without_secrets
 
@@ -43,7 +43,7 @@ _NODE_DERIVED = (
     *("key", "at", "run", "endpoints", "declared_parameters", "parameters", "parameter_files"),
     *("remap", "participants", "after", "transports", "max_datagram_bytes", "connections"),
     *("authority", "events", "membership", "files", "held_by"),
-    *("expected_parameters", "unread_parameter_files", "supervision"),
+    *("expected_parameters", "unread_parameter_files", "supervision", "on_violation"),
 )
 _ENDPOINT_DERIVED = (
     *("kind", "name", "resolved", "type", "qos", "participant", "at"),
@@ -127,12 +127,16 @@ def _document(plan: Plan) -> _Tree:
         "network": _fields(plan.network, "at"),
         "data_layer": _fields(plan.data_layer, "at"),
         "policy": _fields(plan.policy),
+        "on_violation": _consequences(plan.on_violation),
         "links": {
-            f"{flow.topic} from {flow.publisher} to {flow.subscription}": _fields(
-                flow,
-                *("topic", "publisher", "subscription", "linked", "medium", "medium_reason"),
-                "quantities",
-            )
+            f"{flow.topic} from {flow.publisher} to {flow.subscription}": {
+                **_fields(
+                    flow,
+                    *("topic", "publisher", "subscription", "linked", "medium", "medium_reason"),
+                    *("quantities", "on_violation"),
+                ),
+                "on_violation": _consequences(flow.on_violation),
+            }
             for flow in plan.flows
             if flow.linked
         },
@@ -157,6 +161,7 @@ def _node(node: PlannedNode) -> _Tree:
     return {
         **_fields(node, *_NODE_DERIVED),
         **_fields(node.supervision),
+        "on_violation": _consequences(node.on_violation),
         "run": run,
         "parameters": {name: to_plain(value) for name, value in node.parameters},
         "parameter_files": [
@@ -180,6 +185,10 @@ def _node(node: PlannedNode) -> _Tree:
             if each.declared
         },
     }
+
+
+def _consequences(said: OnViolation) -> _Tree:
+    return {name: what.value for name, what in said}
 
 
 def _interface(node: PlannedNode) -> _Tree:

@@ -24,6 +24,7 @@ from lifecycle.manifest import (
     FlowTerms,
     FlowTransport,
     NodeDeclaration,
+    OnViolation,
     ParameterDeclaration,
     ParameterValue,
     Position,
@@ -301,6 +302,7 @@ class PlannedFlow:
             nodes' configurations are.
         medium_reason: one phrase for people, "same host", "links say so".
         quantities: numbers of its links that only a measurement could prove.
+        on_violation: what its links say is done about violations of it.
     """
 
     topic: str
@@ -313,6 +315,7 @@ class PlannedFlow:
     medium: str = ""
     medium_reason: str = ""
     quantities: tuple[Quantity, ...] = ()
+    on_violation: OnViolation = ()
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

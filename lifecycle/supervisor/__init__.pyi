@@ -16,6 +16,7 @@ from .processes.logs import check_log_root as check_log_root
 from .processes.logs import is_running as is_running
 from .processes.logs import ros_log_root as ros_log_root
 from .processes.logs import runs_of as runs_of
+from .run.events import ConsequenceTaken as ConsequenceTaken
 from .run.events import Emitter as Emitter
 from .run.events import Event as Event
 from .run.events import Failure as Failure

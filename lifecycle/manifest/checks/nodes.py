@@ -2,10 +2,9 @@
 
 Owns: check.unknown-machine, check.process-machine, check.process-run, check.process-environment,
 check.process-name, check.ros-args, check.container, check.may-end, check.state,
-check.restart, check.start-limit,
-check.domain, check.ports, check.localhost, check.after-unknown,
-check.after-self, check.after-cycle, check.after-unmanaged, check.after-state. Port arithmetic is in
-`lifecycle.network`. Pure.
+check.restart, check.start-limit, check.on-violation, check.domain, check.ports, check.localhost,
+check.after-unknown, check.after-self, check.after-cycle, check.after-unmanaged, check.after-state.
+Port arithmetic is in `lifecycle.network`. Pure.
 """
 
 from __future__ import annotations
@@ -21,6 +20,7 @@ from lifecycle.manifest.model import (
     SUPERVISION_KEYS,
     After,
     Condition,
+    Consequence,
     DiscoveryMode,
     DiscoveryRange,
     EndpointKind,
@@ -160,6 +160,35 @@ def check_supervision(system: DeclaredSystem) -> Iterator[Diagnostic]:
             hint = "write 'restart: on-failure', or remove 'may_end'"
             yield error("check.restart", places["restart"], message, hint)
         yield from _delays(node, places)
+
+
+def check_on_violation(system: DeclaredSystem) -> Iterator[Diagnostic]:
+    """Yield findings about violations after which nodes are to be deactivated that never can be."""
+    hint = "write 'pause' or 'stop', which are for the whole system"
+    for node in system.manifest.nodes:
+        for name, what in node.on_violation:
+            if what is Consequence.DEACTIVATE and (why := _never_deactivated(node)):
+                message = f"cannot deactivate {node.key!r} when it violates: {why}"
+                at = node.where(f"on_violation.{name}")
+                yield error("check.on-violation", at, message, hint)
+    for link in system.manifest.links:
+        ends = [system.nodes.get(key) for key in (link.from_node, link.to_node)]
+        if all(end is not None and _never_deactivated(end) for end in ends) and any(
+            what is Consequence.DEACTIVATE for _, what in link.on_violation
+        ):
+            message = (
+                f"cannot deactivate an end of {link.topic!r} when it violates: no gate holds "
+                f"{link.from_node!r} or {link.to_node!r}"
+            )
+            yield error("check.on-violation", link.at, message, hint)
+
+
+def _never_deactivated(node: Node) -> str:
+    """Say why a node is never active, or stays so; empty if it may be deactivated."""
+    if not node.holds:
+        return "no gate holds it"
+    kept = node.state is not TargetState.ACTIVE
+    return f"it is kept {node.state.value}" if kept else ""
 
 
 _NOT_RESTARTED = "write 'restart: on-failure', or remove it"

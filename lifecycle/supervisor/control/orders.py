@@ -26,7 +26,8 @@ from lifecycle.supervisor.run.options import UpOptions, local_processes
 ACTIVE = "active"
 PAUSED = "paused"
 HELD = "held"
-"""Phases in which orders are taken. HELD: some nodes wait at a gate that stayed closed."""
+"""Phases in which orders are taken. HELD: some nodes wait at a gate that stayed closed, or that a
+consequence of a violation closed behind them."""
 
 
 class OrderKind(enum.Enum):
@@ -46,11 +47,14 @@ class Order:
         plan: the plan of the manifest that the order names, as it is now; None if it names none.
         reload: for RESTART, `plan` is to run from now on.
         keys: for RESTART by policy, of the nodes, which are down already; empty for one by hand.
+            For PAUSE by policy, of the nodes that are deactivated; empty for all.
+        reason: for PAUSE by policy, what it is for, as `lifecycle status` shows it.
     """
 
     kind: OrderKind
     node: str = ""
     keys: tuple[str, ...] = ()
+    reason: str = ""
     plan: Plan | None = None
     reload: bool = False
 
@@ -175,7 +179,7 @@ class Mailbox:
 
 
 _MOST = 20
-_RELOADED = ("nodes.", "links.", "policy.")
+_RELOADED = ("nodes.", "links.", "policy.", "on_violation.")
 """Parts of a manifest that a running supervisor can reload: the rest made the supervisor's own
 participant, its authority and the networks that it programs."""
 _NOT_RELOADED = ("policy.ros_interface",)

@@ -132,7 +132,7 @@ class SystemStatus(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         phase: "connecting", "verifying", "activating", "active", "pausing", "paused", "held" (some
-            nodes wait at a gate that stayed closed), "restarting" or "stopping".
+            nodes wait at a gate that stayed or was closed), "restarting" or "stopping".
         verdict: of the last judgement; None before the first.
         not_ok: what keeps it from being ok, in one line; empty where nothing does.
         supervisor: pid.

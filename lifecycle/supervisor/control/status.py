@@ -59,7 +59,7 @@ def node_status(
         managed=node.planned.managed,
         reach=node.reach,
         state="" if died else node.state,
-        doing=node.doing,
+        doing=node.doing or node.withheld,
         matched=sum(each.kind.is_topic and bool(each.matched) for each in reports),
         endpoints=sum(each.kind.is_topic for each in node.planned.endpoints),
         unique_flows=sum(flow.unique in (UniqueHow.WEAKLY, UniqueHow.STRONGLY) for flow in flows),

@@ -1,9 +1,9 @@
 """Holds a system that is up: judges it at every change, and carries out orders.
 
 Owns: `Watch`, which judges again and again, and `Holding`: for how long, what ends it, how orders
-(pause, resume, restart) are received and answered, and that what fails is restarted when policy
-says so, by the same orders. What an order does is sequence.py's, when to restart policy/'s. Must
-not import rclpy.
+(pause, resume, restart) are received and answered, and that what fails is restarted, and what is
+violated has its consequence, when policy says so, by the same orders. What an order does is
+sequence.py's, when to restart and what to do about a violation policy/'s. Must not import rclpy.
 """
 
 from __future__ import annotations
@@ -14,8 +14,10 @@ import enum
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-from lifecycle.errors import UsageError
+from lifecycle.errors import ExitCode, UsageError
+from lifecycle.manifest import Consequence
 from lifecycle.supervisor.control.orders import (
+    ACTIVE,
     HELD,
     PAUSED,
     Done,
@@ -32,8 +34,9 @@ from lifecycle.supervisor.gate.sequence import GateSequence, OutrunError
 from lifecycle.supervisor.gate.verification_loop import SETTLED_S, ChangeCounter, VerificationLoop
 from lifecycle.supervisor.health.process_monitor import ProcessMonitor
 from lifecycle.supervisor.nodes.system import System
+from lifecycle.supervisor.policy.consequences import Consequences, Due
 from lifecycle.supervisor.policy.schedule import RestartSchedule
-from lifecycle.supervisor.run.events import Emitter, Notice
+from lifecycle.supervisor.run.events import ConsequenceTaken, Emitter, Notice
 from lifecycle.supervisor.run.failure import StepFailedError, ended, failure_of
 from lifecycle.verify import Outcome, Stage, Verdict, not_ok
 
@@ -44,9 +47,11 @@ class Watch:
     Args:
         schedule: what is away, to be started again by policy, violates nothing by that.
         opens: whether a verdict opens a gate that is waited for; `run` returns then.
+        consequences: what is done about violations; None while nothing is.
 
     Attributes:
         violated: what was seen violated for longer than a passing moment; empty if nothing was.
+        due: what is to be done about a violation; `run` returns then, too. None if nothing is.
     """
 
     def __init__(
@@ -55,17 +60,21 @@ class Watch:
         changes: ChangeCounter,
         stage: Stage,
         schedule: RestartSchedule | None = None,
+        *,
         opens: Callable[[Verdict], bool] = lambda _: False,
+        consequences: Consequences | None = None,
     ) -> None:
+        self._consequences = consequences
         self._schedule = schedule
         self._opens = opens
         self._judge = judge
         self._changes = changes
         self._stage = stage
         self.violated = ""
+        self.due: Due | None = None
 
     async def run(self) -> None:
-        """Judge at every change, until cancelled or a gate may open that is waited for."""
+        """Judge at every change, until cancelled, a gate may open, or something is to be done."""
         while True:
             count = self._changes.count
             whole, again_s = await self._judge.settled(self._stage)
@@ -74,10 +83,17 @@ class Watch:
             away = frozenset[str]() if self._schedule is None else self._schedule.away
             verdict = _without(whole, away)
             bad = verdict.verdict is Outcome.VIOLATED and not self.violated
-            wait_s = SETTLED_S if again_s is None and bad else again_s
+            waits_s = [SETTLED_S if again_s is None and bad else again_s]
+            if self._consequences is not None:
+                self.due, in_s = self._consequences.look(verdict.findings)
+                waits_s.append(in_s)
+            if self.due is not None:
+                self.violated = self.violated or not_ok(verdict)
+                return
+            wait_s = min((each for each in waits_s if each is not None), default=None)
             if await self._changes.beyond(count, wait_s):
                 await self._judge.quiet()
-            elif again_s is None:
+            elif again_s is None and bad:
                 self.violated = not_ok(verdict) or verdict.verdict.value  # no change: it lasts
 
 
@@ -113,6 +129,7 @@ class Holding:
         emit: where events go.
         note_segments: called when processes may be new.
         keep_going: a process that ends is reported, and does not end the run.
+        stop: ends the run, as `lifecycle down` does, with a reason and an exit code.
     """
 
     def __init__(
@@ -128,7 +145,10 @@ class Holding:
         emit: Emitter,
         note_segments: Callable[[], Awaitable[None]],
         keep_going: bool,
+        stop: Callable[[str, ExitCode], None],
     ) -> None:
+        self._stop = stop
+        self._consequences = Consequences(system, emit, lasting_s=SETTLED_S)
         self._system = system
         self._judge = judge
         self._changes = changes
@@ -159,7 +179,18 @@ class Holding:
         deadline = None if hold_s is None else asyncio.get_running_loop().time() + hold_s
         while True:
             opens = self._gate_sequence.may_let_through
-            watch = Watch(self._judge, self._changes, stage, self._schedule, opens)
+            acts = self._gate_sequence.phase in (ACTIVE, HELD)
+            if not acts:
+                self._consequences.forget()
+            consequences = self._consequences if acts else None
+            watch = Watch(
+                self._judge,
+                self._changes,
+                stage,
+                self._schedule,
+                opens=opens,
+                consequences=consequences,
+            )
             watching = asyncio.ensure_future(watch.run())
             try:
                 what = await self._until_ordered(deadline, watching)
@@ -173,8 +204,10 @@ class Holding:
                 await self._carry_out(what)
             elif isinstance(what, StepFailedError):
                 await self._gate_sequence.put_down(what)
+            elif what is _Next.LET_THROUGH and watch.due is not None:
+                await self._take_consequence(watch.due)
             else:
-                await self._by_policy(what)
+                await self._by_policy(self._again if what is _Next.RESTART else self._let_through)
             stage = self._gate_sequence.stage
 
     async def ordered(self, order: Order) -> Done:
@@ -196,8 +229,32 @@ class Holding:
         finally:
             await ended(*waits)
 
-    async def _by_policy(self, what: _Next) -> None:
-        """Start again what is due, or let through its gate what waits there; who fails comes later.
+    async def _take_consequence(self, due: Due) -> None:
+        """Do about a violation what the manifest asks for, as a person would order it.
+
+        Raises:
+            StepFailedError: something failed that is not to be started again, or too often.
+        """
+        found = due.finding
+        names = tuple(self._system.nodes[key].name for key in due.keys)
+        self._emit(
+            ConsequenceTaken(
+                action=due.what.value,
+                nodes=names,
+                rule=found.rule,
+                subject=found.subject,
+                message=found.message,
+            )
+        )
+        reason = f"on_violation: {due.what.value} ({found.rule} of {found.subject})"
+        if due.what is Consequence.STOP:
+            self._stop(reason, ExitCode.VIOLATED)
+            await asyncio.get_running_loop().create_future()  # until it ends us
+        order = Order(kind=OrderKind.PAUSE, keys=due.keys, reason=f"{reason}; lifecycle resume")
+        await self._by_policy(lambda: self._carry_out_in_spite(order))
+
+    async def _by_policy(self, work: Callable[[], Awaitable[None]]) -> None:
+        """Do what no person ordered; who fails in it is put down, to be started again later.
 
         Raises:
             StepFailedError: something failed that is not to be started again, or too often.
@@ -205,12 +262,7 @@ class Holding:
         failure = None
         self._before = self._gate_sequence.phase
         try:
-            if what is _Next.RESTART:
-                keys = self._schedule.begin()
-                await self._gate_sequence.carry_out(Order(kind=OrderKind.RESTART, keys=keys))
-                await self._note_segments()
-            else:
-                await self._gate_sequence.let_through()
+            await work()
         except OutrunError:
             pass
         except VerificationError as error:
@@ -221,6 +273,16 @@ class Holding:
             self._before = ""
         if failure is not None:
             await self._gate_sequence.put_down(failure)
+
+    async def _again(self) -> None:
+        """Start again what is due."""
+        keys = self._schedule.begin()
+        await self._gate_sequence.carry_out(Order(kind=OrderKind.RESTART, keys=keys))
+        await self._note_segments()
+
+    async def _let_through(self) -> None:
+        """Let through its gate what waits there."""
+        await self._gate_sequence.let_through()
 
     def _check(self, order: Order) -> None:
         # A restart by policy is nobody's order: what comes meanwhile is carried out after it.

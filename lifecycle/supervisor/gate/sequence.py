@@ -196,7 +196,7 @@ class GateSequence:
             StepFailedError: a step failed, or a network could not be programmed; the run is over.
         """
         if order.kind is OrderKind.PAUSE:
-            await self._pause()
+            await self._pause(order)
         elif order.kind is OrderKind.RESUME:
             await self._through_the_gate()
         elif order.keys:
@@ -204,12 +204,26 @@ class GateSequence:
         else:
             await self._restart(order)
 
-    async def _pause(self) -> None:
+    async def _pause(self, order: Order) -> None:
         self._gate.close()
         self.phase = "pausing"
-        await self._alive(self._bring_up.deactivate())
-        self._judge.ahead = frozenset()
-        self._reached(PAUSED)
+        nodes = tuple(
+            each
+            for key, each in self._system.nodes.items()
+            if each.planned.holds
+            and each.reach is Reach.ACTIVE
+            and key in (order.keys or self._system.nodes)
+        )
+        for each in nodes:
+            each.withheld = order.reason
+        try:
+            await self._alive(self._bring_up.deactivate(nodes))
+        finally:
+            self._judge.ahead = self.active()
+            if order.keys:
+                self.phase = HELD
+        if not order.keys:
+            self._reached(PAUSED)
 
     async def _restart(self, order: Order) -> None:
         """Take one process or all down, and bring it up as far as the system was."""
@@ -350,7 +364,12 @@ class GateSequence:
             VerificationError: their gate stays closed; they wait at it.
             StepFailedError: as for `activate`.
         """
-        names = self._schedule.returning
+        returning = self._schedule.returning
+        names = returning - self._withheld()
+        if not names:
+            self.phase = HELD
+            self._schedule.returned(self._keys(returning))
+            return
         deadline = asyncio.get_running_loop().time() + self._timeout_s
         try:
             permit = await self._unless_outrun(self.verify(self._timeout_s))
@@ -365,11 +384,11 @@ class GateSequence:
         finally:
             if self.phase != ACTIVE:
                 self.phase = HELD
-        self._schedule.returned(self._keys(names))
+        self._schedule.returned(self._keys(returning))
 
     def may_let_through(self, verdict: Verdict) -> bool:
         """Whether nodes wait that were started again by policy, and `verdict` opens their gate."""
-        names = self._schedule.returning
+        names = self._schedule.returning - self._withheld()
         if self.phase != HELD or not names or names & self._schedule.down:
             return False
         return not self._gate.closes(verdict)
@@ -625,6 +644,8 @@ class GateSequence:
                 trusted=self.trusted,
             )
         )
+        for each in waiting:
+            each.withheld = ""
         async with self._following():
             await self._alive(self._bring_up.activate(permit, behind_s(deadline), waiting))
         self._judge.ahead = frozenset()
@@ -681,6 +702,9 @@ class GateSequence:
             for each in self._system.nodes.values()
             if each.is_to_be_active and each.is_up and each.reach is not Reach.ACTIVE
         )
+
+    def _withheld(self) -> frozenset[str]:
+        return frozenset(each.name for each in self._system.nodes.values() if each.withheld)
 
     def active(self) -> frozenset[str]:
         """Return the names of the nodes that are active, let through or found so."""

@@ -259,6 +259,8 @@ class NodeRun:
         reports_changes: its host reports unasked when its configuration changes.
         unload: has its container unload a component; None for what is not loaded into one.
         is_up: it was started and brought as far as its gate; cleared when it goes down.
+        withheld: why a consequence of a violation keeps it inactive, until a person lets it through
+            the gate again; empty if none does.
     """
 
     def __init__(self, planned: PlannedNode, emit: Emitter) -> None:
@@ -279,6 +281,7 @@ class NodeRun:
         self.reports_changes = False
         self.unload: Callable[[], Awaitable[None]] | None = None
         self.is_up = False
+        self.withheld = ""
         self.changed = asyncio.Event()
         self._emit = emit
 

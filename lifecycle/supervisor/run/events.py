@@ -323,6 +323,25 @@ class GaveUp:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class ConsequenceTaken:
+    """A violation of an active system lasts, and what the manifest asks for is done about it.
+
+    Attributes:
+        action: "deactivate", "pause" or "stop".
+        nodes: those that are deactivated; empty where it is for the whole system.
+        rule: id of the finding's rule.
+        message: the finding's, a whole sentence.
+    """
+
+    kind: ClassVar[str] = "consequence"
+    action: str
+    nodes: tuple[str, ...]
+    rule: str
+    subject: str
+    message: str
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Notice:
     """Something a person should know that changes nothing: orphans swept, a step forced."""
 
@@ -368,6 +387,7 @@ Event = Union[  # noqa: UP007 - a run-time alias on Python 3.10
     RestartScheduled,
     Restarted,
     GaveUp,
+    ConsequenceTaken,
     Notice,
     Stopping,
     Stopped,

@@ -264,6 +264,7 @@ class Session:
             emit=emit,
             note_segments=self._records.note_segments,
             keep_going=options.keep_going,
+            stop=self.stop,
         )
 
         self._ros_interface = RosInterface(
@@ -397,8 +398,9 @@ class Session:
         """Return the result of a run that is asked to end.
 
         It is a success only if the system was verified, is what was asked for, and nothing bound
-        it to stay; an interrupt (Ctrl-C) never is. That other machines of the system were shut down
-        before is how a system of several hosts ends, and no failure of this one.
+        it to stay; an interrupt (Ctrl-C) never is, nor what a violation ends. That other machines
+        of the system were shut down before is how a system of several hosts ends, and no failure
+        of this one.
 
         Args:
             exit_code: of a run that is cut short.
@@ -406,7 +408,7 @@ class Session:
         if not self._held:
             return _RunEnd(exit_code=exit_code, why=self._waits())
         end = self._outcome()
-        if exit_code is ExitCode.INTERRUPTED:
+        if exit_code in (ExitCode.INTERRUPTED, ExitCode.VIOLATED):
             return dataclasses.replace(end, exit_code=exit_code)
         if end.exit_code == ExitCode.VIOLATED and self._hosts_left():
             end = _RunEnd()

@@ -70,6 +70,11 @@ class Rule:
     names_expected: bool = False
     names_log: bool = False
 
+    @property
+    def family(self) -> str:
+        """What its id begins with: `on_violation` names families."""
+        return self.id.partition(".")[0]
+
     def finding(
         self,
         outcome: Outcome,

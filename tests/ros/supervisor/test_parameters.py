@@ -135,6 +135,36 @@ def test_every_change_of_a_parameter_is_judged_until_it_is_set_back(
         assert "param.missing: /robot/left: mode" in judged.stdout
 
 
+def test_a_node_whose_parameter_is_changed_is_deactivated_until_it_is_resumed(
+    tmp_path: Path, fresh_domain: int, set_parameter: Set
+) -> None:
+    manifest = pair(
+        tmp_path,
+        fresh_domain,
+        edit={
+            "on_violation": {"param": "deactivate"},
+            "nodes/talker/interface/parameters": {"rate": {"type": "double", "default_value": 1.5}},
+        },
+    )
+    with up(manifest, runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        since = len(run.events)
+        set_parameter("/talker", "rate", **double(99.0))
+        taken = run.until("consequence")
+        assert (taken["action"], taken["nodes"]) == ("deactivate", ["/talker"])
+        assert (taken["rule"], taken["subject"]) == ("param.value-differs", "/talker: rate")
+        run.met("node", since=since, node="/talker", state="inactive")
+        assert "param.value-differs" in verb("status", "pair", runtime=tmp_path).stdout
+        assert verb("resume", "pair", runtime=tmp_path).returncode == ExitCode.VIOLATED
+        set_parameter("/talker", "rate", **double(1.5))
+        begun = len(run.events)
+        assert verb("resume", "pair", runtime=tmp_path).returncode == ExitCode.OK
+        run.met("request", since=begun, node="/talker", operation="activate")
+        requests = [(each["node"], each["operation"]) for each in run.of_kind("request")]
+        assert ("/listener", "deactivate") not in requests
+        run.assert_gate_held()
+
+
 def test_the_gate_stays_closed_over_parameters_that_are_not_what_is_declared(
     tmp_path: Path, fresh_domain: int
 ) -> None:

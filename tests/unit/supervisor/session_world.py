@@ -35,6 +35,7 @@ from lifecycle.supervisor.processes.adopted_process import RunningNode
 from lifecycle.supervisor.processes.orphans import end_strays
 from lifecycle.supervisor.processes.process import ProcessExit
 from lifecycle.supervisor.run.events import (
+    ConsequenceTaken,
     Emitter,
     Event,
     Failure,
@@ -209,7 +210,11 @@ class FakeParticipant:
         there = {name: "" for name in hosted if name not in self.unseen} | self.others
         seen = Observation(
             nodes=tuple(
-                ObservedNode(full_name=name, state=None if name in self.mute else state or None)
+                ObservedNode(
+                    full_name=name,
+                    state=None if name in self.mute else state or None,
+                    count=1 + (name in self.twice),
+                )
                 for name, state in there.items()
             ),
             configurations=tuple(report for name, report in self._reports.items() if name in there),
@@ -470,6 +475,8 @@ def _line(event: Event, now_s: float) -> str:
         return f"[restarted] {event.process} ({event.restarts})"
     if isinstance(event, GaveUp):
         return f"[gave_up] {event.process} ({len(event.history)} failures)"
+    if isinstance(event, ConsequenceTaken):
+        return f"[consequence] {event.action} {' '.join(event.nodes)} for {event.rule}"
     return f"[{event.kind}]"
 
 
@@ -603,6 +610,11 @@ class SessionWorld:
     def intrude(self) -> None:
         """Let a node appear that nobody declared."""
         self.graph.others["/intruder"] = ""
+        self.graph.note()
+
+    def double(self, *nodes: str) -> None:
+        """Let nodes be there two times, which violates what is declared of them; none: once."""
+        self.graph.twice = set(nodes)
         self.graph.note()
 
     def retreat(self) -> None:

@@ -1,0 +1,162 @@
+"""What is done about violations of an active system: what the manifest says, and when it is due.
+
+Owns: `consequence_of`, which finds the nearest `on_violation` for a finding (link, node, system),
+and `Consequences`: a violation that lasts has the consequence that is asked for it, once. It looks
+at verdicts and carries nothing out: that is gate/hold.py's, by the orders that a person gives. Must
+not import rclpy.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+
+from lifecycle.manifest import BY_DEFAULT, Consequence, EndpointKind, OnViolation, Restart
+from lifecycle.plan import Plan, PlannedFlow
+from lifecycle.supervisor.control.protocol import Reach
+from lifecycle.supervisor.nodes.system import System
+from lifecycle.supervisor.run.events import Emitter
+from lifecycle.verify import About, Finding, Outcome, rule
+
+_ORDER = tuple(Consequence)
+_Key = tuple[str, str, str, EndpointKind | None]
+
+
+def consequence_of(plan: Plan, finding: Finding) -> Consequence:
+    """Return what is to be done about a violation.
+
+    What is nearest counts: a link that it is about, then its nodes, then the system; there the id
+    of the rule, then its family, then the default. Of two ends the stronger one counts.
+    """
+    links = _strongest(
+        finding, (flow.on_violation for flow in plan.flows if _is_about(plan, flow, finding))
+    )
+    names = finding.nodes or (finding.subject,)
+    nodes = _strongest(
+        finding, (each.on_violation for each in plan.nodes if each.full_name in names)
+    )
+    found = links or nodes or _strongest(finding, (plan.on_violation,))
+    return found or Consequence.REPORT
+
+
+def _is_about(plan: Plan, flow: PlannedFlow, finding: Finding) -> bool:
+    if not flow.on_violation:
+        return False
+    ends = plan.node(flow.publisher).full_name, plan.node(flow.subscription).full_name
+    if finding.ends == ends:
+        return finding.subject in (flow.topic, f"{flow.topic}: {ends[0]} → {ends[1]}")
+    return finding.subject == flow.topic and (finding.node, finding.endpoint) in (
+        (ends[0], EndpointKind.PUBLISHER),
+        (ends[1], EndpointKind.SUBSCRIPTION),
+    )
+
+
+def _strongest(finding: Finding, said: Iterable[OnViolation]) -> Consequence | None:
+    """Return the strongest of what several say about one finding; None if none says anything."""
+    family = rule(finding.rule).family
+    found: list[Consequence] = []
+    for each in said:
+        for name in (finding.rule, family, BY_DEFAULT):
+            if own := [what for key, what in each if key == name]:
+                found += own
+                break
+    return max(found, key=_ORDER.index, default=None)
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Due:
+    """A consequence that is to be carried out now.
+
+    Attributes:
+        keys: for DEACTIVATE, of the nodes.
+        finding: what it is for; the first where there are several.
+    """
+
+    what: Consequence
+    keys: tuple[str, ...] = ()
+    finding: Finding
+
+
+class Consequences:
+    """Knows which violations of one system last, and what is to be done about them.
+
+    Args:
+        system: whose nodes.
+        emit: whose clock counts.
+        lasting_s: seconds for which a violation that may pass by itself is only looked at.
+    """
+
+    def __init__(self, system: System, emit: Emitter, *, lasting_s: float) -> None:
+        self._system = system
+        self._emit = emit
+        self._lasting_s = lasting_s
+        self._since: dict[_Key, float] = {}
+
+    def forget(self) -> None:
+        """Begin anew: the system is not active."""
+        self._since = {}
+
+    def look(self, findings: Iterable[Finding]) -> tuple[Due | None, float | None]:
+        """Take what is found of an active system now.
+
+        Args:
+            findings: without those of nodes that are to be started again.
+
+        Returns:
+            What is due, and else in how many seconds something may be; None if nothing is.
+        """
+        now_s = self._emit.elapsed_s
+        every = tuple(findings)
+        coming = self._coming_elsewhere(every)
+        asked: dict[_Key, Due] = {}
+        for each in every:
+            if each.outcome is Outcome.VIOLATED and coming.isdisjoint(each.nodes):
+                due = self._asked(each)
+                if due is not None:
+                    asked[_key(each)] = due
+        self._since = {key: self._since.get(key, now_s) for key in asked}
+        until_s = {key: since_s + self._lasting_s for key, since_s in self._since.items()}
+        lasting = [due for key, due in asked.items() if until_s[key] <= now_s]
+        if not lasting:
+            return None, min(until_s.values()) - now_s if until_s else None
+        worst = max(lasting, key=lambda due: _ORDER.index(due.what))
+        keys = {key for each in lasting if each.what is worst.what for key in each.keys}
+        ordered = tuple(key for key in self._system.nodes if key in keys)
+        return dataclasses.replace(worst, keys=ordered), None
+
+    def _asked(self, finding: Finding) -> Due | None:
+        """Return what would still have an effect."""
+        plan = self._system.plan
+        what = consequence_of(plan, finding)
+        if what is Consequence.REPORT:
+            return None
+        names = set(finding.nodes or (finding.subject,))
+        concerned = [each for each in plan.nodes if each.full_name in names]
+        own = [node for node in self._system.nodes.values() if node.name in names]
+        if concerned and not own:
+            return None  # its own supervisor has the same manifest
+        if what is Consequence.DEACTIVATE:
+            held = [node for node in own if node.is_to_be_active]
+            if held:
+                active = [each for each in held if each.reach is Reach.ACTIVE and not each.is_gone]
+                keys = tuple(each.planned.key for each in active)
+                return Due(what=what, keys=keys, finding=finding) if keys else None
+            what = Consequence.PAUSE
+        return Due(what=what, finding=finding)
+
+    def _coming_elsewhere(self, findings: Iterable[Finding]) -> frozenset[str]:
+        """Return the names of nodes that are away and that another supervisor starts again."""
+        restarted = {
+            each.full_name
+            for each in self._system.plan.nodes
+            if each.supervision.restart is not Restart.NO and each.key not in self._system.nodes
+        }
+        return frozenset(
+            each.node
+            for each in findings
+            if each.node in restarted and rule(each.rule).about is About.PRESENCE
+        )
+
+
+def _key(finding: Finding) -> _Key:
+    return finding.rule, finding.subject, finding.node, finding.endpoint

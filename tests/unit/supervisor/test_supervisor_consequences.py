@@ -1,0 +1,236 @@
+"""What is done about violations of an active system: what is nearest, and whole sessions.
+
+As in test_supervisor_session.py outlines of runs are compared.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from lifecycle.manifest import Condition, Consequence, EndpointKind, OnViolation, Supervision
+from lifecycle.manifest import Restart as RestartWhen
+from lifecycle.manifest.schema import MANIFEST, read_schema
+from lifecycle.plan import PlannedFlow
+from lifecycle.plan.model import Plan
+from lifecycle.supervisor.control.server import ControlRequest
+from lifecycle.supervisor.policy.consequences import consequence_of
+from lifecycle.verify import RULES, Finding, Outcome
+from tests.builders import plan_of, planned_node
+from tests.unit.supervisor.fakes import run
+from tests.unit.supervisor.session_world import DOWN, SessionWorld, over
+
+REPORT, DEACTIVATE, PAUSE, STOP = Consequence
+TWICE = "graph.duplicate-node"
+
+
+def _plan(
+    system: OnViolation = (), camera: OnViolation = (), restart: RestartWhen = RestartWhen.NO
+) -> Plan:
+    supervision = Supervision(restart=restart, restart_sec=1.0)
+    plan = plan_of(
+        dataclasses.replace(planned_node("camera", supervision=supervision), on_violation=camera),
+        planned_node("viewer", after={"camera": Condition.ACTIVE}),
+    )
+    return dataclasses.replace(plan, on_violation=system)
+
+
+# What is asked for
+
+
+def test_the_manifest_knows_every_rule_and_family() -> None:
+    definition = read_schema(MANIFEST)["$defs"]["on_violation"]
+    names = definition["anyOf"][1]["propertyNames"]["enum"]
+    families = dict.fromkeys(each.family for each in RULES)
+    assert names == ["default", *families, *(each.id for each in RULES)]
+
+
+@pytest.mark.parametrize(
+    ("system", "camera", "found"),
+    [
+        ((), (), REPORT),
+        ((("default", STOP),), (), STOP),
+        ((("default", STOP), ("graph", PAUSE)), (), PAUSE),
+        ((("graph", PAUSE), (TWICE, DEACTIVATE)), (), DEACTIVATE),
+        (((TWICE, STOP),), (("default", REPORT),), REPORT),
+        ((("graph", STOP),), (("param", REPORT),), STOP),
+    ],
+)
+def test_what_is_nearest_counts(
+    system: OnViolation, camera: OnViolation, found: Consequence
+) -> None:
+    assert consequence_of(_plan(system, camera), _found(TWICE, "/camera", node="/camera")) is found
+
+
+def test_a_link_speaks_for_its_flow_and_both_ends_of_it_and_the_stronger_end_counts() -> None:
+    flow = PlannedFlow(
+        topic="/video",
+        publisher="camera",
+        subscription="viewer",
+        linked=True,
+        on_violation=(("flow", STOP),),
+    )
+    plan = dataclasses.replace(_plan((), (("default", DEACTIVATE),)), flows=(flow,))
+    ends = ("/camera", "/viewer")
+    pair = _found("flow.not-unique", "/video: /camera → /viewer", ends=ends)
+    publisher = _found(
+        "flow.dscp-not-applied", "/video", node="/camera", endpoint=EndpointKind.PUBLISHER
+    )
+    other = _found("flow.not-unique", "/audio: /camera → /viewer", ends=ends)
+    assert [consequence_of(plan, each) for each in (pair, publisher, other)] == [
+        STOP,
+        STOP,
+        DEACTIVATE,
+    ]
+
+
+def _found(rule: str, subject: str, **rest: object) -> Finding:
+    return Finding(
+        rule=rule,
+        outcome=Outcome.VIOLATED,
+        subject=subject,
+        expected="",
+        observed="",
+        message="",
+        **rest,  # type: ignore[arg-type]
+    )
+
+
+# Sessions
+
+
+def test_a_violated_node_is_deactivated_and_stays_so_until_it_is_resumed(tmp_path: Path) -> None:
+    async def main() -> None:
+        plan = _plan(camera=((TWICE, DEACTIVATE),))
+        world = SessionWorld(plan, tmp_path, stop_after_s=20.0)
+
+        async def violate() -> None:
+            await world.story.until("[system] active")
+            world.double("/camera")
+            await world.story.until("[node] /camera connected", 2)
+            await asyncio.sleep(3.0)
+            camera, viewer = world.status().nodes
+            why = f"on_violation: deactivate ({TWICE} of /camera); lifecycle resume"
+            assert (world.status().phase, camera.doing, viewer.doing) == ("held", why, "")
+            assert (await world.order(ControlRequest.RESUME))[0] == "4"
+            world.double()
+            await asyncio.sleep(3.0)
+            assert world.status().nodes[0].doing == why
+            assert await world.order(ControlRequest.RESUME) == "0"
+            assert world.status().nodes[0].doing == ""
+
+        await world.run(violate())
+        outline = world.since("[verdict] active violated")
+        assert outline[:3] == [
+            f"[verdict] active violated {TWICE} /camera",
+            f"[consequence] deactivate /camera for {TWICE}",
+            "/camera deactivate",
+        ]
+        assert outline[-len(DOWN) - 8 : -len(DOWN) - 3] == [
+            "[system] verified at 6.5 s",
+            "networks programmed (ok)",
+            "[gate] ok: /camera",
+            "/camera activate",
+            "[system] active at 6.5 s",
+        ]
+        assert world.outline.count("/viewer deactivate") == 1
+        assert world.story[-1] == "[stopped] 4"
+
+    run(main())
+
+
+def test_what_passes_has_no_consequence(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = SessionWorld(_plan((("default", STOP),)), tmp_path, stop_after_s=5.0)
+
+        async def violate() -> None:
+            await world.story.until("[system] active")
+            for _ in range(3):
+                world.double("/camera")
+                await asyncio.sleep(0.3)
+                world.double()
+                await asyncio.sleep(0.3)
+
+        await world.run(violate())
+        assert world.story[-1] == "[stopped] 0"
+
+    run(main())
+
+
+def test_a_violation_stops_the_run_in_order_with_exit_code_4(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = SessionWorld(_plan(((TWICE, STOP), ("default", PAUSE))), tmp_path)
+
+        async def violate() -> None:
+            await world.story.until("[system] active")
+            world.double("/viewer")
+
+        await world.run(violate())
+        assert world.since("[consequence]") == [
+            f"[consequence] stop  for {TWICE}",
+            f"[stopping] at 0.5 s: on_violation: stop ({TWICE} of /viewer)",
+            *DOWN,
+            *over(4),
+        ]
+
+    run(main())
+
+
+def test_what_concerns_no_node_of_the_system_pauses_all_of_it(tmp_path: Path) -> None:
+    async def main() -> None:
+        plan = _plan((("graph", DEACTIVATE),))
+        world = SessionWorld(plan, tmp_path, stop_after_s=10.0)
+
+        async def violate() -> None:
+            await world.story.until("[system] active")
+            world.intrude()
+            await world.story.until("[system] paused")
+            await asyncio.sleep(2.0)
+            assert world.status().phase == "paused"
+            assert "graph.undeclared-node of /intruder" in world.status().nodes[1].doing
+            world.retreat()
+            assert await world.order(ControlRequest.RESUME) == "0"
+
+        await world.run(violate())
+        assert world.since("[consequence]")[:4] == [
+            "[consequence] pause  for graph.undeclared-node",
+            "/viewer deactivate",
+            "/camera deactivate",
+            "[system] paused at 0.5 s",
+        ]
+        assert len([each for each in world.outline if each.startswith("[consequence]")]) == 1
+
+    run(main())
+
+
+def test_a_node_that_is_being_restarted_has_no_consequence_and_one_withheld_comes_back_inactive(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        plan = _plan((("default", STOP), (TWICE, DEACTIVATE)), restart=RestartWhen.ON_FAILURE)
+        world = SessionWorld(plan, tmp_path, stop_after_s=20.0)
+
+        async def violate() -> None:
+            await world.story.until("[system] active")
+            world.kill("camera")
+            await world.story.until("[restarted] camera (1)")
+            await asyncio.sleep(1.0)
+            world.double("/camera")
+            await world.story.until("[consequence]")
+            await asyncio.sleep(1.0)
+            world.double()
+            world.kill("camera")
+            await world.story.until("[restarted] camera (2)")
+            await asyncio.sleep(1.0)
+            assert world.status().phase == "held"
+            assert await world.order(ControlRequest.RESUME) == "0"
+
+        await world.run(violate())
+        assert world.outline.count("/camera activate") == 3
+        assert world.outline.count("/viewer activate") == 1
+        assert world.story[-1] == "[stopped] 4"
+
+    run(main())
