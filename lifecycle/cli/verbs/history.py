@@ -193,7 +193,7 @@ def _explanation(explanation: Explanation) -> Iterator[str]:
         yield f"  and {explanation.others} facts about others"
     told = [(at_s, describe(each)) for at_s, each in explanation.events]
     if any(text for _, text in told):
-        yield "  what happened just before:"
+        yield "  what happened then:"
         yield from (f"    {at_s:+.3f} s  {text}" for at_s, text in told if text)
 
 

@@ -69,7 +69,8 @@ def check_log_root(environment: Mapping[str, str]) -> None:
     root = ros_log_root(environment)
     try:
         root.mkdir(parents=True, exist_ok=True)
-        if not os.access(root, os.W_OK | os.X_OK):
+        # As this process is, capabilities included, and not as its real user would be.
+        if not os.access(root, os.W_OK | os.X_OK, effective_ids=True):
             raise PermissionError(errno.EACCES, "it cannot be written")
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):

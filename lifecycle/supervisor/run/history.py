@@ -37,10 +37,12 @@ LONGEST_LINE = 64 * 2**20
 _KINDS: dict[str, type[Any]] = {each.kind: each for each in get_args(Event)}
 
 BEFORE_S = 2.0
-"""Events that are shown as what happened just before, ..."""
+AFTER_S = 0.5
+"""Events from so long before a finding began until so long after it are shown with it: an end of a
+process may be reported a moment after the graph showed it; ..."""
 
 _MOST_EVENTS = 12
-"""... of these the last."""
+"""... of these the nearest."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -260,7 +262,7 @@ class Explanation:
         first: there was no verdict before it that lacked it.
         facts: what was seen to change when it began, that concerns it; one phrase each.
         others: how many other facts changed then.
-        events: what happened just before, oldest first, and after how many seconds of the run.
+        events: what happened then, oldest first, and after how many seconds of the run.
     """
 
     finding: Finding
@@ -285,7 +287,7 @@ def explained(recorded: RecordedRun, at: float, wanted: str = "") -> tuple[Expla
     if verdict is None:
         return ()
     return tuple(
-        _explained(past, finding)
+        _explained(recorded.moments, len(past), finding)
         for finding in verdict.findings
         if wanted in finding.rule or wanted in finding.subject
     )
@@ -302,8 +304,9 @@ def named_findings(recorded: RecordedRun) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _explained(past: Sequence[Moment], finding: Finding) -> Explanation:
+def _explained(moments: Sequence[Moment], until: int, finding: Finding) -> Explanation:
     """Find the verdict that a finding began with, and what was seen to change before that."""
+    past = moments[:until]
     judged = [index for index, each in enumerate(past) if isinstance(each.event, VerdictChanged)]
     begins = judged[-1]
     first = True
@@ -315,14 +318,15 @@ def _explained(past: Sequence[Moment], finding: Finding) -> Explanation:
         begins = index
     facts, others, saw = _turned(past[: begins + 1], finding)
     line = past[begins].line
-    events = tuple(
+    found = [
         (each.line.elapsed_s, each.event)
-        for each in past[:begins]
+        for each in moments
         if not first
         and each.event is not None
         and not isinstance(each.event, VerdictChanged)
-        and saw - BEFORE_S <= each.line.at
-    )
+        and saw - BEFORE_S <= each.line.at <= line.at + AFTER_S
+    ]
+    nearest = sorted(found, key=lambda each: abs(each[0] - line.elapsed_s))[:_MOST_EVENTS]
     return Explanation(
         finding=finding,
         since=line.at,
@@ -330,7 +334,7 @@ def _explained(past: Sequence[Moment], finding: Finding) -> Explanation:
         first=first,
         facts=facts,
         others=others,
-        events=events[-_MOST_EVENTS:],
+        events=tuple(each for each in found if each in nearest),
     )
 
 

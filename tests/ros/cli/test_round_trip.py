@@ -26,7 +26,7 @@ ROS = ("--ros-args", "-r", "__ns:=/robot", "-r", "reset:=clear", "-p", "limit:=4
 
 def _started(folder: Path, domain_id: int) -> list[subprocess.Popen[bytes]]:
     variables = {**os.environ, "ROS_DOMAIN_ID": str(domain_id), "CAMERA_SERIAL": "A1"}
-    variables["ACCESS_TOKEN"] = "secret"
+    variables["ACCESS_TOKEN"] = "hunter2"
     commands = [("several", "go"), ("managed", "go"), ("client",), ("server", *ROS)]
     script = os.path.relpath(PROGRAM, folder)
     processes = [
@@ -106,7 +106,7 @@ def test_programs_started_by_hand_are_adopted_and_come_up_again_from_what_was_ca
         _is_left_alone(_up(manifest, "--adopt", runtime=tmp_path), processes)
     finally:
         _end(processes)
-    assert "secret" not in manifest.read_text()
+    assert "hunter2" not in manifest.read_text()
     nodes = {each.key: each for each in load(str(manifest), {}).manifest.nodes}
     assert nodes["left"].process == nodes["right"].process != ""
     assert nodes["managed"].process == nodes["new"].process != nodes["left"].process

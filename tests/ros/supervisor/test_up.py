@@ -66,9 +66,9 @@ def test_a_healthy_system_is_connected_verified_activated_held_and_taken_down(
 
 
 OTHER_VERSIONS = """
-import ctypes, importlib.metadata
+import ctypes
 
-version, library = importlib.metadata.version, ctypes.CDLL
+library = ctypes.CDLL
 
 
 class Library(library):
@@ -78,7 +78,6 @@ class Library(library):
         super().__init__(name, *arguments, **options)
 
 
-importlib.metadata.version = lambda name: "10.1.0" if name == "ros-rcl" else version(name)
 ctypes.CDLL = Library
 """
 
@@ -87,6 +86,7 @@ def test_with_libraries_that_are_not_known_all_but_unique_flows_is_verified(
     tmp_path: Path, fresh_domain: int
 ) -> None:
     (tmp_path / "sitecustomize.py").write_text(OTHER_VERSIONS)
+    (tmp_path / "ros_rcl-10.1.0.dist-info").mkdir()
     other = ("env", f"PYTHONPATH={tmp_path}")
     optionally = {"chatter": {"unique": "optionally_required"}}
     edit = {
