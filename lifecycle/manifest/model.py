@@ -577,6 +577,7 @@ __all__ = [
     "Link",
     "Machine",
     "Manifest",
+    "Mode",
     "Network",
     "Node",
     "OnFailure",
@@ -729,11 +730,25 @@ class Link:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Mode:
+    """A named set of nodes that are active: all that are to be so, but these.
+
+    Attributes:
+        inactive: keys of the nodes that are kept inactive in it.
+    """
+
+    name: str
+    inactive: tuple[str, ...] = ()
+    at: Position
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class SystemDeclaration:
     """What a manifest declares of its system that the plan takes over as it is.
 
     Attributes:
         on_violation: what is done about violations for which nothing nearer says it.
+        modes: the first is entered at the start; none: every node is as it is declared.
     """
 
     system: str
@@ -743,6 +758,7 @@ class SystemDeclaration:
     data_layer: DataLayer = DataLayer()
     policy: Policy = Policy()
     on_violation: OnViolation = ()
+    modes: tuple[Mode, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

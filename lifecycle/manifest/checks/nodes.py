@@ -2,7 +2,8 @@
 
 Owns: check.unknown-machine, check.process-machine, check.process-run, check.process-environment,
 check.process-name, check.ros-args, check.container, check.may-end, check.state,
-check.restart, check.start-limit, check.on-violation, check.domain, check.ports, check.localhost,
+check.restart, check.start-limit, check.on-violation, check.mode, check.domain, check.ports,
+check.localhost,
 check.after-unknown, check.after-self, check.after-cycle, check.after-unmanaged, check.after-state.
 Port arithmetic is in `lifecycle.network`. Pure.
 """
@@ -181,6 +182,28 @@ def check_on_violation(system: DeclaredSystem) -> Iterator[Diagnostic]:
                 f"{link.from_node!r} or {link.to_node!r}"
             )
             yield error("check.on-violation", link.at, message, hint)
+
+
+def check_modes(system: DeclaredSystem) -> Iterator[Diagnostic]:
+    """Yield findings about modes that cannot be entered, or in which nodes wait for ever."""
+    for mode in system.manifest.modes:
+        for key in mode.inactive:
+            node = system.nodes.get(key)
+            if not system.may_exist(key):
+                message = f"cannot keep {key!r} inactive in mode {mode.name!r}: no such node"
+                yield error("check.mode", mode.at, message, did_you_mean(key, system.known))
+            elif node is not None and (why := _never_deactivated(node)):
+                message = f"cannot keep {key!r} inactive in mode {mode.name!r}: {why}"
+                yield error("check.mode", mode.at, message, "remove it from the mode")
+        for node in system.manifest.nodes:
+            for after in node.after:
+                if after.condition is Condition.ACTIVE and after.node in mode.inactive:
+                    message = (
+                        f"cannot wait until {after.node!r} is active: mode {mode.name!r} "
+                        f"({spell(mode.at)}) keeps it inactive"
+                    )
+                    hint = f"write '{after.node}: connected', or remove it from the mode"
+                    yield error("check.mode", after.at, message, hint)
 
 
 def _never_deactivated(node: Node) -> str:

@@ -1,8 +1,8 @@
 """Holds a system that is up: judges it at every change, and carries out orders.
 
 Owns: `Watch`, which judges again and again, and `Holding`: for how long, what ends it, how orders
-(pause, resume, restart) are received and answered, and that what fails is restarted, and what is
-violated has its consequence, when policy says so, by the same orders. What an order does is
+(pause, resume, restart, mode) are received and answered, and that what fails is restarted, and what
+is violated has its consequence, when policy says so, by the same orders. What an order does is
 sequence.py's, when to restart and what to do about a violation policy/'s. Must not import rclpy.
 """
 
@@ -313,7 +313,7 @@ class Holding:
             await self._gate_sequence.put_down(error)
         except VerificationError as error:
             pending.finish(Done(exit_code=error.exit_code, error=str(error)))
-            if self._gate_sequence.phase not in (PAUSED, HELD):
+            if self._gate_sequence.phase not in (ACTIVE, PAUSED, HELD):
                 raise
             self._emit(Notice(message=str(error)))
         else:

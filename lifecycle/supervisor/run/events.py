@@ -342,6 +342,22 @@ class ConsequenceTaken:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class ModeEntered:
+    """The system is in another mode.
+
+    Attributes:
+        mode: its name.
+        before: that of the mode that it was in.
+        inactive: names of the nodes that it keeps inactive.
+    """
+
+    kind: ClassVar[str] = "mode"
+    mode: str
+    before: str
+    inactive: tuple[str, ...]
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Notice:
     """Something a person should know that changes nothing: orphans swept, a step forced."""
 
@@ -388,6 +404,7 @@ Event = Union[  # noqa: UP007 - a run-time alias on Python 3.10
     Restarted,
     GaveUp,
     ConsequenceTaken,
+    ModeEntered,
     Notice,
     Stopping,
     Stopped,
