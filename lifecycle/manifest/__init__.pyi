@@ -55,6 +55,7 @@ from .model import ParameterDeclaration as ParameterDeclaration
 from .model import ParameterValue as ParameterValue
 from .model import Policy as Policy
 from .model import Quantity as Quantity
+from .model import Reaction as Reaction
 from .model import Restart as Restart
 from .model import RosArguments as RosArguments
 from .model import RosInterfaceAccess as RosInterfaceAccess

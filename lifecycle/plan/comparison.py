@@ -189,7 +189,7 @@ def _node(node: PlannedNode) -> _Tree:
 
 
 def _consequences(said: OnViolation) -> _Tree:
-    return {name: what.value for name, what in said}
+    return {each.rule: f"{each.what.value} {each.mode}".rstrip() for each in said}
 
 
 def _interface(node: PlannedNode) -> _Tree:

@@ -123,7 +123,11 @@ CHECKS = (
     Check(run=lambda scope: check_processes(scope.system), parts=("run",)),
     Check(run=lambda scope: check_programs(scope.system), parts=("run",)),
     Check(run=lambda scope: check_supervision(scope.system), parts=("run",)),
-    Check(run=lambda scope: check_on_violation(scope.system), parts=("run",)),
+    Check(
+        run=lambda scope: check_on_violation(scope.system),
+        parts=("run",),
+        sections=frozenset({"modes"}),
+    ),
     Check(run=lambda scope: check_modes(scope.system), parts=("run", "after")),
     Check(
         run=lambda scope: check_ports(scope.system, scope.needs, scope.environment),

@@ -251,6 +251,8 @@ class Holding:
             self._stop(reason, ExitCode.VIOLATED)
             await asyncio.get_running_loop().create_future()  # until it ends us
         order = Order(kind=OrderKind.PAUSE, keys=due.keys, reason=f"{reason}; lifecycle resume")
+        if due.what is Consequence.MODE:
+            order = Order(kind=OrderKind.MODE, mode=due.mode)
         await self._by_policy(lambda: self._carry_out_in_spite(order))
 
     async def _by_policy(self, work: Callable[[], Awaitable[None]]) -> None:

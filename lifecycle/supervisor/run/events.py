@@ -327,7 +327,7 @@ class ConsequenceTaken:
     """A violation of an active system lasts, and what the manifest asks for is done about it.
 
     Attributes:
-        action: "deactivate", "pause" or "stop".
+        action: "deactivate", "mode", "pause" or "stop".
         nodes: those that are deactivated; empty where it is for the whole system.
         rule: id of the finding's rule.
         message: the finding's, a whole sentence.
