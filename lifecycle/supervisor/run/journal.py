@@ -23,7 +23,14 @@ from lifecycle.codec import Count, says
 from lifecycle.plan import Plan, without_secrets
 from lifecycle.supervisor.processes.logs import JOURNAL_NAME
 from lifecycle.supervisor.processes.usage import ResourceUse, resource_use
-from lifecycle.supervisor.run.events import Event, LogLine, VerdictChanged
+from lifecycle.supervisor.run.events import (
+    Event,
+    Failure,
+    LogLine,
+    ProcessChanged,
+    Stopped,
+    VerdictChanged,
+)
 from lifecycle.verify import (
     Finding,
     NodeConfiguration,
@@ -43,6 +50,9 @@ LARGEST_JOURNAL = 16 * 2**20
 
 USE_S = 60.0
 """How often what the processes use is noted."""
+
+_MARKED = (Failure, ProcessChanged, Stopped, VerdictChanged)
+"""Events at which it is noted how long logs are: what a process wrote explains them."""
 
 _TRIED_AGAIN_S = 1.0
 """How often a journal is tried that could not be written."""
@@ -158,7 +168,8 @@ class JournalLine:
             are without their flows, which follow from the look before.
         look: what was seen and found.
         use: what each process used, by its name.
-        output: bytes in each process's log file at that moment, where that changed.
+        output: bytes in each process's log file at that moment, where that changed; with what
+            processes use, and with events that a process's output may explain.
     """
 
     at: float
@@ -264,7 +275,7 @@ class Journal:
             event = dataclasses.replace(event, verdict=verdict)
         plain = codec.to_plain(event)
         assert isinstance(plain, dict)
-        self._add(event={"event": event.kind, **plain})
+        self._add(event={"event": event.kind, **plain}, marks=isinstance(event, _MARKED))
 
     def looked(
         self,
@@ -326,9 +337,18 @@ class Journal:
         found = {name: resource_use(pid) for name, pid in pids.items()}
         use = {name: each for name, each in found.items() if each is not None}
         if use:
-            self._add(use=use)
+            self._add(use=use, marks=True)
 
-    def _add(self, **content: object) -> None:
+    def _add(self, *, marks: bool = False, **content: object) -> None:
+        if marks:
+            output = {
+                name: position
+                for name, position in self._positions().items()
+                if position != self._noted.get(name)
+            }
+            if output:
+                self._noted.update(output)
+                content["output"] = output
         line = self._line(**content)
         if self._waiting is None:
             self._write(line)
@@ -337,14 +357,6 @@ class Journal:
 
     def _line(self, **content: object) -> bytes:
         now = {"at": round(self._wall(), 6), "elapsed_s": round(self._clock() - self._began, 6)}
-        output = {
-            name: position
-            for name, position in self._positions().items()
-            if position != self._noted.get(name)
-        }
-        if output:
-            self._noted.update(output)
-            content["output"] = output
         return codec.to_json({**now, **content}) + b"\n"
 
     def _write(self, line: bytes) -> None:

@@ -572,12 +572,14 @@ def test_what_a_running_supervisor_cannot_take_is_refused_with_the_reason(
 ) -> None:
     directory, domain_id = active.runtime, shared_domain
     end = "; end it and start it anew: lifecycle down, then lifecycle up\n"
-    manifest = pair(directory, domain_id, edit={"discovery/range": "subnet"})
+    edit = {"discovery/range": "subnet", "policy/ros_interface": "full"}
+    manifest = pair(directory, domain_id, edit=edit)
     refused = verb("restart", str(manifest), "--reload", runtime=directory)
     assert refused.returncode == ExitCode.USAGE
     assert refused.stderr == (
         "cannot reload the manifest of 'pair' while it runs: a running supervisor cannot "
-        'change this:\ndiscovery.range: was "localhost", is "subnet"' + end
+        'change this:\ndiscovery.range: was "localhost", is "subnet"\n'
+        'policy.ros_interface: was "off", is "full"' + end
     )
     refused = verb("restart", "pair", "--reload", runtime=directory)
     assert refused.returncode == ExitCode.USAGE

@@ -484,7 +484,7 @@ def test_a_loss_has_us_and_our_hosts_prepare_and_after_it_tell_our_names_anew(
 
 def test_a_channel_tells_that_its_host_hangs_and_when_it_came_back() -> None:
     async def test() -> None:
-        told: asyncio.Queue[bool] = asyncio.Queue()
+        told: asyncio.Queue[Overdue | None] = asyncio.Queue()
         spec = HostSpec(
             system="robot",
             process="p",
@@ -502,7 +502,10 @@ def test_a_channel_tells_that_its_host_hangs_and_when_it_came_back() -> None:
         sign = BusySign(*descriptors)
         assert sign.limit_s == 0.05
         sign.begin()
-        assert await asyncio.wait_for(told.get(), 10) is Overdue.HANGS
+        # On a busy machine this thread may wait for a processor first, and say so.
+        while (why := await asyncio.wait_for(told.get(), 10)) is Overdue.UNSERVED:
+            pass
+        assert why is Overdue.HANGS
         assert sign.end() is not None
         theirs.sendall(to_json(HostEvent(kind="beat")) + b"\n")
         assert await asyncio.wait_for(told.get(), 10) is None
