@@ -176,8 +176,9 @@ def check_on_violation(system: DeclaredSystem) -> Iterator[Diagnostic]:
         for each in node.on_violation:
             yield from _mode(system, each, node.where(f"on_violation.{each.rule}"))
     for each in system.manifest.on_violation:
-        at = dict(system.manifest.positions).get(f"on_violation.{each.rule}")
-        yield from _mode(system, each, at or system.manifest.nodes[0].at)
+        top = Position(file=system.manifest.path, line=1, column=1)
+        place = system.manifest.where(f"on_violation.{each.rule}", top)
+        yield from _mode(system, each, place)
     for link in system.manifest.links:
         for each in link.on_violation:
             yield from _mode(system, each, link.at)
