@@ -27,6 +27,7 @@ VERBS: dict[str, str] = {
     "pause": "deactivate a running system in reverse order: data stops",
     "resume": "verify a paused system again, and activate it",
     "restart": "take one node or all of a running system down, and up again through the gate",
+    "mode": "enter another mode of a running system: who is active, through the gate",
     "down": "end a running system in reverse order",
     "status": "show what a running supervisor sees",
     "verify": "judge a running system, started by anyone; for CI",
@@ -47,7 +48,7 @@ VERBS: dict[str, str] = {
 }
 
 _ELSEWHERE = {
-    **dict.fromkeys(("pause", "resume", "restart", "down", "status"), "control"),
+    **dict.fromkeys(("pause", "resume", "restart", "mode", "down", "status"), "control"),
     **dict.fromkeys(("explain", "replay"), "history"),
     "schema": "init",
     "import": "import_",
@@ -61,7 +62,7 @@ _ORDERLY = frozenset({ExitCode.OK, ExitCode.VIOLATED, ExitCode.UNVERIFIABLE})
 """Exit codes that no exception becomes: what made participants has closed them itself."""
 
 
-_LINUX = _PARTICIPANTS | {"pause", "resume", "restart", "down", "status", "logs"}
+_LINUX = _PARTICIPANTS | {"pause", "resume", "restart", "mode", "down", "status", "logs"}
 """Verbs that run nodes, or are about what runs."""
 
 _NEEDS_ROS = (

@@ -29,6 +29,7 @@ from lifecycle.supervisor import (
     GaveUp,
     LogLine,
     MachineConnection,
+    ModeEntered,
     NodeAlive,
     NodeChanged,
     NodeSilent,
@@ -444,6 +445,12 @@ def _(event: GaveUp) -> str:
 def _(event: ConsequenceTaken) -> str:
     whom = f" {', '.join(event.nodes)}" if event.nodes else ""
     return f"on_violation: {event.action}{whom} for {event.rule} of {event.subject}"
+
+
+@_describe.register
+def _(event: ModeEntered) -> str:
+    without = f", without {', '.join(event.inactive)}" if event.inactive else ""
+    return f"mode {event.mode}{without}"
 
 
 @_describe.register

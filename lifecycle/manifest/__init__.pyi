@@ -45,6 +45,7 @@ from .model import Limits as Limits
 from .model import Link as Link
 from .model import Machine as Machine
 from .model import Manifest as Manifest
+from .model import Mode as Mode
 from .model import Node as Node
 from .model import NodeDeclaration as NodeDeclaration
 from .model import OnFailure as OnFailure
@@ -54,6 +55,7 @@ from .model import ParameterDeclaration as ParameterDeclaration
 from .model import ParameterValue as ParameterValue
 from .model import Policy as Policy
 from .model import Quantity as Quantity
+from .model import Reaction as Reaction
 from .model import Restart as Restart
 from .model import RosArguments as RosArguments
 from .model import RosInterfaceAccess as RosInterfaceAccess

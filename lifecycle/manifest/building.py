@@ -35,6 +35,7 @@ from lifecycle.manifest.model import (
     ParameterDeclaration,
     ParameterValue,
     Quantity,
+    Reaction,
     Run,
     RunKind,
     Supervision,
@@ -83,7 +84,12 @@ def build_data_layer(root: Cursor, found: list[Diagnostic]) -> DataLayer:
 
 def build_on_violation(cursor: Cursor) -> OnViolation:
     """Build `on_violation` of a document, a node or a link."""
-    return tuple((name, Consequence(each.scalar)) for name, each in _consequences(cursor))
+    return tuple(
+        Reaction(rule=name, what=Consequence.MODE, mode=each.text("mode"))
+        if isinstance(each.value.data, Mapping)
+        else Reaction(rule=name, what=Consequence(each.scalar))
+        for name, each in _consequences(cursor)
+    )
 
 
 def _consequences(cursor: Cursor) -> Iterator[tuple[str, Cursor]]:
@@ -98,11 +104,14 @@ def _consequences(cursor: Cursor) -> Iterator[tuple[str, Cursor]]:
 
 
 def section_positions(root: Cursor) -> tuple[tuple[str, Position], ...]:
-    """Return positions of values of `discovery:` and `data_layer:`, by path, `discovery.mode`."""
-    return tuple(
-        (f"{section}.{key}", value.at)
-        for section in ("discovery", "data_layer")
-        for key, value in root.entries(section)
+    """Return positions of values of `discovery:`, `data_layer:` and `on_violation:`, by path."""
+    return (
+        *(
+            (f"{section}.{key}", value.at)
+            for section in ("discovery", "data_layer")
+            for key, value in root.entries(section)
+        ),
+        *((f"on_violation.{name}", each.key_at) for name, each in _consequences(root)),
     )
 
 

@@ -34,6 +34,7 @@ from lifecycle.manifest.model import (
     Link,
     Machine,
     Manifest,
+    Mode,
     Network,
     Node,
     Policy,
@@ -153,6 +154,14 @@ def build_manifest(
         data_layer=build_data_layer(root, found),
         policy=_policy(root),
         on_violation=build_on_violation(root),
+        modes=tuple(
+            Mode(
+                name=name,
+                inactive=tuple(each.value.text for each in cursor.items("inactive")),
+                at=cursor.key_at,
+            )
+            for name, cursor in root.entries("modes")
+        ),
         nodes=nodes,
         links=tuple(_link(each) for each in root.items("links") if each.place not in unsound),
         positions=section_positions(root),
@@ -333,7 +342,13 @@ def _without_left_out(manifest: Manifest) -> Manifest:
         for link in manifest.links
         if not is_left_out(link.from_node) and not is_left_out(link.to_node)
     )
-    return dataclasses.replace(manifest, nodes=nodes, links=links)
+    modes = tuple(
+        dataclasses.replace(
+            mode, inactive=tuple(key for key in mode.inactive if not is_left_out(key))
+        )
+        for mode in manifest.modes
+    )
+    return dataclasses.replace(manifest, nodes=nodes, links=links, modes=modes)
 
 
 _SEGMENTS = re.compile(r"[^.\[]+")
@@ -730,9 +745,9 @@ class _Loading:
             self._outermost = manifest
             return
         outer = self._outermost
-        for key in ("discovery", "network", "data_layer", "policy", "on_violation"):
+        for key in ("discovery", "network", "data_layer", "policy", "on_violation", "modes"):
             mine, holds = getattr(manifest, key), getattr(outer, key)
-            if key not in ("policy", "on_violation"):
+            if key not in ("policy", "on_violation", "modes"):
                 mine = dataclasses.replace(mine, at=holds.at)
             if key in root and mine != holds:
                 message = f"cannot use the {key} of an included manifest; the including one's holds"

@@ -321,6 +321,7 @@ class Consequence(enum.Enum):
 
     REPORT = "report"  # nothing but the verdict
     DEACTIVATE = "deactivate"  # the nodes it is about; all where it is about none of the system
+    MODE = "mode"  # another mode is entered
     PAUSE = "pause"  # all nodes, as `lifecycle pause`
     STOP = "stop"  # the run ends
 
@@ -328,8 +329,23 @@ class Consequence(enum.Enum):
 BY_DEFAULT = "default"
 """Key of `on_violation` for every rule that it does not name."""
 
-OnViolation = tuple[tuple[str, Consequence], ...]
-"""By id of a rule, family of rules (the id's part before the dot) or BY_DEFAULT; may be empty."""
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Reaction:
+    """What is done about violations of some rules.
+
+    Attributes:
+        rule: id of a rule, family of rules (the id's part before the dot) or BY_DEFAULT.
+        mode: name of the one that is entered, for MODE; else empty.
+    """
+
+    rule: str
+    what: Consequence
+    mode: str = ""
+
+
+OnViolation = tuple[Reaction, ...]
+"""Each rule, family or BY_DEFAULT once; may be empty."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -577,6 +593,7 @@ __all__ = [
     "Link",
     "Machine",
     "Manifest",
+    "Mode",
     "Network",
     "Node",
     "OnFailure",
@@ -586,6 +603,7 @@ __all__ = [
     "ParameterValue",
     "Policy",
     "Quantity",
+    "Reaction",
     "Restart",
     "RosArguments",
     "RosInterfaceAccess",
@@ -729,11 +747,25 @@ class Link:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Mode:
+    """A named set of nodes that are active: all that are to be so, but these.
+
+    Attributes:
+        inactive: keys of the nodes that are kept inactive in it.
+    """
+
+    name: str
+    inactive: tuple[str, ...] = ()
+    at: Position
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class SystemDeclaration:
     """What a manifest declares of its system that the plan takes over as it is.
 
     Attributes:
         on_violation: what is done about violations for which nothing nearer says it.
+        modes: the first is entered at the start; none: every node is as it is declared.
     """
 
     system: str
@@ -743,6 +775,7 @@ class SystemDeclaration:
     data_layer: DataLayer = DataLayer()
     policy: Policy = Policy()
     on_violation: OnViolation = ()
+    modes: tuple[Mode, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

@@ -58,6 +58,7 @@ from lifecycle.plan.model import (
     PlannedNode,
     PlannedProcess,
     declared,
+    in_mode,
 )
 from lifecycle.plan.negotiation.parties import ANY, LinksByPair
 from lifecycle.plan.parameters import ParameterFiles
@@ -276,7 +277,7 @@ def build_plan(
         server=wired.server,
         observers=wired.observers,
     )
-    return _told(plan)
+    return _told(in_mode(plan, plan.modes[0].name) if plan.modes else plan)
 
 
 def with_files_of_now(plan: Plan) -> Plan:

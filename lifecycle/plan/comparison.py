@@ -128,6 +128,7 @@ def _document(plan: Plan) -> _Tree:
         "data_layer": _fields(plan.data_layer, "at"),
         "policy": _fields(plan.policy),
         "on_violation": _consequences(plan.on_violation),
+        "modes": {each.name: {"inactive": list(each.inactive)} for each in plan.modes},
         "links": {
             f"{flow.topic} from {flow.publisher} to {flow.subscription}": {
                 **_fields(
@@ -188,7 +189,7 @@ def _node(node: PlannedNode) -> _Tree:
 
 
 def _consequences(said: OnViolation) -> _Tree:
-    return {name: what.value for name, what in said}
+    return {each.rule: f"{each.what.value} {each.mode}".rstrip() for each in said}
 
 
 def _interface(node: PlannedNode) -> _Tree:

@@ -31,6 +31,7 @@ from lifecycle.manifest import (
     Quantity,
     Run,
     SystemDeclaration,
+    TargetState,
     UniqueHow,
 )
 from lifecycle.network import UDP_UNICAST, Medium
@@ -373,6 +374,22 @@ class Plan(SystemDeclaration):
             KeyError: no such key.
         """
         return _by_key(self.nodes)[key]
+
+
+def in_mode(plan: Plan, name: str) -> Plan:
+    """Return a plan as it is in a mode; a plan without modes, or with an unknown one, as it is."""
+    mode = next((each for each in plan.modes if each.name == name), None)
+    if mode is None:
+        return plan
+    switched = {key for each in plan.modes for key in each.inactive}
+
+    def as_in_mode(node: PlannedNode) -> PlannedNode:
+        if node.key not in switched:
+            return node
+        state = TargetState.INACTIVE if node.key in mode.inactive else TargetState.ACTIVE
+        return node if node.state is state else dataclasses.replace(node, state=state)
+
+    return dataclasses.replace(plan, nodes=tuple(map(as_in_mode, plan.nodes)))
 
 
 _INDEXES: dict[int, tuple[tuple[PlannedNode, ...], dict[str, PlannedNode]]] = {}

@@ -25,6 +25,7 @@ from .run.events import GaveUp as GaveUp
 from .run.events import Listener as Listener
 from .run.events import LogLine as LogLine
 from .run.events import MachineConnection as MachineConnection
+from .run.events import ModeEntered as ModeEntered
 from .run.events import NodeAlive as NodeAlive
 from .run.events import NodeChanged as NodeChanged
 from .run.events import NodeSilent as NodeSilent

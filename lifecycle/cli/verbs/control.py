@@ -47,9 +47,11 @@ def status_text(status: SystemStatus) -> str:
     widths = [max(len(row[index]) for row in rows) for index in range(len(_HEADS))]
     living = sum(not node.died and node.next_try_s is None for node in status.nodes)
     count = "" if living == len(status.nodes) else f" {living}/{len(status.nodes)}"
+    mode = f", mode {status.mode}" if status.mode else ""
     head = (
-        f"{status.system}: {status.phase}{count}, verdict {verdict}, domain {status.domain_id}, "
-        f"supervisor {status.supervisor}, up for {status.elapsed_s:.1f} s"
+        f"{status.system}: {status.phase}{count}{mode}, verdict {verdict}, "
+        f"domain {status.domain_id}, supervisor {status.supervisor}, "
+        f"up for {status.elapsed_s:.1f} s"
     )
     text = [one_line(head)]
     for row, node in zip(rows, (None, *status.nodes), strict=True):
@@ -200,6 +202,7 @@ def give_order(  # noqa: PLR0917 - in the order of the command line
     node: str = "",
     *,
     reload: bool = False,
+    mode: str = "",
 ) -> int:
     """Have a running supervisor carry out an order; say why where it does not.
 
@@ -211,6 +214,7 @@ def give_order(  # noqa: PLR0917 - in the order of the command line
         timeout: seconds.
         node: for `restart`, one node; empty for all.
         reload: for `restart`, take the manifest as it is now.
+        mode: for `mode`, the one to enter.
 
     Returns:
         Its exit code: 2 if the order does not fit what the system is doing, 4 or 5 if the gate
@@ -231,7 +235,7 @@ def give_order(  # noqa: PLR0917 - in the order of the command line
         load_manifest(target, assignments, quiet=True, machine=machine)
     from lifecycle.supervisor import ControlRequest, Question, order
 
-    question = Question(ask=ControlRequest(verb), node=node, plan=plan, reload=reload)
+    question = Question(ask=ControlRequest(verb), node=node, plan=plan, reload=reload, mode=mode)
     try:
         answer = order(path, question, timeout)
     except TimeoutError:
@@ -318,3 +322,28 @@ def restart_command(
         raise UsageError(f"cannot restart {', '.join(nodes)} at once; name one node, or none")
     assignments = tuple(word for word in words if ":=" in word)
     return give_order("restart", target, assignments, machine, timeout, *nodes, reload=reload)
+
+
+@click.command("mode")
+@target_argument
+@click.argument(
+    "words",
+    nargs=-1,
+    metavar="NAME [NAME:=VALUE]...",
+    shell_complete=completing("arguments"),
+)
+@machine_option("As it was given to `lifecycle up`.")
+@order_timeout
+def mode_command(*, target: str, words: tuple[str, ...], machine: str, timeout: float) -> int:
+    """Enter a mode of a running system: another set of its nodes is active.
+
+    Nodes that the mode keeps inactive are deactivated in reverse order; those that it has active
+    and the mode before had not are verified and activated only if the gate opens. If it stays
+    closed the system goes back to the mode before, and this exits with 4. NAME is one of `modes:`
+    of the manifest; `lifecycle status` shows which it is in.
+    """
+    names = [word for word in words if ":=" not in word]
+    if len(names) != 1:
+        raise UsageError("cannot enter a mode without its name; name one of the manifest's")
+    assignments = tuple(word for word in words if ":=" in word)
+    return give_order("mode", target, assignments, machine, timeout, mode=names[0])

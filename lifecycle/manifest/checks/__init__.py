@@ -32,6 +32,7 @@ from lifecycle.manifest.checks.flows import (
 from lifecycle.manifest.checks.names import check_names, check_remaps
 from lifecycle.manifest.checks.nodes import (
     check_machines,
+    check_modes,
     check_on_violation,
     check_order,
     check_ports,
@@ -122,7 +123,12 @@ CHECKS = (
     Check(run=lambda scope: check_processes(scope.system), parts=("run",)),
     Check(run=lambda scope: check_programs(scope.system), parts=("run",)),
     Check(run=lambda scope: check_supervision(scope.system), parts=("run",)),
-    Check(run=lambda scope: check_on_violation(scope.system), parts=("run",)),
+    Check(
+        run=lambda scope: check_on_violation(scope.system),
+        parts=("run",),
+        sections=frozenset({"modes"}),
+    ),
+    Check(run=lambda scope: check_modes(scope.system), parts=("run", "after")),
     Check(
         run=lambda scope: check_ports(scope.system, scope.needs, scope.environment),
         whole=True,

@@ -2,7 +2,8 @@
 
 Owns: check.unknown-machine, check.process-machine, check.process-run, check.process-environment,
 check.process-name, check.ros-args, check.container, check.may-end, check.state,
-check.restart, check.start-limit, check.on-violation, check.domain, check.ports, check.localhost,
+check.restart, check.start-limit, check.on-violation, check.mode, check.domain, check.ports,
+check.localhost,
 check.after-unknown, check.after-self, check.after-cycle, check.after-unmanaged, check.after-state.
 Port arithmetic is in `lifecycle.network`. Pure.
 """
@@ -27,6 +28,7 @@ from lifecycle.manifest.model import (
     Executor,
     Machine,
     Node,
+    Reaction,
     Restart,
     RosArguments,
     Run,
@@ -166,21 +168,65 @@ def check_on_violation(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about violations after which nodes are to be deactivated that never can be."""
     hint = "write 'pause' or 'stop', which are for the whole system"
     for node in system.manifest.nodes:
-        for name, what in node.on_violation:
-            if what is Consequence.DEACTIVATE and (why := _never_deactivated(node)):
+        for each in node.on_violation:
+            if each.what is Consequence.DEACTIVATE and (why := _never_deactivated(node)):
                 message = f"cannot deactivate {node.key!r} when it violates: {why}"
-                at = node.where(f"on_violation.{name}")
+                at = node.where(f"on_violation.{each.rule}")
                 yield error("check.on-violation", at, message, hint)
+        for each in node.on_violation:
+            yield from _mode(system, each, node.where(f"on_violation.{each.rule}"))
+    for each in system.manifest.on_violation:
+        top = Position(file=system.manifest.path, line=1, column=1)
+        place = system.manifest.where(f"on_violation.{each.rule}", top)
+        yield from _mode(system, each, place)
     for link in system.manifest.links:
+        for each in link.on_violation:
+            yield from _mode(system, each, link.at)
         ends = [system.nodes.get(key) for key in (link.from_node, link.to_node)]
         if all(end is not None and _never_deactivated(end) for end in ends) and any(
-            what is Consequence.DEACTIVATE for _, what in link.on_violation
+            each.what is Consequence.DEACTIVATE for each in link.on_violation
         ):
             message = (
                 f"cannot deactivate an end of {link.topic!r} when it violates: no gate holds "
                 f"{link.from_node!r} or {link.to_node!r}"
             )
             yield error("check.on-violation", link.at, message, hint)
+
+
+def _mode(system: DeclaredSystem, reaction: Reaction, at: Position) -> Iterator[Diagnostic]:
+    modes = [each.name for each in system.manifest.modes]
+    if reaction.what is not Consequence.MODE:
+        return
+    if reaction.mode not in modes:
+        message = f"cannot enter mode {reaction.mode!r} on a violation: there is no such mode"
+        hint = did_you_mean(reaction.mode, modes) or "declare it under 'modes:'"
+        yield error("check.on-violation", at, message, hint)
+    elif len({node.machine for node in system.manifest.nodes}) > 1:
+        message = f"cannot enter mode {reaction.mode!r} on a violation: several machines run in it"
+        hint = "write 'deactivate', 'pause' or 'stop'; a mode is switched by one supervisor"
+        yield error("check.on-violation", at, message, hint)
+
+
+def check_modes(system: DeclaredSystem) -> Iterator[Diagnostic]:
+    """Yield findings about modes that cannot be entered, or in which nodes wait for ever."""
+    for mode in system.manifest.modes:
+        for key in mode.inactive:
+            node = system.nodes.get(key)
+            if not system.may_exist(key):
+                message = f"cannot keep {key!r} inactive in mode {mode.name!r}: no such node"
+                yield error("check.mode", mode.at, message, did_you_mean(key, system.known))
+            elif node is not None and (why := _never_deactivated(node)):
+                message = f"cannot keep {key!r} inactive in mode {mode.name!r}: {why}"
+                yield error("check.mode", mode.at, message, "remove it from the mode")
+        for node in system.manifest.nodes:
+            for after in node.after:
+                if after.condition is Condition.ACTIVE and after.node in mode.inactive:
+                    message = (
+                        f"cannot wait until {after.node!r} is active: mode {mode.name!r} "
+                        f"({spell(mode.at)}) keeps it inactive"
+                    )
+                    hint = f"write '{after.node}: connected', or remove it from the mode"
+                    yield error("check.mode", after.at, message, hint)
 
 
 def _never_deactivated(node: Node) -> str:

@@ -16,7 +16,7 @@ from collections.abc import Collection, Iterable, Iterator
 
 from lifecycle.codec import to_plain
 from lifecycle.errors import BringUpError, ExitCode, UsageError
-from lifecycle.manifest import DataLayerSource
+from lifecycle.manifest import DataLayerSource, did_you_mean
 from lifecycle.network import parse
 from lifecycle.plan import Plan, PlanDifference, PlannedNode, changes, with_files_of_now
 from lifecycle.supervisor.control.protocol import ProcessState
@@ -36,6 +36,12 @@ class OrderKind(enum.Enum):
     PAUSE = "pause"
     RESUME = "resume"
     RESTART = "restart"
+    MODE = "mode"
+
+    @property
+    def said(self) -> str:
+        """How messages say it, after "cannot"."""
+        return "switch the mode of" if self is OrderKind.MODE else self.value
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,12 +55,14 @@ class Order:
         keys: for RESTART by policy, of the nodes, which are down already; empty for one by hand.
             For PAUSE by policy, of the nodes that are deactivated; empty for all.
         reason: for PAUSE by policy, what it is for, as `lifecycle status` shows it.
+        mode: for MODE, the one to enter.
     """
 
     kind: OrderKind
     node: str = ""
     keys: tuple[str, ...] = ()
     reason: str = ""
+    mode: str = ""
     plan: Plan | None = None
     reload: bool = False
 
@@ -79,11 +87,13 @@ _PHASES = {
     OrderKind.PAUSE: (ACTIVE, HELD),
     OrderKind.RESUME: (PAUSED, HELD),
     OrderKind.RESTART: (ACTIVE, PAUSED, HELD),
+    OrderKind.MODE: (ACTIVE, PAUSED, HELD),
 }
 _HINTS = {
     OrderKind.PAUSE: "only an active system can be paused",
     OrderKind.RESUME: "only a paused system can be resumed",
     OrderKind.RESTART: "only a system that is active or paused can be restarted",
+    OrderKind.MODE: "only a system that is active or paused can enter another mode",
 }
 
 
@@ -95,7 +105,7 @@ def check_order(order: Order, system: System, phase: str) -> None:
     """
     if phase not in _PHASES[order.kind]:
         raise UsageError(
-            f"cannot {order.kind.value} {system.plan.system!r}: it is {phase}",
+            f"cannot {order.kind.said} {system.plan.system!r}: it is {phase}",
             hint=_HINTS[order.kind],
         )
     server = system.server
@@ -107,6 +117,23 @@ def check_order(order: Order, system: System, phase: str) -> None:
         )
     if order.node:
         node_of(order, system)
+    if order.kind is OrderKind.MODE:
+        _check_mode(order, system)
+
+
+def _check_mode(order: Order, system: System) -> None:
+    name, modes = system.plan.system, [each.name for each in system.plan.modes]
+    if order.mode not in modes:
+        raise UsageError(
+            f"cannot enter mode {order.mode!r} of {name!r}: it has "
+            f"{'the modes ' + ', '.join(modes) if modes else 'no modes'}",
+            hint=did_you_mean(order.mode, modes) if modes else "declare them under 'modes:'",
+        )
+    if system.remote:
+        raise UsageError(
+            f"cannot switch the mode of {name!r}: nodes on other machines run in it, too",
+            hint="modes are switched where one supervisor runs all nodes",
+        )
 
 
 def node_of(order: Order, system: System) -> NodeRun:
@@ -179,7 +206,7 @@ class Mailbox:
 
 
 _MOST = 20
-_RELOADED = ("nodes.", "links.", "policy.", "on_violation.")
+_RELOADED = ("nodes.", "links.", "policy.", "on_violation.", "modes.")
 """Parts of a manifest that a running supervisor can reload: the rest made the supervisor's own
 participant, its authority and the networks that it programs."""
 _NOT_RELOADED = ("policy.ros_interface",)
@@ -233,13 +260,14 @@ class Revisions:
 
     def _refused(self, order: Order, found: Iterable[PlanDifference]) -> UsageError:
         system = self._system.plan.system
-        what = order.kind.value
+        what, said = order.kind.value, order.kind.said
         listed = "\n".join(_lines(found))
         path = (order.plan or self._system.first).manifest_path
         take = f"lifecycle restart {path} --reload"
         same = f"; or keep what runs: lifecycle {what} {system}" if order.plan is not None else ""
+        same = f"{same} {order.mode}" if same and order.mode else same
         return UsageError(
-            f"cannot {what} {system!r}: its manifest is not the one that runs:\n{listed}\n"
+            f"cannot {said} {system!r}: its manifest is not the one that runs:\n{listed}\n"
             f"take the new one: {take}{same}"
         )
 

@@ -132,10 +132,12 @@ class SystemStatus(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         phase: "connecting", "verifying", "activating", "active", "pausing", "paused", "held" (some
-            nodes wait at a gate that stayed or was closed), "restarting" or "stopping".
+            nodes wait at a gate that stayed or was closed), "restarting",
+            "switching" (to another mode) or "stopping".
         verdict: of the last judgement; None before the first.
         not_ok: what keeps it from being ok, in one line; empty where nothing does.
         supervisor: pid.
+        mode: name of the one that it is in; empty for a system without modes.
     """
 
     system: str
@@ -146,6 +148,7 @@ class SystemStatus(msgspec.Struct, frozen=True, kw_only=True):
     elapsed_s: float
     nodes: tuple[NodeStatus, ...]
     not_ok: str = ""
+    mode: str = ""
 
 
 class ControlRequest(enum.Enum):
@@ -158,6 +161,7 @@ class ControlRequest(enum.Enum):
     PAUSE = "pause"
     RESUME = "resume"
     RESTART = "restart"
+    MODE = "mode"
     DIFFERENCES = "differences"
 
 
@@ -169,12 +173,14 @@ class Question(msgspec.Struct, frozen=True, kw_only=True):
         plan: for DIFFERENCES and orders, the Plan of the client's manifest as it is now; None if
             it was given none. What reads it knows its type, see server.py.
         reload: for RESTART, `plan` is to run from now on.
+        mode: for MODE, the name of the one to enter.
     """
 
     ask: ControlRequest
     node: str = ""
     plan: object = None
     reload: bool = False
+    mode: str = ""
 
 
 class Answer(msgspec.Struct, frozen=True, kw_only=True):

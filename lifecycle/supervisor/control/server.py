@@ -156,6 +156,7 @@ class ControlServer:
                 node=question.node,
                 plan=question.plan,
                 reload=question.reload,
+                mode=question.mode,
             )
             done = await self._order(order)
             return Answer(exit_code=done.exit_code, error=done.error)

@@ -125,4 +125,5 @@ def system_status(
             for node in system.nodes.values()
         ),
         not_ok="" if verdict is None else not_ok(verdict),
+        mode=system.mode,
     )

@@ -1,8 +1,8 @@
 """Holds a system that is up: judges it at every change, and carries out orders.
 
 Owns: `Watch`, which judges again and again, and `Holding`: for how long, what ends it, how orders
-(pause, resume, restart) are received and answered, and that what fails is restarted, and what is
-violated has its consequence, when policy says so, by the same orders. What an order does is
+(pause, resume, restart, mode) are received and answered, and that what fails is restarted, and what
+is violated has its consequence, when policy says so, by the same orders. What an order does is
 sequence.py's, when to restart and what to do about a violation policy/'s. Must not import rclpy.
 """
 
@@ -251,6 +251,8 @@ class Holding:
             self._stop(reason, ExitCode.VIOLATED)
             await asyncio.get_running_loop().create_future()  # until it ends us
         order = Order(kind=OrderKind.PAUSE, keys=due.keys, reason=f"{reason}; lifecycle resume")
+        if due.what is Consequence.MODE:
+            order = Order(kind=OrderKind.MODE, mode=due.mode)
         await self._by_policy(lambda: self._carry_out_in_spite(order))
 
     async def _by_policy(self, work: Callable[[], Awaitable[None]]) -> None:
@@ -313,7 +315,7 @@ class Holding:
             await self._gate_sequence.put_down(error)
         except VerificationError as error:
             pending.finish(Done(exit_code=error.exit_code, error=str(error)))
-            if self._gate_sequence.phase not in (PAUSED, HELD):
+            if self._gate_sequence.phase not in (ACTIVE, PAUSED, HELD):
                 raise
             self._emit(Notice(message=str(error)))
         else:

@@ -1,4 +1,4 @@
-"""The gate sequence up to activation, and the orders that go through it: pause, resume, restart.
+"""The gate sequence up to activation, and the orders by it: pause, resume, restart, mode.
 
 Owns: the one way from a connected to an active system: judge, permit, networks, activate, judge
 again; the steps of each order, given by a person or by policy; and `undiscovered`, which reads from
@@ -23,6 +23,7 @@ from collections.abc import Callable, Collection, Coroutine, Iterable, Mapping
 from typing import Any
 
 from lifecycle.errors import BringUpError
+from lifecycle.manifest import TargetState
 from lifecycle.node import Operation
 from lifecycle.plan import Plan, PlanError, moving_nodes, restarted
 from lifecycle.supervisor.control.orders import (
@@ -47,7 +48,7 @@ from lifecycle.supervisor.nodes.bring_up import BringUp
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.policy.schedule import RestartSchedule
 from lifecycle.supervisor.processes.process import Spawner
-from lifecycle.supervisor.run.events import Emitter, GateOpened, Notice, SystemReached
+from lifecycle.supervisor.run.events import Emitter, GateOpened, ModeEntered, Notice, SystemReached
 from lifecycle.supervisor.run.failure import StepFailedError, ended, failure_of, together
 from lifecycle.supervisor.run.shutdown import TakeDown
 from lifecycle.verify import (
@@ -199,6 +200,8 @@ class GateSequence:
             await self._pause(order)
         elif order.kind is OrderKind.RESUME:
             await self._through_the_gate()
+        elif order.kind is OrderKind.MODE:
+            await self._switch(order.mode)
         elif order.keys:
             await self._restart_by_policy(order.keys)
         else:
@@ -224,6 +227,57 @@ class GateSequence:
                 self.phase = HELD
         if not order.keys:
             self._reached(PAUSED)
+
+    async def _switch(self, mode: str) -> None:
+        """Enter a mode: deactivate in reverse order, activate through the gate, or go back.
+
+        What goes down needs no gate, so that a mode with less can be entered whatever is violated.
+        """
+        before = self._system.mode
+        try:
+            await self._enter(mode)
+        except VerificationError:
+            if self.phase not in (PAUSED, HELD):
+                raise
+            self._emit(Notice(message=f"cannot enter mode {mode!r}: back to {before!r}"))
+            # As far as the gate allows; what it does not let through waits at it.
+            with contextlib.suppress(VerificationError):
+                await self._enter(before)
+            raise
+
+    async def _enter(self, mode: str) -> None:
+        phase, before = self.phase, self._system.mode
+        nodes = tuple(self._system.nodes.values())
+        wanted = {each for each in nodes if each.is_to_be_active}
+        self._gate.close()
+        self.phase = "switching"
+        self._system.enter(mode)
+        going = [
+            each
+            for each in nodes
+            if each in wanted and not each.is_to_be_active and each.reach is Reach.ACTIVE
+        ]
+        try:
+            await self._alive(self._bring_up.deactivate(going))
+        finally:
+            self.phase = phase
+            self._judge.ahead = self.active()
+        self._emit(
+            ModeEntered(
+                mode=mode,
+                before=before,
+                inactive=tuple(
+                    each.name for each in nodes if each.planned.state is TargetState.INACTIVE
+                ),
+            )
+        )
+        self._system.touched.set()
+        if phase == PAUSED:
+            return
+        if any(each not in wanted for each in self._inactive()):
+            await self._through_the_gate()
+        elif not self._inactive():
+            self._reached(ACTIVE)
 
     async def _restart(self, order: Order) -> None:
         """Take one process or all down, and bring it up as far as the system was."""

@@ -19,7 +19,7 @@ from lifecycle.errors import BringUpError
 from lifecycle.manifest import Condition, RunKind, TargetState
 from lifecycle.node import INTERFACE_ON_DEMAND, Operation
 from lifecycle.node import Event as HostEvent
-from lifecycle.plan import Plan, PlannedNode, PlannedProcess, attached_to
+from lifecycle.plan import Plan, PlannedNode, PlannedProcess, attached_to, in_mode
 from lifecycle.supervisor.control.protocol import ProcessState, Reach
 from lifecycle.supervisor.gate.gate import Permit
 from lifecycle.supervisor.health.liveliness import SilenceMonitor
@@ -405,6 +405,7 @@ class System:
         adopts: takes nodes that others started as they are found, active ones too.
         adopted: processes that others started and that run nodes of it, where they are known.
         touched: set whenever a node reported something of itself: time to judge again.
+        mode: name of the one that it is in, or is on its way to; empty for a plan without modes.
         liveliness: which nodes are silent.
         present: names of the nodes that are in the graph; None before it was first looked at.
         first: the plan as the run began with it.
@@ -425,6 +426,7 @@ class System:
         self.first = plan
         self.plan = plan
         self.expected = plan
+        self.mode = plan.modes[0].name if plan.modes else ""
         self.server: ManagedProcess | None = None
         self.emit = emit
         own = tuple(processes)
@@ -502,6 +504,11 @@ class System:
         for key, node in self.nodes.items():
             node.planned = plan.node(key)
 
+    def enter(self, mode: str) -> None:
+        """Have nodes be as a mode of the plan says; running nodes do not notice."""
+        self.mode = mode
+        self.replan(in_mode(self.plan, mode))
+
     def reload(
         self, plan: Plan, processes: Iterable[PlannedProcess], nodes: Collection[NodeRun]
     ) -> tuple[NodeRun, ...]:
@@ -522,7 +529,9 @@ class System:
             if node.running is not None and names.get(key) == node.name
         }
         self.first = plan
-        self.plan = self.expected = attached_to(plan, adopted)
+        if self.mode not in {each.name for each in plan.modes}:
+            self.mode = plan.modes[0].name if plan.modes else ""
+        self.plan = self.expected = attached_to(in_mode(plan, self.mode), adopted)
         down = {each.planned.key: each for each in nodes}
         stay = {key: each for key, each in self.nodes.items() if key not in down}
         kept = {each.process.name: each.process for each in stay.values() if each.process}

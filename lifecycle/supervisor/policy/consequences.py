@@ -1,6 +1,6 @@
 """What is done about violations of an active system: what the manifest says, and when it is due.
 
-Owns: `consequence_of`, which finds the nearest `on_violation` for a finding (link, node, system),
+Owns: `reaction_of`, which finds the nearest `on_violation` for a finding (link, node, system),
 and `Consequences`: a violation that lasts has the consequence that is asked for it, once. It looks
 at verdicts and carries nothing out: that is gate/hold.py's, by the orders that a person gives. Must
 not import rclpy.
@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable
 
-from lifecycle.manifest import BY_DEFAULT, Consequence, EndpointKind, OnViolation, Restart
+from lifecycle.manifest import BY_DEFAULT, Consequence, EndpointKind, OnViolation, Reaction, Restart
 from lifecycle.plan import Plan, PlannedFlow
 from lifecycle.supervisor.control.protocol import Reach
 from lifecycle.supervisor.nodes.system import System
@@ -22,7 +22,7 @@ _ORDER = tuple(Consequence)
 _Key = tuple[str, str, str, EndpointKind | None]
 
 
-def consequence_of(plan: Plan, finding: Finding) -> Consequence:
+def reaction_of(plan: Plan, finding: Finding) -> Reaction:
     """Return what is to be done about a violation.
 
     What is nearest counts: a link that it is about, then its nodes, then the system; there the id
@@ -36,7 +36,7 @@ def consequence_of(plan: Plan, finding: Finding) -> Consequence:
         finding, (each.on_violation for each in plan.nodes if each.full_name in names)
     )
     found = links or nodes or _strongest(finding, (plan.on_violation,))
-    return found or Consequence.REPORT
+    return found or Reaction(rule=BY_DEFAULT, what=Consequence.REPORT)
 
 
 def _is_about(plan: Plan, flow: PlannedFlow, finding: Finding) -> bool:
@@ -51,16 +51,16 @@ def _is_about(plan: Plan, flow: PlannedFlow, finding: Finding) -> bool:
     )
 
 
-def _strongest(finding: Finding, said: Iterable[OnViolation]) -> Consequence | None:
+def _strongest(finding: Finding, said: Iterable[OnViolation]) -> Reaction | None:
     """Return the strongest of what several say about one finding; None if none says anything."""
     family = rule(finding.rule).family
-    found: list[Consequence] = []
+    found: list[Reaction] = []
     for each in said:
         for name in (finding.rule, family, BY_DEFAULT):
-            if own := [what for key, what in each if key == name]:
+            if own := [one for one in each if one.rule == name]:
                 found += own
                 break
-    return max(found, key=_ORDER.index, default=None)
+    return max(found, key=lambda one: _ORDER.index(one.what), default=None)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,11 +69,13 @@ class Due:
 
     Attributes:
         keys: for DEACTIVATE, of the nodes.
+        mode: for MODE, the one to enter.
         finding: what it is for; the first where there are several.
     """
 
     what: Consequence
     keys: tuple[str, ...] = ()
+    mode: str = ""
     finding: Finding
 
 
@@ -91,6 +93,7 @@ class Consequences:
         self._emit = emit
         self._lasting_s = lasting_s
         self._since: dict[_Key, float] = {}
+        self._tried: set[_Key] = set()
 
     def forget(self) -> None:
         """Begin anew: the system is not active."""
@@ -108,6 +111,7 @@ class Consequences:
         now_s = self._emit.elapsed_s
         every = tuple(findings)
         coming = self._coming_elsewhere(every)
+        self._tried &= {_key(each) for each in every}
         asked: dict[_Key, Due] = {}
         for each in every:
             if each.outcome is Outcome.VIOLATED and coming.isdisjoint(each.nodes):
@@ -121,13 +125,17 @@ class Consequences:
             return None, min(until_s.values()) - now_s if until_s else None
         worst = max(lasting, key=lambda due: _ORDER.index(due.what))
         keys = {key for each in lasting if each.what is worst.what for key in each.keys}
+        if worst.what is Consequence.MODE:
+            # A mode that its gate refuses is left again, and not entered for the same reason twice.
+            self._tried |= {key for key, due in asked.items() if due.mode == worst.mode}
         ordered = tuple(key for key in self._system.nodes if key in keys)
         return dataclasses.replace(worst, keys=ordered), None
 
     def _asked(self, finding: Finding) -> Due | None:
         """Return what would still have an effect."""
         plan = self._system.plan
-        what = consequence_of(plan, finding)
+        reaction = reaction_of(plan, finding)
+        what = reaction.what
         if what is Consequence.REPORT:
             return None
         names = set(finding.nodes or (finding.subject,))
@@ -135,6 +143,10 @@ class Consequences:
         own = [node for node in self._system.nodes.values() if node.name in names]
         if concerned and not own:
             return None  # its own supervisor has the same manifest
+        if what is Consequence.MODE:
+            if self._system.mode == reaction.mode or _key(finding) in self._tried:
+                return None
+            return Due(what=what, mode=reaction.mode, finding=finding)
         if what is Consequence.DEACTIVATE:
             held = [node for node in own if node.is_to_be_active]
             if held:

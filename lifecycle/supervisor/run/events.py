@@ -327,7 +327,7 @@ class ConsequenceTaken:
     """A violation of an active system lasts, and what the manifest asks for is done about it.
 
     Attributes:
-        action: "deactivate", "pause" or "stop".
+        action: "deactivate", "mode", "pause" or "stop".
         nodes: those that are deactivated; empty where it is for the whole system.
         rule: id of the finding's rule.
         message: the finding's, a whole sentence.
@@ -339,6 +339,22 @@ class ConsequenceTaken:
     rule: str
     subject: str
     message: str
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class ModeEntered:
+    """The system is in another mode.
+
+    Attributes:
+        mode: its name.
+        before: that of the mode that it was in.
+        inactive: names of the nodes that it keeps inactive.
+    """
+
+    kind: ClassVar[str] = "mode"
+    mode: str
+    before: str
+    inactive: tuple[str, ...]
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -388,6 +404,7 @@ Event = Union[  # noqa: UP007 - a run-time alias on Python 3.10
     Restarted,
     GaveUp,
     ConsequenceTaken,
+    ModeEntered,
     Notice,
     Stopping,
     Stopped,

@@ -614,3 +614,24 @@ def test_a_parameter_file_that_changed_is_not_taken_in_silence(
         taken = verb("restart", str(manifest), "talker", "--reload", runtime=tmp_path)
         assert (taken.returncode, taken.stderr) == (ExitCode.OK, "")
         assert verb("restart", "pair", runtime=tmp_path).returncode == ExitCode.OK
+
+
+def test_a_mode_takes_a_node_out_and_another_brings_it_back_through_the_gate(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    modes = {"normal": {}, "quiet": {"inactive": ["talker"]}}
+    with up(pair(tmp_path, fresh_domain, edit={"modes": modes}), runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        since = len(run.events)
+        assert verb("mode", "pair", "quiet", runtime=tmp_path).returncode == ExitCode.OK
+        assert run.met("mode", since=since)["inactive"] == ["/talker"]
+        status = verb("status", "pair", runtime=tmp_path)
+        assert status.returncode == ExitCode.OK
+        assert "pair: active, mode quiet, verdict ok" in status.stdout
+        since = len(run.events)
+        assert verb("mode", "pair", "normal", runtime=tmp_path).returncode == ExitCode.OK
+        assert run.met("gate", since=since)["nodes"] == ["/talker"]
+        assert verb("mode", "pair", "loud", runtime=tmp_path).returncode == ExitCode.USAGE
+        assert verb("down", "pair", runtime=tmp_path).returncode == ExitCode.OK
+        assert run.finish() == ExitCode.OK
+        run.assert_gate_held()

@@ -41,6 +41,7 @@ from lifecycle.supervisor.run.events import (
     Failure,
     GateOpened,
     GaveUp,
+    ModeEntered,
     NodeChanged,
     NodeJoined,
     NodeLeft,
@@ -475,6 +476,8 @@ def _line(event: Event, now_s: float) -> str:
         return f"[restarted] {event.process} ({event.restarts})"
     if isinstance(event, GaveUp):
         return f"[gave_up] {event.process} ({len(event.history)} failures)"
+    if isinstance(event, ModeEntered):
+        return f"[mode] {event.mode} without {' '.join(event.inactive)}".removesuffix(" without ")
     if isinstance(event, ConsequenceTaken):
         return f"[consequence] {event.action} {' '.join(event.nodes)} for {event.rule}"
     return f"[{event.kind}]"
@@ -594,13 +597,13 @@ class SessionWorld:
             self._directory.release()
 
     async def order(
-        self, ask: ControlRequest, node: str = "", *, reload: Plan | None = None
+        self, ask: ControlRequest, node: str = "", *, reload: Plan | None = None, mode: str = ""
     ) -> str:
         """Order something through the control socket; return the answer, `0` or `4 cannot …`."""
         assert self._directory is not None
         with short_path(self._directory.socket_path) as path:
             reader, writer = await asyncio.open_unix_connection(path)
-        question = Question(ask=ask, node=node, plan=reload, reload=reload is not None)
+        question = Question(ask=ask, node=node, plan=reload, reload=reload is not None, mode=mode)
         writer.write(to_json(question) + b"\n")
         answer = from_json(await reader.readline(), Answer)
         writer.close()

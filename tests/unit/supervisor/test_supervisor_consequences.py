@@ -11,31 +11,44 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.manifest import Condition, Consequence, EndpointKind, OnViolation, Supervision
+from lifecycle.manifest import (
+    Condition,
+    Consequence,
+    EndpointKind,
+    Mode,
+    OnViolation,
+    Reaction,
+    Supervision,
+)
 from lifecycle.manifest import Restart as RestartWhen
 from lifecycle.manifest.schema import MANIFEST, read_schema
-from lifecycle.plan import PlannedFlow
+from lifecycle.plan import PlannedFlow, in_mode
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.control.server import ControlRequest
-from lifecycle.supervisor.policy.consequences import consequence_of
+from lifecycle.supervisor.policy.consequences import reaction_of
 from lifecycle.verify import RULES, Finding, Outcome
-from tests.builders import plan_of, planned_node
+from tests.builders import HERE, plan_of, planned_node
 from tests.unit.supervisor.fakes import run
 from tests.unit.supervisor.session_world import DOWN, SessionWorld, over
 
-REPORT, DEACTIVATE, PAUSE, STOP = Consequence
+REPORT, DEACTIVATE, MODE, PAUSE, STOP = Consequence
+Said = tuple[tuple[str, Consequence], ...]
 TWICE = "graph.duplicate-node"
 
 
-def _plan(
-    system: OnViolation = (), camera: OnViolation = (), restart: RestartWhen = RestartWhen.NO
-) -> Plan:
+def _plan(system: Said = (), camera: Said = (), restart: RestartWhen = RestartWhen.NO) -> Plan:
     supervision = Supervision(restart=restart, restart_sec=1.0)
     plan = plan_of(
-        dataclasses.replace(planned_node("camera", supervision=supervision), on_violation=camera),
+        dataclasses.replace(
+            planned_node("camera", supervision=supervision), on_violation=_said(camera)
+        ),
         planned_node("viewer", after={"camera": Condition.ACTIVE}),
     )
-    return dataclasses.replace(plan, on_violation=system)
+    return dataclasses.replace(plan, on_violation=_said(system))
+
+
+def _said(pairs: Said) -> OnViolation:
+    return tuple(Reaction(rule=rule, what=what) for rule, what in pairs)
 
 
 # What is asked for
@@ -59,10 +72,9 @@ def test_the_manifest_knows_every_rule_and_family() -> None:
         ((("graph", STOP),), (("param", REPORT),), STOP),
     ],
 )
-def test_what_is_nearest_counts(
-    system: OnViolation, camera: OnViolation, found: Consequence
-) -> None:
-    assert consequence_of(_plan(system, camera), _found(TWICE, "/camera", node="/camera")) is found
+def test_what_is_nearest_counts(system: Said, camera: Said, found: Consequence) -> None:
+    finding = _found(TWICE, "/camera", node="/camera")
+    assert reaction_of(_plan(system, camera), finding).what is found
 
 
 def test_a_link_speaks_for_its_flow_and_both_ends_of_it_and_the_stronger_end_counts() -> None:
@@ -71,7 +83,7 @@ def test_a_link_speaks_for_its_flow_and_both_ends_of_it_and_the_stronger_end_cou
         publisher="camera",
         subscription="viewer",
         linked=True,
-        on_violation=(("flow", STOP),),
+        on_violation=_said((("flow", STOP),)),
     )
     plan = dataclasses.replace(_plan((), (("default", DEACTIVATE),)), flows=(flow,))
     ends = ("/camera", "/viewer")
@@ -80,7 +92,7 @@ def test_a_link_speaks_for_its_flow_and_both_ends_of_it_and_the_stronger_end_cou
         "flow.dscp-not-applied", "/video", node="/camera", endpoint=EndpointKind.PUBLISHER
     )
     other = _found("flow.not-unique", "/audio: /camera → /viewer", ends=ends)
-    assert [consequence_of(plan, each) for each in (pair, publisher, other)] == [
+    assert [reaction_of(plan, each).what for each in (pair, publisher, other)] == [
         STOP,
         STOP,
         DEACTIVATE,
@@ -232,5 +244,47 @@ def test_a_node_that_is_being_restarted_has_no_consequence_and_one_withheld_come
         assert world.outline.count("/camera activate") == 3
         assert world.outline.count("/viewer activate") == 1
         assert world.story[-1] == "[stopped] 4"
+
+    run(main())
+
+
+def test_a_violation_enters_a_mode_once_and_one_that_its_gate_refuses_is_left_again(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        plan = plan_of(planned_node("camera"), planned_node("viewer"))
+        plan = dataclasses.replace(
+            plan,
+            modes=(
+                Mode(name="normal", inactive=("viewer",), at=HERE),
+                Mode(name="safe", inactive=("camera", "viewer"), at=HERE),
+                Mode(name="other", inactive=("camera",), at=HERE),
+            ),
+            on_violation=(
+                Reaction(rule=TWICE, what=MODE, mode="safe"),
+                Reaction(rule="graph.undeclared-node", what=MODE, mode="other"),
+            ),
+        )
+        world = SessionWorld(in_mode(plan, "normal"), tmp_path, stop_after_s=20.0)
+
+        async def violate() -> None:
+            await world.story.until("[system] active")
+            world.double("/camera")
+            await world.story.until("[mode] safe")
+            await asyncio.sleep(3.0)
+            assert (world.status().mode, world.status().phase) == ("safe", "active")
+            world.double()
+            assert await world.order(ControlRequest.MODE, mode="normal") == "0"
+            world.intrude()
+            await world.story.until("[notice] cannot enter mode 'other': back to 'normal'")
+            await asyncio.sleep(3.0)
+            assert (world.status().mode, world.status().phase) == ("normal", "held")
+
+        await world.run(violate())
+        taken = [each for each in world.outline if each.startswith("[consequence]")]
+        assert taken == [
+            f"[consequence] mode  for {TWICE}",
+            "[consequence] mode  for graph.undeclared-node",
+        ]
 
     run(main())
