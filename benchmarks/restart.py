@@ -36,7 +36,7 @@ def manifest(directory: Path, domain_id: int, *, tcp: bool) -> Path:
     topic = {"name": "chatter", "type": "std_msgs/msg/String"}
     discovery: dict[str, Any] = {"domain_id": domain_id, "range": "localhost"}
     if tcp:
-        discovery |= {"mode": "static", "transport": "tcpv4"}
+        discovery = {"domain_id": domain_id, "mode": "static", "transport": "tcpv4"}
     listener = {
         "run": {"python": f"{NODES}:Listener", "output": "log"},
         "interface": {"subscriptions": [topic]},

@@ -156,7 +156,8 @@ def introduce(
     if not asked or (urls and not leaves_discovery_open(urls)):
         return
     new = frozenset(newcomers)
-    for kind, found in listening((*new, *pids)).items():
+    # The observer itself is no target of its own probes, and is to answer as well.
+    for kind, found in listening((*new, *pids, os.getpid())).items():
         family = kind.socket_family
         answered_at = [(each.address, each.port) for each, pid in found.items() if pid in new]
         targets = dict.fromkeys((*asked.get(kind, ()), *found))

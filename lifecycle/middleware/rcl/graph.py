@@ -473,7 +473,8 @@ class GraphObserver:
             kept.topical[place] = made
             if made[1] is not None:
                 yield made[1]
-        self._known = frozenset(known)
+        # Who was known and left is not on the way into the graph.
+        self._known |= frozenset(known)
 
     def _shown(
         self,

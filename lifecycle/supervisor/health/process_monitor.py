@@ -10,14 +10,18 @@ import rclpy.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import Coroutine, Iterable, Sequence
 from typing import Any, Protocol
 
+from lifecycle.errors import BringUpError
+from lifecycle.node import Operation
 from lifecycle.supervisor.control.protocol import ProcessState, Reach
 from lifecycle.supervisor.gate.verification_loop import ChangeCounter
 from lifecycle.supervisor.nodes.bring_up import ALSO_S, died
 from lifecycle.supervisor.nodes.system import NodeRun, ObservedGraph, System
 from lifecycle.supervisor.processes.adopted_process import AdoptedProcess
+from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.supervisor.processes.process import ManagedProcess
 from lifecycle.supervisor.run.events import Event, NodeChanged, ProcessChanged
 from lifecycle.supervisor.run.failure import StepFailedError, ended
@@ -115,7 +119,7 @@ AGAIN_S = (0.1, 0.5, 1.0, 2.0, 4.0)
 """Seconds between repetitions: what the process itself had sent may be read after the first, and a
 datagram may be lost. After the first two only while discovery still shows a participant."""
 
-INTRODUCED_AGAIN_S = (0.1, 0.2, 0.4, 0.8)
+INTRODUCED_AGAIN_S = (0.1, 0.1, 0.1, 0.2, 0.4, 0.8)
 """Seconds between repetitions: a datagram may be lost, and be answered before it is listened."""
 
 _ALWAYS = 3
@@ -139,6 +143,12 @@ class ParticipantRegistry(Protocol):
         """Have new participants discovered by, and discover, those that were there before."""
 
 
+async def _republish(channel: ControlChannel, node: str) -> None:
+    # One that ends meanwhile has nothing to publish any more.
+    with contextlib.suppress(BringUpError):
+        await channel.request(node, Operation.REPUBLISH_NAMES)
+
+
 class StaleNodes:
     """Removes what processes of one system leave in the graph when they die.
 
@@ -155,6 +165,7 @@ class StaleNodes:
         self._system = system
         self._graph = graph
         self._later: set[asyncio.TimerHandle] = set()
+        self._publishing: set[asyncio.Future[None]] = set()
         self._closed = False
 
     def on_event(self, event: Event) -> None:
@@ -176,6 +187,12 @@ class StaleNodes:
             return
         pids = [each.pid for each in self._system.living if each is not process]
         self._graph.introduce([process.pid], pids)
+        if repetition and process.channel is not None and name not in (self._system.present or ()):
+            # Its endpoints may be matched and its name not be known: what it published before the
+            # match is only repeated with the next heartbeat, 3 s later.
+            publishing = asyncio.ensure_future(_republish(process.channel, name))
+            self._publishing.add(publishing)
+            publishing.add_done_callback(self._publishing.discard)
         if repetition == len(INTRODUCED_AGAIN_S):
             return
 
@@ -193,6 +210,8 @@ class StaleNodes:
         for each in self._later:
             each.cancel()
         self._later.clear()
+        for task in self._publishing:
+            task.cancel()
 
     def _ended(self, process: ManagedProcess) -> None:
         self.forget(process.pid, [self._system.nodes[key] for key in process.planned.nodes])

@@ -318,15 +318,20 @@ def _explained(moments: Sequence[Moment], until: int, finding: Finding) -> Expla
         begins = index
     facts, others, saw = _turned(past[: begins + 1], finding)
     line = past[begins].line
+    names = _names(past[begins].plan, finding)
     found = [
-        (each.line.elapsed_s, each.event)
+        each
         for each in moments
         if not first
         and each.event is not None
         and not isinstance(each.event, VerdictChanged)
         and saw - BEFORE_S <= each.line.at <= line.at + AFTER_S
+        and (each.line.at <= line.at or _concerns(each.event, names))
     ]
-    nearest = sorted(found, key=lambda each: abs(each[0] - line.elapsed_s))[:_MOST_EVENTS]
+    # Those that concern it first, then the nearest.
+    found.sort(key=lambda each: (not _concerns(each.event, names), abs(each.line.at - line.at)))
+    chosen = sorted(found[:_MOST_EVENTS], key=lambda each: each.line.elapsed_s)
+    events = tuple((each.line.elapsed_s, each.event) for each in chosen if each.event is not None)
     return Explanation(
         finding=finding,
         since=line.at,
@@ -334,8 +339,20 @@ def _explained(moments: Sequence[Moment], until: int, finding: Finding) -> Expla
         first=first,
         facts=facts,
         others=others,
-        events=tuple(each for each in found if each in nearest),
+        events=events,
     )
+
+
+def _names(plan: Plan | None, finding: Finding) -> frozenset[str]:
+    """Return the names of the nodes that a finding concerns, and of their processes."""
+    nodes = {finding.subject, *finding.nodes}
+    processes = (each.process for each in (plan.nodes if plan else ()) if each.full_name in nodes)
+    return frozenset((*nodes, *processes))
+
+
+def _concerns(event: Event | None, names: frozenset[str]) -> bool:
+    told = (getattr(event, each, "") for each in ("node", "process", "subject"))
+    return any(each in names for each in told if each)
 
 
 def _is_same(one: Finding | JudgedFinding, other: Finding) -> bool:

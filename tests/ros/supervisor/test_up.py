@@ -461,9 +461,12 @@ def test_keep_going_reports_the_death_and_the_verdict_and_goes_on_but_is_no_succ
         before = len(run.events)
         os.kill(run.pid_of("talker"), signal.SIGKILL)
         run.until("failure", rule="run.process-died")
+        died_s = time.monotonic()
         # A judgement that was under way may see the death a moment before it is reported.
         verdict = run.until_found("graph.missing-node", "/talker", since=before)
         assert verdict["verdict"] == "violated"
+        # Not as late as participants are waited for that may be on their way into the graph.
+        assert time.monotonic() - died_s < 2.0
         run.signal(signal.SIGTERM)
         assert run.finish() == ExitCode.BRING_UP_FAILED
         assert run.verdict["run"]["reason"] == "terminated; failed: /talker (run.process-died)"

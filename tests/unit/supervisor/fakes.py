@@ -196,6 +196,9 @@ class FakeProcess:
             while line := await reader.readline():
                 command = from_json(line, Command)
                 state, connected = _STATES.get(command.operation, ("active", True))
+                before = self._spawner.interfaces.get(command.node)
+                if command.operation is Operation.REPUBLISH_NAMES and before is not None:
+                    state, connected = before.state, before.connected
                 what = " ".join(
                     filter(None, (command.node, command.operation.value, _what(command)))
                 )

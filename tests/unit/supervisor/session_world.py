@@ -425,6 +425,8 @@ class _Story(list[str]):
         self._more = asyncio.Event()
 
     def append(self, line: str) -> None:
+        if line.endswith(Operation.REPUBLISH_NAMES.value):
+            return  # as often as it takes until discovery shows a node that was started again
         super().append(line)
         for start in tuple(self.in_the_moment):
             if line.startswith(start):

@@ -447,7 +447,7 @@ def test_a_log_directory_that_cannot_be_used_is_said(
     access: bool, home: str, why: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     home = str(tmp_path) if home == "/tmp" else home
-    monkeypatch.setattr(os, "access", lambda *_: access)
+    monkeypatch.setattr(os, "access", lambda *_, **__: access)
     with pytest.raises(UsageError) as refused:
         check_log_root({"HOME": home})
     assert str(refused.value) == (
