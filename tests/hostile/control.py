@@ -129,7 +129,7 @@ def _other_plan(change: str, verb: str, system: Running) -> None:
 
 def _ordered(node: str, system: Running) -> None:
     question = Question(ask=ControlRequest.RESTART, node=node)
-    answer = ask(system.run / "control", question, 10.0)
+    answer = ask(system.run / "control", question, 10.0, Answer)
     if answer is None or answer.exit_code in {None, 0, 70} or not answer.error:
         raise Unhandled(f"restart of {node!r}: {answer}")
     system.check()
