@@ -227,6 +227,8 @@ class ConnectionAuthority:
 
     def replan(self, plan: Plan, names: Collection[str]) -> None:
         """Forget what these nodes were instructed: they are started again, by this plan."""
+        if self._dynamic:
+            self._early = configured_before_any_connect(self._system)
         self._source.replan(plan, names)
         for name in names:
             self._wirings.pop(name, None)

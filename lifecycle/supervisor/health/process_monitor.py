@@ -178,10 +178,12 @@ class StaleNodes:
                 asyncio.get_running_loop().call_soon(self._ended, process)
 
     def _came_again(self, name: str, reach: Reach, repetition: int = 0) -> None:
-        """Introduce a process that was started again to the others, while it is so far."""
+        """Introduce a process that was started again, or added, to the others, while so far."""
         node = self._system.node_named(name)
         process = None if node is None else node.process
-        if node is None or process is None or not process.is_restarted or not process.pid:
+        if node is None or process is None or not process.pid:
+            return
+        if not (process.is_restarted or process.joins):
             return
         if self._closed or node.reach is not reach or process.is_gone:
             return

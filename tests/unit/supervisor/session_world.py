@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from lifecycle.codec import from_json, to_json
+from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.model import Condition, RunKind
 from lifecycle.node.host.control import Operation
 from lifecycle.plan.model import ParticipantConnections, Plan, PlannedNode
@@ -41,6 +42,7 @@ from lifecycle.supervisor.run.events import (
     Failure,
     GateOpened,
     GaveUp,
+    ManifestApplied,
     ModeEntered,
     NodeChanged,
     NodeJoined,
@@ -177,6 +179,7 @@ class FakeParticipant:
         asked_for: services that have a client.
         while_looking: done once, when the next look has seen everything and is not over yet.
         ros: what ROS programs see of the supervisor; None before it is made.
+        refuses: why nodes do not take parameters while they run.
     """
 
     def __init__(self, hosts: FakeForkServer) -> None:
@@ -191,6 +194,7 @@ class FakeParticipant:
         self.asked_for: set[str] = set()
         self.while_looking: Callable[[], None] | None = None
         self.ros: FakeRosInterface | None = None
+        self.refuses: dict[str, str] = {}
         self._hosts = hosts
         self._reports: dict[str, NodeConfiguration] = {}
         self._changed = asyncio.Event()
@@ -252,6 +256,15 @@ class FakeParticipant:
 
     async def give(self, node: PlannedNode) -> None:
         """No node of this world has parameter services."""
+
+    async def set_parameters(
+        self, node: str, values: Mapping[str, Any], types: Mapping[str, str]
+    ) -> None:
+        assert values.keys() == types.keys()
+        self._hosts.log.append(f"{node} set {values}")
+        await asyncio.sleep(self._hosts.takes_s.get(f"{node} set", 0.0))
+        if node in self.refuses:
+            raise MiddlewareError(self.refuses[node])
 
     def driver(self, node: PlannedNode) -> NodeDriver:
         return ServiceDriver(self.services, node)
@@ -386,6 +399,9 @@ class FakeNetworks(Networks):
         self.fails = ""
         self._log = log
 
+    def replan(self, plan: Plan) -> None:
+        """What it programs is of no account."""
+
     async def begin(self, verdict: Verdict, timeout_s: float | None = None) -> None:
         del timeout_s
         self._log.append(f"networks programmed ({verdict.verdict.value})")
@@ -480,6 +496,15 @@ def _line(event: Event, now_s: float) -> str:
         return f"[gave_up] {event.process} ({len(event.history)} failures)"
     if isinstance(event, ModeEntered):
         return f"[mode] {event.mode} without {' '.join(event.inactive)}".removesuffix(" without ")
+    if isinstance(event, ManifestApplied):
+        what = {
+            "added": event.added,
+            "removed": event.removed,
+            "restarted": event.restarted,
+            "parameters of": event.parameters,
+        }
+        said = "".join(f", {word} {' '.join(names)}" for word, names in what.items() if names)
+        return f"[apply] {event.stage} revision {event.revision}{said}"
     if isinstance(event, ConsequenceTaken):
         return f"[consequence] {event.action} {' '.join(event.nodes)} for {event.rule}"
     return f"[{event.kind}]"
@@ -602,15 +627,29 @@ class SessionWorld:
         self, ask: ControlRequest, node: str = "", *, reload: Plan | None = None, mode: str = ""
     ) -> str:
         """Order something through the control socket; return the answer, `0` or `4 cannot …`."""
+        question = Question(ask=ask, node=node, plan=reload, reload=reload is not None, mode=mode)
+        answer = await self._asked(question)
+        return f"{answer.exit_code} {answer.error}".rstrip()
+
+    async def apply(self, plan: Plan, *, dry_run: bool = False, timeout_s: float = 0.0) -> Answer:
+        """Have the system run by another manifest, which declares these nodes."""
+        for node in plan.nodes:
+            if node.managed and node.run.kind is not RunKind.ATTACH:
+                report = interface_of(node.full_name)
+                self.hosts.interfaces.setdefault(node.full_name, report)
+        return await self._asked(
+            Question(ask=ControlRequest.APPLY, plan=plan, dry_run=dry_run, timeout_s=timeout_s)
+        )
+
+    async def _asked(self, question: Question) -> Answer:
         assert self._directory is not None
         with short_path(self._directory.socket_path) as path:
             reader, writer = await asyncio.open_unix_connection(path)
-        question = Question(ask=ask, node=node, plan=reload, reload=reload is not None, mode=mode)
         writer.write(to_json(question) + b"\n")
         answer = from_json(await reader.readline(), Answer)
         writer.close()
         await writer.wait_closed()
-        return f"{answer.exit_code} {answer.error}".rstrip()
+        return answer
 
     def intrude(self) -> None:
         """Let a node appear that nobody declared."""
