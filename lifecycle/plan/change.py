@@ -133,15 +133,20 @@ def _as_run(node: PlannedNode) -> object:
         on_violation=(),
         timeouts=node.timeouts if hosted else Timeouts(),
     )
-    return _without_positions(to_plain(bare))
+    return without_positions(bare)
 
 
-def _without_positions(value: object) -> object:
-    if isinstance(value, dict):
-        return {key: _without_positions(each) for key, each in value.items() if key != "at"}
-    if isinstance(value, list):
-        return [_without_positions(each) for each in value]
-    return value
+def without_positions(value: object) -> object:
+    """Return a part of a plan as plain data, without where in the manifest it is declared."""
+
+    def bare(plain: object) -> object:
+        if isinstance(plain, dict):
+            return {key: bare(each) for key, each in plain.items() if key != "at"}
+        if isinstance(plain, list | tuple):
+            return [bare(each) for each in plain]
+        return plain
+
+    return bare(to_plain(value))
 
 
 def _processes(plan: Plan) -> Mapping[str, object]:

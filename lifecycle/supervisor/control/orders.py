@@ -14,7 +14,6 @@ import dataclasses
 import enum
 from collections.abc import Collection, Iterable, Iterator
 
-from lifecycle.codec import to_plain
 from lifecycle.errors import BringUpError, ExitCode, LifecycleError, UsageError
 from lifecycle.manifest import DataLayerSource, did_you_mean
 from lifecycle.network import parse
@@ -26,6 +25,7 @@ from lifecycle.plan import (
     change_between,
     changes,
     with_files_of_now,
+    without_positions,
 )
 from lifecycle.supervisor.control.protocol import ChangedNodes, ProcessState
 from lifecycle.supervisor.nodes.system import NodeRun, System
@@ -471,12 +471,4 @@ def _urls(plan: Plan) -> Iterator[str]:
 
 def _bare(node: PlannedNode) -> object:
     """Return a planned node without positions."""
-
-    def bare(value: object) -> object:
-        if isinstance(value, dict):
-            return {key: bare(each) for key, each in value.items() if key != "at"}
-        if isinstance(value, list):
-            return [bare(each) for each in value]
-        return value
-
-    return bare(to_plain(dataclasses.replace(node, files=())))
+    return without_positions(dataclasses.replace(node, files=()))
