@@ -120,6 +120,7 @@ def _as_run(node: PlannedNode) -> object:
     bare = dataclasses.replace(
         node,
         endpoints=tuple(dataclasses.replace(each, **_ENDPOINT) for each in node.endpoints),
+        participants=tuple(dataclasses.replace(each, reason="") for each in node.participants),
         parameters=(),
         parameter_files=(),
         expected_parameters=(),
@@ -165,7 +166,7 @@ def _not_parameters(words: Iterator[str]) -> Iterator[str]:
     for word in words:
         if word in _PARAMETER_WORDS:
             next(words, None)
-        else:
+        elif word != "--ros-args":  # which is there only where something follows
             yield word
 
 
