@@ -211,6 +211,7 @@ class Run:
         environment: extra variables, (name, value).
         component: `package/Plugin` that `container` loads; the node's kind is ATTACH then.
         container: full name of the container's node.
+        extra_arguments: (name, value) that the container is told of the component besides.
         ros_args: of a COMMAND.
         prefix: words before the command line of the process.
         output: where goes what the process prints.
@@ -231,6 +232,7 @@ class Run:
     working_directory: str = ""
     component: str = ""
     container: str = ""
+    extra_arguments: tuple[tuple[str, ParameterValue], ...] = ()
     ros_args: RosArguments = RosArguments.AUTO
     prefix: tuple[str, ...] = ()
     output: Output = Output.BOTH
