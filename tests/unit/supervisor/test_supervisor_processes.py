@@ -268,6 +268,41 @@ def test_when_the_supervisor_vanishes_the_fork_server_ends_what_it_forked(tmp_pa
     _run(test())
 
 
+def test_what_is_kept_outlives_the_supervisor_and_its_output_goes_to_its_log(
+    tmp_path: Path,
+) -> None:
+    writes = "import time\nfor n in range(10**9): print(f'line {n}', flush=True); time.sleep(0.02)"
+
+    async def test() -> None:
+        process = ForkServerProcess(preload=False, environment=os.environ)
+        bench = _Bench(tmp_path, ForkServer(process))
+        kept, let_go, never = [await bench.start(PYTHON, "-c", writes) for _ in range(3)]
+        for each in (kept, let_go):
+            each.running()
+            each.keep()
+        let_go.release()
+        await bench.spoke.wait()
+        for each in (kept, let_go, never):  # as the kernel does when this process is killed
+            for reader in each._readers:
+                reader.close()
+        process.socket.shutdown(2)
+        await asyncio.gather(let_go.ended, never.ended)
+        size = kept.log.path.stat().st_size
+        deadline = time.monotonic() + BOUND_S
+        while kept.log.path.stat().st_size < size + 100:
+            assert time.monotonic() < deadline
+            await asyncio.sleep(0.02)
+        assert psutil.pid_exists(kept.pid)
+        assert kept.log.path.read_text().rstrip("\n").rpartition("\n")[2].startswith("line ")
+        os.kill(kept.pid, signal.SIGTERM)
+        await kept.ended
+        # Nothing is left to guard.
+        assert await asyncio.get_running_loop().run_in_executor(None, process.popen.wait) == 0
+        await bench.close()
+
+    _run(test())
+
+
 def test_lines_are_split_and_a_line_without_end_cannot_fill_the_memory() -> None:
     async def test() -> None:
         read, write = os.pipe()
