@@ -27,7 +27,7 @@ from collections.abc import Iterable
 from typing import NoReturn
 
 from lifecycle.codec import from_json, to_json
-from lifecycle.middleware import adopt_orphans, refuse_new_privileges
+from lifecycle.middleware import adopt_orphans, fill_heap, refuse_new_privileges
 from lifecycle.supervisor.processes.forerunner import PRELOAD
 
 LARGEST_MESSAGE = 1 << 18
@@ -316,6 +316,7 @@ def _preload(names: Iterable[str]) -> None:
 
     gc.disable()
     preload(names)
+    fill_heap()
     gc.freeze()
     gc.enable()
 
