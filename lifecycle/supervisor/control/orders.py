@@ -314,7 +314,7 @@ class Revisions:
         what, said = order.kind.value, order.kind.said
         listed = "\n".join(_lines(found))
         path = (order.plan or self._system.first).manifest_path
-        take = f"lifecycle restart {path} --reload"
+        take = f"lifecycle apply {path}"
         same = f"; or keep what runs: lifecycle {what} {system}" if order.plan is not None else ""
         same = f"{same} {order.mode}" if same and order.mode else same
         return UsageError(
