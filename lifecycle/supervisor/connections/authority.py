@@ -303,6 +303,18 @@ class ConnectionAuthority:
         found += [not_wired(system, each) for each in self._source.problems]
         return tuple(found)
 
+    def is_at_work(self) -> bool:
+        """Whether a running node lacks something that is still to be made."""
+        if not (self._dynamic or self._repairs):
+            return False
+        for name, _, _, configuration in self._wirable():
+            wiring = self._wirings.get(name) or _Wiring()
+            given_up = wiring.rounds >= TRIES and configuration.checksum == wiring.given_up
+            wanted = self._instructions[name]
+            if not given_up and steps(wanted, wired(configuration), ours=wiring.ours):
+                return True
+        return False
+
     def _negotiate(self) -> Mapping[str, Instructions]:
         known = dict(self._others)
         for node in self._system.nodes.values():

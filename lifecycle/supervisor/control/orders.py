@@ -159,6 +159,11 @@ def check_order(order: Order, system: System, phase: str) -> None:
         node_of(order, system)
     if order.kind is OrderKind.MODE:
         _check_mode(order, system)
+    if order.kind is OrderKind.APPLY and (order.plan is None or not order.timeout_s >= 0):
+        raise UsageError(
+            f"cannot apply a manifest to {system.plan.system!r} without one, or within "
+            f"{order.timeout_s:g} s"
+        )
 
 
 def _check_mode(order: Order, system: System) -> None:

@@ -34,7 +34,7 @@ from lifecycle.supervisor.policy.schedule import RestartSchedule
 from lifecycle.supervisor.processes.process import Spawner
 from lifecycle.supervisor.run.events import Emitter, ManifestApplied, Notice, SystemReached
 from lifecycle.supervisor.run.failure import StepFailedError, together
-from lifecycle.verify import PROCESS_DIED, not_ok
+from lifecycle.verify import PROCESS_DIED, Stage, not_ok
 
 Alive = Callable[[Coroutine[Any, Any, object]], Coroutine[Any, Any, None]]
 """Runs a step; the unexpected end of any process ends it."""
@@ -230,6 +230,7 @@ class Applying:
         await self._sequence.connect_unfinished(_left_s(deadline))
         if done.touched:
             self._emit(SystemReached(reached="connected", elapsed_s=self._emit.elapsed_s))
+        await self._alive(self._judge.reconciled(Stage.CONNECTED, _left_s(deadline)))
         permit = await self._sequence.verify(_left_s(deadline))
         if before.phase == PAUSED:
             self._sequence.reached(PAUSED)
@@ -329,6 +330,7 @@ class Applying:
             )
         )
         await sequence.connect_unfinished(_left_s(deadline))
+        await self._alive(self._judge.reconciled(Stage.CONNECTED, _left_s(deadline)))
         permit = await sequence.verify(_left_s(deadline))
         if before.phase == PAUSED:
             sequence.reached(PAUSED)
@@ -340,7 +342,7 @@ class Applying:
             await self._alive(sequence.program_flows(permit, deadline))
         if sequence.inactive():
             sequence.phase = HELD
-            return "verified, and held as before"
+            return "verified, and held as before: lifecycle resume"
         if not waiting:
             await sequence.confirm(deadline)
         sequence.reached(ACTIVE)

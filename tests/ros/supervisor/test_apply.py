@@ -139,3 +139,31 @@ def test_endpoints_that_change_restart_their_nodes_and_what_fails_is_as_if_it_ha
         for name in ("explain", "replay"):
             said = verb(name, runtime=tmp_path)
             assert said.returncode == ExitCode.OK, said.stdout + said.stderr
+
+
+@pytest.mark.thorough
+def test_a_running_node_is_connected_otherwise_where_the_supervisor_connects_it(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    how = {"data_layer": {"source": "dynamic", "authority": "supervisor"}}
+    with up(pair(tmp_path, fresh_domain, edit=how), runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        since = len(run.events)
+        _, before = status(tmp_path)
+        link = {"topic": "/chatter", "from": "talker", "to": "listener", "transport": "network"}
+        report = apply(pair(tmp_path, fresh_domain, edit={**how, "links": [link]}))
+        assert (report["outcome"], report["restarted"]) == ("applied", [])
+        told, now = status(tmp_path)
+        assert (told["verdict"], now) == ("ok", before)
+        assert transitions(run, since) == set()
+        run.met("wiring", since=since, operation="map_to", endpoint="publishers/chatter")
+        # It may also be another node's business.
+        nodes = {"nodes/second": listener(), "links": [link]}
+        report = apply(pair(tmp_path, fresh_domain, edit={**how, **nodes}))
+        assert (report["outcome"], report["added"]) == ("applied", ["/second"])
+        assert apply(pair(tmp_path, fresh_domain, edit=how))["outcome"] == "applied"
+        assert status(tmp_path)[1] == before
+        assert verb("down", "pair", runtime=tmp_path).returncode == ExitCode.OK
+        assert run.finish() == ExitCode.OK
+        run.assert_gate_held()
+        run.assert_nothing_left()

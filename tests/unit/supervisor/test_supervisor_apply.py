@@ -340,9 +340,7 @@ def test_a_failing_node_is_started_at_once_by_a_manifest_that_mends_it(tmp_path:
     assert world.outline[-1] == "[stopped] 0"
 
 
-def test_other_orders_wait_for_no_manifest_and_an_end_takes_what_is_there_down(
-    tmp_path: Path,
-) -> None:
+def test_other_orders_are_refused_meanwhile(tmp_path: Path) -> None:
     async def acts(world: SessionWorld) -> None:
         world.hosts.takes_s["/arm configure"] = 5.0
         applying = asyncio.ensure_future(world.apply(plan_of(CAMERA, LOUD, ARM)))
@@ -353,15 +351,82 @@ def test_other_orders_wait_for_no_manifest_and_an_end_takes_what_is_there_down(
         ):
             said = await world.order(order)
             assert said == f"2 cannot {order.value} 'robot': it is connecting; {why}"
-        assert _told(await world.apply(CHAIN)) == (
-            "2 cannot apply another manifest to 'robot': it is connecting; only a system that is "
-            "active or paused can take another manifest"
-        )
+        for dry_run in (False, True):
+            assert _told(await world.apply(CHAIN, dry_run=dry_run)) == (
+                "2 cannot apply another manifest to 'robot': it is connecting; only a system that "
+                "is active or paused can take another manifest"
+            )
+        assert _told(await applying) == "0"
+        # What no command line sends is refused, too.
+        assert (await world.apply(CHAIN, timeout_s=-1.0)).exit_code == 2
+        assert (await world.order(ControlRequest.APPLY)).startswith("2 cannot apply a manifest")
+
+    _session(tmp_path, CHAIN, acts)
+
+
+STAGES = {
+    "/viewer deactivate": "applying",
+    "/viewer shutdown": "applying",
+    "/arm configure": "connecting",
+    "networks programmed": "verifying",
+    "/arm activate": "activating",
+    "[apply] rolling_back": "rolling back",
+}
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_an_end_in_the_middle_takes_down_what_is_there(tmp_path: Path, stage: str) -> None:
+    async def acts(world: SessionWorld) -> None:
+        world.hosts.takes_s[stage] = 5.0
+        times = 1 + sum(line.startswith(stage) for line in world.story)
+        if stage.startswith("["):
+            world.hosts.ways["/arm connect"] = "no cable"
+            world.hosts.takes_s["/arm shutdown"] = 5.0
+        world.networks.takes_s = 5.0
+        applying = asyncio.ensure_future(world.apply(plan_of(CAMERA, LOUD, ARM)))
+        await world.story.until(stage, times)
+        await asyncio.sleep(0.1)
+        assert world.status().phase == STAGES[stage]
         assert await world.order(ControlRequest.DOWN) == "6"
         assert _told(await applying) == "6 cannot go on: 'robot' is being taken down"
 
     world = _session(tmp_path, CHAIN, acts, code="6")
-    assert world.report.endswith("the system was connecting, not active")
+    assert world.report.endswith(f"the system was {STAGES[stage]}, not active")
+
+
+def test_what_waits_at_its_gate_is_let_through_by_a_manifest_or_waits_on(tmp_path: Path) -> None:
+    async def acts(world: SessionWorld) -> None:
+        world.intrude()
+        assert (await world.order(ControlRequest.RESTART, "viewer"))[0] == "4"
+        world.retreat()
+        assert world.status().phase == "held"
+        world.hosts.ways["/arm configure"] = "no gripper"
+        assert _told(await world.apply(MORE)).endswith(
+            "revision 1, verified, and held as before: lifecycle resume"
+        )
+        assert world.status().phase == "held"
+        assert [each.state for each in world.status().nodes] == ["active", "inactive"]
+        world.hosts.ways.clear()
+        assert _told(await world.apply(MORE)) == "0"
+        assert world.status().phase == "active"
+
+    world = _session(tmp_path, CHAIN, acts)
+    assert world.story.count("/camera activate") == 1
+    assert world.story.count("/viewer activate") == 2
+
+
+def test_a_network_that_cannot_be_programmed_rolls_back(tmp_path: Path) -> None:
+    async def acts(world: SessionWorld) -> None:
+        world.networks.fails = "cannot reach the server"
+        world.story.in_the_moment["[apply] rolling_back"] = lambda: setattr(
+            world.networks, "fails", ""
+        )
+        answer = await world.apply(MORE)
+        assert _told(answer).startswith("6 cannot apply robot.lifecycle.yaml: cannot reach")
+        assert answer.error.endswith(BACK)
+
+    world = _session(tmp_path, CHAIN, acts)
+    assert "/arm activate" not in world.story
 
 
 def test_a_paused_system_takes_a_manifest_and_stays_paused(tmp_path: Path) -> None:
