@@ -344,6 +344,8 @@ class Revisions:
         """Make sure that the running system can become that of another plan."""
         system, running = self._system, self._system.first
         what = f"cannot apply {plan.manifest_path} to {running.system!r} while it runs"
+        if not _is_whole(plan):
+            raise UsageError(f"{what}: it is no plan; its nodes and processes do not fit together")
         change = self.change(plan)
         # Whoever has other ports by that has other connections, too, and is started again.
         found = tuple(each for each in change.differences if each.path != "order of nodes")
@@ -402,6 +404,21 @@ class Revisions:
                     "otherwise",
                     hint=whole,
                 )
+
+
+def _is_whole(plan: Plan) -> bool:
+    """Whether a plan, which a client sent, names no nodes but its own, each once."""
+    nodes = {each.key: each.process for each in plan.nodes}
+    placed = [(key, each.name) for each in plan.processes for key in each.nodes]
+    named = {after.node for each in plan.nodes for after in each.after}
+    named.update(key for flow in plan.flows for key in (flow.publisher, flow.subscription))
+    named.update(key for level in plan.levels for key in level)
+    named.update(key for mode in plan.modes for key in mode.inactive)
+    return (
+        len(nodes) == len(plan.nodes) == len({each.full_name for each in plan.nodes})
+        and sorted(placed) == sorted(nodes.items())
+        and named <= nodes.keys()
+    )
 
 
 _TCP = "a TCP port that was used is not connected to again by who used it"

@@ -488,6 +488,26 @@ def test_what_a_running_supervisor_cannot_change_is_refused_before_anything_is_t
     assert not any(line.startswith("[apply]") for line in world.story)
 
 
+def test_a_plan_that_does_not_hold_together_is_refused(tmp_path: Path) -> None:
+    nobody = dataclasses.replace(MORE.processes[0], nodes=("nobody",))
+    broken = [
+        dataclasses.replace(MORE, nodes=()),
+        dataclasses.replace(MORE, nodes=MORE.nodes * 2),
+        dataclasses.replace(MORE, nodes=MORE.nodes[1:]),
+        dataclasses.replace(MORE, processes=(nobody, *MORE.processes[1:])),
+        dataclasses.replace(MORE, levels=(("nobody",),)),
+        dataclasses.replace(MORE, modes=(Mode(name="m", inactive=("nobody",), at=HERE),)),
+    ]
+
+    async def acts(world: SessionWorld) -> None:
+        for plan in broken:
+            answer = await world.apply(plan)
+            assert _told(answer).endswith("its nodes and processes do not fit together")
+
+    world = _session(tmp_path, CHAIN, acts)
+    assert not any(line.startswith("[apply]") for line in world.story)
+
+
 def test_over_tcp_only_what_restarts_nothing_is_applied(tmp_path: Path) -> None:
     rules = dataclasses.replace(DIALLING, policy=Policy(undeclared_nodes=EndpointPolicy.OPEN))
 
