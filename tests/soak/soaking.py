@@ -22,7 +22,7 @@ from pathlib import Path
 
 import psutil
 
-from lifecycle.middleware import leftovers
+from lifecycle.middleware import leftovers, segments_of
 from tests.ros.supervisor.running import ROOT, command, environment, left_of
 from tests.soak.model import (
     DIES,
@@ -364,6 +364,7 @@ class Soaking:
             if early := self.transitions.activated(closed + 0.3, opened):
                 raise Violated(f"became active while an intruder was there: {early}")
         finally:
+            self._spare += tuple(segments_of([stranger.pid]))
             stranger.kill() if sys.exc_info()[0] else stranger.terminate()
             stranger.wait(DOWN_S)
             assert stranger.stdout is not None
