@@ -39,8 +39,8 @@ from tests.soak.model import (
 )
 from tests.soak.nodes import address
 from tests.soak.running import (
-    Transitions,
     NotAsPromisedError,
+    Transitions,
     Watched,
     assert_activated_on_request,
     assert_gate_held,
