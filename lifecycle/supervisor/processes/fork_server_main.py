@@ -1,12 +1,13 @@
 """The fork server's own process: forks the processes of a system, and guards them.
 
 Owns: what runs in `python -m lifecycle.supervisor.processes.fork_server_main SOCKET_FD [--preload]
-[--again]`. It stays single-threaded and never calls rclpy.init, so that forking is safe and every
-child is a participant of its own; with `--preload` a forked host skips ~130 ms of imports. Each
-child leads a session of its own. It adopts what its children leave behind (PR_SET_CHILD_SUBREAPER),
-so as long as it lives, what descends from it is what the run started. If the supervisor vanishes it
-ends what is left of its children, bounded, and of those of a fork server before it that was killed;
-those that are to be kept it reads, so that none of them writes to a pipe without a reader.
+[--programs] [--again]`. It stays single-threaded and never calls rclpy.init, so that forking is
+safe and every child is a participant of its own; with `--preload` a forked host skips ~130 ms of
+imports. Each child leads a session of its own. It adopts what its children leave behind
+(PR_SET_CHILD_SUBREAPER), so as long as it lives, what descends from it is what the run started. If
+the supervisor vanishes it ends what is left of its children, bounded, and of those of a fork server
+before it that was killed; those that are to be kept it reads, so that none of them writes to a pipe
+without a reader.
 """
 
 from __future__ import annotations
@@ -16,7 +17,6 @@ import contextlib
 import dataclasses
 import gc
 import os
-import resource
 import selectors
 import signal
 import socket
@@ -29,7 +29,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 from lifecycle.codec import from_json, to_json
-from lifecycle.middleware import adopt_orphans, refuse_new_privileges
+from lifecycle.errors import MiddlewareError
+from lifecycle.middleware import (
+    adopt_orphans,
+    drop_network_administration,
+    fill_heap,
+    limit_resources,
+    refuse_new_privileges,
+)
 from lifecycle.supervisor.processes.forerunner import PRELOAD
 
 if TYPE_CHECKING:
@@ -340,9 +347,7 @@ class _ForkServer:
             os.environ.update(dict(request.environment))
             if request.working_directory:
                 os.chdir(request.working_directory)
-            _confine(request.limits)
-            if request.no_new_privileges:
-                refuse_new_privileges()
+            _confine(request)
             control = descriptors[2] if request.control else None
             code = _run(request.argv, control)
         except SystemExit as error:
@@ -369,18 +374,14 @@ def _take_streams(stdout: int, stderr: int) -> None:
         stream.reconfigure(line_buffering=True)  # type: ignore[union-attr]
 
 
-def _confine(limits: Iterable[tuple[str, int]]) -> None:
-    """Limit what this process may use, and all that it starts."""
-    for name, value in limits:
-        number = getattr(resource, name)
-        # At its soft limit a signal ends it that says why, at the hard one SIGKILL.
-        hard = value + 1 if number == resource.RLIMIT_CPU else value
-        try:
-            resource.setrlimit(number, (value, hard))
-        except (OSError, ValueError) as error:
-            most = resource.getrlimit(number)[1]
-            print(f"cannot set {name} to {value}: {error}; allowed: {most}", file=sys.stderr)
-            raise SystemExit(1) from error
+def _confine(request: ForkRequest) -> None:
+    try:
+        limit_resources(request.limits)
+        if request.no_new_privileges:
+            refuse_new_privileges()
+    except MiddlewareError as error:
+        print(error, file=sys.stderr)
+        raise SystemExit(1) from error
 
 
 def _run(argv: tuple[str, ...], control: int | None) -> int:
@@ -424,6 +425,7 @@ def _preload(names: Iterable[str]) -> None:
 
     gc.disable()
     preload(names)
+    fill_heap()
     gc.freeze()
     gc.enable()
 
@@ -433,12 +435,15 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog=f"python -m {__spec__.name}")
     parser.add_argument("socket_fd", type=int)
     parser.add_argument("--preload", action="store_true")
+    parser.add_argument("--programs", action="store_true", help="its supervisor programs networks")
     parser.add_argument("--again", action="store_true", help="another one before it was killed")
     options = parser.parse_args()
     # Ctrl-C is the supervisor's to handle, and its end is what ends us.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     adopt_orphans()
+    if options.programs and os.geteuid() != 0:
+        drop_network_administration()
     if options.preload:
         _preload(())
     _ForkServer(socket.socket(fileno=options.socket_fd), again=options.again).serve()

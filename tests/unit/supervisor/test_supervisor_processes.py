@@ -543,16 +543,19 @@ def test_a_process_of_another_run_boot_or_start_time_is_left_alone(stray: psutil
 
 _CONFINED = """
 import os, subprocess, sys
-from lifecycle.middleware import refuse_new_privileges
-from lifecycle.supervisor.processes.fork_server_main import _confine
-_confine([("RLIMIT_NOFILE", 77), ("RLIMIT_CPU", 60), ("RLIMIT_AS", 4096 * 2**20)])
-refuse_new_privileges()
+from lifecycle.supervisor.processes.fork_server_main import ForkRequest, _confine
+
+def confine(*limits):
+    request = dict(id=1, argv=(), environment=(), working_directory="", control=False)
+    _confine(ForkRequest(**request, limits=limits, no_new_privileges=True))
+
+confine(("RLIMIT_NOFILE", 77), ("RLIMIT_CPU", 60), ("RLIMIT_AS", 4096 * 2**20))
 assert "rclpy" not in sys.modules
 status = "grep NoNewPrivs /proc/self/status; ulimit -n; ulimit -St; ulimit -Ht; ulimit -v"
 print(subprocess.run(["bash", "-c", status], check=True, capture_output=True, text=True).stdout)
 sys.stdout.flush()
 os.setuid(65534) if os.getuid() == 0 else None
-_confine([("RLIMIT_NOFILE", 78)])
+confine(("RLIMIT_NOFILE", 78))
 """
 
 
@@ -564,3 +567,15 @@ def test_a_process_is_confined_with_all_that_it_starts_and_a_limit_too_high_fail
     assert done.returncode == 1
     assert done.stderr.startswith("cannot set RLIMIT_NOFILE to 78: ")
     assert done.stderr.endswith("; allowed: 77\n")
+
+
+def test_what_runs_without_a_supervisor_is_confined_as_well(tmp_path: Path) -> None:
+    manifest = tmp_path / "one.lifecycle.yaml"
+    manifest.write_text(
+        "manifest_version: 1\nsystem: one\nnodes:\n  it:\n    managed: false\n    run:\n"
+        "      command: [bash, -c, 'grep NoNewPrivs /proc/self/status; ulimit -n', bash]\n"
+        "      no_new_privileges: true\n      limits: {nofile: 77}\n"
+    )
+    words = [sys.executable, "-m", "lifecycle", "run", str(manifest), "it"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=60)
+    assert (done.stdout.split(), done.stderr) == (["NoNewPrivs:", "1", "77"], "")
