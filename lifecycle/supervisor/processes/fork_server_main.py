@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import dataclasses
 import gc
 import os
 import resource
@@ -26,6 +25,7 @@ import warnings
 from collections.abc import Iterable, Iterator
 from typing import NoReturn
 
+from lifecycle import dataclasses
 from lifecycle.codec import from_json, to_json
 from lifecycle.middleware import adopt_orphans, fill_heap, refuse_new_privileges
 from lifecycle.supervisor.processes.forerunner import PRELOAD
