@@ -14,10 +14,20 @@ from collections.abc import Callable, Iterator
 from dataclasses import FrozenInstanceError, field, fields, is_dataclass, replace
 from typing import TYPE_CHECKING, Any, NoReturn
 
-__all__ = ["FrozenInstanceError", "dataclass", "field", "fields", "is_dataclass", "replace"]
+__all__ = [
+    "FrozenInstanceError",
+    "dataclass",
+    "field",
+    "fields",
+    "is_dataclass",
+    "make_constructors",
+    "replace",
+]
 
 _ABSENT = dataclasses.MISSING
 _lock = threading.Lock()
+_classes: list[type] = []
+"""All whose methods are made so."""
 
 
 class _Method:
@@ -35,6 +45,17 @@ class _Method:
         method.__module__ = self._cls.__module__
         setattr(self._cls, self._name, method)
         return method if instance is None else method.__get__(instance, owner)
+
+
+def make_constructors(*prefixes: str) -> None:
+    """Make `__init__` of the types of some modules, for a process that forks those who call it.
+
+    Args:
+        prefixes: what the modules' names begin with.
+    """
+    for each in _classes:
+        if each.__module__.startswith(prefixes):
+            getattr(each, "__init__")  # noqa: B009 - looking it up is the point
 
 
 def _init(cls: Any, *, frozen: bool) -> Any:
@@ -151,6 +172,7 @@ def _decorate(cls: type, *, frozen: bool, kw_only: bool, eq: bool) -> type:
         for name, method in _FROZEN.items():
             if name not in own:
                 setattr(made, name, method)
+    _classes.append(made)
     return made  # type: ignore[no-any-return]
 
 

@@ -104,15 +104,20 @@ def _soak(options: argparse.Namespace, rounds: list, *, private: bool) -> int:
         return 1
     counted = collections.Counter(each.condition.value for each in rounds)
     what = ", ".join(f"{count} {name}" for name, count in sorted(counted.items()))
-    print(f"seed {options.seed}: {len(rounds)} rounds as expected ({what}), "
-          f"{time.monotonic() - began_s:.0f} s")
+    print(
+        f"seed {options.seed}: {len(rounds)} rounds as expected ({what}), "
+        f"{time.monotonic() - began_s:.0f} s"
+    )
     shutil.rmtree(directory, ignore_errors=True)
     return 0
 
 
 def _sockets(directory: str, names: list[str]) -> list[str]:
-    return [each for each in names if not (Path(directory, each).is_file()
-                                           or Path(directory, each).is_dir())]
+    return [
+        each
+        for each in names
+        if not (Path(directory, each).is_file() or Path(directory, each).is_dir())
+    ]
 
 
 def _history(soaking, since: str, file: Path) -> None:

@@ -465,9 +465,7 @@ class Soaking:
         for node in status.nodes:
             wanted = "" if node.node[1:] in UNMANAGED else "active"
             if node.state != wanted or node.silent or node.died or node.next_try_s is not None:
-                lacks.append(
-                    f"{node.node}: {node.state} {node.silent} {node.died} {node.doing}"
-                )
+                lacks.append(f"{node.node}: {node.state} {node.silent} {node.died} {node.doing}")
         if len(status.nodes) != len(NODES):
             lacks.append(f"{len(status.nodes)} nodes")
         if not lacks:
