@@ -104,7 +104,9 @@ def _rehearse() -> None:
     codec.from_json(codec.to_json(command), Command)
     codec.to_json(Event(kind="ready"))
     LifecycleMachine().resolve(0, "configure")
-    dataclasses.make_constructors("lifecycle.node", "lifecycle.middleware", "lifecycle.verify.o")
+    dataclasses.make_constructors(
+        "lifecycle.node", "lifecycle.middleware", "lifecycle.verify.o", "lifecycle.network.ports"
+    )
 
 
 def _load(name: str) -> None:
