@@ -7,13 +7,14 @@ by. Pure.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Collection, Iterable, Iterator, Mapping
+from typing import Any
 
+from lifecycle import dataclasses
 from lifecycle.codec import to_plain
 from lifecycle.manifest import ParameterValue, RunKind, Supervision, TargetState, Timeouts
 from lifecycle.plan.comparison import PlanDifference, changes
-from lifecycle.plan.model import ExpectedParameter, Plan, PlannedEndpoint, PlannedNode
+from lifecycle.plan.model import ExpectedParameter, Plan, PlannedEndpoint, PlannedNode, in_mode
 from lifecycle.plan.parameters import COMMAND
 
 _JUDGED_BY = (
@@ -22,11 +23,11 @@ _JUDGED_BY = (
 )
 """Fields of an endpoint that its process does not know: they are for the verdict and networks."""
 
-_ENDPOINT = {
+_ENDPOINT: dict[str, Any] = {
     each.name: each.default
     for each in dataclasses.fields(PlannedEndpoint)
-    if each.name in _JUDGED_BY and each.default is not dataclasses.MISSING
-} | {"qos_defaults": (), "quantities": ()}
+    if each.name in _JUDGED_BY
+}
 
 _NOT_SET = ("array", "byte_array")
 """Types of which a value alone does not say how it is to be sent."""
@@ -73,14 +74,19 @@ class PlanChange:
         return bool(self.added or self.removed or self.restarted)
 
 
-def change_between(running: Plan, plan: Plan) -> PlanChange:
+def change_between(running: Plan, plan: Plan, *, modes: tuple[str, str] = ("", "")) -> PlanChange:
     """Return what has to be done so that a system that runs by one plan runs by the other.
 
     A process is started again as a whole, and a component with its container. What others run
     (`attach`) is only judged by.
+
+    Args:
+        running: of the manifest in force.
+        plan: of the other one.
+        modes: that the system is in now, and then; empty for a plan without.
     """
-    old = {each.key: each for each in running.nodes}
-    new = {each.key: each for each in plan.nodes}
+    old = {each.key: each for each in in_mode(running, modes[0]).nodes}
+    new = {each.key: each for each in in_mode(plan, modes[1]).nodes}
     both = [key for key in old if key in new]
     given = {key: _settable(old[key], new[key]) for key in both}
     again = {key for key in both if given[key] is None or _as_run(old[key]) != _as_run(new[key])}
@@ -122,6 +128,7 @@ def _as_run(node: PlannedNode) -> object:
         endpoints=tuple(dataclasses.replace(each, **_ENDPOINT) for each in node.endpoints),
         participants=tuple(dataclasses.replace(each, reason="") for each in node.participants),
         parameters=(),
+        mode_parameters=(),
         parameter_files=(),
         expected_parameters=(),
         unread_parameter_files=(),
@@ -206,7 +213,7 @@ def _settable(old: PlannedNode, new: PlannedNode) -> GivenParameters | None:
             return None
         if one.type != other.type or not (_may_be_set(one) and _may_be_set(other)):
             return None
-        before[name], now[name], types[name] = one.value, other.value, other.type
+        before[name], now[name], types[name] = one.raw, other.raw, other.type
     return GivenParameters(before=before, now=now, types=types)
 
 

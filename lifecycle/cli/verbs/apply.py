@@ -5,13 +5,13 @@ Owns: the verb, `ApplyReport` and how it is said, and which running system a man
 
 from __future__ import annotations
 
-import dataclasses
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import click
 
+from lifecycle import dataclasses
 from lifecycle.cli.common import (
     assignments_argument,
     completing,

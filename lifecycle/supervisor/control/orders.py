@@ -10,10 +10,10 @@ are carried out is gate/sequence.py's, what differs `plan.comparison`'s. Must no
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 import enum
 from collections.abc import Collection, Iterable, Iterator
 
+from lifecycle import dataclasses
 from lifecycle.errors import BringUpError, ExitCode, LifecycleError, UsageError
 from lifecycle.manifest import DataLayerSource, did_you_mean
 from lifecycle.network import parse
@@ -278,7 +278,8 @@ class Revisions:
 
     def change(self, plan: Plan) -> PlanChange:
         """Return what `plan` is for the system that runs."""
-        return change_between(self._system.first, plan)
+        system = self._system
+        return change_between(system.first, plan, modes=(system.mode, system.mode_by(plan)))
 
     def said(self, change: PlanChange, plan: Plan) -> ChangedNodes:
         """Return a change in the words of the control socket, with the revision in force."""

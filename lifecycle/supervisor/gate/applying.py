@@ -10,10 +10,10 @@ touched stays active meanwhile. Must not import rclpy.
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 from collections.abc import Awaitable, Callable, Collection, Coroutine, Mapping
 from typing import Any, Protocol
 
+from lifecycle import dataclasses
 from lifecycle.errors import BringUpError, MiddlewareError
 from lifecycle.plan import GivenParameters, Plan, PlanChange
 from lifecycle.supervisor.control.orders import (

@@ -10,11 +10,11 @@ rclpy.
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 import enum
 from collections.abc import Awaitable, Callable
 from typing import Any
 
+from lifecycle import dataclasses
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest import Consequence
 from lifecycle.supervisor.control.orders import (
@@ -275,7 +275,7 @@ class Holding:
             await work()
         except OutrunError:
             pass
-        except VerificationError as error:
+        except (VerificationError, NotBegunError) as error:
             self._emit(Notice(message=str(error)))
         except StepFailedError as error:
             failure = error

@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import dataclasses
 from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Protocol
 
+from lifecycle import dataclasses
 from lifecycle.errors import BringUpError
 from lifecycle.manifest import Condition, OnSupervisorLost, RunKind, TargetState
 from lifecycle.node import INTERFACE_ON_DEMAND, Operation
@@ -537,6 +537,11 @@ class System:
         self.mode = mode
         self.replan(in_mode(self.plan, mode))
 
+    def mode_by(self, plan: Plan) -> str:
+        """Return the mode that it would be in by another manifest: the same, if that has it."""
+        names = [each.name for each in plan.modes]
+        return self.mode if self.mode in names else next(iter(names), "")
+
     def reload(
         self,
         plan: Plan,
@@ -565,8 +570,7 @@ class System:
             revision = self._last_revision = self._last_revision + 1
         self.revision = revision
         ran, self.first = self.first, plan
-        if self.mode not in {each.name for each in plan.modes}:
-            self.mode = plan.modes[0].name if plan.modes else ""
+        self.mode = self.mode_by(plan)
         down = {each.planned.key: each for each in nodes}
         stay = {key: each for key, each in self.nodes.items() if key not in down}
         taken = _connected_as(attached_to(in_mode(plan, self.mode), adopted), stay, ran)

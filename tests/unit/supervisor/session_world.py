@@ -179,7 +179,8 @@ class FakeParticipant:
         asked_for: services that have a client.
         while_looking: done once, when the next look has seen everything and is not over yet.
         ros: what ROS programs see of the supervisor; None before it is made.
-        refuses: why nodes do not take parameters while they run.
+        refuses: value of a parameter that no node takes, `rate=5`.
+        refuses_live: why nodes do not take parameters while they run.
     """
 
     def __init__(self, hosts: FakeForkServer) -> None:
@@ -194,7 +195,8 @@ class FakeParticipant:
         self.asked_for: set[str] = set()
         self.while_looking: Callable[[], None] | None = None
         self.ros: FakeRosInterface | None = None
-        self.refuses: dict[str, str] = {}
+        self.refuses = ""
+        self.refuses_live: dict[str, str] = {}
         self._hosts = hosts
         self._reports: dict[str, NodeConfiguration] = {}
         self._changed = asyncio.Event()
@@ -255,7 +257,11 @@ class FakeParticipant:
         """No container is in this world."""
 
     async def give(self, node: PlannedNode) -> None:
-        """No node of this world has parameter services."""
+        """Note what is set; a node may refuse."""
+        given = " ".join(f"{each.name}={each.value}" for each in node.expected_parameters)
+        self._hosts.log.append(f"{node.full_name} given {given}")
+        if self.refuses in given.split():
+            raise MiddlewareError(f"cannot set {self.refuses!r}")
 
     async def set_parameters(
         self, node: str, values: Mapping[str, Any], types: Mapping[str, str]
@@ -263,8 +269,8 @@ class FakeParticipant:
         assert values.keys() == types.keys()
         self._hosts.log.append(f"{node} set {values}")
         await asyncio.sleep(self._hosts.takes_s.get(f"{node} set", 0.0))
-        if node in self.refuses:
-            raise MiddlewareError(self.refuses[node])
+        if node in self.refuses_live:
+            raise MiddlewareError(self.refuses_live[node])
 
     def driver(self, node: PlannedNode) -> NodeDriver:
         return ServiceDriver(self.services, node)

@@ -156,7 +156,7 @@ def test_a_parameter_is_set_while_its_node_runs_and_else_by_a_restart(
 
     async def acts(world: SessionWorld) -> None:
         if refuses:
-            world.graph.refuses["/viewer"] = "cannot set 'rate' of '/viewer': it is read-only"
+            world.graph.refuses_live["/viewer"] = "cannot set 'rate' of '/viewer': it is read-only"
         assert _told(await world.apply(plans[1])) == "0"
 
     world = _session(tmp_path, plans[0], acts)
