@@ -17,7 +17,7 @@ from lifecycle.manifest import (
     Restart,
     Supervision,
 )
-from lifecycle.plan.model import ExpectedParameter, Plan, PlannedNode
+from lifecycle.plan.model import ExpectedParameter, ModeParameters, Plan, PlannedNode
 from lifecycle.supervisor.control.protocol import Answer, ControlRequest
 from tests.builders import HERE, plan_of, planned_node
 from tests.unit.supervisor.fakes import run
@@ -461,6 +461,37 @@ def test_modes_may_change_and_the_nodes_follow(tmp_path: Path) -> None:
 
     world = _session(tmp_path, CHAIN, acts)
     assert "viewer start" not in _since_begun(world)
+
+
+def test_parameters_of_the_mode_that_the_system_is_in_are_set(tmp_path: Path) -> None:
+    def plan(rate: float) -> Plan:
+        rates = {"day": 1.0, "night": rate}
+        camera = _rate(CAMERA, 1.0)
+        given = tuple(
+            ModeParameters(
+                mode=mode,
+                parameters=tuple(
+                    dataclasses.replace(each, value=value) for each in camera.expected_parameters
+                ),
+            )
+            for mode, value in rates.items()
+        )
+        camera = dataclasses.replace(camera, mode_parameters=given)
+        modes = tuple(Mode(name=each, at=HERE) for each in rates)
+        policy = Policy(undeclared_nodes=EndpointPolicy.OPEN) if rate > 2.0 else Policy()
+        return dataclasses.replace(plan_of(camera, VIEWER), modes=modes, policy=policy)
+
+    async def acts(world: SessionWorld) -> None:
+        assert await world.order(ControlRequest.MODE, mode="night") == "0"
+        assert _told(await world.apply(plan(3.0))) == "0"
+        assert world.status().mode == "night"
+        assert world.system.plan.node("camera").parameters == (("rate", 3.0),)
+        assert await world.order(ControlRequest.MODE, mode="day") == "0"
+        assert _told(await world.apply(plan(4.0))) == "0"
+
+    world = _session(tmp_path, plan(2.0), acts)
+    assert [line for line in world.story if " set " in line] == ["/camera set {'rate': 3.0}"]
+    assert "camera start" not in _since_begun(world)
 
 
 def test_what_a_running_supervisor_cannot_change_is_refused_before_anything_is_touched(
