@@ -10,6 +10,9 @@ from typing import Any
 import pytest
 
 from lifecycle.errors import ExitCode
+from lifecycle.supervisor import SystemStatus
+from lifecycle.supervisor import status as ask_status
+from lifecycle.verify import Outcome
 from tests.ros.supervisor.running import Up, pair, up, verb
 
 _NODES = "tests.ros.supervisor.systems"
@@ -52,11 +55,12 @@ def apply(path: Path, *options: str) -> dict[str, Any]:
     return report
 
 
-def status(runtime: Path) -> tuple[dict[str, Any], dict[str, int]]:
+def status(runtime: Path) -> tuple[SystemStatus, dict[str, int]]:
     """Status of the system, and the pid of each node."""
-    told = json.loads(verb("status", "pair", "--format", "json", runtime=runtime).stdout)
-    assert {each["state"] for each in told["nodes"]} == {"active"}
-    return told, {each["node"]: each["pid"] for each in told["nodes"]}
+    (run,) = (runtime / "lifecycle").iterdir()
+    told = ask_status(run)
+    assert {each.state for each in told.nodes} == {"active"}
+    return told, {each.node: each.pid for each in told.nodes}
 
 
 def transitions(run: Up, since: int) -> set[str]:
@@ -84,14 +88,13 @@ def test_nodes_come_and_go_and_take_parameters_while_all_others_run_on(
         assert "nodes.second: was not declared, is declared\n" in shown.stdout
         assert "nodes.bystander.parameters.rate: was 1.0, is 2.0\n" in shown.stdout
         assert shown.stdout.endswith("added: /second\ngiven parameters: /bystander\n")
-        assert status(tmp_path)[1] == before
 
         report = apply(path)
         assert (report["outcome"], report["revision"]) == ("applied", 2)
         assert (report["added"], report["parameters"]) == (["/second"], ["/bystander"])
         told, now = status(tmp_path)
         assert {name: now[name] for name in before} == before
-        assert (told["phase"], told["verdict"], told["revision"]) == ("active", "ok", 2)
+        assert (told.phase, told.verdict, told.revision) == ("active", Outcome.OK, 2)
         assert transitions(run, since) == {"/second"}
 
         since = len(run.events)
@@ -99,7 +102,6 @@ def test_nodes_come_and_go_and_take_parameters_while_all_others_run_on(
         assert status(tmp_path)[1] == before
         assert transitions(run, since) == {"/second"}
         assert run.met("process", since=since, process="second", state="exited")
-        assert apply(path.parent / path.name)["outcome"] == "unchanged"
         assert verb("down", "pair", runtime=tmp_path).returncode == ExitCode.OK
         assert run.finish() == ExitCode.OK
         run.assert_gate_held()
@@ -119,14 +121,26 @@ def test_endpoints_that_change_restart_their_nodes_and_what_fails_is_as_if_it_ha
         assert "the sensor is on fire" in report["error"]
         assert report["error"].endswith("is in force again, revision 1, active and verified")
         told, now = status(tmp_path)
-        assert (told["verdict"], told["revision"], now) == ("ok", 1, before)
+        assert (told.verdict, told.revision, now) == (Outcome.OK, 1, before)
 
         deeper = listener(history="KEEP_LAST", depth=3, reliability="RELIABLE")
         report = apply(manifest(tmp_path, fresh_domain, rate=1.0, listener=deeper))
         assert (report["outcome"], report["restarted"]) == ("applied", ["/listener"])
         told, now = status(tmp_path)
-        assert now.pop("/listener") != before.pop("/listener")
-        assert (told["verdict"], now) == ("ok", before)
+        changed = now.pop("/listener")
+        assert changed != before.pop("/listener")
+        assert (told.verdict, now) == (Outcome.OK, before)
+
+        # Another name or domain is another system, and this one is named.
+        for other in (
+            pair(tmp_path, fresh_domain, edit={"system": "other"}),
+            pair(tmp_path, fresh_domain + 1),
+        ):
+            refused = verb("apply", str(other), runtime=tmp_path)
+            assert refused.returncode == ExitCode.USAGE
+            assert f"to 'pair@{fresh_domain}': a running system keeps its name" in refused.stderr
+            assert f"lifecycle down pair@{fresh_domain}, then lifecycle up" in refused.stderr
+        assert status(tmp_path)[1] == {**before, "/listener": changed}
 
         # It goes on by the manifest in force.
         assert verb("restart", "pair", runtime=tmp_path).returncode == ExitCode.OK
@@ -154,7 +168,7 @@ def test_a_running_node_is_connected_otherwise_where_the_supervisor_connects_it(
         report = apply(pair(tmp_path, fresh_domain, edit={**how, "links": [link]}))
         assert (report["outcome"], report["restarted"]) == ("applied", [])
         told, now = status(tmp_path)
-        assert (told["verdict"], now) == ("ok", before)
+        assert (told.verdict, now) == (Outcome.OK, before)
         assert transitions(run, since) == set()
         run.met("wiring", since=since, operation="map_to", endpoint="publishers/chatter")
         # It may also be another node's business.
