@@ -21,7 +21,7 @@ from lifecycle.cli.common import (
     timeout_option,
 )
 from lifecycle.codec import Count, says, to_json
-from lifecycle.errors import ExitCode, UsageError
+from lifecycle.errors import BringUpError, ExitCode, UsageError
 from lifecycle.printable import json_text, lines
 
 if TYPE_CHECKING:
@@ -164,7 +164,7 @@ def _asked(path: Path, plan: Plan, *, dry_run: bool, timeout_s: float, wait_s: f
     try:
         return order(path, question, wait_s)
     except TimeoutError as error:
-        raise UsageError(
+        raise BringUpError(
             f"cannot apply {plan.manifest_path} to {path.name!r} within {wait_s:g} s; it is still "
             "at it",
             hint=f"see what it does: lifecycle status {path.name}",

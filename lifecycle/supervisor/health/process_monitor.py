@@ -216,7 +216,9 @@ class StaleNodes:
             task.cancel()
 
     def _ended(self, process: ManagedProcess) -> None:
-        self.forget(process.pid, [self._system.nodes[key] for key in process.planned.nodes])
+        nodes = self._system.nodes
+        # Another manifest may have been taken meanwhile.
+        self.forget(process.pid, [nodes[key] for key in process.planned.nodes if key in nodes])
 
     def forget(self, pid: int, nodes: Sequence[NodeRun]) -> None:
         """Remove what a process left that is known to have ended.

@@ -539,6 +539,33 @@ def test_a_plan_that_does_not_hold_together_is_refused(tmp_path: Path) -> None:
     assert not any(line.startswith("[apply]") for line in world.story)
 
 
+def test_what_was_adopted_is_judged_by_another_manifest_and_never_taken_down(
+    tmp_path: Path,
+) -> None:
+    async def main() -> SessionWorld:
+        world = SessionWorld(CHAIN, tmp_path, adopt=True)
+        world.graph.others["/viewer"] = "active"
+
+        async def acts() -> None:
+            await world.story.until("[system] active")
+            for plan in (plan_of(CAMERA, LOUD), plan_of(CAMERA)):
+                assert _told(await world.apply(plan)) == (
+                    "2 cannot apply robot.lifecycle.yaml to 'robot' while it runs: '/viewer' would "
+                    "be taken down, and was adopted; who started it ends it; then lifecycle down, "
+                    "and lifecycle up"
+                )
+            assert _told(await world.apply(MORE)) == "0"
+            assert [each.state for each in world.status().nodes] == ["active"] * 3
+            assert await world.order(ControlRequest.DOWN) == "0"
+
+        await world.run(acts())
+        return world
+
+    world = run(main())
+    assert "viewer start" not in world.story
+    assert not any(line.startswith("/viewer") for line in world.story)
+
+
 def test_over_tcp_only_what_restarts_nothing_is_applied(tmp_path: Path) -> None:
     rules = dataclasses.replace(DIALLING, policy=Policy(undeclared_nodes=EndpointPolicy.OPEN))
 
