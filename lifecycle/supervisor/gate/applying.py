@@ -15,6 +15,7 @@ from typing import Any, Protocol
 
 from lifecycle import dataclasses
 from lifecycle.errors import BringUpError, MiddlewareError
+from lifecycle.manifest import Condition
 from lifecycle.plan import GivenParameters, Plan, PlanChange
 from lifecycle.supervisor.control.orders import (
     ACTIVE,
@@ -108,7 +109,7 @@ class _Before:
 
     Attributes:
         other: path of that manifest.
-        active: keys of the nodes that were active.
+        active: keys of the nodes that were active, or had failed and were to be again.
     """
 
     other: str
@@ -191,8 +192,11 @@ class Applying:
                 raise NotBegunError(
                     f"cannot apply {plan.manifest_path}: {error.message}; everything stays as it is"
                 ) from error
+        there = self._sequence.active()
         active = frozenset(
-            key for key, each in system.nodes.items() if each.name in self._sequence.active()
+            key
+            for key, each in system.nodes.items()
+            if each.name in there or (key in failed and not each.withheld)
         )
         before = _Before(
             other=plan.manifest_path,
@@ -335,9 +339,9 @@ class Applying:
         if before.phase == PAUSED:
             sequence.reached(PAUSED)
             return "paused and verified"
-        waiting = [each for each in sequence.inactive() if each.planned.key in before.active]
+        waiting = self._waiting(before.active)
         if waiting:
-            await self._activate(permit, deadline, tuple(waiting))
+            await self._activate(permit, deadline, waiting)
         else:
             await self._alive(sequence.program_flows(permit, deadline))
         if sequence.inactive():
@@ -401,6 +405,27 @@ class Applying:
             for each in self._system.nodes.values()
             if each.planned.holds and each.reach is Reach.ACTIVE and not each.is_to_be_active
         )
+
+    def _waiting(self, keys: Collection[str]) -> tuple[NodeRun, ...]:
+        """Return those of some inactive nodes that wait for none which stays inactive."""
+        nodes = self._system.nodes
+        found = {
+            each.planned.key: each for each in self._sequence.inactive() if each.planned.key in keys
+        }
+        while stuck := [
+            key
+            for key, each in found.items()
+            if any(
+                after.condition is Condition.ACTIVE
+                and after.node in nodes
+                and after.node not in found
+                and not nodes[after.node].has_reached(Condition.ACTIVE)
+                for after in each.planned.after
+            )
+        ]:
+            for key in stuck:
+                del found[key]
+        return tuple(found.values())
 
     def _of_others(
         self, error: StepFailedError | VerificationError, done: _Done

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+import random
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from lifecycle.manifest import (
 )
 from lifecycle.plan.model import ExpectedParameter, ModeParameters, Plan, PlannedNode
 from lifecycle.supervisor.control.protocol import Answer, ControlRequest
+from lifecycle.verify import Outcome
 from tests.builders import HERE, plan_of, planned_node
 from tests.unit.supervisor.fakes import run
 from tests.unit.supervisor.session_world import (
@@ -580,3 +582,83 @@ def test_over_tcp_only_what_restarts_nothing_is_applied(tmp_path: Path) -> None:
         assert urls != rules.node("viewer").connections
 
     _session(tmp_path, DIALLING, acts)
+
+
+POOL = (
+    CHAIN,
+    MORE,
+    plan_of(CAMERA),
+    plan_of(CAMERA, LOUD, ARM),
+    plan_of(dataclasses.replace(CAMERA, log_level="warn"), VIEWER),
+    plan_of(*(dataclasses.replace(each, process="both") for each in CHAIN.nodes), ARM),
+    plan_of(CAMERA, _rate(VIEWER, 1.0)),
+    plan_of(CAMERA, _rate(VIEWER, 2.0), ARM),
+    dataclasses.replace(MORE, policy=Policy(undeclared_nodes=EndpointPolicy.OPEN)),
+    dataclasses.replace(
+        MORE, modes=(Mode(name="a", inactive=("arm",), at=HERE), Mode(name="b", at=HERE))
+    ),
+)
+FAULTS = (
+    *("/arm configure", "/arm connect", "/arm activate", "arm start", "/viewer configure"),
+    *("/viewer activate", "/camera connect", "/viewer deactivate", "/camera cleanup"),
+)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_whatever_fails_one_of_two_manifests_is_in_force_as_a_whole(
+    tmp_path: Path, seed: int
+) -> None:
+    chance = random.Random(seed)
+    pool = [
+        dataclasses.replace(
+            each, nodes=tuple(dataclasses.replace(one, supervision=AGAIN) for one in each.nodes)
+        )
+        for each in POOL
+    ]
+
+    async def disturb(world: SessionWorld) -> None:
+        await asyncio.sleep(chance.choice([0.0, 0.05, 0.3, 1.1]))
+        what = chance.choice(["kill", "intrude", "nothing", "nothing"])
+        if what == "intrude":
+            world.intrude()
+            await asyncio.sleep(chance.choice([0.2, 1.5]))
+            world.retreat()
+        elif what == "kill" and world.system.processes:
+            name = chance.choice(sorted(world.system.processes))
+            process = world.hosts.processes.get(name)
+            if process is not None and not process.exited.done():
+                world.kill(name)
+
+    async def acts(world: SessionWorld) -> None:
+        for line in FAULTS:
+            world.hosts.takes_s[line] = chance.choice([0.0, 0.0, 0.2])
+        for _ in range(4):
+            before, plan = world.system.first, chance.choice(pool)
+            if chance.random() < 0.6:
+                world.hosts.ways[chance.choice(FAULTS)] = chance.choice(["no power", "die"])
+            if chance.random() < 0.2:
+                world.graph.refuses_live["/viewer"] = "read-only"
+            disturbing = asyncio.ensure_future(disturb(world))
+            world.story.in_the_moment["[apply] rolling_back"] = world.hosts.ways.clear
+            answer = await world.apply(plan)
+            assert world.system.first == (plan if answer.exit_code == 0 else before)
+            assert sorted(world.system.nodes) == sorted(
+                each.key for each in world.system.first.nodes
+            )
+            assert world.system.processes.keys() == {
+                each.name for each in world.system.first.processes
+            }
+            world.hosts.ways.clear()
+            world.graph.refuses_live.clear()
+            await disturbing
+            await asyncio.sleep(60.0)
+            if world.status().phase == "held":
+                assert await world.order(ControlRequest.RESUME) == "0"
+            status = world.status()
+            # Parameters are not seen in this world.
+            assert (status.phase, status.verdict) != ("active", Outcome.VIOLATED), status.not_ok
+            assert status.revision == world.system.revision
+            wanted = {each.name for each in world.system.nodes.values() if each.is_to_be_active}
+            assert {each.node for each in status.nodes if each.state == "active"} == wanted
+
+    _session(tmp_path, pool[0], acts)
