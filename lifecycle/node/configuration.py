@@ -54,7 +54,13 @@ from lifecycle.node.endpoints.making import CLIENTS, wire_name
 from lifecycle.node.endpoints.mapping import Mapping, count_peers
 from lifecycle.node.lifecycle.machine import NodeState
 from lifecycle.plan import PARADIGMS, SERIALIZATIONS, PlannedEndpoint, PlannedNode
-from lifecycle.verify import ConnectionReport, EndpointReport, Identity, NodeConfiguration
+from lifecycle.verify import (
+    ConnectionReport,
+    EndpointReport,
+    HealthReport,
+    Identity,
+    NodeConfiguration,
+)
 
 if TYPE_CHECKING:
     from rclpy.node import Node
@@ -132,6 +138,8 @@ def collect(
     spec: PlannedNode,
     data_layer: NodeDataLayer,
     undeclared: Iterable[tuple[EndpointKind, Any]],
+    *,
+    health: HealthReport | None = None,
 ) -> NodeConfiguration:
     """Return the configuration of `node` as it is now.
 
@@ -141,6 +149,7 @@ def collect(
         spec: what it was planned to be.
         data_layer: its declared endpoints and their entities.
         undeclared: kind and rclpy object of endpoints that its code made by itself.
+        health: what it says of itself; None if it says nothing.
     """
     endpoints = (
         *(_report(node, mapping) for mapping in data_layer.mappings),
@@ -152,6 +161,7 @@ def collect(
         connected=state.connected,
         endpoints=endpoints,
         connections=connection_reports(spec, data_layer),
+        health=health,
     )
 
 
@@ -234,6 +244,7 @@ def _document(
     connected: bool,
     endpoints: tuple[EndpointReport, ...],
     connections: tuple[ConnectionReport, ...],
+    health: HealthReport | None = None,
 ) -> NodeConfiguration:
     name = node.get_fully_qualified_name()
     configuration = NodeConfiguration(
@@ -252,6 +263,7 @@ def _document(
         endpoints=endpoints,
         connections=connections,
         parameters=parameters.reports(node),
+        health=health,
     )
     return dataclasses.replace(configuration, checksum=checksum(configuration))
 
