@@ -11,13 +11,13 @@ name; how names become DDS topics, `rt/`, `rq/…Request`, `rr/…Reply`
 
 from __future__ import annotations
 
-import dataclasses
 import datetime as dt
 import itertools
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping
 
+from lifecycle import dataclasses
 from lifecycle.manifest import EndpointKind, RunKind
 from lifecycle.plan import Plan, PlannedNode, PlannedProcess
 from lifecycle.verify import GRAPH_TOPIC, NODE_SERVICES, OUR_SERVICES, supervisor_endpoints

@@ -10,7 +10,6 @@ Touches the file system; needs no ROS.
 
 from __future__ import annotations
 
-import dataclasses
 import ipaddress
 import os
 import re
@@ -18,6 +17,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 
+from lifecycle import dataclasses
 from lifecycle.manifest.building import (
     Findings,
     build_data_layer,

@@ -7,10 +7,10 @@ Nothing here knows YAML. Pure.
 from __future__ import annotations
 
 import bisect
-import dataclasses
 import enum
 from typing import Annotated
 
+from lifecycle import dataclasses
 from lifecycle.codec import DomainId, Positive, says
 from lifecycle.manifest.diagnostics import Position, Severity
 from lifecycle.manifest.qos import POLICIES, QosProfile

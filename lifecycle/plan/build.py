@@ -9,12 +9,12 @@ Pure but for the environment, for finding executables and for reading parameter 
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import hashlib
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 
+from lifecycle import dataclasses
 from lifecycle.errors import UsageError
 from lifecycle.manifest import (
     After,

@@ -15,12 +15,12 @@ from __future__ import annotations
 
 import base64
 import binascii
-import dataclasses
 import hashlib
 import json
 import zlib
 from collections.abc import Iterator, Mapping
 
+from lifecycle import dataclasses
 from lifecycle.codec import from_json, to_json, to_plain
 from lifecycle.manifest import OnViolation, Position, RunKind
 from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedNode

@@ -7,10 +7,10 @@ Owns: the types that cross from here into verify/, middleware/, node/ and superv
 
 from __future__ import annotations
 
-import dataclasses
 import enum
 from typing import Annotated, Any
 
+from lifecycle import dataclasses
 from lifecycle.codec import DomainId, DscpValue, Port, Positive, says
 from lifecycle.errors import ExitCode, LifecycleError
 from lifecycle.manifest import (

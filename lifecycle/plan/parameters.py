@@ -12,12 +12,12 @@ and of those that match a node the later wins. `-p` goes into the section `/**`.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import os
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, NamedTuple
 
+from lifecycle import dataclasses
 from lifecycle.manifest import (
     Mode,
     ModeParameter,

@@ -11,11 +11,11 @@ article (https://design.ros2.org/articles/actions.html), names of nodes as the t
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import re
 from collections.abc import Collection, Iterable, Mapping
 
+from lifecycle import dataclasses
 from lifecycle.manifest import TOLERATED_NODES, EndpointKind, RosInterfaceAccess, join
 from lifecycle.plan import Plan, PlannedNode, owner_of
 from lifecycle.verify.observation import NodeConfiguration, ObservedEndpoint

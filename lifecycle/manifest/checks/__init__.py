@@ -8,12 +8,12 @@ from the ament index.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import os
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
+from lifecycle import dataclasses
 from lifecycle.manifest.checks.connection_urls import check_urls
 from lifecycle.manifest.checks.connections import (
     check_connections,

@@ -12,13 +12,13 @@ An interface that declares no parameters leaves them open, so nothing is checked
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import os
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
+from lifecycle import dataclasses
 from lifecycle.manifest.checks.system import DeclaredSystem, full_name
 from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, Severity
 from lifecycle.manifest.model import ModeParameter, Node, ParameterValue, RunKind

@@ -724,12 +724,15 @@ class GateSequence:
             each.withheld = ""
         async with self._following():
             await self._alive(self._bring_up.activate(permit, behind_s(deadline), waiting))
-        self._judge.ahead = frozenset()
-        await self._alive(self._judge.until_clear(Stage.ACTIVE, behind_s(deadline)))
+        # Who waits at another gate, or was deactivated for a violation, is not to be active yet.
+        whole = not self._inactive()
+        self._judge.ahead = frozenset() if whole else self.active()
+        stage = Stage.ACTIVE if whole else Stage.CONNECTED
+        await self._alive(self._judge.until_clear(stage, behind_s(deadline)))
         # The same question as at the gate: what became active must be what was verified.
         assert self._judge.latest is not None
         self._gate.judge(self._judge.latest)
-        if nodes is None or not self._inactive():
+        if not self._inactive():
             self._reached(ACTIVE)
 
     async def _through_the_gate(self) -> None:

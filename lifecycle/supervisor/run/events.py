@@ -6,11 +6,11 @@ order. Presentation lives in cli/. Must not import rclpy.
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from collections.abc import Callable
 from typing import ClassVar, Union
 
+from lifecycle import dataclasses
 from lifecycle.codec import to_plain
 from lifecycle.node import Operation
 from lifecycle.supervisor.control.protocol import Failed, ProcessState, Reach

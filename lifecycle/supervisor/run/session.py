@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import dataclasses
 import os
 import signal
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterable, Iterator
 from typing import Any, Protocol
 
+from lifecycle import dataclasses
 from lifecycle.errors import ExitCode
 from lifecycle.plan import PlannedNode
 from lifecycle.run_directory import RunDirectory
