@@ -194,8 +194,38 @@ class GateSequence:
             VerificationError: the gate stays closed, or closed again before every node was sent its
                 request, and what had become active is inactive again. In phase PAUSED or HELD the
                 system stays as it is and can be asked again; in any other the run is over.
-            StepFailedError: a step failed, or a network could not be programmed; the run is over.
+            StepFailedError: a step failed, or a network could not be programmed; the run is over,
+                unless what failed is put down to be started again.
         """
+        before = self.phase
+        try:
+            await self._carry_out(order)
+        except StepFailedError:
+            self._cut_short(before)
+            raise
+
+    def _cut_short(self, before: str) -> None:
+        """Leave a system whose order failed in a phase in which it is held, and takes orders.
+
+        What the order would have activated waits at its gate until all is back, and then passes;
+        a system that was paused stays so unless its gate had opened.
+
+        Args:
+            before: the phase before the order.
+        """
+        if self.phase in (ACTIVE, PAUSED, HELD):
+            return
+        if before == PAUSED and self.phase != "activating":
+            self.phase = PAUSED
+            return
+        self.phase = HELD
+        self._schedule.wait_at_gate(
+            key
+            for key, each in self._system.nodes.items()
+            if each.is_to_be_active and not each.withheld and each.reach is not Reach.ACTIVE
+        )
+
+    async def _carry_out(self, order: Order) -> None:
         if order.kind is OrderKind.PAUSE:
             await self._pause(order)
         elif order.kind is OrderKind.RESUME:
