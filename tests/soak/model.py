@@ -265,10 +265,12 @@ def follows(state: State, done: Round) -> tuple[Expectation, State]:
 def _violated(
     state: State, done: Round, found: Iterable[Fault], silent: Iterable[str]
 ) -> bool | None:
-    if state.violated or done.condition is Condition.INTRUDER or tuple(found):
+    if state.violated or tuple(found):
         return True
     # What is silent for a moment, or cut, may be violated for long enough.
     unsure = (Condition.CUT, Condition.LINK_DOWN, Condition.FROZEN, Condition.STORM)
+    # A violation counts only while the whole system is active.
+    unsure = (*unsure, Condition.INTRUDER)
     if tuple(silent) or done.condition in (*unsure, Condition.PAUSED, Condition.SAFE):
         return None
     return state.violated
