@@ -577,6 +577,33 @@ def test_a_death_is_reported_at_once_also_while_another_process_is_taken_down(
     run(main())
 
 
+@pytest.mark.parametrize(
+    ("asked", "node"), [(ControlRequest.RESTART, "viewer"), (ControlRequest.RESUME, "")]
+)
+def test_an_order_does_not_keep_others_from_coming_again_that_its_gate_waits_for(
+    tmp_path: Path, asked: ControlRequest, node: str
+) -> None:
+    async def main() -> None:
+        world = SessionWorld(_chain(), tmp_path, stop_after_s=30.0)
+
+        async def order() -> None:
+            await world.story.until("[system] active")
+            if asked is ControlRequest.RESUME:
+                assert await world.order(ControlRequest.PAUSE) == "0"
+            world.kill("camera")
+            await world.story.until("[backoff] camera in 1.0 s")
+            began = asyncio.get_running_loop().time()
+            assert await world.order(asked, node) == "0"
+            assert asyncio.get_running_loop().time() - began < 2.0
+            assert world.status().phase == "active"
+            assert {each.state for each in world.status().nodes} == {"active"}
+            await world.story.until("[restarted] camera (1)")
+
+        await world.run(order())
+
+    run(main())
+
+
 def test_a_resume_that_a_death_cuts_short_leaves_the_system_paused_and_open_to_orders(
     tmp_path: Path,
 ) -> None:
