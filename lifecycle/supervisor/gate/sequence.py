@@ -767,13 +767,12 @@ class GateSequence:
     async def _verify_with_who_comes_again(self) -> Permit:
         """Judge until the gate opens, and start again meanwhile what is due: it may wait for it."""
         while True:
-            try:
+            with contextlib.suppress(OutrunError):
                 return await self._unless_outrun(self.verify(self._timeout_s), self._schedule.due())
-            except OutrunError:
-                self.phase = "restarting"
-                keys = self._schedule.begin()
-                await self._begin_again(tuple(self._system.nodes[key] for key in keys))
-                await self._connect_unfinished(self._timeout_s)
+            self.phase = "restarting"
+            keys = self._schedule.begin()
+            await self._begin_again(tuple(self._system.nodes[key] for key in keys))
+            await self._connect_unfinished(self._timeout_s)
 
     async def _withdraw(self, permit: Permit) -> None:
         """Deactivate again what was activated since the gate opened: the rest may not follow."""
