@@ -259,19 +259,21 @@ class GateSequence:
             self._reached(PAUSED)
 
     async def _switch(self, mode: str) -> None:
-        """Enter a mode: deactivate in reverse order, activate through the gate, or go back.
+        """Enter a mode: deactivate in reverse order, set parameters, activate through the gate.
+
+        If a node refuses a value, or the gate stays closed, it goes back to the mode before.
 
         What goes down needs no gate, so that a mode with less can be entered whatever is violated.
         """
         before = self._system.mode
         try:
             await self._enter(mode)
-        except VerificationError:
-            if self.phase not in (PAUSED, HELD):
+        except (VerificationError, NotBegunError) as error:
+            if isinstance(error, VerificationError) and self.phase not in (PAUSED, HELD):
                 raise
             self._emit(Notice(message=f"cannot enter mode {mode!r}: back to {before!r}"))
             # As far as the gate allows; what it does not let through waits at it.
-            with contextlib.suppress(VerificationError):
+            with contextlib.suppress(VerificationError, NotBegunError):
                 await self._enter(before)
             raise
 
@@ -279,9 +281,11 @@ class GateSequence:
         phase, before = self.phase, self._system.mode
         nodes = tuple(self._system.nodes.values())
         wanted = {each for each in nodes if each.is_to_be_active}
+        had = {each: each.planned.expected_parameters for each in nodes}
         self._gate.close()
         self.phase = "switching"
         self._system.enter(mode)
+        changed = [each for each in nodes if each.planned.expected_parameters != had[each]]
         going = [
             each
             for each in nodes
@@ -289,6 +293,7 @@ class GateSequence:
         ]
         try:
             await self._alive(self._bring_up.deactivate(going))
+            await self._set_parameters(mode, changed)
         finally:
             self.phase = phase
             self._judge.ahead = self.active()
@@ -299,6 +304,7 @@ class GateSequence:
                 inactive=tuple(
                     each.name for each in nodes if each.planned.state is TargetState.INACTIVE
                 ),
+                parameters=tuple(each.name for each in changed),
             )
         )
         self._system.touched.set()
@@ -308,6 +314,22 @@ class GateSequence:
             await self._through_the_gate()
         elif not self._inactive():
             self._reached(ACTIVE)
+
+    async def _set_parameters(self, mode: str, nodes: Iterable[NodeRun]) -> None:
+        """Set what a mode has of parameters; what does not run yet is started with it.
+
+        Raises:
+            NotBegunError: a node refuses a value, or does not answer.
+        """
+        running = [each for each in nodes if each.is_up and not each.is_gone]
+        if not running:
+            return
+        try:
+            await self._alive(self._bring_up.set_parameters(mode, running))
+        except StepFailedError:
+            raise
+        except BringUpError as error:
+            raise NotBegunError(f"cannot enter mode {mode!r}: {error.message}") from error
 
     async def _restart(self, order: Order) -> None:
         """Take one process or all down, and bring it up as far as the system was."""

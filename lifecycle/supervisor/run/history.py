@@ -7,7 +7,6 @@ today (`replayed`). Needs no ROS.
 
 from __future__ import annotations
 
-import dataclasses
 import datetime as dt
 import re
 from collections.abc import Iterable, Iterator, Sequence
@@ -16,7 +15,7 @@ from typing import Any, get_args
 
 import msgspec
 
-from lifecycle import codec
+from lifecycle import codec, dataclasses
 from lifecycle.errors import UsageError
 from lifecycle.plan import Plan
 from lifecycle.supervisor.processes.logs import JOURNAL_NAME
