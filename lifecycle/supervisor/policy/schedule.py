@@ -301,10 +301,15 @@ class RestartSchedule:
         self._watchdogs.clear()
 
     def _taken_by(self, cause: StepFailedError) -> ManagedProcess | None:
-        """Return the process that a failure is of, if that is to be started again after it."""
+        """Return the process that a failure is of, if that is to be started again after it.
+
+        A component that cannot be loaded, or fails in a step, is its container's failure.
+        """
         process = self._system.processes.get(cause.process)
         if process is None:
             node = self._system.node_named(cause.subject)
+            if node is not None and node.planned.run.component:
+                node = self._system.nodes.get(node.planned.run.container)
             process = None if node is None else node.process
         if process is None or not process.planned.nodes:
             return None

@@ -7,7 +7,10 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+from concurrent.futures import Future
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -21,8 +24,13 @@ from lifecycle.manifest import (
 )
 from lifecycle.plan.model import Plan, PlannedNode
 from lifecycle.supervisor.control.server import ControlRequest
+from lifecycle.supervisor.nodes.system import NodeRun
 from lifecycle.supervisor.policy.restart import RestartPolicy, delay_s, group_of
+from lifecycle.supervisor.policy.schedule import RestartSchedule
 from lifecycle.supervisor.processes.process import ProcessExit
+from lifecycle.supervisor.run.events import Emitter
+from lifecycle.supervisor.run.failure import StepFailedError
+from lifecycle.verify import rule
 from tests.builders import plan_of, planned_node
 from tests.unit.supervisor.fakes import run
 from tests.unit.supervisor.session_world import (
@@ -544,6 +552,28 @@ def test_what_is_active_outlives_a_killed_supervisor_and_nothing_does_before_or_
         }
 
     run(main())
+
+
+@pytest.mark.parametrize(("restart", "taken"), [(Restart.ON_FAILURE, True), (Restart.NO, False)])
+def test_a_component_that_cannot_be_loaded_is_its_container_s_failure(
+    restart: Restart, taken: bool
+) -> None:
+    how = dataclasses.replace(ON_FAILURE, restart=restart)
+    helper = NodeRun(planned_node("helper", supervision=how), Emitter())
+    part = NodeRun(_component("part", of="helper"), Emitter())
+    process: Any = SimpleNamespace(
+        name="helper", planned=SimpleNamespace(nodes=("helper",)), started_s=0.0, ended=Future()
+    )
+    helper.process = process
+    nodes = {"helper": helper, "part": part}
+    system: Any = SimpleNamespace(
+        nodes=nodes,
+        processes={"helper": process},
+        liveliness=SimpleNamespace(listen=lambda _: None),
+        node_named=lambda name: nodes[name[1:]],
+    )
+    failure = StepFailedError("cannot load it", rule=rule("run.start-failed"), subject="/part")
+    assert RestartSchedule(system, Emitter()).covers(failure) is taken
 
 
 def test_a_death_is_reported_at_once_also_while_another_process_is_taken_down(
