@@ -40,6 +40,7 @@ from .model import FlowIdentification as FlowIdentification
 from .model import FlowNeed as FlowNeed
 from .model import FlowTerms as FlowTerms
 from .model import FlowTransport as FlowTransport
+from .model import Health as Health
 from .model import Interface as Interface
 from .model import Limits as Limits
 from .model import Link as Link
