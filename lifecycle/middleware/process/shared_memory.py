@@ -46,7 +46,7 @@ _LOCK_FIELDS = 8
 """Of a held lock in /proc/locks: number, FLOCK, ADVISORY, WRITE, pid, file, start, end."""
 
 _AGAIN_S = 0.02
-"""After so long it is tried again to remove what others still use: no event says that they let go."""
+"""So often it is tried again to remove what others still use: no event says that they let go."""
 
 _Inode = tuple[int, int]
 """(device, inode number)."""
