@@ -19,6 +19,7 @@ from rich.text import Text
 
 from lifecycle.cli.standard_streams import Writer
 from lifecycle.cli.up_output import Rollback, describe, verdict_line
+from lifecycle.fleet import Record
 from lifecycle.printable import log_line, one_line
 from lifecycle.supervisor import (
     Event,
@@ -230,3 +231,135 @@ def _away(node: NodeStatus) -> str:
     if node.next_try_s is not None:
         return f"starts again in {node.next_try_s:.1f} s"
     return f"restarted {node.restarts}×" if node.restarts else ""
+
+
+class LiveHosts:
+    """The combined view of `lifecycle up --hosts`: a row for each host, lines scroll above it.
+
+    Use it in a `with`.
+
+    Args:
+        system: its name.
+        hosts: names of its machines.
+        writer: of the terminal.
+        console: None for one on `writer`.
+    """
+
+    def __init__(
+        self,
+        system: str,
+        hosts: Sequence[str],
+        *,
+        writer: Writer,
+        console: Console | None = None,
+    ) -> None:
+        from lifecycle.cli.hosts import PlainHosts
+
+        self._system = system
+        self._writer = writer
+        self._console = console or Console(file=writer.stream(), highlight=False)
+        self._live = RichLive(console=self._console, auto_refresh=False, transient=False)
+        self._rows = {each: _HostRow() for each in hosts}
+        self._lines = PlainHosts(self)
+        self._drawn_s = 0.0
+
+    def __enter__(self) -> LiveHosts:  # noqa: PYI034 - typing.Self is not in Python 3.10
+        self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._draw()
+        self._live.stop()
+
+    def put(self, text: str, *, kept: bool = True) -> None:
+        """Print lines above the table; log lines are left out while the terminal is stopped."""
+        if kept or not self._writer.is_behind:
+            self._console.print(Text(text.rstrip("\n")))
+
+    def close(self) -> None:
+        """Be a sink of which nothing is left."""
+
+    def __call__(self, host: str, record: Record) -> None:
+        """Show one event of a host, or of all."""
+        urgent = not host
+        if host in self._rows:
+            urgent = self._rows[host].note(record)
+        # What is in the table need not scroll by as well.
+        if record.get("event") not in ("node", "process", "verdict"):
+            self._lines(host, record)
+        now_s = time.monotonic()
+        if urgent or now_s - self._drawn_s >= _REDRAW_S:
+            self._drawn_s = now_s
+            self._draw()
+
+    def _draw(self) -> None:
+        if self._writer.is_behind:
+            return
+        table = Table(box=box.SIMPLE_HEAD, pad_edge=False, header_style="bold")
+        for column in (self._system, "supervisor", "system", "active", "clock", "verdict"):
+            table.add_column(column, no_wrap=True)
+        for name, row in self._rows.items():
+            table.add_row(_short(one_line(name), "bold"), *row.cells())
+        self._live.update(table, refresh=True)
+
+
+class _HostRow:
+    """What the table shows of one host."""
+
+    def __init__(self) -> None:
+        self._link = "connecting"
+        self._reached = ""
+        self._nodes: dict[str, bool] = {}
+        self._clock = ""
+        self._verdict = ""
+        self._why = ""
+
+    def note(self, record: Record) -> bool:
+        """Take an event; whether it is to be seen at once."""
+        kind = record.get("event")
+        if kind == "host":
+            self._link = str(record["state"])
+            status = record["status"]
+            if isinstance(status, dict):
+                self._reached = str(status.get("phase", ""))
+                self._nodes = {
+                    str(each["node"]): each["state"] == "active"
+                    for each in status.get("nodes", ())
+                    if each["process_state"] is not None
+                }
+            return True
+        if kind == "clock":
+            self._clock = (
+                f"{record['offset_s'] * 1e3:+.1f} ms ± {record['uncertainty_s'] * 1e3:.1f}"
+            )
+        elif kind == "run":
+            self._nodes = dict.fromkeys(map(str, record["nodes"]), False)
+        elif kind == "node" and record["node"] in self._nodes:
+            self._nodes[str(record["node"])] = record["reach"] == "active"
+        elif kind == "system":
+            self._reached = str(record["reached"])
+            return True
+        elif kind == "stopping":
+            self._reached = "stopping"
+        elif kind == "verdict":
+            self._verdict = str(record["verdict"]["verdict"])
+            found = record["verdict"].get("findings") or ()
+            self._why = str(found[0].get("message", "")) if found else ""
+        return kind == "failure"
+
+    def cells(self) -> tuple[Text, ...]:
+        """Return the columns after its name."""
+        bad = self._link in ("cut", "failed", "left", "taken")
+        link = {"started": "runs", "attached": "runs", "healed": "runs"}.get(self._link, self._link)
+        active = sum(self._nodes.values())
+        count = f"{active}/{len(self._nodes)}" if self._nodes else "–"
+        is_all = bool(self._nodes) and active == len(self._nodes)
+        colour = _OUTCOMES.get(Outcome(self._verdict), "") if self._verdict else ""
+        why = f" {self._why}" if self._verdict == Outcome.VIOLATED.value else ""
+        return (
+            Text(link, style="red" if bad else "green" if link == "runs" else "yellow"),
+            Text(self._reached, style="bold green" if self._reached == "active" else "yellow"),
+            Text(count, style="green" if is_all else "yellow"),
+            Text(self._clock, style="dim"),
+            _short(one_line(f"{self._verdict or '–'}{why}"), colour),
+        )

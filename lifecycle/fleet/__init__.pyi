@@ -7,6 +7,7 @@ from .coordinator import Record as Record
 from .coordinator import down as down
 from .coordinator import worst as worst
 from .parts import destinations as destinations
+from .parts import in_place as in_place
 from .parts import parts_of as parts_of
 from .parts import ranks as ranks
 from .protocol import Part as Part

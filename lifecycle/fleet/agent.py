@@ -64,6 +64,7 @@ _BEGIN_S = 10.0
 _LOOK_S = 0.02
 
 _EVENTS, _ERRORS, _STARTED, _READER = "events", "errors", "started.json", "reader.json"
+_FILES = "files"
 _NAME = re.compile(r"[A-Za-z0-9_@][A-Za-z0-9_.@-]*")
 
 COMMAND = (sys.executable, "-m", "lifecycle.cli")
@@ -309,10 +310,12 @@ class _Agent:
         directory.mkdir(mode=0o700)
         try:
             for file in part.files:
-                target = directory.joinpath("files", *_relative(file.path))
+                target = directory.joinpath(_FILES, *_relative(file.path))
                 target.parent.mkdir(parents=True, exist_ok=True)
                 target.write_bytes(file.data)
-            manifest = directory.joinpath("files", *_relative(part.manifest))
+            manifest = Path(part.manifest)
+            if not manifest.is_absolute():
+                manifest = directory.joinpath(_FILES, *_relative(part.manifest))
             # The supervisor has both ends open, so that it can write whoever reads.
             with contextlib.ExitStack() as stack:
                 ends = []
@@ -402,8 +405,10 @@ class _Agent:
             for each in followed.events.read():
                 self._out += each + b"\n"
         if followed.errors.descriptor in ready:
+            sent = f"{followed.directory / _FILES}/"
             for each in followed.errors.read():
-                self._say(Said(agent=Word.STDERR, message=each.decode(errors="replace")))
+                message = each.decode(errors="replace").replace(sent, "")
+                self._say(Said(agent=Word.STDERR, message=message))
 
     def _leave(self) -> None:
         if self._followed is not None:

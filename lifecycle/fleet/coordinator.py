@@ -355,9 +355,11 @@ class Coordinator:
 
     async def _run(self) -> str:
         """Return what failed; empty if nothing did."""
-        if not await self._until(
-            lambda: all(each.is_ready or each.has_failed for each in self._hosts), 2 * HELLO_S
-        ):
+
+        def is_answered() -> bool:
+            return self._is_asked or all(each.is_ready or each.has_failed for each in self._hosts)
+
+        if not await self._until(is_answered, 2 * HELLO_S):
             return "not all hosts answered"
         if self._is_asked or any(each.has_failed for each in self._hosts):
             return "" if self._is_asked else "not all hosts can be reached"
@@ -432,7 +434,7 @@ class Coordinator:
 
     def _lost(self) -> str:
         """Name the hosts whose supervisor ended in another way than well."""
-        return ", ".join(each.name for each in self._hosts if each.exit_code)
+        return ", ".join(each.name for each in self._hosts if each.exit_code or each.has_failed)
 
     async def _end(self, hosts: Iterable[_Host], reason: str) -> None:
         """End supervisors, those first whose nodes come last."""
@@ -488,7 +490,8 @@ class Coordinator:
                 code = ExitCode.BRING_UP_FAILED if code in _CUT_SHORT else code
             elif any(each.runs for each in self._hosts):
                 code = worst((code, ExitCode.BRING_UP_FAILED))
-        reason = self._reason or failure or "done"
+        is_taken = any(each.is_taken for each in self._hosts)
+        reason = self._reason or failure or ("followed by another" if is_taken else "done")
         self._emit(
             HostsEnded(
                 reason=reason,

@@ -5,6 +5,7 @@ Owns: `parts_of`, from a manifest and its plan. Pure but for reading files. Must
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import os
 from collections.abc import Callable, Mapping
@@ -78,6 +79,17 @@ def parts_of(
         )
         for machine in machines
     ), tuple(unsent)
+
+
+def in_place(part: Part, manifest: str) -> Part:
+    """Return the part of this host, where the manifest lies with all that is beside it.
+
+    Args:
+        part: as it would be sent.
+        manifest: the file.
+    """
+    path = os.path.abspath(manifest)  # noqa: PTH100 - links are kept
+    return dataclasses.replace(part, manifest=path, files=())
 
 
 def ranks(plan: Plan) -> dict[str, int]:

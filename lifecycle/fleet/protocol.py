@@ -48,7 +48,7 @@ class Part:
 
     Attributes:
         name: of the run directory, see run_directory.run_name.
-        manifest: which of the files it is.
+        manifest: which of the files it is; an absolute path for one that is there already.
         arguments: `name:=value` of the manifest.
         options: further options of `lifecycle up`.
         digest: of all that must be equal for a supervisor that runs to be this one.

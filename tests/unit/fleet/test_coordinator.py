@@ -59,6 +59,13 @@ def test_a_host_that_never_answers_is_given_up_in_time() -> None:
     assert world.states("b") == ["failed"]
 
 
+def test_a_signal_while_hosts_are_asked_ends_at_once() -> None:
+    world = World()
+    world.host("a", is_cut=True, heals_s=None)
+    assert run(world.run(at=(2.0, _interrupt))) is ExitCode.INTERRUPTED
+    assert world.of("end")[0]["elapsed_s"] < 3
+
+
 def test_another_version_is_an_error_of_that_host_with_the_next_step() -> None:
     world = World()
     world.host("a", version="0.9")
