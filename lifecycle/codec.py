@@ -10,7 +10,8 @@ Imports nothing of the package.
 
 from __future__ import annotations
 
-from typing import Annotated, TypeVar
+import functools
+from typing import Annotated, Any, TypeVar
 
 import msgspec
 
@@ -55,9 +56,15 @@ def from_json(data: bytes | str, type_: type[T], *, longest: int | None = None) 
     if longest is not None and len(data) > longest:
         raise ValueError(f"{len(data)} characters of JSON; at most {longest} are read")
     try:
-        return msgspec.json.decode(data, type=type_)
+        return _decoder(type_).decode(data)  # type: ignore[no-any-return, arg-type]
     except (RecursionError, OverflowError, MemoryError) as error:
         raise ValueError("JSON that is nested too deep, or a number too large") from error
+
+
+@functools.cache
+def _decoder(type_: Any) -> Any:
+    """Return what decodes a type: made once, as it looks at all that the type is made of."""
+    return msgspec.json.Decoder(type_)
 
 
 def to_plain(value: object) -> object:

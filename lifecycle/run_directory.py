@@ -376,6 +376,41 @@ def is_held(path: Path) -> bool:
     return False
 
 
+FORK_SERVER = "zygote"
+"""The fork server's name in a record; every other process there runs nodes, or serves them."""
+
+
+def lost(path: Path) -> UsageError:
+    """Return that the supervisor of a run was killed, with what still runs of it."""
+    record = read_record(path)
+    pid, left = "", list[str]()
+    if record is not None:
+        pid = f" (pid {record.supervisor.pid})"
+        here = record.boot_id == boot_id()
+        left = [
+            f"{each.name} (pid {each.pid})"
+            for each in sorted(record.children, key=lambda child: child.name)
+            if here and each.name != FORK_SERVER and start_ticks(each.pid) == each.start_ticks
+        ]
+    count = "1 process still runs" if len(left) == 1 else f"{len(left)} processes still run"
+    still = f"{count}: {', '.join(left)}" if left else "none of its processes runs any more"
+    end = f"lifecycle down {path.name}"
+    return UsageError(
+        f"cannot ask {path.name!r}: its supervisor{pid} died; {still}",
+        hint=f"end them: {end}; the next lifecycle up does so, too"
+        if left
+        else f"clean up after it: {end}",
+    )
+
+
+def left_behind(root: Path) -> tuple[str, ...]:
+    """Return the names of all runs whose supervisor was killed, sorted."""
+    if not root.is_dir():
+        return ()
+    paths = sorted(root.iterdir())
+    return tuple(each.name for each in paths if not is_held(each) and read_record(each) is not None)
+
+
 def running(root: Path) -> tuple[str, ...]:
     """Return the names of all runs that a supervisor holds, sorted."""
     if not root.is_dir():

@@ -65,8 +65,11 @@ _ORDERLY = frozenset({ExitCode.OK, ExitCode.VIOLATED, ExitCode.UNVERIFIABLE})
 """Exit codes that no exception becomes: what made participants has closed them itself."""
 
 
-_LINUX = _PARTICIPANTS | {"pause", "resume", "restart", "mode", "down", "status", "logs"}
-"""Verbs that run nodes, or are about what runs."""
+_LINUX = _PARTICIPANTS | {
+    *("pause", "resume", "restart", "mode", "down", "status"),
+    *("logs", "history", "explain", "replay"),
+}
+"""Verbs that run nodes, or are about what runs or ran."""
 
 _NEEDS_ROS = (
     "pip install 'ros-lifecycle-manifests[ros]', or source /opt/ros/jazzy/setup.bash for its Python"

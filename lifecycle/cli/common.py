@@ -226,10 +226,9 @@ def asking(path: Path) -> Iterator[None]:
     except TimeoutError as error:
         raise UsageError(f"cannot ask {path.name!r}: its supervisor does not answer") from error
     except (FileNotFoundError, ConnectionRefusedError) as error:
-        raise UsageError(
-            f"cannot ask {path.name!r}: its supervisor was killed",
-            hint=f"clean up after it: lifecycle down {path.name}",
-        ) from error
+        from lifecycle.run_directory import lost
+
+        raise lost(path) from error
 
 
 def say_differences(path: Path, plan: Plan) -> None:

@@ -311,10 +311,7 @@ class _Walk:
             else:
                 self._file(node, str(each))
         if parameters:
-            evaluated = importlib.import_module("launch_ros.utilities").evaluate_parameters(
-                self._context, parameters
-            )
-            for each in evaluated:
+            for each in self._evaluated(parameters):
                 if isinstance(each, Mapping):
                     for name, value in each.items():
                         self._parameter(node, name, value)
@@ -326,6 +323,10 @@ class _Walk:
         rules += [(self._text(source), self._text(target)) for source, target in remappings or ()]
         for source, target in rules:
             node.remap.setdefault(source, target)  # rcl takes the first that matches
+
+    def _evaluated(self, parameters: Any) -> Iterable[Any]:
+        utilities = importlib.import_module("launch_ros.utilities")
+        return utilities.evaluate_parameters(self._context, parameters)  # type: ignore[no-any-return]
 
     def _parameter(self, node: LaunchedNode, name: str, value: Any) -> None:
         if isinstance(value, (list, tuple)):
@@ -386,7 +387,13 @@ class _Walk:
         )
         self._settings(node, described.parameters, described.remappings)
         if described.extra_arguments:
-            node.gaps.append("extra_arguments: a manifest gives a component none")
+            told: dict[str, Tree] = {}
+            for each in self._evaluated(described.extra_arguments):
+                if isinstance(each, Mapping):
+                    told.update(each)
+                else:
+                    node.gaps.append("extra_arguments: those of a file are missing")
+            node.run["extra_arguments"] = told
         self.found.nodes.append(node)
 
     # -- values
@@ -443,7 +450,14 @@ def _literal(value: str) -> str:
     return value.replace("$(", "$$(")
 
 
-def to_launched_manifest(found: Launched, *, source: str, system: str, folder: Path) -> str:
+def to_launched_manifest(
+    found: Launched,
+    *,
+    source: str,
+    system: str,
+    folder: Path,
+    schema: str = "manifest.v1.schema.json",
+) -> str:
     """Return what a launch file describes as a manifest, gaps marked.
 
     Args:
@@ -451,6 +465,7 @@ def to_launched_manifest(found: Launched, *, source: str, system: str, folder: P
         source: how the launch file is named in the first lines.
         system: name to give the system.
         folder: of the manifest, from which its paths start.
+        schema: where editors find the manifest's schema, a path or URL.
     """
     keys = _keys(found.nodes)
     by_name = {node.full_name: key for node, key in zip(found.nodes, keys, strict=True)}
@@ -462,7 +477,8 @@ def to_launched_manifest(found: Launched, *, source: str, system: str, folder: P
             del node.parameters["use_sim_time"]
     nodes = {key: _tree(node, by_name, folder) for node, key in zip(found.nodes, keys, strict=True)}
     head = [
-        comment(f"Imported from {source}: evaluated, and never run. `gap:` marks what is missing.")
+        f"# yaml-language-server: $schema={schema}",
+        comment(f"Imported from {source}: evaluated, and never run. `gap:` marks what is missing."),
     ]
     head += [comment(f"{name}:={value}") for name, value in found.arguments.items()]
     head += [comment(f"gap: {each}") for each in found.gaps]

@@ -461,21 +461,26 @@ def _run(node: Cursor, base: Path, found: Findings) -> Run:
     elif "attach" in cursor:
         kind = RunKind.ATTACH
         _refuse(cursor, _OF_A_PROCESS, "an attached node", found)
+    if "component" not in cursor:
+        _refuse(cursor, ("extra_arguments",), "what is no component", found)
     _check_python_keys(cursor, kind, found)
     folder = cursor.text("working_directory")
-    arguments = (
-        (name, _parameter(name, each, found)) for name, each in cursor.entries("arguments")
-    )
     limits = cursor.get("limits")
     return cursor.build(
         Run,
         kind=kind,
-        arguments=tuple((name, value) for name, value in arguments if value is not None),
+        arguments=_values(cursor, "arguments", found),
+        extra_arguments=_values(cursor, "extra_arguments", found),
         environment=tuple((name, each.value.text) for name, each in cursor.entries("environment")),
         working_directory=absolute(base, folder) if folder else "",
         prefix=_words(cursor, "prefix", found),
         limits=None if limits is None else limits.build(Limits),
     )
+
+
+def _values(run: Cursor, key: str, found: Findings) -> tuple[tuple[str, ParameterValue], ...]:
+    values = ((name, _parameter(name, each, found)) for name, each in run.entries(key))
+    return tuple((name, value) for name, value in values if value is not None)
 
 
 _OF_A_PROCESS = (

@@ -211,6 +211,7 @@ class Run:
         environment: extra variables, (name, value).
         component: `package/Plugin` that `container` loads; the node's kind is ATTACH then.
         container: full name of the container's node.
+        extra_arguments: (name, value) that the container is told of the component besides.
         ros_args: of a COMMAND.
         prefix: words before the command line of the process.
         output: where goes what the process prints.
@@ -231,6 +232,7 @@ class Run:
     working_directory: str = ""
     component: str = ""
     container: str = ""
+    extra_arguments: tuple[tuple[str, ParameterValue], ...] = ()
     ros_args: RosArguments = RosArguments.AUTO
     prefix: tuple[str, ...] = ()
     output: Output = Output.BOTH
@@ -282,9 +284,16 @@ class OnFailure(enum.Enum):
     ALL = "all"
 
 
+class OnSupervisorLost(enum.Enum):
+    """What a process that was active does once its supervisor was killed."""
+
+    KEEP = "keep"  # it goes on
+    DEACTIVATE = "deactivate"  # its nodes deactivate themselves; what cannot do that ends
+
+
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Supervision:
-    """What is done when the process of a node fails; keys of a node as systemd spells them.
+    """What is done when the process of a node, or its supervisor, fails; as systemd spells it.
 
     All nodes of one process have the same. Seconds.
 
@@ -301,6 +310,7 @@ class Supervision:
         on_failure: who goes down, and comes again, with it.
         watchdog_sec: a process that is stopped by a signal or hangs in a callback for so long is
             ended with SIGKILL, which is a failure; 0 for never.
+        on_supervisor_lost: what it does itself when its supervisor is killed.
     """
 
     restart: Restart = Restart.NO
@@ -311,6 +321,7 @@ class Supervision:
     start_limit_interval_sec: float = 10.0
     on_failure: OnFailure = OnFailure.NODE
     watchdog_sec: float = 3.0
+    on_supervisor_lost: OnSupervisorLost = OnSupervisorLost.KEEP
 
 
 SUPERVISION_KEYS = tuple(each.name for each in dataclasses.fields(Supervision))
@@ -597,6 +608,7 @@ __all__ = [
     "Network",
     "Node",
     "OnFailure",
+    "OnSupervisorLost",
     "OnViolation",
     "Output",
     "ParameterDeclaration",

@@ -29,7 +29,10 @@ from .process.busy_timer import BusySign as BusySign
 from .process.busy_timer import Overdue as Overdue
 from .process.control import adopt_orphans as adopt_orphans
 from .process.control import check_threads as check_threads
+from .process.control import drop_network_administration as drop_network_administration
 from .process.control import exit_after as exit_after
+from .process.control import fill_heap as fill_heap
+from .process.control import limit_resources as limit_resources
 from .process.control import machine_id as machine_id
 from .process.control import no_room_for_threads as no_room_for_threads
 from .process.control import refuse_new_privileges as refuse_new_privileges

@@ -38,6 +38,10 @@ _DECLARED = {
 }
 """Fields that the manifest calls otherwise."""
 
+_RUN_SPELLED = (
+    *("kind", "environment", "working_directory", "arguments", "executor", "extra_arguments"),
+)
+
 _NODE_DERIVED = (
     # What the planner, the authority or a restart makes of the rest, and what `_node` adds itself.
     *("key", "at", "run", "endpoints", "declared_parameters", "parameters", "parameter_files"),
@@ -149,11 +153,13 @@ def _document(plan: Plan) -> _Tree:
 
 
 def _node(node: PlannedNode) -> _Tree:
-    run = _fields(node.run, "kind", "environment", "working_directory", "arguments", "executor")
+    run = _fields(node.run, *_RUN_SPELLED)
     run = {name: value for name, value in run.items() if value} or {node.run.kind.value: True}
     if node.run.kind is RunKind.PYTHON:
         run["arguments"] = {name: to_plain(value) for name, value in node.run.arguments}
         run["executor"] = node.run.executor.value
+    if node.run.extra_arguments:
+        run["extra_arguments"] = {name: to_plain(value) for name, value in node.run.extra_arguments}
     written = {each.place: each for each in node.files}
     folder = written.get("run.working_directory")
     run["working_directory"] = folder.written if folder else node.run.working_directory or None

@@ -238,6 +238,43 @@ def test_down_removes_what_a_killed_supervisor_programmed(
         assert tables(one) == ""
 
 
+def test_an_ordinary_user_programs_by_an_ambient_capability_that_no_node_has(
+    hosts: Hosts, tmp_path: Path, mapping: str
+) -> None:
+    one, other = hosts.bridged("A", "B")
+    manifest = article(tmp_path, one.ipv4, other.ipv4, edit=_MARKED)
+    # Besides the capability, those by which a user without a home reads this installation.
+    capabilities = "+net_admin,+dac_read_search,+dac_override"
+    user = ("--reuid", "54322", "--clear-groups", "--inh-caps", capabilities)
+    with up_on(other, manifest, "--machine", "b", runtime=tmp_path / "b"):
+        near = Up(
+            manifest,
+            *("--machine", "a", *_PROGRAM, mapping),
+            runtime=tmp_path / "a",
+            through=one.command("setpriv", *user, "--ambient-caps", capabilities, guarded=True),
+            variables=one.environment(tmp_path / "a", {}),
+        )
+        try:
+            near.until("system", reached="active")
+            assert "dscp set ef" in listing(one)
+            assert _may_administrate(near.process.pid)
+            nodes = [each["pid"] for each in near.of_kind("process") if each.get("pid")]
+            assert nodes
+            assert not [pid for pid in nodes if _may_administrate(pid)]
+            near.signal(signal.SIGTERM)
+            assert near.finish() == ExitCode.OK
+        finally:
+            near.close()
+    assert tables(one) == ""
+
+
+def _may_administrate(pid: int) -> bool:
+    status = Path(f"/proc/{pid}/status").read_text()
+    sets = [int(each, 16) for each in re.findall(r"Cap(?:Inh|Prm|Eff|Amb):\t(\w+)", status)]
+    assert len(sets) == 4
+    return any(each >> 12 & 1 for each in sets)
+
+
 def test_without_the_privilege_nothing_is_activated_and_the_run_says_which_is_missing(
     hosts: Hosts, tmp_path: Path, mapping: str
 ) -> None:

@@ -231,6 +231,15 @@ def _logged_systems(_: click.Context, incomplete: str) -> Iterator[CompletionIte
     yield from _beginning(sorted(systems), incomplete)
 
 
+def _runs(context: click.Context, incomplete: str) -> Iterator[CompletionItem[Any]]:
+    """Yield the log directories of runs that have a journal, latest first."""
+    from lifecycle.supervisor import ros_log_root, runs_of
+
+    runs = runs_of(ros_log_root(os.environ), context.params.get("system") or "")
+    there = (each.name for each in runs if (each / "journal.jsonl").is_file())
+    yield from _beginning(there, incomplete)
+
+
 def _machines(context: click.Context, incomplete: str) -> Iterator[CompletionItem[Any]]:
     yield from _beginning(_mapping(_target(context), "machines"), incomplete)
 
@@ -260,6 +269,7 @@ _SOURCES: dict[str, Source] = {
     "machines": _machines,
     "arguments": _arguments,
     "logged": _logged,
+    "runs": _runs,
     "logged_systems": _logged_systems,
 }
 

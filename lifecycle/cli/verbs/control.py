@@ -179,15 +179,18 @@ def _watch(path: Path, format_: str) -> int:
 
 
 def _list_running(format_: str) -> int:
-    from lifecycle.run_directory import running, runtime_root
+    from lifecycle.run_directory import left_behind, lost, running, runtime_root
 
-    names = running(runtime_root(os.environ))
+    root = runtime_root(os.environ)
+    names = running(root)
     if format_ == "json":
         from lifecycle.codec import to_json
 
         click.echo(to_json(names).decode())
     else:
         click.echo("\n".join(names) or "no system runs")
+        for name in left_behind(root):
+            click.echo(lines(str(lost(root / name))), err=True)
     return ExitCode.OK
 
 

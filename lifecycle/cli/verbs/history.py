@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from lifecycle.cli.common import format_option
+from lifecycle.cli.common import completing, format_option
 from lifecycle.cli.standard_streams import echo_while_read
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.printable import json_text, lines, one_line
@@ -26,10 +26,29 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 def _run_argument(function: F) -> F:
     """Add `[RUN]` and `--system` to a verb."""
-    function = click.option(
-        "--system", default="", metavar="NAME", help="The latest run of this system."
+    return click.argument(
+        "run", required=False, metavar="[RUN]", shell_complete=completing("runs")
+    )(_system_option(function))
+
+
+def _system_option(function: F) -> F:
+    return click.option(
+        "--system",
+        default="",
+        metavar="NAME",
+        shell_complete=completing("logged_systems"),
+        help="The latest run of this system.",
     )(function)
-    return click.argument("run", required=False, metavar="[RUN]")(function)
+
+
+def _run_option(function: F) -> F:
+    return click.option(
+        "--run",
+        default=None,
+        metavar="RUN",
+        shell_complete=completing("runs"),
+        help="A run's log directory, or its journal.",
+    )(function)
 
 
 def _recorded(run: str | None, system: str) -> RecordedRun:
@@ -142,8 +161,8 @@ def _is_of_name(character: str) -> bool:
 @click.command("explain")
 @click.argument("finding", required=False, default="", metavar="[FINDING]")
 @click.option("--at", default="", metavar="TIME", help="Which moment; default: the last verdict.")
-@click.option("--run", default=None, metavar="RUN", help="A run's log directory, or its journal.")
-@click.option("--system", default="", metavar="NAME", help="The latest run of this system.")
+@_run_option
+@_system_option
 @format_option("text", "json")
 def explain_command(*, finding: str, at: str, run: str | None, system: str, format_: str) -> int:
     """Say which fact turned a verdict from ok: what was seen to change, and what happened before.

@@ -35,6 +35,7 @@ def import_command(
     goes to stderr, and the exit code is 3 if it cannot be used.
     """
     from lifecycle.cli.launch_files import evaluate, gaps_of, to_launched_manifest
+    from lifecycle.cli.verbs.init import schema_reference
 
     found = evaluate(launch_file, parse_assignments(assignments))
     if not found.nodes:
@@ -44,7 +45,13 @@ def import_command(
         )
     name = system or _name(launch_file)
     folder = Path.cwd() if output is None else output.parent
-    text = to_launched_manifest(found, source=launch_file.name, system=name, folder=folder)
+    text = to_launched_manifest(
+        found,
+        source=launch_file.name,
+        system=name,
+        folder=folder,
+        schema=schema_reference(folder),
+    )
     for gap in gaps_of(found):
         click.echo(one_line(f"gap: {gap}"), err=True)
     if output is None:

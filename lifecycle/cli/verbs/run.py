@@ -14,7 +14,7 @@ import click
 from lifecycle.cli.common import completing, load_manifest
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest import DiscoveryRange, RunKind
-from lifecycle.middleware import peers_environment
+from lifecycle.middleware import limit_resources, peers_environment, refuse_new_privileges
 from lifecycle.plan import Plan, PlannedNode, build_plan, reached_hosts
 
 _ROS_ARGUMENTS = "--ros-args"
@@ -54,6 +54,10 @@ def command(manifest: str, node: str, words: tuple[str, ...], *, auto: bool) -> 
         raise UsageError(
             f"cannot run {planned.full_name}: it is attached, and started outside of the manifest"
         )
+    if planned.run.limits:
+        limit_resources(planned.run.limits.resources())
+    if planned.run.no_new_privileges:
+        refuse_new_privileges()
     if planned.run.kind is RunKind.COMMAND:
         _replace_process(plan, planned, words[split:])
     return _run_class(plan, planned, list(words[split:]), lifecycle="auto" if auto else "manual")

@@ -161,7 +161,7 @@ def command(
             # Its imports and ours, and reading the manifest, take as long as each other: side by
             # side.
             program = _networks(targets, **rest)
-            forerunner = Forerunner(without=_tokens(program))
+            forerunner = Forerunner(without=_tokens(program), programs=bool(program))
             try:
                 from lifecycle.cli.up_output import output
                 from lifecycle.plan import build_plan, started_by_others

@@ -153,7 +153,7 @@ def check_supervision(system: DeclaredSystem) -> Iterator[Diagnostic]:
             continue
         if (node.process or node.key) not in restarted:
             for key in own:
-                if key != "restart":
+                if key not in ("restart", "on_supervisor_lost"):
                     message = f"cannot use {key} of {node.key!r}: it is not started again"
                     yield error("check.restart", places[key], message, _NOT_RESTARTED)
             continue

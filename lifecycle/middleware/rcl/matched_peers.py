@@ -17,7 +17,7 @@ from typing import Any
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 
-from lifecycle.middleware.rcl import abi
+from lifecycle.middleware.rcl import abi, graph_queries
 
 _FASTDDS = "libfastrtps.so.2.14"
 _RTPS = "8eprosima8fastrtps4rtps"
@@ -177,6 +177,7 @@ class _MatchLibrary:
 def load_libraries() -> None:
     """Load what every node asks rcl and Fast DDS through, for a process that forks hosts."""
     _library()
+    graph_queries.load_library()
 
 
 @functools.lru_cache(maxsize=1)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import importlib
-from collections.abc import Awaitable, Callable, Collection, Sequence
+from collections.abc import Awaitable, Callable, Collection, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from lifecycle_msgs.msg import TransitionEvent
@@ -229,10 +229,8 @@ class NodeClients:
             node_name=node.name,
             node_namespace=node.namespace,
             remap_rules=[f"{source}:={target}" for source, target in node.remap],
-            parameters=[
-                RclpyParameter(name, value=value).to_parameter_msg()
-                for name, value in _given_values(node).items()
-            ],
+            parameters=_messages(_given_values(node).items()),
+            extra_arguments=_messages(node.run.extra_arguments),
         )
         response = await self._calls.call(
             f"{container}/_container/load_node",
@@ -282,12 +280,7 @@ class NodeClients:
         response = await self._calls.call(
             f"{node}/set_parameters",
             SetParameters,
-            SetParameters.Request(
-                parameters=[
-                    RclpyParameter(name, value=value).to_parameter_msg()
-                    for name, value in wanted.items()
-                ]
-            ),
+            SetParameters.Request(parameters=_messages(wanted.items())),
             timeout_s=timeout_s,
             repeat=True,
         )
@@ -452,6 +445,10 @@ def _given_values(node: PlannedNode) -> dict[str, Any]:
         for each in node.expected_parameters
         if each.value is not None and each.source not in (DEFAULT, COMMAND)
     }
+
+
+def _messages(values: Iterable[tuple[str, Any]]) -> list[Any]:
+    return [RclpyParameter(name, value=value).to_parameter_msg() for name, value in values]
 
 
 def _not_finite(value: Any) -> Any:

@@ -5,7 +5,7 @@ writing these lines in a host, and the descriptors that arrive beside the first 
 
 It carries what the lifecycle services and `~/get_configuration` carry, without waiting for
 discovery; both ways drive the same state machine. End of file from the supervisor makes a host shut
-down. Imports no rclpy.
+down, unless it was told to KEEP. Imports no rclpy.
 """
 
 from __future__ import annotations
@@ -56,8 +56,11 @@ class Operation(enum.Enum):
     # announce to the graph anew which nodes are here.
     SEND_AGAIN_SOON = "send_again_soon"
     REPUBLISH_NAMES = "republish_names"
-    # The one that is not answered: the participants of all are there, make endpoints.
+    # Those that are not answered: the participants of all are there, make endpoints; and should the
+    # supervisor be killed, do what `on_supervisor_lost` says, or again end with it.
     PROCEED = "proceed"
+    KEEP = "keep"
+    RELEASE = "release"
 
 
 INTERFACE_ON_DEMAND = ("alias", "connect_to", "disconnect", "remap")

@@ -18,7 +18,7 @@ from typing import NoReturn
 
 from lifecycle import codec
 from lifecycle.manifest import DiscoveryRange
-from lifecycle.node.host.control import Command, HostChannel, HostSpec, Operation, give_up
+from lifecycle.node.host.control import Command, Event, HostChannel, HostSpec, Operation, give_up
 from lifecycle.plan import PlannedNode
 
 _PRELOADED = (
@@ -77,7 +77,21 @@ def preload(names: Iterable[str] = ()) -> None:
     for name in names:
         with contextlib.suppress(Exception):
             _load(name)
-    # The codec learns a type's shape at first use.
+    load_libraries()
+    _rehearse()
+
+
+def _rehearse() -> None:
+    """Do what every host does before it has a node: what is written meanwhile is shared after."""
+    import codecs
+    import hashlib
+
+    from lifecycle.node.author.spec import default_name
+    from lifecycle.node.lifecycle.machine import LifecycleMachine
+
+    codecs.lookup("ascii")  # in which the machine's id is read
+    hashlib.sha256()
+    default_name(HostSpec)
     spec = HostSpec(
         system="",
         process="",
@@ -88,8 +102,8 @@ def preload(names: Iterable[str] = ()) -> None:
     codec.from_json(codec.to_json(spec), HostSpec)
     command = Command(id=0, node="", operation=Operation.CONFIGURE)
     codec.from_json(codec.to_json(command), Command)
-    # Reading which rcl is installed takes most of a host's `connect`.
-    load_libraries()
+    codec.to_json(Event(kind="ready"))
+    LifecycleMachine()
 
 
 def _load(name: str) -> None:

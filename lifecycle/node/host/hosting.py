@@ -1,11 +1,11 @@
 """Construct and run the nodes of a host process: carry out the supervisor's commands, report back.
 
 Owns: the order of a host's life: construct every node, say "ready", obey, and at end of file shut
-down and leave; which nodes of a process share a participant, and what a class must be to be hosted;
-what is reported without a request; what each Operation of control.py does to the nodes, by the same
-state machines that the lifecycle services drive, and that each command is answered exactly once. It
-holds no state of its nodes. While the user's modules are imported there is nothing to shut down:
-then it ends at once, and silently.
+down and leave, or outlive a supervisor that was killed; which nodes of a process share a
+participant, and what a class must be to be hosted; what is reported without a request; what each
+Operation of control.py does to the nodes, by the same state machines that the lifecycle services
+drive, and that each command is answered exactly once. It holds no state of its nodes. While the
+user's modules are imported there is nothing to shut down: then it ends at once, and silently.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import signal
+import sys
 import threading
 import traceback
 from collections.abc import Callable, Iterator, Mapping
@@ -25,7 +26,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from lifecycle import codec
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest import Executor
+from lifecycle.manifest import Executor, OnSupervisorLost
 from lifecycle.middleware import (
     BusySign,
     ParticipantSettings,
@@ -238,6 +239,7 @@ class Host:
         self._lock = threading.Lock()
         self._imports = False
         self._ended = False
+        self._is_kept = False
         self._proceed = threading.Event()
         self._nodes: dict[str, Hosted] = {}
         self._adoption = Adoption(
@@ -396,7 +398,10 @@ class Host:
     def _receive(self) -> bool:
         """Take what the supervisor sends; False once it has ended the channel."""
         if not self._channel.receive():
-            self._end("end of the control channel")
+            if self._is_kept:
+                self._outlive()
+            else:
+                self._end("end of the control channel")
             return False
         self._obey()
         return True
@@ -412,8 +417,50 @@ class Host:
                 continue
             if command.operation is Operation.PROCEED:
                 self._proceed.set()
+            elif command.operation in (Operation.KEEP, Operation.RELEASE):
+                self._is_kept = command.operation is Operation.KEEP
             else:
                 self._loop.call_soon(self._execute, command)
 
+    def _outlive(self) -> None:
+        """Go on without the supervisor, which was killed: as before, or with inactive nodes."""
+        if self._spec.nodes[0].supervision.on_supervisor_lost is OnSupervisorLost.KEEP:
+            _say("nodes go on (on_supervisor_lost: keep)")
+            return
+        limit_s = sum(each.spec.timeouts.deactivate_s for each in self._nodes.values()) + _LEAVE_S
+        late = f"nodes are not deactivated within {limit_s:g} s after the supervisor has gone"
+        guard = threading.Timer(limit_s, self._loop.stop, (late,), {"code": 1})
+        guard.daemon = True
+        guard.start()
+        self._loop.call_soon(self._deactivate, guard)
+
+    async def _deactivate(self, guard: threading.Timer) -> None:
+        """Deactivate what is active, and end this process if that fails: it must not go on."""
+        failed = ""
+        for hosted in reversed(self._nodes.values()):
+            if hosted.spec.managed and hosted.reported.label != "active":
+                continue
+            try:
+                result = await hosted.change_for_supervisor("deactivate")
+            except Exception as error:  # noqa: BLE001 - the user's code
+                traceback.print_exc()
+                failed = f"{hosted.full_name} cannot be deactivated: {error}"
+            else:
+                if result.outcome is not CallbackOutcome.SUCCESS:
+                    failed = f"{hosted.full_name} cannot be deactivated: {result.error}"
+        guard.cancel()
+        if failed:
+            _say(f"{failed}; the process ends")
+            self._loop.stop(failed, code=1)
+        else:
+            _say("nodes are inactive (on_supervisor_lost: deactivate)")
+
     async def _execute(self, command: Command) -> None:
         self._channel.write(await self._commands.execute(command))
+
+
+def _say(what: str) -> None:
+    # The fork server reads it now; where that is gone, too, nobody does.
+    with contextlib.suppress(OSError):
+        sys.stderr.write(f"the supervisor is gone: {what}\n")
+        sys.stderr.flush()

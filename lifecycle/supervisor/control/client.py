@@ -9,8 +9,8 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lifecycle.errors import ExitCode, UsageError
-from lifecycle.run_directory import RunDirectory, is_held, new_run_id
+from lifecycle.errors import ExitCode
+from lifecycle.run_directory import RunDirectory, is_held, lost, new_run_id
 from lifecycle.supervisor.control.protocol import (
     A,
     Answer,
@@ -38,7 +38,7 @@ def status(path: Path) -> SystemStatus:
     """
     answer = _asked(path, Question(ask=ControlRequest.STATUS), STATUS_S, Answer)
     if answer is None:
-        raise _killed(path)
+        raise lost(path)
     if answer.status is None:
         raise strange(path / _SOCKET, "it has no status")
     return answer.status
@@ -55,7 +55,7 @@ def look(path: Path) -> SupervisorSnapshot:
 
     answer = _asked(path, Question(ask=ControlRequest.LOOK), STATUS_S, LookAnswer)
     if answer is None:
-        raise _killed(path)
+        raise lost(path)
     if answer.look is None:
         raise strange(path / _SOCKET, "it shows nothing")
     return answer.look
@@ -91,7 +91,7 @@ def order(path: Path, question: Question, timeout_s: float) -> Answer:
     """
     answer = _asked(path, question, timeout_s, Answer)
     if answer is None:
-        raise _killed(path)
+        raise lost(path)
     if answer.exit_code not in _ANSWERED:
         code = answer.exit_code
         why = "it has no exit code" if code is None else f"its exit code is {code}"
@@ -105,13 +105,6 @@ def _asked(path: Path, question: Question, timeout_s: float, type_: type[A]) -> 
         return ask(path / _SOCKET, question, timeout_s, type_)
     except (FileNotFoundError, ConnectionError):
         return None
-
-
-def _killed(path: Path) -> UsageError:
-    return UsageError(
-        f"cannot ask {path.name!r}: its supervisor was killed",
-        hint=f"clean up after it: lifecycle down {path.name}",
-    )
 
 
 def down(path: Path, timeout_s: float) -> ExitCode:

@@ -3,8 +3,10 @@
 Owns: when the system is judged again, how long a verdict that closes the gate is waited out, and
 `GracePeriod`: which findings may pass by themselves while a system is watched, because the facts of
 one change arrive one by one, and for how long a verdict that is worse by these alone is kept back.
-The gate itself has no grace period. Nothing is polled: the graph, or a node over its control
-channel, notifies when to verify again. Must not import rclpy.
+The gate itself has no grace period. The graph, or a node over its control channel, notifies when to
+verify again; only while the gate waits for what nobody notifies, a match of a node that does not
+report its own or the plan of another supervisor, does it ask again, ever more rarely. Must not
+import rclpy.
 """
 
 from __future__ import annotations

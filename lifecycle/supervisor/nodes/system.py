@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Protocol
 
 from lifecycle.errors import BringUpError
-from lifecycle.manifest import Condition, RunKind, TargetState
+from lifecycle.manifest import Condition, OnSupervisorLost, RunKind, TargetState
 from lifecycle.node import INTERFACE_ON_DEMAND, Operation
 from lifecycle.node import Event as HostEvent
 from lifecycle.plan import Plan, PlannedNode, PlannedProcess, attached_to, in_mode
@@ -213,6 +213,8 @@ _BURST_S = 0.5
 """While a system comes up the graph changes all the time: then it is looked at so often."""
 
 _OFFER_S = 5.0
+
+_KEEP = OnSupervisorLost.KEEP
 
 _REPORTING = {
     True: (Reach.CONFIGURED, Reach.CONNECTED, Reach.ACTIVE),
@@ -461,7 +463,26 @@ class System:
             variables=self._variables,
             nodes={each.full_name: each.key for each in nodes},
             may_end=bool(nodes) and all(each.may_end for each in nodes),
+            # A host of ours deactivates its nodes itself.
+            outlives=planned.run.kind is RunKind.PYTHON
+            or all(each.supervision.on_supervisor_lost is _KEEP for each in nodes),
         )
+
+    def keep(self) -> None:
+        """Have each process whose nodes are all active, as far as they are to be, outlive us."""
+        for process in self.processes.values():
+            if not process.is_kept and all(
+                node.is_up and (node.reach is Reach.ACTIVE or not node.is_to_be_active)
+                for node in (self.nodes[key] for key in process.planned.nodes)
+            ):
+                process.keep()
+        if self.server is not None:
+            self.server.keep()
+
+    def release(self) -> None:
+        """Have everything end with us, however we end."""
+        for process in self.living:
+            process.release()
 
     def over(self) -> dict[str, str]:
         """Return how the process ended of each node that has ended by itself as it may."""

@@ -119,8 +119,20 @@ class ControlChannel:
 
     def proceed(self) -> None:
         """Have the host make its endpoints."""
+        self._tell(Operation.PROCEED)
+
+    def keep(self) -> None:
+        """Have the host outlive us, should we be killed, as its manifest says."""
+        self._tell(Operation.KEEP)
+
+    def release(self) -> None:
+        """Have the host end with us again, as it does until `keep`."""
+        self._tell(Operation.RELEASE)
+
+    def _tell(self, operation: Operation) -> None:
+        """Send what is not answered."""
         if self._writer is not None:
-            command = Command(id=0, node="", operation=Operation.PROCEED)
+            command = Command(id=0, node="", operation=operation)
             self._writer.write(to_json(command) + b"\n")
 
     async def request(

@@ -32,17 +32,25 @@ class ForkServerProcess:
     Args:
         preload: import rclpy and what every node has, to fork Python nodes.
         environment: complete environment of the fork server, which its children inherit.
+        programs: the supervisor programs networks: what that takes its children shall not have.
+        again: another one ran before it.
     """
 
     def __init__(
-        self, *, preload: bool, environment: Mapping[str, str], again: bool = False
+        self,
+        *,
+        preload: bool,
+        environment: Mapping[str, str],
+        programs: bool = False,
+        again: bool = False,
     ) -> None:
         self._preload = preload
+        self._programs = programs
         self._environment = dict(environment)
         self._names: tuple[str, ...] = ()
         self.socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         argv = [sys.executable, "-m", _MAIN, str(theirs.fileno())]
-        argv += ["--preload"] * preload + ["--again"] * again
+        argv += ["--preload"] * preload + ["--programs"] * programs + ["--again"] * again
         try:
             self.popen = subprocess.Popen(
                 argv,
@@ -64,7 +72,10 @@ class ForkServerProcess:
             BringUpError: it cannot be started.
         """
         another = ForkServerProcess(
-            preload=self._preload, environment=self._environment, again=True
+            preload=self._preload,
+            environment=self._environment,
+            programs=self._programs,
+            again=True,
         )
         another.preload(self._names)
         return another
@@ -101,17 +112,22 @@ class Forerunner:
     Args:
         preload: see ForkServerProcess.
         without: variables of our environment that nothing it starts shall have.
+        programs: see ForkServerProcess.
 
     Attributes:
         run_id: of the run that it is for.
     """
 
-    def __init__(self, *, preload: bool = True, without: Collection[str] = ()) -> None:
+    def __init__(
+        self, *, preload: bool = True, without: Collection[str] = (), programs: bool = False
+    ) -> None:
         self.run_id = new_run_id()
         hidden = {*without, *_OF_SERVICE_MANAGER}
         environment = {name: text for name, text in os.environ.items() if name not in hidden}
         self.process = ForkServerProcess(
-            preload=preload, environment={**environment, RUN_VARIABLE: self.run_id}
+            preload=preload,
+            environment={**environment, RUN_VARIABLE: self.run_id},
+            programs=programs,
         )
 
     def close(self) -> None:

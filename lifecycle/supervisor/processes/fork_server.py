@@ -13,15 +13,17 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import BringUpError
 from lifecycle.graph import set_within
 from lifecycle.supervisor.processes.forerunner import CLOSE_S, ForkServerProcess
 from lifecycle.supervisor.processes.fork_server_main import (
+    KEEP,
     LARGEST_MESSAGE,
     MSG_CMSG_CLOEXEC,
+    RELEASE,
     SERVES,
     ChildReport,
     ForkRequest,
@@ -55,12 +57,19 @@ class ForkServerChild:
     Args:
         on_stop: see SpawnRequest.
         lineage: which processes descend from it.
+        send: sends the fork server a message with descriptors.
     """
 
     def __init__(
-        self, pid: int, pidfd: int, on_stop: Callable[[bool], None], lineage: Lineage
+        self,
+        pid: int,
+        pidfd: int,
+        on_stop: Callable[[bool], None],
+        lineage: Lineage,
+        send: Callable[[str, Collection[int]], None],
     ) -> None:
         self.pid = pid
+        self._send = send
         self._lineage = lineage
         self.exited: asyncio.Future[ProcessExit] = asyncio.get_running_loop().create_future()
         self.on_stop = on_stop
@@ -80,6 +89,17 @@ class ForkServerChild:
             # It has not reached setsid yet, or only its pidfd is left of it.
             with contextlib.suppress(ProcessLookupError):
                 signal.pidfd_send_signal(self._pidfd, number)
+
+    def keep(self, log: str, outputs: Collection[int]) -> None:
+        """Have the fork server spare it, and read its output, should this process be killed.
+
+        Children of a fork server that died are not known to another one, which ends them then.
+        """
+        self._send(f"{KEEP}\n{self.pid}\n{log}", outputs)
+
+    def release(self) -> None:
+        """Have the fork server end it, should this process be killed."""
+        self._send(f"{RELEASE}\n{self.pid}\n", ())
 
     def run_delay_s(self) -> float:
         """Return how long its threads, and those of its descendants, waited for a processor."""
@@ -243,6 +263,12 @@ class ForkServer:
             raise
         return await born
 
+    def _send(self, message: str, descriptors: Collection[int]) -> None:
+        """Send what is not answered; one that has died is noticed elsewhere."""
+        if self._alive:
+            with contextlib.suppress(OSError):
+                socket.send_fds(self._process.socket, [message.encode()], list(descriptors))
+
     def _begin(self, process: ForkServerProcess) -> None:
         self._process = process
         self._alive = True
@@ -292,7 +318,9 @@ class ForkServer:
             if not born.done():
                 born.set_exception(BringUpError(report.error))
             return
-        child = ForkServerChild(report.pid, descriptors[0], request.on_stop, self._lineage)
+        child = ForkServerChild(
+            report.pid, descriptors[0], request.on_stop, self._lineage, self._send
+        )
         self._children[report.id] = child
         child.exited.add_done_callback(lambda _: self._children.pop(report.id, None))
         if born.cancelled():

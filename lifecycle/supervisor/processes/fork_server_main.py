@@ -1,11 +1,13 @@
 """The fork server's own process: forks the processes of a system, and guards them.
 
 Owns: what runs in `python -m lifecycle.supervisor.processes.fork_server_main SOCKET_FD [--preload]
-[--again]`. It stays single-threaded and never calls rclpy.init, so that forking is safe and every
-child is a participant of its own; with `--preload` a forked host skips ~130 ms of imports. Each
-child leads a session of its own. It adopts what its children leave behind (PR_SET_CHILD_SUBREAPER),
-so as long as it lives, what descends from it is what the run started. If the supervisor vanishes it
-ends what is left of its children, bounded, and of those of a fork server before it that was killed.
+[--programs] [--again]`. It stays single-threaded and never calls rclpy.init, so that forking is
+safe and every child is a participant of its own; with `--preload` a forked host skips ~130 ms of
+imports. Each child leads a session of its own. It adopts what its children leave behind
+(PR_SET_CHILD_SUBREAPER), so as long as it lives, what descends from it is what the run started. If
+the supervisor vanishes it ends what is left of its children, bounded, and of those of a fork server
+before it that was killed; those that are to be kept it reads, so that none of them writes to a pipe
+without a reader.
 """
 
 from __future__ import annotations
@@ -15,7 +17,6 @@ import contextlib
 import dataclasses
 import gc
 import os
-import resource
 import selectors
 import signal
 import socket
@@ -24,11 +25,22 @@ import time
 import traceback
 import warnings
 from collections.abc import Iterable
-from typing import NoReturn
+from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
 
 from lifecycle.codec import from_json, to_json
-from lifecycle.middleware import adopt_orphans, refuse_new_privileges
+from lifecycle.errors import MiddlewareError
+from lifecycle.middleware import (
+    adopt_orphans,
+    drop_network_administration,
+    fill_heap,
+    limit_resources,
+    refuse_new_privileges,
+)
 from lifecycle.supervisor.processes.forerunner import PRELOAD
+
+if TYPE_CHECKING:
+    from lifecycle.supervisor.processes.logs import ProcessLog
 
 LARGEST_MESSAGE = 1 << 18
 """Bytes; a request is one datagram, its argv and variables must fit."""
@@ -79,6 +91,14 @@ class ChildReport:
     stopped: bool | None = None
 
 
+KEEP = "keep"
+"""Begins a message: should the supervisor vanish, spare the child of this pid, and write its output
+to this file; one a line, with our ends of its output."""
+
+RELEASE = "release"
+"""Begins a message: should the supervisor vanish, end the child of this pid, as all others."""
+
+
 GRACE_S = 4.0
 """How long orphans get to end by themselves once the supervisor is gone."""
 
@@ -88,13 +108,60 @@ _STOPS = os.WSTOPPED | os.WCONTINUED | os.WNOHANG
 _PIPE_BYTES = 65536
 
 
+class _Kept:
+    """A child that outlives the supervisor, and its output.
+
+    Attributes:
+        log: file that it is written to; empty for none.
+    """
+
+    def __init__(self, log: str, outputs: Iterable[int]) -> None:
+        self.log = log
+        self.outputs = list(outputs)
+        self._rest = b""
+        self._file: ProcessLog | None = None
+
+    def open(self) -> None:
+        """Begin to write its log; nobody else does any more."""
+        from lifecycle.supervisor.processes.logs import LogDirectory, ProcessLog
+
+        if self.log:
+            path = Path(self.log)
+            self._file = ProcessLog(LogDirectory(path.parent, lambda _: None), path.stem)
+            self._file.open()
+
+    def read(self, output: int) -> bool:
+        """Take what it wrote; False at end of file."""
+        try:
+            data = os.read(output, _PIPE_BYTES)
+        except BlockingIOError:
+            return True
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        if len(self._rest) >= _PIPE_BYTES or not data:
+            lines, self._rest = [*lines, self._rest], b""
+        for line in lines:
+            if self._file is not None and line:
+                self._file.add(line.decode(errors="replace"))
+        return bool(data)
+
+    def close(self) -> None:
+        """Give up its output."""
+        for each in self.outputs:
+            os.close(each)
+        self.outputs = []
+        if self._file is not None:
+            self._file.close()
+
+
 class _ForkServer:
     def __init__(self, sock: socket.socket, *, again: bool) -> None:
         self._sock = sock
         self._again = again
+        self._serves = True
         self._selector = selectors.DefaultSelector()
         self._selector.register(sock, selectors.EVENT_READ, None)
         self._children: dict[int, tuple[int, int]] = {}  # pid → (request id, pidfd)
+        self._kept: dict[int, _Kept] = {}  # by pid
         # SIGCHLD notifies a parent that a child was stopped; nothing else does.
         self._signals = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
         signal.signal(signal.SIGCHLD, _arrived)
@@ -127,6 +194,9 @@ class _ForkServer:
         if data.startswith(PRELOAD.encode()):
             _preload(data.decode().split("\n")[1:])
             return True
+        if data.startswith((KEEP.encode(), RELEASE.encode())):
+            self._keep(data.decode(), descriptors)
+            return True
         request = from_json(data, ForkRequest)
         if request == SERVES:
             self._tell(ChildReport(id=request.id))
@@ -148,6 +218,26 @@ class _ForkServer:
             self._born(request.id, pid)
         return True
 
+    def _keep(self, message: str, outputs: Iterable[int]) -> None:
+        """Spare a child should the supervisor vanish, or not any more."""
+        what, pid, log = message.split("\n", 2)
+        kept = _Kept(log, outputs)
+        if what == KEEP and int(pid) in self._children:
+            self._kept[int(pid)] = kept
+        else:
+            kept.close()
+            self._give_up(int(pid))
+
+    def _give_up(self, pid: int) -> None:
+        """Keep a child no more."""
+        if (kept := self._kept.pop(pid, None)) is not None:
+            for each in kept.outputs:
+                with contextlib.suppress(KeyError):
+                    self._selector.unregister(each)
+                if not self._serves:
+                    kept.read(each)
+            kept.close()
+
     def _born(self, request: int, pid: int) -> None:
         pidfd = os.pidfd_open(pid)
         self._children[pid] = (request, pidfd)
@@ -161,6 +251,7 @@ class _ForkServer:
         self._selector.unregister(pidfd)
         os.close(pidfd)
         _, status = os.waitpid(pid, 0)
+        self._give_up(pid)
         self._tell(ChildReport(id=request, pid=pid, status=status))
 
     def _note_stops(self) -> None:
@@ -189,25 +280,47 @@ class _ForkServer:
             socket.send_fds(self._sock, [to_json(report)], descriptors)
 
     def _guard(self) -> None:
-        """End what is left: hosts end by themselves at end of file, commands are asked to."""
+        """End what is left: hosts end by themselves at end of file, commands are asked to.
+
+        What is kept is read until it ends; that may be asked for by the next `up`, or by `down`.
+        """
+        self._serves = False
+        self._selector.unregister(self._sock)
+        for kept in self._kept.values():
+            kept.open()
+            for output in kept.outputs:
+                self._selector.register(output, selectors.EVENT_READ, kept)
         self._signal(signal.SIGINT)
         deadline = time.monotonic() + GRACE_S
-        self._selector.unregister(self._sock)
-        self._selector.unregister(self._signals[0])
-        while self._children and (left := deadline - time.monotonic()) > 0:
-            for key, _ in self._selector.select(left):
-                self._reap(key.data)
+        while self._doomed() and (left := deadline - time.monotonic()) > 0:
+            self._attend(left)
         self._signal(signal.SIGKILL)
-        for pid in tuple(self._children):
+        for pid in self._doomed():
             self._reap(pid)
         if self._again:
             from lifecycle.run_directory import RUN_VARIABLE
             from lifecycle.supervisor.processes.orphans import end_strays
 
-            end_strays(os.environ.get(RUN_VARIABLE, ""))
+            end_strays(os.environ.get(RUN_VARIABLE, ""), spare=self._kept)
+        while self._kept:
+            self._attend(None)
+
+    def _attend(self, limit_s: float | None) -> None:
+        """Bury children that have ended, and take what those that are kept write."""
+        for key, _ in self._selector.select(limit_s):
+            if key.data == _CHILD_SIGNAL:
+                self._note_stops()
+                self._bury_adopted()
+            elif not isinstance(key.data, _Kept):
+                self._reap(key.data)
+            elif key.fd in key.data.outputs and not key.data.read(key.fd):
+                self._selector.unregister(key.fd)
+
+    def _doomed(self) -> tuple[int, ...]:
+        return tuple(pid for pid in self._children if pid not in self._kept)
 
     def _signal(self, number: int) -> None:
-        for pid in self._children:
+        for pid in self._doomed():
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(pid, number)
 
@@ -224,6 +337,8 @@ class _ForkServer:
             self._sock.close()
             for _, pidfd in self._children.values():
                 os.close(pidfd)
+            for kept in self._kept.values():
+                kept.close()
             # A host takes them itself, once there is something to shut down; until then it ends
             # at once, and without a KeyboardInterrupt in the middle of an import.
             signal.signal(signal.SIGINT, signal.SIG_DFL)
@@ -232,9 +347,7 @@ class _ForkServer:
             os.environ.update(dict(request.environment))
             if request.working_directory:
                 os.chdir(request.working_directory)
-            _confine(request.limits)
-            if request.no_new_privileges:
-                refuse_new_privileges()
+            _confine(request)
             control = descriptors[2] if request.control else None
             code = _run(request.argv, control)
         except SystemExit as error:
@@ -261,18 +374,14 @@ def _take_streams(stdout: int, stderr: int) -> None:
         stream.reconfigure(line_buffering=True)  # type: ignore[union-attr]
 
 
-def _confine(limits: Iterable[tuple[str, int]]) -> None:
-    """Limit what this process may use, and all that it starts."""
-    for name, value in limits:
-        number = getattr(resource, name)
-        # At its soft limit a signal ends it that says why, at the hard one SIGKILL.
-        hard = value + 1 if number == resource.RLIMIT_CPU else value
-        try:
-            resource.setrlimit(number, (value, hard))
-        except (OSError, ValueError) as error:
-            most = resource.getrlimit(number)[1]
-            print(f"cannot set {name} to {value}: {error}; allowed: {most}", file=sys.stderr)
-            raise SystemExit(1) from error
+def _confine(request: ForkRequest) -> None:
+    try:
+        limit_resources(request.limits)
+        if request.no_new_privileges:
+            refuse_new_privileges()
+    except MiddlewareError as error:
+        print(error, file=sys.stderr)
+        raise SystemExit(1) from error
 
 
 def _run(argv: tuple[str, ...], control: int | None) -> int:
@@ -316,6 +425,7 @@ def _preload(names: Iterable[str]) -> None:
 
     gc.disable()
     preload(names)
+    fill_heap()
     gc.freeze()
     gc.enable()
 
@@ -325,12 +435,15 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog=f"python -m {__spec__.name}")
     parser.add_argument("socket_fd", type=int)
     parser.add_argument("--preload", action="store_true")
+    parser.add_argument("--programs", action="store_true", help="its supervisor programs networks")
     parser.add_argument("--again", action="store_true", help="another one before it was killed")
     options = parser.parse_args()
     # Ctrl-C is the supervisor's to handle, and its end is what ends us.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     adopt_orphans()
+    if options.programs and os.geteuid() != 0:
+        drop_network_administration()
     if options.preload:
         _preload(())
     _ForkServer(socket.socket(fileno=options.socket_fd), again=options.again).serve()

@@ -173,6 +173,11 @@ class LineReader:
         os.set_blocking(descriptor, False)
         self._loop.add_reader(descriptor, self._read)
 
+    @property
+    def descriptors(self) -> tuple[int, ...]:
+        """The pipe; nothing once it is closed."""
+        return (self._descriptor,) if self._open else ()
+
     def _read(self) -> None:
         try:
             data = os.read(self._descriptor, LONGEST_LINE)

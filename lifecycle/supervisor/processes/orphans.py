@@ -14,7 +14,7 @@ import os
 import select
 import signal
 import time
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Protocol
 
@@ -64,7 +64,11 @@ class ProcessFamily(Protocol):
 
 
 def end_strays(
-    run_id: str, fork_server: ProcessFamily | None = None, grace_s: float = 0.5
+    run_id: str,
+    fork_server: ProcessFamily | None = None,
+    grace_s: float = 0.5,
+    *,
+    spare: Collection[int] = (),
 ) -> tuple[int, ...]:
     """End everything that still belongs to a run, but for this process and the fork server itself.
 
@@ -72,12 +76,14 @@ def end_strays(
         run_id: of the run; empty for none.
         fork_server: what this process started them by; None if only the run's id shows it.
         grace_s: seconds between SIGTERM and SIGKILL.
+        spare: processes that are left, with all that descends from them.
 
     Returns:
         The pids that had to be ended.
     """
     ended: list[int] = []
     spared = {os.getpid()} if fork_server is None else {os.getpid(), fork_server.pid}
+    spared.update(*(Lineage().of(each) for each in spare))
     # Again for what they started meanwhile.
     for _ in range(_ROUNDS):
         strays = set(_carrying(run_id)) if run_id else set()

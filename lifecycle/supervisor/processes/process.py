@@ -137,6 +137,17 @@ class Child(Protocol):
     def signal(self, number: int) -> None:
         """Send a signal to the process and everything in its group; harmless once it ended."""
 
+    def keep(self, log: str, outputs: Collection[int]) -> None:
+        """Leave it running should this supervisor be killed.
+
+        Args:
+            log: file that its output is written to then; empty for none.
+            outputs: descriptors of our ends of its output, for who reads it then.
+        """
+
+    def release(self) -> None:
+        """Have it end with this supervisor again, as it does until `keep`."""
+
     def run_delay_s(self) -> float:
         """Return the seconds that its threads have waited for a processor, added up.
 
@@ -201,6 +212,7 @@ class ManagedProcess:
     Args:
         nodes: keys of its nodes by their full names; of several, each has a log file of its own
             beside the process's, with the lines of its logger.
+        outlives: `keep` has it outlive a supervisor that is killed.
 
     Attributes:
         planned: what the plan declares of it.
@@ -214,6 +226,7 @@ class ManagedProcess:
         may_end: it may end by itself, with exit status 0.
         started_s: when it was spawned, in seconds since the supervisor started.
         is_restarted: another one ran in its place before.
+        is_kept: it outlives a supervisor that is killed.
         last_stderr: the last line that it wrote to standard error; empty if none.
     """
 
@@ -226,8 +239,11 @@ class ManagedProcess:
         variables: tuple[tuple[str, str], ...] = (),
         nodes: Mapping[str, str] | None = None,
         may_end: bool = False,
+        outlives: bool = True,
     ) -> None:
         self.planned = planned
+        self._outlives = outlives
+        self.is_kept = False
         self.may_end = may_end
         self._variables = variables
         self.state = ProcessState.STARTING
@@ -315,6 +331,24 @@ class ManagedProcess:
         if self.state is ProcessState.STARTING:
             self._change(ProcessState.RUNNING)
 
+    def keep(self) -> None:
+        """Have it outlive a supervisor that is killed, if its manifest has it do so."""
+        if self._outlives and not self.is_kept and self.state is ProcessState.RUNNING:
+            assert self.child is not None
+            self.is_kept = True
+            outputs = [each for reader in self._readers for each in reader.descriptors]
+            self.child.keep(self.log.shown, outputs)
+            if self.channel is not None:
+                self.channel.keep()
+
+    def release(self) -> None:
+        """Have it end with this supervisor, however that ends."""
+        if self.is_kept and self.child is not None:
+            self.is_kept = False
+            self.child.release()
+            if self.channel is not None:
+                self.channel.release()
+
     def back_off(self) -> None:
         """Note that it has ended and that another one is to be started in its place."""
         if self.state is ProcessState.STARTING and self.child is None:
@@ -343,6 +377,7 @@ class ManagedProcess:
         if self.state in (ProcessState.STARTING, ProcessState.RUNNING):
             self.asked_to_end = True
             self._change(ProcessState.STOPPING)
+        self.release()
         if self.channel is not None:
             await self.channel.close()
         needed = ""

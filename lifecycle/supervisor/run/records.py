@@ -14,7 +14,7 @@ from collections.abc import Iterator
 
 from lifecycle.graph import set_within
 from lifecycle.middleware import Creations, segments_by_holder, segments_of, still_there
-from lifecycle.run_directory import ChildRecord, RunDirectory, start_ticks
+from lifecycle.run_directory import FORK_SERVER, ChildRecord, RunDirectory, start_ticks
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.orphans import ProcessFamily
 from lifecycle.supervisor.run.events import Emitter, Notice
@@ -93,7 +93,7 @@ class Records:
             self._again.cancel()
 
     def _write(self) -> None:
-        pids = {"zygote": self._fork_server.pid}
+        pids = {FORK_SERVER: self._fork_server.pid}
         pids.update({each.name: each.pid for each in self._system.living})
         known = self._start_ticks
         self._start_ticks = {

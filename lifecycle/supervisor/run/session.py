@@ -56,7 +56,9 @@ from lifecycle.supervisor.processes.orphans import ProcessFamily, end_strays, re
 from lifecycle.supervisor.processes.process import Spawner
 from lifecycle.supervisor.run.events import (
     Emitter,
+    Event,
     LogLine,
+    NodeChanged,
     Notice,
     Stopped,
     Stopping,
@@ -191,6 +193,7 @@ class Session:
         self._ending = ending
         self._furthest: str | None = None
         self._held = False
+        self._keeps = False
         self._ends = ""
         self._hurry = asyncio.Event()
         self._stop: asyncio.Future[None] = asyncio.get_running_loop().create_future()
@@ -328,6 +331,7 @@ class Session:
         self._agreement.open()
         self._emit.listen(lambda event: None if isinstance(event, LogLine) else server.changed())
         self._emit.listen(self._ros_interface.on_event)
+        self._emit.listen(self._keep)
         result = UpResult(exit_code=ExitCode.INTERNAL, verdict=NOT_JUDGED)
         offering = asyncio.ensure_future(self._interfaces.follow())
         try:
@@ -551,9 +555,18 @@ class Session:
         finally:
             await ended(running)
 
+    def _keep(self, event: Event) -> None:
+        """From when the system is active, have what is active outlive this process if killed."""
+        if isinstance(event, SystemReached) and event.reached == ACTIVE:
+            self._keeps = True
+        if self._keeps and isinstance(event, SystemReached | NodeChanged):
+            self._system.keep()
+
     async def _take_down(self) -> None:
         """End everything, also what our processes left behind."""
         self._gate_sequence.phase = _STOPPING
+        self._keeps = False
+        self._system.release()
         self._schedule.close()
         self._agreement.leave(self._ends)
         self._observer_participant.prepare_to_leave()

@@ -297,7 +297,9 @@ def _preloading(
     python = [each for each in processes if each.run.kind is RunKind.PYTHON]
     if forerunner is None:
         without = token_variables(options.program)
-        forerunner = Forerunner(preload=bool(python), without=without)
+        forerunner = Forerunner(
+            preload=bool(python), without=without, programs=bool(options.program)
+        )
     nodes = (plan.node(key) for process in python for key in process.nodes)
     forerunner.process.preload(needed_by(nodes))
     return forerunner

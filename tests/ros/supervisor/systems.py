@@ -86,6 +86,16 @@ class Numbered(Talker):
         self.publisher("chatter").publish(String(data=f"pid {os.getpid()}"))
 
 
+class Counting(Talker):
+    """Sends another message each time."""
+
+    _count = 0
+
+    def _tick(self) -> None:
+        self._count += 1
+        self.publisher("chatter").publish(String(data=str(self._count)))
+
+
 class Chatty(Talker):
     """Prints a megabyte a second, says how it is taken down, and has a child that nothing ends."""
 

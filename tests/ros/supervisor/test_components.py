@@ -92,6 +92,7 @@ def test_components_in_a_container_of_others_come_and_go(
     tmp_path: Path, fresh_domain: int, pool: subprocess.Popen[str]
 ) -> None:
     nodes = talker_and_hearer("/pool", tmp_path / "values.yaml")
+    nodes["hearer"]["run"]["extra_arguments"] = {"use_intra_process_comms": True}
     others = {"run": {"attach": True}, **OPEN}
     manifest = system(tmp_path, fresh_domain, pool=others, **nodes)
     run = Up(manifest, runtime=tmp_path, variables=VARIABLES)
@@ -100,7 +101,8 @@ def test_components_in_a_container_of_others_come_and_go(
         run.until("system", reached="active")
         run.assert_gate_held()
         loaded = {pool.stdout.readline() for _ in range(2)}
-        assert loaded == {"loaded /robot/talker\n", "loaded /hearer\n"}
+        told = "use_intra_process_comms:=True"
+        assert loaded == {"loaded /robot/talker\n", f"loaded /hearer {told}\n"}
         judged = verb("verify", str(manifest), *ENOUGH, runtime=tmp_path)
         assert judged.returncode == ExitCode.OK, judged.stdout
         again = verb("restart", str(manifest), "talker", runtime=tmp_path)

@@ -41,6 +41,7 @@ def place(tmp_path: Path) -> Path:
     for run in ("13-00-00-000000-host-1-17-arm", "12-00-00-000000-host-16-leg"):
         (tmp_path / "log" / f"2026-11-23-{run}").mkdir(parents=True)
     (tmp_path / "log/2026-11-23-13-00-00-000000-host-1-17-arm/camera.log").write_text("")
+    (tmp_path / "log/2026-11-23-13-00-00-000000-host-1-17-arm/journal.jsonl").write_text("")
     return tmp_path
 
 
@@ -104,6 +105,9 @@ def _asked(line: str, place: Path, shell: str = "bash") -> list[str]:
         ("lifecycle up arm.lifecycle.yaml rate:=", ["plain 5", "plain 10"]),
         ("lifecycle logs ", ["plain camera"]),
         ("lifecycle logs --system ", ["plain arm", "plain leg"]),
+        ("lifecycle history ", ["plain 2026-11-23-13-00-00-000000-host-1-17-arm"]),
+        ("lifecycle replay --system leg ", []),
+        ("lifecycle explain --run 2", ["plain 2026-11-23-13-00-00-000000-host-1-17-arm"]),
     ],
 )
 def test_what_can_come_next_is_offered(line: str, offered: list[str], place: Path) -> None:

@@ -231,7 +231,8 @@ def test_what_launch_leaves_open_is_marked(tmp_path: Path) -> None:
     assert manifest.nodes[0].run.command == ("/bin/talk", "$(date)")
     assert dict(manifest.nodes[1].parameters) == {"text": "$(x)", "list": ("$(y)", "on")}
     first = "launch leaves its name to its code; the key must be that name"
-    assert text.splitlines()[:10] == [
+    assert text.splitlines()[:11] == [
+        "# yaml-language-server: $schema=manifest.v1.schema.json",
         "# Imported from x.launch.py: evaluated, and never run. `gap:` marks what is missing.",
         "# mode:=fast",
         "# gap: a timer",

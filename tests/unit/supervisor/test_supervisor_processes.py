@@ -268,6 +268,41 @@ def test_when_the_supervisor_vanishes_the_fork_server_ends_what_it_forked(tmp_pa
     _run(test())
 
 
+def test_what_is_kept_outlives_the_supervisor_and_its_output_goes_to_its_log(
+    tmp_path: Path,
+) -> None:
+    writes = "import time\nfor n in range(10**9): print(f'line {n}', flush=True); time.sleep(0.02)"
+
+    async def test() -> None:
+        process = ForkServerProcess(preload=False, environment=os.environ)
+        bench = _Bench(tmp_path, ForkServer(process))
+        kept, let_go, never = [await bench.start(PYTHON, "-c", writes) for _ in range(3)]
+        for each in (kept, let_go):
+            each.running()
+            each.keep()
+        let_go.release()
+        await bench.spoke.wait()
+        for each in (kept, let_go, never):  # as the kernel does when this process is killed
+            for reader in each._readers:
+                reader.close()
+        process.socket.shutdown(2)
+        await asyncio.gather(let_go.ended, never.ended)
+        size = kept.log.path.stat().st_size
+        deadline = time.monotonic() + BOUND_S
+        while kept.log.path.stat().st_size < size + 100:
+            assert time.monotonic() < deadline
+            await asyncio.sleep(0.02)
+        assert psutil.pid_exists(kept.pid)
+        assert kept.log.path.read_text().rstrip("\n").rpartition("\n")[2].startswith("line ")
+        os.kill(kept.pid, signal.SIGTERM)
+        await kept.ended
+        # Nothing is left to guard.
+        assert await asyncio.get_running_loop().run_in_executor(None, process.popen.wait) == 0
+        await bench.close()
+
+    _run(test())
+
+
 def test_lines_are_split_and_a_line_without_end_cannot_fill_the_memory() -> None:
     async def test() -> None:
         read, write = os.pipe()
@@ -508,16 +543,19 @@ def test_a_process_of_another_run_boot_or_start_time_is_left_alone(stray: psutil
 
 _CONFINED = """
 import os, subprocess, sys
-from lifecycle.middleware import refuse_new_privileges
-from lifecycle.supervisor.processes.fork_server_main import _confine
-_confine([("RLIMIT_NOFILE", 77), ("RLIMIT_CPU", 60), ("RLIMIT_AS", 4096 * 2**20)])
-refuse_new_privileges()
+from lifecycle.supervisor.processes.fork_server_main import ForkRequest, _confine
+
+def confine(*limits):
+    request = dict(id=1, argv=(), environment=(), working_directory="", control=False)
+    _confine(ForkRequest(**request, limits=limits, no_new_privileges=True))
+
+confine(("RLIMIT_NOFILE", 77), ("RLIMIT_CPU", 60), ("RLIMIT_AS", 4096 * 2**20))
 assert "rclpy" not in sys.modules
 status = "grep NoNewPrivs /proc/self/status; ulimit -n; ulimit -St; ulimit -Ht; ulimit -v"
 print(subprocess.run(["bash", "-c", status], check=True, capture_output=True, text=True).stdout)
 sys.stdout.flush()
 os.setuid(65534) if os.getuid() == 0 else None
-_confine([("RLIMIT_NOFILE", 78)])
+confine(("RLIMIT_NOFILE", 78))
 """
 
 
@@ -529,3 +567,15 @@ def test_a_process_is_confined_with_all_that_it_starts_and_a_limit_too_high_fail
     assert done.returncode == 1
     assert done.stderr.startswith("cannot set RLIMIT_NOFILE to 78: ")
     assert done.stderr.endswith("; allowed: 77\n")
+
+
+def test_what_runs_without_a_supervisor_is_confined_as_well(tmp_path: Path) -> None:
+    manifest = tmp_path / "one.lifecycle.yaml"
+    manifest.write_text(
+        "manifest_version: 1\nsystem: one\nnodes:\n  it:\n    managed: false\n    run:\n"
+        "      command: [bash, -c, 'grep NoNewPrivs /proc/self/status; ulimit -n', bash]\n"
+        "      no_new_privileges: true\n      limits: {nofile: 77}\n"
+    )
+    words = [sys.executable, "-m", "lifecycle", "run", str(manifest), "it"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=60)
+    assert (done.stdout.split(), done.stderr) == (["NoNewPrivs:", "1", "77"], "")

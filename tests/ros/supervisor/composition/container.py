@@ -1,6 +1,7 @@
 """A component container as rclcpp_components has it, of rclpy nodes: `container.py [NAME]`.
 
-Prints `loaded NAME` and `unloaded NAME`, and ends where it is asked to load `demo/Fatal`.
+Prints `loaded NAME [EXTRA:=VALUE]…` and `unloaded NAME`, and ends where it is asked to load
+`demo/Fatal`.
 """
 
 from __future__ import annotations
@@ -60,7 +61,8 @@ class Container(Node):
         number = len(self._nodes) + 1
         self._nodes[number] = node
         self._runs.add_node(node)
-        print(f"loaded {node.get_fully_qualified_name()}", flush=True)
+        extra = [f"{name}:={value}" for name, value in asked["extra_arguments"].items()]
+        print(" ".join(["loaded", node.get_fully_qualified_name(), *extra]), flush=True)
         return respond(response, success=True, error_message="", unique_id=number)
 
     def _unload(self, request: Any, response: Any) -> Any:

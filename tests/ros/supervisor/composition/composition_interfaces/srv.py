@@ -9,25 +9,41 @@ from __future__ import annotations
 import json
 from typing import Any
 
+import rclpy.parameter
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import SetParametersAtomically
 
+_EXTRA = "/extra/"
 _FIELDS = "/fields"  # no parameter of a node has a slash in front
 
 
 def _request(base: type[Any]) -> type[Any]:
     class Request(base):  # type: ignore[misc]
-        def __init__(self, *, parameters: Any = (), **fields: Any) -> None:
+        def __init__(
+            self, *, parameters: Any = (), extra_arguments: Any = (), **fields: Any
+        ) -> None:
             text = ParameterValue(string_value=json.dumps(fields))
-            super().__init__(parameters=[*parameters, Parameter(name=_FIELDS, value=text)])
+            extra = (
+                Parameter(name=_EXTRA + each.name, value=each.value) for each in extra_arguments
+            )
+            rest = (*extra, Parameter(name=_FIELDS, value=text))
+            super().__init__(parameters=[*parameters, *rest])
 
     return Request
 
 
 def fields_of(request: Any) -> dict[str, Any]:
-    """Return the fields of a request as it was received, `parameters` among them."""
-    *parameters, fields = request.parameters
-    return {**json.loads(fields.value.string_value), "parameters": parameters}
+    """Return the fields of a request as it was received, lists of parameters among them."""
+    *given, fields = request.parameters
+    return {
+        **json.loads(fields.value.string_value),
+        "parameters": [each for each in given if not each.name.startswith(_EXTRA)],
+        "extra_arguments": {
+            each.name.removeprefix(_EXTRA): rclpy.parameter.parameter_value_to_python(each.value)
+            for each in given
+            if each.name.startswith(_EXTRA)
+        },
+    }
 
 
 def respond(response: Any, **fields: Any) -> Any:

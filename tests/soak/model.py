@@ -1,0 +1,363 @@
+"""What is done to the system in each round, and what must follow by its policies: pure.
+
+Owns: `PROCESSES`, the system; `plan`, the rounds that a seed stands for; and `follows`, what must
+come of a round, from what the manual says of the policies (docs/supervision.md) and nothing else.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import random
+from collections.abc import Iterable
+
+DECLARED_RATE = 1.0
+WATCHDOG_S = 1.5
+SILENT_S = 0.8
+ENDED_6, ENDED_7, ENDED_4 = 6, 7, 4
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Process:
+    """A process and its policies, as the manifest has them.
+
+    Attributes:
+        nodes: keys, which are the nodes' names, too.
+        takes_down: keys of all nodes that go down and come again with it.
+        orders: its nodes take orders (tests.soak.nodes).
+        violation: what a parameter that differs has done: `deactivate`, `pause`, `stop`.
+    """
+
+    name: str
+    nodes: tuple[str, ...]
+    restart: str = "on-failure"
+    takes_down: tuple[str, ...] = ()
+    burst: int | None = None
+    orders: bool = True
+    violation: str = "report"
+
+
+_ALL = ("base", "arm", "camera", "filter", "detector", "core", "fragile", "lone", "pool", "part")
+SAFE_INACTIVE = ("arm", "camera")
+"""Kept inactive in mode `safe`."""
+UNMANAGED = ("pool",)
+
+PROCESSES = (
+    Process(name="base", nodes=("base",), takes_down=("base", "arm")),
+    Process(name="arm", nodes=("arm",), takes_down=("arm",), violation="pause"),
+    Process(name="camera", nodes=("camera",), takes_down=("camera",), violation="deactivate"),
+    Process(
+        name="vision",
+        nodes=("filter", "detector"),
+        restart="always",
+        takes_down=("filter", "detector"),
+    ),
+    Process(name="core", nodes=("core",), takes_down=_ALL),
+    Process(name="fragile", nodes=("fragile",), takes_down=("fragile",), burst=2),
+    Process(
+        name="lone", nodes=("lone",), restart="no", takes_down=("lone",), violation="stop"
+    ),
+    Process(name="pool", nodes=("pool",), takes_down=("pool", "part"), orders=False),
+)
+NODES = _ALL
+
+
+def process(name: str) -> Process:
+    """Return the process of a name."""
+    return next(each for each in PROCESSES if each.name == name)
+
+
+class Kind(enum.Enum):
+    """What is done to a process."""
+
+    KILL = "kill"
+    EXIT_9 = "exit9"
+    EXIT_0 = "exit0"
+    RAISE = "raise"
+    STOP = "stop"
+    SLEEP = "sleep"
+    SPIN = "spin"
+    LOCK = "lock"
+    STOP_BRIEFLY = "stop_briefly"
+    STUMBLE = "stumble"  # killed, and fails once in a step when it comes again
+    ALTER = "alter"  # a parameter has another value than was declared
+    STRAY = "stray"  # publishes what was not declared
+
+
+DIES = frozenset({Kind.KILL, Kind.EXIT_9, Kind.EXIT_0, Kind.RAISE, Kind.STUMBLE})
+HANGS = frozenset({Kind.STOP, Kind.SLEEP, Kind.SPIN, Kind.LOCK})
+VIOLATES = frozenset({Kind.ALTER, Kind.STRAY})
+_STEPS = ("construct", "configure", "connect", "activate")
+_WAYS = ("raise", "exit9", "sleep")
+
+
+class Condition(enum.Enum):
+    """What is so while it is done."""
+
+    NONE = "none"
+    CUT = "cut"  # no UDP arrives
+    LINK_DOWN = "link_down"  # the loopback is down: sending fails
+    DISK_FULL = "disk_full"
+    FROZEN = "frozen"  # the supervisor is stopped: its clock jumps when it goes on
+    INTRUDER = "intruder"  # a node that was not declared: the gate must stay closed
+    PAUSED = "paused"
+    SAFE = "safe"  # mode
+    STORM = "storm"  # several `lifecycle restart` at once
+    SUPERVISOR_KILLED = "supervisor_killed"  # and started again
+
+
+NEEDS_ROOT = frozenset({Condition.CUT, Condition.LINK_DOWN, Condition.DISK_FULL})
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Fault:
+    """What is done to one process; `detail` is `step way` of a stumble."""
+
+    kind: Kind
+    target: str
+    detail: str = ""
+
+    def __str__(self) -> str:
+        """How the list of a seed shows it."""
+        detail = f" ({self.detail})" if self.detail else ""
+        return f"{self.kind.value} {self.target}{detail}"
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Round:
+    """One round.
+
+    Attributes:
+        spread_s: seconds between its faults.
+        lasts_s: how long the condition lasts after the first fault.
+        orders: what `lifecycle restart` is asked for in a storm; empty text: the whole system.
+        ends: how the run is ended after it; empty: it goes on.
+    """
+
+    number: int
+    condition: Condition
+    faults: tuple[Fault, ...]
+    spread_s: float = 0.0
+    lasts_s: float = 0.0
+    orders: tuple[str, ...] = ()
+    ends: str = ""
+
+    def __str__(self) -> str:
+        """How the list of a seed shows it."""
+        done = ", ".join(str(each) for each in self.faults) or "nothing"
+        storm = f" restart {', '.join(each or 'all' for each in self.orders)}"
+        what = f"{self.condition.value}{storm if self.orders else ''}"
+        lasts = f" for {self.lasts_s:.1f} s" if self.lasts_s else ""
+        apart = f", {self.spread_s:.2f} s apart" if self.spread_s and len(self.faults) > 1 else ""
+        then = f"; then {self.ends}" if self.ends else ""
+        return f"round {self.number}: [{what}{lasts}] {done}{apart}{then}"
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class State:
+    """What rounds before left of one run.
+
+    Attributes:
+        starts: how often `fragile` was started as its limit counts; None: not known.
+        violated: whether a violation has lasted: True, False; None: perhaps.
+    """
+
+    starts: int | None = 1
+    violated: bool | None = False
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Expectation:
+    """What must come of a round.
+
+    Attributes:
+        exit_codes: the run ends with one of these; empty: it goes on.
+        failed: processes of which a failure is reported.
+        may_fail: processes of which one may be, or that they are silent.
+        silent: processes whose nodes are reported as silent.
+        violated: nodes, or processes, of which a violation is reported, with its rule.
+        again: nodes that come again in a new process.
+        may_again: nodes of which that is not known.
+        heal: orders that bring the system back; each is given until it is carried out.
+        consequence: the action that is reported; empty: none.
+    """
+
+    exit_codes: frozenset[int] = frozenset()
+    failed: frozenset[str] = frozenset()
+    may_fail: frozenset[str] = frozenset()
+    silent: frozenset[str] = frozenset()
+    violated: frozenset[tuple[str, str]] = frozenset()
+    again: frozenset[str] = frozenset()
+    may_again: frozenset[str] = frozenset()
+    heal: tuple[tuple[str, ...], ...] = ()
+    consequence: str = ""
+
+
+def follows(state: State, done: Round) -> tuple[Expectation, State]:
+    """Return what must come of a round, and what it leaves for those after it."""
+    if done.condition is Condition.SUPERVISOR_KILLED:
+        return Expectation(may_again=frozenset(NODES)), State()
+    failed: set[str] = set()
+    again: set[str] = set()
+    silent: set[str] = set()
+    codes: set[int] = set()
+    starts = state.starts
+    for fault in done.faults:
+        own = process(fault.target)
+        if fault.kind in HANGS or fault.kind is Kind.STOP_BRIEFLY:
+            silent.add(own.name)
+        if fault.kind not in DIES | HANGS:
+            continue
+        failed.add(own.name)
+        if own.restart == "no" or (own.restart == "on-failure" and fault.kind is Kind.EXIT_0):
+            codes.add(ENDED_6)
+            continue
+        again |= set(own.takes_down)
+        if own.burst is not None:
+            fails = 1 + (fault.kind is Kind.STUMBLE)
+            assert starts is not None
+            if starts + fails > own.burst:
+                codes.add(ENDED_7)
+            starts += fails
+    # Who goes down with another may be down before it fails itself.
+    covered = {
+        each.target
+        for each in done.faults
+        for other in done.faults
+        if other.target != each.target
+        and other.kind in DIES | HANGS
+        and set(process(each.target).nodes) <= set(process(other.target).takes_down)
+    }
+    found = [each for each in done.faults if each.kind in VIOLATES]
+    violated = {
+        (each.target, "param.value-differs" if each.kind is Kind.ALTER else
+         "graph.undeclared-publisher")
+        for each in found
+    }
+    heal, consequence = _consequence(done, found)
+    if consequence == "stop":
+        codes.add(ENDED_4)
+    if done.condition is Condition.PAUSED:
+        heal = (("resume",),)
+    if done.condition is Condition.SAFE:
+        heal = (("mode", "normal"),)
+    may = frozenset[str]()
+    if done.condition is Condition.STORM:
+        may = frozenset(_restarted(done.orders))
+        if "fragile" in may:
+            starts = None
+    expected = Expectation(
+        exit_codes=frozenset(codes),
+        failed=frozenset(failed) - covered,
+        may_fail=frozenset(covered),
+        silent=frozenset(silent) - covered,
+        violated=frozenset(violated),
+        again=frozenset(again) - may,
+        may_again=may,
+        heal=heal,
+        consequence=consequence,
+    )
+    if codes:
+        return expected, State()
+    return expected, State(starts=starts, violated=_violated(state, done, found, silent))
+
+
+def _violated(
+    state: State, done: Round, found: Iterable[Fault], silent: Iterable[str]
+) -> bool | None:
+    if state.violated or done.condition is Condition.INTRUDER or tuple(found):
+        return True
+    # What is silent for a moment, or cut, may be violated for long enough.
+    unsure = (Condition.CUT, Condition.LINK_DOWN, Condition.FROZEN, Condition.STORM)
+    if tuple(silent) or done.condition in (*unsure, Condition.PAUSED, Condition.SAFE):
+        return None
+    return state.violated
+
+
+def _consequence(done: Round, found: list[Fault]) -> tuple[tuple[tuple[str, ...], ...], str]:
+    for fault in found:
+        if fault.kind is Kind.STRAY:
+            return (("mode", "normal"),), "mode"
+        action = process(fault.target).violation
+        return ((("resume",),) if action in ("pause", "deactivate") else ()), action
+    return (), ""
+
+
+def _restarted(orders: Iterable[str]) -> set[str]:
+    found: set[str] = set()
+    for order in orders:
+        own = next((each for each in PROCESSES if order in each.nodes), None)
+        with_it = () if own is None else own.nodes
+        found |= {*(with_it or NODES), *(("part",) if order == "pool" else ())}
+    return found
+
+
+def plan(seed: int, rounds: int) -> tuple[Round, ...]:
+    """Return the rounds that a seed stands for; the first of many are those of few."""
+    state, found = State(), []
+    for number in range(1, rounds + 1):
+        chosen = _round(random.Random(f"{seed} {number}"), number, state)
+        _, state = follows(state, chosen)
+        state = State() if chosen.ends else state
+        found.append(chosen)
+    return tuple(found)
+
+
+def _round(dice: random.Random, number: int, state: State) -> Round:
+    conditions = [Condition.NONE] * 8 + [each for each in Condition if each is not Condition.NONE]
+    condition = dice.choice(conditions)
+    targets = [each.name for each in PROCESSES]
+    ends = state.violated is not None and dice.random() < 0.08
+    if state.starts is None:
+        targets.remove("fragile")
+    if condition in (Condition.STORM, Condition.PAUSED, Condition.SAFE, Condition.FROZEN):
+        targets = [each for each in targets if each not in ("fragile", "lone")]
+    if condition is Condition.NONE and dice.random() < 0.25:
+        kind = dice.choice(sorted(VIOLATES, key=str))
+        able = [each for each in targets if process(each).violation != "report"]
+        if kind is Kind.STRAY:
+            able = [each for each in targets if process(each).orders]
+        faults = [Fault(kind, dice.choice(able))]
+        beside = [each for each in targets if each not in (faults[0].target, "core", "fragile")]
+        beside = [each for each in beside if process(each).restart != "no" and each != "base"]
+        if process(faults[0].target).violation != "stop" and dice.random() < 0.4:
+            faults.append(Fault(Kind.KILL, dice.choice(beside)))
+        return Round(number=number, condition=condition, faults=tuple(faults))
+    chosen = dice.sample(targets, dice.choice((1, 1, 1, 2, 2, 3)))
+    if "core" in chosen:  # it takes all down with it: how they failed is not known
+        chosen = [each for each in chosen if each not in ("fragile", "lone")]
+    if "lone" in chosen and dice.random() < 0.6:  # each such round ends the run
+        chosen.remove("lone")
+        chosen = chosen or ["base"]
+    return Round(
+        number=number,
+        condition=condition,
+        faults=tuple(_fault(dice, each, condition) for each in chosen),
+        spread_s=dice.choice((0.0, 0.0, 0.02, 0.15, 0.4, 1.0)),
+        lasts_s=round(dice.uniform(0.5, 3.0), 1) if condition is not Condition.NONE else 0.0,
+        orders=_orders(dice) if condition is Condition.STORM else (),
+        ends=dice.choice(("down", "term", "interrupt")) if ends else "",
+    )
+
+
+def _orders(dice: random.Random) -> tuple[str, ...]:
+    able = [each.nodes[0] for each in PROCESSES if each.name not in ("fragile", "lone")]
+    return tuple(dice.sample(able, dice.randint(2, 4))) + (("",) if dice.random() < 0.3 else ())
+
+
+def _fault(dice: random.Random, target: str, condition: Condition) -> Fault:
+    own = process(target)
+    kinds = [Kind.KILL] * 3 + [Kind.STOP, Kind.STOP_BRIEFLY]
+    if own.orders:
+        kinds += [Kind.EXIT_9, Kind.RAISE, Kind.SLEEP, Kind.SPIN, Kind.LOCK]
+        kinds += [Kind.EXIT_0] * (own.restart == "always" or dice.random() < 0.15)
+    calm = condition not in (Condition.STORM, Condition.PAUSED, Condition.SAFE)
+    if own.orders and own.restart != "no" and calm:
+        kinds += [Kind.STUMBLE] * 3
+    if own.restart == "no":
+        kinds = [each for each in kinds if each not in HANGS]
+    if condition in (Condition.STORM, Condition.FROZEN):
+        kinds = [each for each in kinds if each in DIES and each is not Kind.EXIT_0]
+    kind = dice.choice(kinds)
+    detail = f"{dice.choice(_STEPS)} {dice.choice(_WAYS)}" if kind is Kind.STUMBLE else ""
+    return Fault(kind, target, detail)

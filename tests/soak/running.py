@@ -1,0 +1,176 @@
+"""One run of the soak's system, looked at from outside: events, control socket, graph, /proc.
+
+Owns: `Watched`, a `lifecycle up` whose events have times; `Transitions`, what the nodes themselves
+tell the graph of their states; and `assert_gate_held`, the promise of the gate read from both.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import threading
+import time
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from lifecycle.graph import EventKind, Graph, GraphEvent, StateChanged
+from lifecycle.supervisor.control.protocol import (
+    Answer,
+    ControlRequest,
+    Question,
+    SystemStatus,
+    ask,
+)
+from tests.ros.supervisor.running import BOUND_S, Event, Up
+from tests.soak.system import COMPOSITION, NAME
+
+ACTIVE = "active"
+
+
+class Violated(AssertionError):
+    """Something that was promised did not hold."""
+
+
+class Watched(Up):
+    """A `lifecycle up` whose events can be waited for together with their times."""
+
+    def __init__(self, manifest: Path, *, runtime: Path) -> None:
+        self.times: list[float] = []
+        self._came = threading.Condition()
+        variables = {"PYTHONPATH": str(COMPOSITION)}
+        super().__init__(manifest, runtime=runtime, variables=variables)
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            now = time.monotonic()
+            event = json.loads(line)
+            with self._came:
+                self.times.append(now)
+                self.events.append(event)
+                self._came.notify_all()
+        self._lines.put("")
+        with self._came:
+            self._came.notify_all()
+
+    def wait(
+        self,
+        wanted: Callable[[Event], object],
+        *,
+        since: int,
+        within_s: float,
+        what: str,
+    ) -> tuple[int, float]:
+        """Return number and time of the first event that is wanted, after the first `since`."""
+        deadline = time.monotonic() + within_s
+        looked = since
+        with self._came:
+            while True:
+                while looked < len(self.events):
+                    if wanted(self.events[looked]):
+                        return looked, self.times[looked]
+                    looked += 1
+                left_s = deadline - time.monotonic()
+                if left_s <= 0:
+                    raise Violated(f"no {what} within {within_s:g} s")
+                self._came.wait(left_s)
+
+    def close_streams(self) -> None:
+        """Let go of a supervisor that ended."""
+        for each in self._readers:
+            each.join(BOUND_S)
+        for stream in (self.process.stdout, self.process.stderr):
+            assert stream is not None
+            stream.close()
+
+    def status(self) -> SystemStatus | None:
+        """Ask over the control socket; None if nobody answers."""
+        for path in (self.runtime / "lifecycle").glob(f"{NAME}@*/control"):
+            with contextlib.suppress(OSError):
+                answer = ask(path, Question(ask=ControlRequest.STATUS), BOUND_S, Answer)
+                if answer is not None:
+                    return answer.status
+        return None
+
+
+class Transitions:
+    """What nodes tell of their states, received by a participant of our own.
+
+    Attributes:
+        seen: time, node and state of each change, in the order in which they came.
+    """
+
+    def __init__(self, domain_id: int) -> None:
+        self.seen: list[tuple[float, str, str]] = []
+        self._graph = Graph.open(domain_id)
+        self._graph.events.on((EventKind.STATE_CHANGED, EventKind.JOINED), self._take)
+
+    def _take(self, event: GraphEvent) -> None:
+        if isinstance(event.message, StateChanged):
+            self.seen.append((time.monotonic(), event.node, event.message.state))
+
+    def activated(self, since: float, until: float) -> list[tuple[float, str]]:
+        """Return when which nodes became active between two times."""
+        return [
+            (at, node)
+            for at, node, state in tuple(self.seen)
+            if state == ACTIVE and since <= at <= until
+        ]
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self._graph.close()
+
+
+def assert_gate_held(events: Sequence[Event]) -> None:
+    """Assert that every activate request follows a gate that opened on a passing verdict.
+
+    Raises:
+        Violated: one did not.
+    """
+    verdict: Event | None = None
+    let_through: set[str] = set()
+    for event in events:
+        kind = event.get("event")
+        if kind == "verdict":
+            verdict = event["verdict"]
+            if verdict["blocking"] and event["stage"] == "connected":
+                let_through = set()
+        elif kind == "gate":
+            if verdict is None or verdict["blocking"]:
+                raise Violated(f"the gate opened on {_short(verdict)}: {event}")
+            let_through = set(event["nodes"])
+        elif kind == "request" and event["operation"] == "activate":
+            if event["node"] not in let_through:
+                raise Violated(f"{event} came behind a closed gate: {_short(verdict)}")
+
+
+def assert_activated_on_request(
+    run: Watched, transitions: Transitions, began: float, until: float, names: Iterable[str]
+) -> None:
+    """Assert that no node became active, by its own report, without a request of the supervisor.
+
+    Raises:
+        Violated: one did.
+    """
+    asked: dict[str, int] = {}
+    for at, event in zip(tuple(run.times), tuple(run.events), strict=False):
+        if event.get("event") == "request" and event["operation"] == "activate" and at <= until:
+            asked[event["node"]] = asked.get(event["node"], 0) + 1
+    became: dict[str, int] = {}
+    for _, node in transitions.activated(began, until - 0.5):
+        became[node] = became.get(node, 0) + 1
+    for name in names:
+        if became.get(name, 0) > asked.get(name, 0):
+            raise Violated(
+                f"{name} became active {became[name]} times, and was asked to "
+                f"{asked.get(name, 0)} times"
+            )
+
+
+def _short(verdict: Any) -> str:
+    if verdict is None:
+        return "no verdict"
+    found = [f"{each['rule']} of {each['subject']}" for each in verdict["findings"]]
+    return f"verdict {verdict['verdict']}, blocking {verdict['blocking']}: {found}"
