@@ -54,6 +54,9 @@ AGAIN_S = (0.5, 1.0, 2.0, 4.0)
 END_S = 90.0
 """For a supervisor to take its part down."""
 
+CLEAN_S = 30.0
+"""For what a supervisor that was killed left running."""
+
 CUT_END_S = 10.0
 """How long a host that cannot be reached is waited for when it is to end."""
 
@@ -210,6 +213,7 @@ class _Host:
         is_cut: its link is.
         starts: how often we asked for a supervisor.
         asked_s: since when an answer is due to START or ATTACH.
+        was_killed: its supervisor was, and may have left what it ran.
         exit_code: of its supervisor; None while that runs, or none was started.
         has_failed: there will be no supervisor.
     """
@@ -220,6 +224,7 @@ class _Host:
         self.channel: Channel | None = None
         self.is_ready = self.is_begun = self.is_ours = self.is_taken = False
         self.is_active = self.is_cut = self.is_ending = self.has_failed = False
+        self.was_killed = False
         self.exit_code: int | None = None
         self.reached = ""
         self.heard_s = 0.0
@@ -437,13 +442,28 @@ class Coordinator:
         return ", ".join(each.name for each in self._hosts if each.exit_code or each.has_failed)
 
     async def _end(self, hosts: Iterable[_Host], reason: str) -> None:
-        """End supervisors, those first whose nodes come last."""
+        """End supervisors, those first whose nodes come last, and what killed ones have left."""
+        hosts = tuple(hosts)
         left = [each for each in hosts if each.is_begun or each.starts]
         left = [each for each in left if not each.is_over]
         if left:
             self._emit(HostsEnding(reason=reason))
         for rank in sorted({each.rank for each in left}, reverse=True):
             await asyncio.gather(*(self._end_one(each) for each in left if each.rank == rank))
+        if not self._leaves:
+            await asyncio.gather(*(self._clean_up(each) for each in hosts if each.was_killed))
+
+    async def _clean_up(self, host: _Host) -> None:
+        code, message = await _down(host.part.name, host.transport, CLEAN_S)
+        if code is not ExitCode.OK:
+            self._emit(
+                HostChanged(
+                    state=LinkState.LEFT,
+                    message=f"what its killed supervisor left could not be ended: {message}",
+                    hint=f"on that host: lifecycle down {host.part.name}",
+                ),
+                host,
+            )
 
     async def _end_one(self, host: _Host) -> None:
         host.is_ending = True
@@ -649,6 +669,7 @@ class Coordinator:
             )
         elif said.agent is Word.ENDED:
             host.exit_code = host.ended(said)
+            host.was_killed = bool(said.signal)
             by = f"killed by signal {said.signal}" if said.signal else ""
             self._emit(
                 HostChanged(state=LinkState.ENDED, exit_code=host.exit_code, message=by), host

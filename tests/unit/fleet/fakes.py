@@ -43,6 +43,10 @@ class Supervisor:
             self._host.world.ended.append(self._host.name)
             self._host.say(to_json(Said(agent=Word.ENDED, exit_code=code)))
 
+    def kill(self) -> None:
+        self.exit_code = -9
+        self._host.say(to_json(Said(agent=Word.ENDED, signal=9)))
+
     def terminate(self) -> None:
         if self._host.ends_s is not None:
             code = ExitCode.OK if self.is_active else ExitCode.TERMINATED
@@ -108,6 +112,7 @@ class FakeTransport:
     is_cut: bool = False
     channel: FakeChannel | None = None
     starts: int = 0
+    downs: int = 0
 
     @property
     def destination(self) -> str:
@@ -169,6 +174,9 @@ class FakeTransport:
             if self.supervisor is not None:
                 self.supervisor.terminate()
             return None
+        if order.do is Do.DOWN:
+            self.downs += 1
+            return Said(agent=Word.DONE, exit_code=0)
         if self.refuses:
             return Said(agent=Word.REFUSED, message=self.refuses, hint="end it")
         channel.follows = True

@@ -134,6 +134,27 @@ def test_a_host_that_a_person_takes_down_is_no_failure() -> None:
     assert world.of("end")[0]["elapsed_s"] > 20
 
 
+def test_what_a_killed_supervisor_left_is_ended_with_the_others() -> None:
+    world = World()
+    world.host("a")
+    world.host("b")
+
+    async def main() -> ExitCode:
+        def kill() -> None:
+            supervisor = world.hosts["b"].supervisor
+            assert supervisor is not None
+            supervisor.kill()
+
+        asyncio.get_running_loop().call_later(5.0, kill)
+        return await world.run()
+
+    assert run(main()) is ExitCode.BRING_UP_FAILED
+    assert world.of("host", "b")[-1]["message"] == "killed by signal 9"
+    assert world.of("ending")[0]["reason"] == "the supervisor of b failed"
+    assert [each.downs for each in world.hosts.values()] == [0, 1]
+    assert world.ended == ["a"]
+
+
 def test_an_active_system_is_ended_after_the_time_that_was_asked_for() -> None:
     world = World()
     world.host("a")
