@@ -49,6 +49,7 @@ from lifecycle.verify import Outcome, Verdict, render_text
 if TYPE_CHECKING:
     from lifecycle.fleet import Part
     from lifecycle.plan import Plan
+    from lifecycle.supervisor import Event
 
 _MORE_S = TIMEOUT_S
 """For supervisors to start, and to end by themselves at the deadline that they have, too."""
@@ -285,12 +286,12 @@ class PlainHosts:
         if line is not None:
             self._sink.put((f"{host} | " if host else "") + one_line(line) + "\n")
             return
+        event = event_of(record)
+        if event is None:
+            return
         if host not in self._hosts:
             self._hosts[host] = PlainLines(_Prefixed(self._sink, f"{one_line(host)} | "))
-        with contextlib.suppress(ValueError):  # of another version
-            event = from_record({name: each for name, each in record.items() if name != "host"})
-            if event is not None:
-                self._hosts[host](event)
+        self._hosts[host](event)
 
     def _finish(self, host: str, record: Record) -> None:
         """Write the last verdict of a host, in full where it is not ok; its flows are many."""
@@ -302,6 +303,14 @@ class PlainHosts:
         is_ok = verdict.verdict is Outcome.OK
         text = verdict_line(verdict) if is_ok else render_text(verdict, flows=False)
         _Prefixed(self._sink, f"{one_line(host)} | ").put(text)
+
+
+def event_of(record: Record) -> Event | None:
+    """Return the event of a host's supervisor; None for what is none, or none that we know."""
+    try:
+        return from_record({name: each for name, each in record.items() if name != "host"})
+    except ValueError:
+        return None
 
 
 class _Prefixed:

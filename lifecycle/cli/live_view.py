@@ -17,8 +17,10 @@ from rich.live import Live as RichLive
 from rich.table import Table
 from rich.text import Text
 
+from lifecycle.cli.hosts import PlainHosts, event_of
 from lifecycle.cli.standard_streams import Writer
 from lifecycle.cli.up_output import Rollback, describe, verdict_line
+from lifecycle.codec import from_json, to_json
 from lifecycle.fleet import Record
 from lifecycle.printable import log_line, one_line
 from lifecycle.supervisor import (
@@ -28,6 +30,8 @@ from lifecycle.supervisor import (
     NodeChanged,
     NodeStatus,
     ProcessChanged,
+    Reach,
+    RunStarted,
     Stopped,
     Stopping,
     SystemReached,
@@ -35,7 +39,7 @@ from lifecycle.supervisor import (
     UpResult,
     VerdictChanged,
 )
-from lifecycle.verify import Outcome, render_text
+from lifecycle.verify import Outcome, not_ok, render_text
 
 _REDRAW_S = 0.04
 """At most 25 times a second, however many events there are."""
@@ -253,8 +257,6 @@ class LiveHosts:
         writer: Writer,
         console: Console | None = None,
     ) -> None:
-        from lifecycle.cli.hosts import PlainHosts
-
         self._system = system
         self._writer = writer
         self._console = console or Console(file=writer.stream(), highlight=False)
@@ -282,8 +284,10 @@ class LiveHosts:
     def __call__(self, host: str, record: Record) -> None:
         """Show one event of a host, or of all."""
         urgent = not host
-        if host in self._rows:
-            urgent = self._rows[host].note(record)
+        if (row := self._rows.get(host)) is not None:
+            urgent = row.note(record)
+            if (event := event_of(record)) is not None:
+                urgent = row.take(event)
         # What is in the table need not scroll by as well.
         if record.get("event") not in ("node", "process", "verdict"):
             self._lines(host, record)
@@ -296,7 +300,8 @@ class LiveHosts:
         if self._writer.is_behind:
             return
         table = Table(box=box.SIMPLE_HEAD, pad_edge=False, header_style="bold")
-        for column in (self._system, "supervisor", "system", "active", "clock", "verdict"):
+        table.add_column(Text(one_line(self._system)), no_wrap=True)
+        for column in ("supervisor", "system", "active", "clock", "verdict"):
             table.add_column(column, no_wrap=True)
         for name, row in self._rows.items():
             table.add_row(_short(one_line(name), "bold"), *row.cells())
@@ -311,41 +316,38 @@ class _HostRow:
         self._reached = ""
         self._nodes: dict[str, bool] = {}
         self._clock = ""
-        self._verdict = ""
+        self._verdict: Outcome | None = None
         self._why = ""
 
     def note(self, record: Record) -> bool:
-        """Take an event; whether it is to be seen at once."""
-        kind = record.get("event")
-        if kind == "host":
-            self._link = str(record["state"])
-            status = record["status"]
-            if isinstance(status, dict):
-                self._reached = str(status.get("phase", ""))
-                self._nodes = {
-                    str(each["node"]): each["state"] == "active"
-                    for each in status.get("nodes", ())
-                    if each["process_state"] is not None
-                }
-            return True
-        if kind == "clock":
-            self._clock = (
-                f"{record['offset_s'] * 1e3:+.1f} ms ± {record['uncertainty_s'] * 1e3:.1f}"
-            )
-        elif kind == "run":
-            self._nodes = dict.fromkeys(map(str, record["nodes"]), False)
-        elif kind == "node" and record["node"] in self._nodes:
-            self._nodes[str(record["node"])] = record["reach"] == "active"
-        elif kind == "system":
-            self._reached = str(record["reached"])
-            return True
-        elif kind == "stopping":
+        """Take an event of the coordinator; whether it is to be seen at once."""
+        if record.get("event") == "clock":
+            ahead_ms, around_ms = record["offset_s"] * 1e3, record["uncertainty_s"] * 1e3
+            self._clock = f"{ahead_ms:+.1f} ms ± {around_ms:.1f}"
+        if record.get("event") != "host":
+            return False
+        self._link = str(record["state"])
+        with contextlib.suppress(ValueError):
+            status = from_json(to_json(record["status"]), SystemStatus)
+            self._reached = status.phase
+            own = [each for each in status.nodes if each.process_state is not None]
+            self._nodes = {each.node: each.state == "active" for each in own}
+        return True
+
+    def take(self, event: Event) -> bool:
+        """Take an event of the supervisor; whether it is to be seen at once."""
+        if isinstance(event, RunStarted):
+            self._nodes = dict.fromkeys(event.nodes, False)
+        elif isinstance(event, NodeChanged) and event.node in self._nodes:
+            self._nodes[event.node] = event.reach is Reach.ACTIVE
+        elif isinstance(event, SystemReached):
+            self._reached = event.reached
+        elif isinstance(event, Stopping):
             self._reached = "stopping"
-        elif kind == "verdict":
-            self._verdict = str(record["verdict"]["verdict"])
-            found = record["verdict"].get("findings") or ()
-            self._why = str(found[0].get("message", "")) if found else ""
-        return kind == "failure"
+        elif isinstance(event, VerdictChanged):
+            self._verdict = event.verdict.verdict
+            self._why = not_ok(event.verdict)
+        return isinstance(event, SystemReached | Failure)
 
     def cells(self) -> tuple[Text, ...]:
         """Return the columns after its name."""
@@ -354,12 +356,15 @@ class _HostRow:
         active = sum(self._nodes.values())
         count = f"{active}/{len(self._nodes)}" if self._nodes else "–"
         is_all = bool(self._nodes) and active == len(self._nodes)
-        colour = _OUTCOMES.get(Outcome(self._verdict), "") if self._verdict else ""
-        why = f" {self._why}" if self._verdict == Outcome.VIOLATED.value else ""
+        verdict = "–" if self._verdict is None else self._verdict.value
+        colour = "" if self._verdict is None else _OUTCOMES[self._verdict]
+        why = f"; {self._why}" if self._why else ""
         return (
             Text(link, style="red" if bad else "green" if link == "runs" else "yellow"),
-            Text(self._reached, style="bold green" if self._reached == "active" else "yellow"),
+            _short(
+                one_line(self._reached), "bold green" if self._reached == "active" else "yellow"
+            ),
             Text(count, style="green" if is_all else "yellow"),
             Text(self._clock, style="dim"),
-            _short(one_line(f"{self._verdict or '–'}{why}"), colour),
+            _short(one_line(f"{verdict}{why}"), colour),
         )

@@ -202,6 +202,7 @@ class _Agent:
     def run(self) -> None:
         from importlib.metadata import version
 
+        self._out += b"\n"  # what a login shell printed may have no end
         self._say(
             Said(agent=Word.HELLO, version=version("ros-lifecycle-manifests"), protocol=PROTOCOL)
         )

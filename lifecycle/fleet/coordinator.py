@@ -15,7 +15,7 @@ import enum
 import json
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple, Union
+from typing import Any, ClassVar, NamedTuple, Union, get_args
 
 from lifecycle.codec import from_json, to_plain
 from lifecycle.errors import ExitCode
@@ -183,6 +183,9 @@ HostEvent = Union[  # noqa: UP007 - a run-time alias on Python 3.10
 ]
 
 
+_OURS = frozenset(each.kind for each in get_args(HostEvent))
+
+
 def to_record(event: HostEvent, host: str = "") -> Record:
     """Return an event of ours as the JSON object that `--format json` prints."""
     plain = to_plain(event)
@@ -312,7 +315,7 @@ class Coordinator:
         self._began_s = 0.0
 
     def stop(self, reason: str, exit_code: ExitCode) -> None:
-        """End all supervisors in order; asked again, without asking their nodes politely.
+        """End all supervisors in order; asked again, at once and without any politeness.
 
         Args:
             reason: for people.
@@ -323,7 +326,8 @@ class Coordinator:
             self._changed.set()
             return
         for each in self._hosts:
-            if each.is_ending:
+            if each.runs:
+                each.is_ending = True
                 self._send(each, Order(do=Do.END))
 
     def leave(self, reason: str) -> None:
@@ -635,14 +639,15 @@ class Coordinator:
     def _pass_on(self, host: _Host, data: bytes) -> None:
         try:
             record = json.loads(data)
-        except ValueError:
+        except (ValueError, RecursionError):
             record = None
-        if not isinstance(record, dict):
+        # What only a coordinator says is not for a host to say.
+        if not isinstance(record, dict) or str(record.get("event")) in _OURS:
             self._emit(HostStderr(line=data.decode(errors="replace")), host)
             return
         was_active, was_reached = host.is_active, host.reached
         host.note(record)
-        self._listener(host.name, {"host": host.name, **record})
+        self._listener(host.name, {"host": host.name, **record} | {"host": host.name})
         if (host.is_active, host.reached) != (was_active, was_reached):
             self._notify()
 

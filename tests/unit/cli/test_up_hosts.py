@@ -16,6 +16,7 @@ from lifecycle.cli.live_view import LiveHosts
 from lifecycle.cli.standard_streams import Writer
 from lifecycle.errors import ExitCode
 from lifecycle.fleet import Record
+from lifecycle.supervisor import NodeChanged, Reach, RunStarted, to_record
 from lifecycle.verify import Finding, Outcome, RunEnd, Verdict, to_json
 from tests.unit.fleet.fakes import World
 from tests.unit.supervisor.fakes import run
@@ -112,17 +113,18 @@ def test_the_live_view_has_a_row_for_each_host() -> None:
         with LiveHosts("patrol", ("a", "b"), writer=writer, console=console) as live:
             for each in _said():
                 live(each["host"], each)
-            live("b", {"host": "b", "event": "run", "nodes": ["/camera", "/lamp"], "processes": []})
-            live(
-                "b",
-                {
-                    "host": "b",
-                    "event": "node",
-                    "node": "/lamp",
-                    "reach": "active",
-                    "state": "active",
-                },
+            started = RunStarted(
+                system="patrol",
+                domain_id=7,
+                rmw="rmw_fastrtps_cpp",
+                discovery_range="subnet",
+                nodes=("/camera", "/lamp"),
+                processes=(),
+                log_directory="/tmp",
             )
+            active = NodeChanged(node="/lamp", reach=Reach.ACTIVE, state="active", connected=True)
+            for event in (started, active):
+                live("b", {"host": "b", **to_record(event)})
     finally:
         writer.close()
         os.close(read)
@@ -131,6 +133,50 @@ def test_the_live_view_has_a_row_for_each_host() -> None:
     assert "-2500.0 ms ± 1.0" in text
     assert "1/2" in text
     assert "system active on all hosts (a, b)" in text
+
+
+JUNK = (
+    b" ",
+    b"\xff\x00\x1b[2J",
+    b"null",
+    b"[" * 100_000,
+    b'{"event":["run"]}',
+    b'{"event":"run","nodes":7}',
+    b'{"event":"node","node":"/x","reach":"flying"}',
+    b'{"event":"verdict","verdict":{"verdict":"great"}}',
+    b'{"event":"end","host":""}',
+    b'{"event":"clock"}',
+    b'{"event":"host","state":"\\u001b[2J"}',
+    b'{"event":"stopped","exit_code":"none","host":"a"}',
+    b'{"verdict":[],"run":7}',
+    b'{"event":"system","reached":"\\u001b]0;x\\u0007","elapsed_s":1}',
+    b'{"event":"log","process":"n","stream":"stdout","line":"\\u001b[31mred"}',
+)
+
+
+def test_nothing_that_a_host_says_ends_the_run_speaks_for_another_or_reaches_the_terminal() -> None:
+    world = World()
+    world.host("a")
+    world.host("b", junk=JUNK)
+    assert run(world.run(stop_after_s=3.0)) is ExitCode.OK
+    for kind in ("end", "active"):
+        assert len(world.of(kind)) == 1
+    assert {each["host"] for each in world.said if each.get("event") == "stopped"} == {"b"}
+    sink, screen = Lines(), io.StringIO()
+    read, write = os.pipe()
+    writer = Writer(write, "a pipe", marker=str)
+    try:
+        console = Console(file=screen, width=120, height=30, force_terminal=True)
+        with LiveHosts("patrol", ("a", "b"), writer=writer, console=console) as live:
+            for output in (PlainHosts(sink), JsonHosts(sink), live):
+                for each in world.said:
+                    output(each["host"], each)
+    finally:
+        writer.close()
+        os.close(read)
+        os.close(write)
+    assert all(line.rstrip("\n").isprintable() for line, _ in sink.lines)
+    assert "\x1b]0;" not in screen.getvalue()
 
 
 @pytest.mark.parametrize(

@@ -27,6 +27,8 @@ class Supervisor:
         self.is_active = False
         self.exit_code: int | None = None
         self._loop = asyncio.get_running_loop()
+        for each in host.junk:
+            self._loop.call_later(0.1, host.say, each)
         if host.active_s is not None:
             self._loop.call_later(host.active_s, self.activate)
         if host.fails_s is not None:
@@ -91,6 +93,7 @@ class FakeTransport:
         ahead_s: its clock.
         cut_at: the order upon which the link is cut, as it comes.
         heals_s: how long after.
+        junk: lines that its supervisor writes besides.
         stderr: of a connection that brings no agent; empty for one that does.
     """
 
@@ -113,6 +116,7 @@ class FakeTransport:
     channel: FakeChannel | None = None
     starts: int = 0
     downs: int = 0
+    junk: tuple[bytes, ...] = ()
 
     @property
     def destination(self) -> str:
@@ -253,7 +257,7 @@ class World:
 
     @staticmethod
     def _is(record: Record, kind: str, host: str) -> bool:
-        return record["event"] == kind and record["host"] == host
+        return record.get("event") == kind and record["host"] == host
 
 
 CUT_S = coordinator.CUT_S
