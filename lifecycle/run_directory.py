@@ -8,7 +8,6 @@ import rclpy.
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import errno
 import fcntl
 import os
@@ -22,6 +21,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from lifecycle import dataclasses
 from lifecycle.errors import UsageError
 
 if TYPE_CHECKING:

@@ -12,7 +12,6 @@ substitution. The processes that it describes are not started.
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import importlib
 import os
 import re
@@ -23,6 +22,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError, UsageError
 from lifecycle.export import Noted, Tree, comment, to_yaml
 from lifecycle.manifest import ParameterValue

@@ -7,7 +7,6 @@ nothing: it is opened before the rest of a command is imported.
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import stat
 from collections.abc import Callable
@@ -17,6 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from lifecycle import dataclasses
 from lifecycle.errors import ExitCode, LifecycleError, UsageError
 from lifecycle.printable import lines
 

@@ -6,11 +6,11 @@ assigned to their nodes, everything that the graph does not show named as a gap.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import re
 from collections.abc import Iterable, Mapping
 
+from lifecycle import dataclasses
 from lifecycle.export.programs import (
     CapturedProgram,
     CapturedRun,

@@ -11,13 +11,13 @@ apps/v1; the Compose Specification.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping
 
 import yaml
 
+from lifecycle import dataclasses
 from lifecycle.errors import ExitCode
 from lifecycle.plan import Plan
 from lifecycle.run_directory import run_name

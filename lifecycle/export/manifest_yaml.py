@@ -8,13 +8,13 @@ give the same text. What is written passes `lifecycle check`. Pure.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import re
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Union
 
+from lifecycle import dataclasses
 from lifecycle.export.captured import (
     TARGETS,
     CapturedEndpoint,

@@ -7,13 +7,13 @@ was and the manifest appends nothing to it. Pure but for looking whether paramet
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import re
 import tempfile
 from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 
+from lifecycle import dataclasses
 from lifecycle.manifest import (
     EndpointKind,
     RosArguments,

@@ -11,13 +11,13 @@ name; how names become DDS topics, `rt/`, `rq/…Request`, `rr/…Reply`
 
 from __future__ import annotations
 
-import dataclasses
 import datetime as dt
 import itertools
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping
 
+from lifecycle import dataclasses
 from lifecycle.manifest import EndpointKind, RunKind
 from lifecycle.plan import Plan, PlannedNode, PlannedProcess
 from lifecycle.verify import GRAPH_TOPIC, NODE_SERVICES, OUR_SERVICES, supervisor_endpoints
@@ -250,7 +250,10 @@ def _supervisor_profile(plan: Plan, machine: str) -> Profile:
         allowed |= {(kind, topic), (kind, f"{topic}_pulse")}
     several = len({each.machine for each in plan.nodes}) > 1
     allowed |= supervisor_endpoints(
-        plan.system, machine if several else "", plan.policy.ros_interface
+        plan.system,
+        machine if several else "",
+        plan.policy.ros_interface,
+        () if several else [each.name for each in plan.modes],
     )
     return Profile(namespace="/", name="_lifecycle_observer", allowed=frozenset(allowed))
 

@@ -11,13 +11,12 @@ arrives shows whether something before it was lost.
 
 from __future__ import annotations
 
-import dataclasses
 import enum
 import secrets
 import time
 from typing import ClassVar
 
-from lifecycle import codec
+from lifecycle import codec, dataclasses
 from lifecycle.errors import LifecycleError
 
 VERSION = 1

@@ -9,10 +9,10 @@ a publisher with a subscription. Whether two are matched is judged as `lifecycle
 
 from __future__ import annotations
 
-import dataclasses
 import enum
 from collections.abc import Iterable, Sequence
 
+from lifecycle import dataclasses
 from lifecycle.graph.messages import (
     ConnectionEstablished,
     ConnectionLost,

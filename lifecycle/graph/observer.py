@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import dataclasses
 import functools
 import logging
 import typing
 from collections.abc import Callable, Collection, Iterable
 from typing import Protocol
 
+from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
 from lifecycle.graph.events import GraphEvents
 from lifecycle.graph.messages import GraphMessage, Heartbeat

@@ -10,13 +10,13 @@ public method may be called from any thread, and what it returns does not change
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import logging
 import threading
 import typing
 from collections.abc import Callable, Mapping
 
+from lifecycle import dataclasses
 from lifecycle.graph.events import GraphEvents
 from lifecycle.graph.messages import (
     ConfigurationChanged,

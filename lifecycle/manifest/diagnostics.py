@@ -6,11 +6,11 @@ that a user sees all findings at once. Pure.
 
 from __future__ import annotations
 
-import dataclasses
 import enum
 from collections.abc import Iterable
 from typing import Annotated
 
+from lifecycle import dataclasses
 from lifecycle.codec import Positive, says
 from lifecycle.errors import ExitCode, LifecycleError
 

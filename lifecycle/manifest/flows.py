@@ -9,10 +9,10 @@ interface definitions; starts nothing.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
+from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.installed_types import bounded_size
 from lifecycle.manifest.model import (

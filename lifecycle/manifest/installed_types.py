@@ -17,7 +17,6 @@ the file system.
 
 from __future__ import annotations
 
-import dataclasses
 import difflib
 import enum
 import functools
@@ -28,6 +27,7 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
+from lifecycle import dataclasses
 from lifecycle.manifest.schema import nearest
 
 _INDEX = Path("share", "ament_index", "resource_index")

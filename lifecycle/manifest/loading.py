@@ -10,7 +10,6 @@ Touches the file system; needs no ROS.
 
 from __future__ import annotations
 
-import dataclasses
 import ipaddress
 import os
 import re
@@ -18,10 +17,12 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 
+from lifecycle import dataclasses
 from lifecycle.manifest.building import (
     Findings,
     build_data_layer,
     build_discovery,
+    build_modes,
     build_node,
     build_on_violation,
     quantities,
@@ -34,7 +35,6 @@ from lifecycle.manifest.model import (
     Link,
     Machine,
     Manifest,
-    Mode,
     Network,
     Node,
     Policy,
@@ -155,14 +155,7 @@ def build_manifest(
         data_layer=build_data_layer(root, found),
         policy=_policy(root),
         on_violation=build_on_violation(root),
-        modes=tuple(
-            Mode(
-                name=name,
-                inactive=tuple(each.value.text for each in cursor.items("inactive")),
-                at=cursor.key_at,
-            )
-            for name, cursor in root.entries("modes")
-        ),
+        modes=build_modes(root, found),
         nodes=nodes,
         links=tuple(_link(each) for each in root.items("links") if each.place not in unsound),
         positions=section_positions(root),
@@ -345,7 +338,9 @@ def _without_left_out(manifest: Manifest) -> Manifest:
     )
     modes = tuple(
         dataclasses.replace(
-            mode, inactive=tuple(key for key in mode.inactive if not is_left_out(key))
+            mode,
+            inactive=tuple(key for key in mode.inactive if not is_left_out(key)),
+            parameters=tuple(each for each in mode.parameters if not is_left_out(each.node)),
         )
         for mode in manifest.modes
     )

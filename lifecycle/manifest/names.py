@@ -9,12 +9,12 @@ of a remap rule of `ros2 run … --ros-args -r RULE`, as rcl's argument parser h
 
 from __future__ import annotations
 
-import dataclasses
 import enum
 import functools
 import re
 from collections.abc import Iterable, Mapping, Sequence
 
+from lifecycle import dataclasses
 from lifecycle.errors import ExitCode, LifecycleError
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.yaml.yaml_parser import quote

@@ -5,11 +5,12 @@ Owns: the one rule of QoS compatibility that static checks and live verification
 
 from __future__ import annotations
 
-import dataclasses
 import enum
 import types
 from collections.abc import Collection, Mapping
 from typing import TypeVar
+
+from lifecycle import dataclasses
 
 
 class History(enum.Enum):

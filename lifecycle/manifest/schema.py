@@ -9,7 +9,6 @@ which a document that fits needs no jsonschema. Pure but for reading the shipped
 
 from __future__ import annotations
 
-import dataclasses
 import difflib
 import functools
 import itertools
@@ -19,6 +18,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
+from lifecycle import dataclasses
 from lifecycle.manifest.diagnostics import Diagnostic
 from lifecycle.manifest.yaml.document import Document, Place, error
 from lifecycle.manifest.yaml.yaml_parser import (

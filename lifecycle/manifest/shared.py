@@ -9,9 +9,9 @@ done when a process fails (`restart:` …) all nodes of the process share, which
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
 
+from lifecycle import dataclasses
 from lifecycle.manifest.building import Findings, build_parameters
 from lifecycle.manifest.checks.parameters import is_implicit, read_sections, shown_path
 from lifecycle.manifest.checks.system import full_name

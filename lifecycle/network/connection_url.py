@@ -16,7 +16,6 @@ becomes is decided in middleware/. Pure.
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import difflib
 import functools
 import ipaddress
@@ -25,6 +24,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 from urllib.parse import parse_qsl, urlencode, urlsplit
 
+from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError
 from lifecycle.network.medium import SCHEMES, Medium
 

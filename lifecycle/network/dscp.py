@@ -11,12 +11,12 @@ are always shown side by side.
 
 from __future__ import annotations
 
-import dataclasses
 import difflib
 import functools
 import re
 from typing import Annotated
 
+from lifecycle import dataclasses
 from lifecycle.codec import Octet, read_table, says
 
 MAX_DSCP = 63

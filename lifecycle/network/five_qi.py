@@ -8,10 +8,10 @@ configured in that network. Pure.
 
 from __future__ import annotations
 
-import dataclasses
 import enum
 import functools
 
+from lifecycle import dataclasses
 from lifecycle.codec import from_json, read_table
 from lifecycle.network.dscp import parse_dscp
 

@@ -14,9 +14,10 @@ datagram of its own, with ports.
 
 from __future__ import annotations
 
-import dataclasses
 import enum
 import socket
+
+from lifecycle import dataclasses
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

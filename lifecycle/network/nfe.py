@@ -17,12 +17,12 @@ of the tuple; so publishers are compared with publishers and subscriptions with 
 
 from __future__ import annotations
 
-import dataclasses
 import enum
 import functools
 import ipaddress
 from collections.abc import Iterable, Sequence
 
+from lifecycle import dataclasses
 from lifecycle.codec import DscpValue, FlowLabel, PortOrNone
 from lifecycle.network.medium import Medium
 

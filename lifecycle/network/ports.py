@@ -10,9 +10,10 @@ ports of a running system are read from it, never inferred from here.
 
 from __future__ import annotations
 
-import dataclasses
 import enum
 from collections.abc import Callable
+
+from lifecycle import dataclasses
 
 PB = 7400
 """Port base."""

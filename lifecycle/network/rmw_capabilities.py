@@ -6,10 +6,10 @@ is feasible. The reality at run time decides; this only fails earlier. Pure.
 
 from __future__ import annotations
 
-import dataclasses
 import enum
 import functools
 
+from lifecycle import dataclasses
 from lifecycle.codec import read_table
 from lifecycle.network.nfe import UniqueRequirement
 

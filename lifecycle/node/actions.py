@@ -11,7 +11,6 @@ that its name is what is left of theirs. `manifest.names.resolve` is the same wi
 
 from __future__ import annotations
 
-import dataclasses
 import inspect
 import threading
 import traceback
@@ -20,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from rclpy.node import Node
 
+from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest import action_of, hidden_names
 from lifecycle.node.author.handlers import ActionHandler

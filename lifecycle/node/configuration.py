@@ -13,7 +13,6 @@ Communication Negotiation*, "Node Configuration Interface".
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import hashlib
 import os
@@ -26,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 from rclpy.exceptions import InvalidHandle
 from rclpy.utilities import get_rmw_implementation_identifier
 
-from lifecycle import codec
+from lifecycle import codec, dataclasses
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest import EndpointKind, QosProfile
 from lifecycle.middleware import (

@@ -9,7 +9,6 @@ acknowledgements. Pure.
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
 import os
@@ -17,6 +16,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
+from lifecycle import dataclasses
 from lifecycle.manifest import (
     Node,
     ParameterValue,

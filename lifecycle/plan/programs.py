@@ -8,13 +8,13 @@ is an error; what only running it, or another host, can show is named as unresol
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
+from lifecycle import dataclasses
 from lifecycle.manifest import (
     Authority,
     Diagnostic,

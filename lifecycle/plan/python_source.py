@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import ast
 import builtins
-import dataclasses
 import importlib.machinery
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest import EndpointKind, did_you_mean
 

@@ -11,10 +11,10 @@ for all of its partners that stayed: none of them can know that port.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Collection, Iterator, Mapping
 from types import MappingProxyType
 
+from lifecycle import dataclasses
 from lifecycle.network import ConnectionUrl, Peer, parse
 from lifecycle.plan.connections.hosts import PortPool, contacts_of
 from lifecycle.plan.model import ParticipantConnections, Plan, PlanError, PlannedNode

@@ -6,10 +6,10 @@ and the processes that it starts, on a terminal, on disk or on the network, goes
 
 from __future__ import annotations
 
-import dataclasses
 import re
 from collections.abc import Iterable
 
+from lifecycle import dataclasses
 from lifecycle.plan.model import Plan
 
 REDACTED = "(redacted)"

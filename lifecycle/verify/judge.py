@@ -8,9 +8,9 @@ its arguments. Pure.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
+from lifecycle import dataclasses
 from lifecycle.manifest import EndpointKind, EndpointPolicy, UniqueHow
 from lifecycle.network import Medium, NetworkFlowEndpoint, TransportProtocol, is_ip
 from lifecycle.plan import Plan

@@ -6,11 +6,11 @@ what is left over. All rules read the result, so that they agree on what is the 
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import operator
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
+from lifecycle import dataclasses
 from lifecycle.manifest import EndpointKind
 from lifecycle.plan import Plan, PlannedEndpoint, PlannedFlow, PlannedNode
 from lifecycle.verify.observation import (

@@ -6,13 +6,12 @@ schemas/node_configuration.v1.schema.json), which nodes report and observers col
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import ipaddress
 import re
 from collections.abc import Iterable
 
-from lifecycle import codec
+from lifecycle import codec, dataclasses
 from lifecycle.codec import Count, DscpValue
 from lifecycle.manifest import EndpointKind, ParameterValue, QosProfile
 from lifecycle.network import NetworkFlowEndpoint, UniqueRequirement

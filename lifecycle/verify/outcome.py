@@ -6,9 +6,10 @@ shows them, which loads no plan, no manifest and no rule. Pure.
 
 from __future__ import annotations
 
-import dataclasses
 import enum
 from collections.abc import Iterable
+
+from lifecycle import dataclasses
 
 
 class Outcome(enum.Enum):

@@ -9,12 +9,12 @@ NFEs on that address are judged: it is by this one that flows between machines g
 
 from __future__ import annotations
 
-import dataclasses
 import operator
 from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Protocol
 
+from lifecycle import dataclasses
 from lifecycle.manifest import EndpointKind
 from lifecycle.network import (
     InternetProtocol,

@@ -5,10 +5,10 @@ Owns: the result types of `verify` (schema: schemas/verdict.v1.schema.json). Pur
 
 from __future__ import annotations
 
-import dataclasses
 import enum
 from typing import Annotated
 
+from lifecycle import dataclasses
 from lifecycle.codec import DscpValue, Octet, says
 from lifecycle.manifest import EndpointKind, UniqueHow
 from lifecycle.network import FlowTuple, Medium, NetworkFlowEndpoint, UniqueRequirement, flow_tuples

@@ -8,10 +8,10 @@ judgement to the next while all that they are made of does, and what was found o
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping
 from typing import Any, Generic, TypeVar
 
+from lifecycle import dataclasses
 from lifecycle.manifest import (
     Durability,
     EndpointKind,

@@ -54,9 +54,7 @@ PROCESSES = (
     ),
     Process(name="core", nodes=("core",), takes_down=_ALL),
     Process(name="fragile", nodes=("fragile",), takes_down=("fragile",), burst=2),
-    Process(
-        name="lone", nodes=("lone",), restart="no", takes_down=("lone",), violation="stop"
-    ),
+    Process(name="lone", nodes=("lone",), restart="no", takes_down=("lone",), violation="stop"),
     Process(name="pool", nodes=("pool",), takes_down=("pool", "part"), orders=False),
 )
 NODES = _ALL
@@ -230,8 +228,10 @@ def follows(state: State, done: Round) -> tuple[Expectation, State]:
     }
     found = [each for each in done.faults if each.kind in VIOLATES]
     violated = {
-        (each.target, "param.value-differs" if each.kind is Kind.ALTER else
-         "graph.undeclared-publisher")
+        (
+            each.target,
+            "param.value-differs" if each.kind is Kind.ALTER else "graph.undeclared-publisher",
+        )
         for each in found
     }
     heal, consequence = _consequence(done, found)

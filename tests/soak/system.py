@@ -46,7 +46,10 @@ def manifest(directory: Path, domain_id: int, mark: str) -> Path:
             if not process.orders:
                 continue
             nodes[key] = {
-                "run": {"python": f"tests.soak.nodes:{_CLASSES.get(key, 'Soaked')}", "environment": variables},
+                "run": {
+                    "python": f"tests.soak.nodes:{_CLASSES.get(key, 'Soaked')}",
+                    "environment": variables,
+                },
                 "process": process.name,
                 "restart": process.restart,
                 "timeouts": {
@@ -54,8 +57,9 @@ def manifest(directory: Path, domain_id: int, mark: str) -> Path:
                     "start_s": _STEP_S,
                     "silent_s": SILENT_S,
                 },
-                "interface": {"parameters": {"rate": {"type": "double",
-                                                      "default_value": DECLARED_RATE}}},
+                "interface": {
+                    "parameters": {"rate": {"type": "double", "default_value": DECLARED_RATE}}
+                },
             }
             if process.restart != "no":
                 nodes[key] |= {"watchdog_sec": WATCHDOG_S}

@@ -24,6 +24,7 @@ PURE_ROOMS = (
     "run_directory",
     "programming.rules.registry",
     "codec",
+    "dataclasses",
     "errors",
 )
 

@@ -7,7 +7,6 @@ ever skipped.
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
 import re
@@ -17,6 +16,7 @@ from urllib.parse import quote
 
 import click
 
+from lifecycle import dataclasses
 from lifecycle.cli.common import (
     format_option,
     machine_option,

@@ -5,12 +5,12 @@ Owns: the verb and what it prints; the arithmetic is `lifecycle.network`'s.
 
 from __future__ import annotations
 
-import dataclasses
 import os
 from pathlib import Path
 
 import click
 
+from lifecycle import dataclasses
 from lifecycle.cli.common import (
     assignments_argument,
     completing,

@@ -6,9 +6,9 @@ Owns: the picture as a whole, its nodes and where they are. The matching of plan
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterable, Mapping
 
+from lifecycle import dataclasses
 from lifecycle.export.picture.lines import pictured_flows, pictured_lines, pictured_participants
 from lifecycle.export.picture.model import (
     Basis,

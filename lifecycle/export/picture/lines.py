@@ -7,9 +7,9 @@ matching planned with reported participants, and which carries what. Pure.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 
+from lifecycle import dataclasses
 from lifecycle.export.picture.model import (
     Basis,
     LineKind,

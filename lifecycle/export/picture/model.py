@@ -11,10 +11,10 @@ distinguish; each also has a symbol, and its label is written beside it.
 
 from __future__ import annotations
 
-import dataclasses
 import enum
 from collections.abc import Callable, Mapping, Sequence
 
+from lifecycle import dataclasses
 from lifecycle.codec import DomainId, Positive
 from lifecycle.verify import Finding, FlowReport, Outcome, Verdict, View
 

@@ -7,11 +7,11 @@ two.
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import re
 from collections.abc import Callable, Iterable, Iterator
 
+from lifecycle import dataclasses
 from lifecycle.export.picture.lines import OWN
 from lifecycle.export.picture.model import (
     DASHES,

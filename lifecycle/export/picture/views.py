@@ -9,12 +9,12 @@ without a font. Pure.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import re
 import textwrap
 from collections.abc import Iterable, Sequence
 
+from lifecycle import dataclasses
 from lifecycle.export.picture.lines import OWN
 from lifecycle.export.picture.model import (
     PRESENCE_WORDS,

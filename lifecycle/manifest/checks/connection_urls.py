@@ -6,10 +6,10 @@ check.connection-urls. Pure.
 
 from __future__ import annotations
 
-import dataclasses
 import ipaddress
 from collections.abc import Iterator
 
+from lifecycle import dataclasses
 from lifecycle.manifest.checks.system import DeclaredSystem, spell
 from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.model import (

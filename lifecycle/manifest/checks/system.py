@@ -9,10 +9,10 @@ services, rcl_lifecycle's services and event. Pure.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Mapping
 
+from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import Endpoint, EndpointKind, EndpointPolicy, Manifest, Node

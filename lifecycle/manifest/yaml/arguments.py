@@ -9,10 +9,10 @@ is one whole unquoted value.
 
 from __future__ import annotations
 
-import dataclasses
 import re
 from collections.abc import Collection, Mapping
 
+from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.diagnostics import Diagnostic
 from lifecycle.manifest.schema import did_you_mean

@@ -8,7 +8,6 @@ it as well. Pure.
 
 from __future__ import annotations
 
-import dataclasses
 import enum
 import functools
 import json
@@ -18,6 +17,7 @@ from typing import Any, TypeVar, get_type_hints
 
 import msgspec
 
+from lifecycle import dataclasses
 from lifecycle.manifest.diagnostics import Diagnostic, Position, Severity
 
 Scalar = bool | int | float | str | None

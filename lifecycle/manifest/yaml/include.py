@@ -7,10 +7,10 @@ existence only.
 
 from __future__ import annotations
 
-import dataclasses
 import os
 from pathlib import Path
 
+from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.building import Findings
 from lifecycle.manifest.diagnostics import Position

@@ -10,7 +10,6 @@ A program is run as its words stand, by no shell, once in a load however often i
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import os
 import re
 import selectors
@@ -23,6 +22,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import IO
 
+from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.diagnostics import ManifestError
 from lifecycle.manifest.installed_types import find_resource, list_resources, search_prefixes

@@ -16,7 +16,6 @@ number.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import re
 from collections.abc import Iterator, Mapping
@@ -24,6 +23,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 import lazy_loader
 
+from lifecycle import dataclasses
 from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position
 from lifecycle.manifest.yaml.document import Document, Place, Scalar, Value, error, spell_place
 

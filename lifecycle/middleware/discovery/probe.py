@@ -16,7 +16,6 @@ our participant's port, and to a socket of ours that counts the participants.
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import ipaddress
 import os
 import socket
@@ -24,6 +23,7 @@ import struct
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
+from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds.dscp import own_udp_socket
 from lifecycle.middleware.fastdds.participant_profile import default_profile

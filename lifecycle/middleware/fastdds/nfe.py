@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -30,6 +29,7 @@ from rclpy.subscription import Subscription
 from rclpy.type_support import check_is_valid_msg_type
 from rclpy.validate_topic_name import validate_topic_name
 
+from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest import QosProfile
 from lifecycle.middleware.fastdds.settings import noted_shared_memory

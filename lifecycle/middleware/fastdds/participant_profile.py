@@ -15,13 +15,13 @@ of the table exist: who they are and where is announced, what they publish is no
 from __future__ import annotations
 
 import copy
-import dataclasses
 import ipaddress
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
+from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds import url_profile
 from lifecycle.middleware.fastdds.profiles import DEFAULT_FILE, PROFILES_FILE_VARIABLE

@@ -8,13 +8,13 @@ exists and receives nothing. Linux: sockets are read from proc(5). Must not impo
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import ipaddress
 import socket
 import struct
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
+from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds.url_profile import UrlTransport, families
 from lifecycle.network import CONNECTABLE, ConnectionUrl, Medium

@@ -11,12 +11,12 @@ DDS would send everything twice.
 
 from __future__ import annotations
 
-import dataclasses
 import ipaddress
 import os
 from collections.abc import Iterable, Sequence
 from xml.etree import ElementTree as ET
 
+from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds.profiles import child as _child
 from lifecycle.middleware.fastdds.profiles import locator as _locator

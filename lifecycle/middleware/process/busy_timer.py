@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import dataclasses
 import enum
 import functools
 import mmap
@@ -28,6 +27,7 @@ import time
 import typing
 from pathlib import Path
 
+from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.process.control import CLOCK_MONOTONIC, TimerSpec, libc
 

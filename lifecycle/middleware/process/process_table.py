@@ -6,13 +6,13 @@ environment variables matter to who starts it again. Reads /proc, and runs nothi
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import re
 import shutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+from lifecycle import dataclasses
 from lifecycle.export import CapturedProgram
 from lifecycle.middleware.discovery.dead_peers import is_of_process
 from lifecycle.plan import is_secret

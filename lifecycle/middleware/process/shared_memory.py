@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import dataclasses
 import fcntl
 import os
 import re
@@ -30,6 +29,7 @@ import struct
 from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path
 
+from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.process.control import libc
 

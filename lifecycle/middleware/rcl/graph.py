@@ -8,7 +8,6 @@ rmw_cyclonedds announce hashes since Iron.
 
 from __future__ import annotations
 
-import dataclasses
 import operator
 import os
 import threading
@@ -19,6 +18,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 import rclpy
 from rclpy.node import Node
 
+from lifecycle import dataclasses
 from lifecycle.export import CapturedProgram
 from lifecycle.manifest import EndpointKind, join
 from lifecycle.middleware.discovery.dead_peers import (

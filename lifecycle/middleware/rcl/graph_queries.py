@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import dataclasses
 import functools
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -25,6 +24,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, LivelinessPolicy, ReliabilityPolicy
 
+from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest import (
     Durability,

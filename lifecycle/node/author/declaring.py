@@ -7,13 +7,13 @@ an endpoint: its handler and hints.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any
 
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
+from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest import EndpointKind, EndpointPolicy, Position, QosProfile
 from lifecycle.middleware import from_rclpy

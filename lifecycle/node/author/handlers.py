@@ -7,11 +7,11 @@ an endpoint. Pure: knows no rclpy.
 
 from __future__ import annotations
 
-import dataclasses
 import difflib
 from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
 
+from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest import EndpointKind
 from lifecycle.plan import PlannedEndpoint

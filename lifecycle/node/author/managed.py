@@ -9,7 +9,6 @@ that authors have every other attribute name to themselves.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Collection
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +19,7 @@ from rclpy.node import Node
 from rclpy.task import Future
 from rclpy.timer import Timer
 
+from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest import EndpointKind
 from lifecycle.node import configuration

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import contextvars
-import dataclasses
 import enum
 import importlib
 import importlib.util
@@ -22,6 +21,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
+from lifecycle import dataclasses
 from lifecycle.errors import BringUpError, LifecycleError
 from lifecycle.manifest import EndpointPolicy, Position, Run, RunKind
 from lifecycle.node.author.handlers import nearest

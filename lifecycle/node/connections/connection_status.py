@@ -9,7 +9,6 @@ which it happened. See *Topological Discovery and Communication Negotiation*, "N
 from __future__ import annotations
 
 import collections
-import dataclasses
 import enum
 import functools
 import inspect
@@ -17,6 +16,7 @@ from collections.abc import Callable
 from collections.abc import Mapping as AbstractMapping
 from typing import TYPE_CHECKING, Any
 
+from lifecycle import dataclasses
 from lifecycle.node.connections.connections import Connection, Connections
 from lifecycle.node.endpoints.mapping import Key, Mapping, count_peers
 

@@ -7,11 +7,11 @@ Negotiation*; which endpoint is on which connection is data_layer.py's.
 
 from __future__ import annotations
 
-import dataclasses
 import re
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
+from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError, MiddlewareError
 from lifecycle.middleware import FlowParticipant, has_shared_memory
 from lifecycle.network import ConnectionUrl

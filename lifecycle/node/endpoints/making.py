@@ -6,7 +6,6 @@ what exists where is data_layer.py's.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -15,6 +14,7 @@ from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 from rclpy.qos import qos_profile_system_default
 
+from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest import EndpointKind, QosProfile
 from lifecycle.middleware import create_publisher, create_subscription, to_rclpy

@@ -8,7 +8,6 @@ author's callback that awaits something must not delay the event of a peer that 
 
 from __future__ import annotations
 
-import dataclasses
 import typing
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
@@ -21,6 +20,7 @@ from rclpy.event_handler import (
 )
 from rclpy.publisher import Publisher
 
+from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest import EndpointKind
 from lifecycle.node.author.handlers import nearest

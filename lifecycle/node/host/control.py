@@ -10,7 +10,6 @@ down, unless it was told to KEEP. Imports no rclpy.
 
 from __future__ import annotations
 
-import dataclasses
 import enum
 import importlib
 import logging
@@ -24,7 +23,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import NoReturn
 
-from lifecycle import codec
+from lifecycle import codec, dataclasses
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest import DiscoveryRange
 from lifecycle.plan import ParticipantConnections, PlannedNode

@@ -16,7 +16,7 @@ import socket
 from collections.abc import Iterable
 from typing import NoReturn
 
-from lifecycle import codec
+from lifecycle import codec, dataclasses
 from lifecycle.manifest import DiscoveryRange
 from lifecycle.node.host.control import Command, Event, HostChannel, HostSpec, Operation, give_up
 from lifecycle.plan import PlannedNode
@@ -103,7 +103,14 @@ def _rehearse() -> None:
     command = Command(id=0, node="", operation=Operation.CONFIGURE)
     codec.from_json(codec.to_json(command), Command)
     codec.to_json(Event(kind="ready"))
-    LifecycleMachine()
+    LifecycleMachine().resolve(0, "configure")
+    dataclasses.make_constructors(
+        "lifecycle.node",
+        "lifecycle.middleware",
+        "lifecycle.verify.observation",
+        "lifecycle.verify.outcome",
+        "lifecycle.network.ports",
+    )
 
 
 def _load(name: str) -> None:

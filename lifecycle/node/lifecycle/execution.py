@@ -9,13 +9,13 @@ Python: it is judged when it returns, and a supervisor that lost patience ends t
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import inspect
 import time
 import traceback
 from collections.abc import Callable, Coroutine, Generator
 from typing import Any
 
+from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError
 from lifecycle.node.lifecycle.machine import CallbackOutcome
 

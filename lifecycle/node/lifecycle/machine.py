@@ -11,12 +11,12 @@ A transition has two halves, as in rcl: a *request* moves a primary state into a
 
 from __future__ import annotations
 
-import dataclasses
 import enum
 from collections.abc import Callable
 
 import transitions
 
+from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError
 
 

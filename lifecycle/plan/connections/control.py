@@ -11,9 +11,9 @@ fixed, not shared memory beside UDP. Pure.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 
+from lifecycle import dataclasses
 from lifecycle.manifest import Discovery, DiscoveryMode, FlowTransport, RunKind
 from lifecycle.network import (
     DEFAULT_TCP,

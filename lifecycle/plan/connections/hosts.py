@@ -11,10 +11,10 @@ Pure.
 
 from __future__ import annotations
 
-import dataclasses
 import ipaddress
 from collections.abc import Collection, Iterable, Mapping, Sequence
 
+from lifecycle import dataclasses
 from lifecycle.manifest import (
     DiscoveryMode,
     DiscoveryRange,

@@ -14,9 +14,9 @@ topics `negotiate` finds the like; what is negotiated while the system runs is j
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
+from lifecycle import dataclasses
 from lifecycle.manifest import (
     ConnectionDeclaration,
     DataLayerSource,

@@ -6,8 +6,7 @@ Pure.
 
 from __future__ import annotations
 
-import dataclasses
-
+from lifecycle import dataclasses
 from lifecycle.manifest import EndpointKind, FlowTransport, QosProfile
 from lifecycle.network import CONNECTABLE, DEFAULT_TCP, RMW_DEFAULT, Medium, Peer
 from lifecycle.plan.connections.hosts import Contact

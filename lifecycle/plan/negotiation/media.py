@@ -6,9 +6,9 @@ and why. Pure.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Collection
 
+from lifecycle import dataclasses
 from lifecycle.manifest import FlowTransport
 from lifecycle.network import CONNECTABLE, Medium, is_fragmented, max_unfragmented
 from lifecycle.plan.negotiation.data_layer import Party, PartyEndpoint

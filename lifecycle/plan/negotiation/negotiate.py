@@ -9,11 +9,11 @@ order of the parties. Pure.
 
 from __future__ import annotations
 
-import dataclasses
 import ipaddress
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
+from lifecycle import dataclasses
 from lifecycle.manifest import EndpointKind, FlowTransport
 from lifecycle.network import LOOPBACK, UDP_UNICAST, ConnectionUrl, Medium, medium_of, parse
 from lifecycle.plan.connections.hosts import (

@@ -7,10 +7,10 @@ while it does. Pure.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 
+from lifecycle import dataclasses
 from lifecycle.manifest import (
     DataLayer,
     Discovery,

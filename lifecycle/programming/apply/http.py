@@ -9,7 +9,6 @@ of what is asked for.
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import email.utils
 import json
 import socket
@@ -21,6 +20,7 @@ from collections.abc import Collection, Mapping
 from typing import Any, NoReturn, Protocol
 from urllib.parse import quote, unquote, urlsplit
 
+from lifecycle import dataclasses
 from lifecycle.network import is_loopback
 from lifecycle.programming.apply.settings import Token
 from lifecycle.programming.apply.target import HttpError, MissingFeatureError, SettingsError

@@ -8,7 +8,6 @@ It holds ids and digests, never a credential.
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import enum
 import fcntl
 import hashlib
@@ -18,6 +17,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from lifecycle import dataclasses
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import UsageError
 from lifecycle.programming.apply.target import ProgrammingError

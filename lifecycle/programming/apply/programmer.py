@@ -8,7 +8,6 @@ flows remove` or `lifecycle down` ends it. Blocking: a supervisor has a thread f
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import socket
 import time
@@ -18,6 +17,7 @@ from typing import TypeVar
 
 import psutil
 
+from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError, UsageError
 from lifecycle.network import DscpMapping, canonical, dscp_mapping, is_loopback, parse_mapping
 from lifecycle.plan import Plan, PlannedNode

@@ -8,12 +8,12 @@ was lost. What a thing is and how it is asked for is the service's.
 from __future__ import annotations
 
 import abc
-import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar, cast
 
+from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError, UsageError
 from lifecycle.programming.apply.http import Api
 from lifecycle.programming.apply.ledger import (

@@ -22,7 +22,6 @@ traceback could show.
 
 from __future__ import annotations
 
-import dataclasses
 import errno
 import os
 import stat
@@ -34,6 +33,7 @@ from urllib.parse import urlsplit
 import msgspec
 import yaml
 
+from lifecycle import dataclasses
 from lifecycle.network import is_loopback
 from lifecycle.programming.apply.target import SettingsError
 

@@ -6,11 +6,11 @@ package. Pure.
 
 from __future__ import annotations
 
-import dataclasses
 import enum
 from collections.abc import Iterable, Sequence
 from typing import Protocol
 
+from lifecycle import dataclasses
 from lifecycle.errors import ExitCode, LifecycleError, UsageError
 from lifecycle.programming.rules.rules import FlowRule, asks
 

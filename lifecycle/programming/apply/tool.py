@@ -9,7 +9,6 @@ cancelled from another thread or a signal and pure but for its clock.
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import math
 import os
 import re
@@ -20,6 +19,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Protocol
 
+from lifecycle import dataclasses
 from lifecycle.codec import from_json
 from lifecycle.programming.apply.target import (
     MissingFeatureError,

@@ -8,10 +8,10 @@ server's ports, both ways, UDP and TCP alike.
 
 from __future__ import annotations
 
-import dataclasses
 import re
 from collections.abc import Iterable, Mapping
 
+from lifecycle import dataclasses
 from lifecycle.programming.rules.mobile import (
     DeviceEnd,
     Requests,

@@ -9,10 +9,10 @@ is the priority; here its lowest byte is the TOS byte, as Connext takes it, and 
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterable, Iterator, Sequence
 from xml.sax.saxutils import quoteattr
 
+from lifecycle import dataclasses
 from lifecycle.network import InternetProtocol, TransportProtocol, describe, tos
 from lifecycle.programming.rules.rules import FlowRule, LeftOut, named
 

@@ -6,11 +6,11 @@ devices, so a flow between two devices is asked for twice, once for each. Pure.
 
 from __future__ import annotations
 
-import dataclasses
 import ipaddress
 from collections.abc import Callable, Iterable, Mapping
 from typing import Generic, Protocol, TypeVar
 
+from lifecycle import dataclasses
 from lifecycle.codec import to_json
 from lifecycle.programming.rules.packet_filter import Direction, check_address
 from lifecycle.programming.rules.rules import FlowRule, LeftOut, asks

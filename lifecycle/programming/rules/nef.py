@@ -9,11 +9,11 @@ flows. The interface's schema does not look inside filter strings, so they are c
 
 from __future__ import annotations
 
-import dataclasses
 import enum
 import re
 from collections.abc import Iterable, Mapping
 
+from lifecycle import dataclasses
 from lifecycle.programming.rules.mobile import (
     DeviceEnd,
     Requests,

@@ -10,10 +10,10 @@ bits of the DSCP are written: ECN is the transport's (RFC 3168).
 
 from __future__ import annotations
 
-import dataclasses
 import re
 from collections.abc import Iterable, Iterator, Sequence
 
+from lifecycle import dataclasses
 from lifecycle.codec import to_json
 from lifecycle.network import InternetProtocol, code_points, describe, dscp_name
 from lifecycle.programming.rules.rules import FlowRule, LeftOut, asks, named

@@ -8,11 +8,11 @@ packet matches. Pure.
 
 from __future__ import annotations
 
-import dataclasses
 import enum
 import ipaddress
 import re
 
+from lifecycle import dataclasses
 from lifecycle.network import IpAddress
 
 PROTOCOL_NUMBERS = {"udp": 17, "tcp": 6}

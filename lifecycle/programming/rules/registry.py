@@ -7,12 +7,12 @@ network flow, for spreadsheets and other tools. Columns are only ever added at t
 from __future__ import annotations
 
 import csv
-import dataclasses
 import io
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from types import MappingProxyType
 from typing import TypeVar
 
+from lifecycle import dataclasses
 from lifecycle.network import DscpMapping, FlowTuple, dscp_name, tos
 from lifecycle.plan import Plan
 from lifecycle.programming.rules.camara import CamaraSettings, render_camara

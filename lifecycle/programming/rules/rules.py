@@ -9,10 +9,10 @@ for. Pure.
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
+from lifecycle import dataclasses
 from lifecycle.codec import to_json
 from lifecycle.manifest import EndpointKind
 from lifecycle.network import (

@@ -19,12 +19,12 @@ first place of each family.
 
 from __future__ import annotations
 
-import dataclasses
 import enum
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
+from lifecycle import dataclasses
 from lifecycle.network import InternetProtocol, describe, dscp_name, five_qi_of, parse_dscp, tos
 from lifecycle.programming.rules.rules import FlowRule, LeftOut, asks, named
 

@@ -12,10 +12,10 @@ what a negotiation asks before it waits: what it waits for must not in turn wait
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Protocol
 
+from lifecycle import dataclasses
 from lifecycle.errors import BringUpError
 from lifecycle.graph import set_within
 from lifecycle.manifest import Authority, Condition, DataLayerSource

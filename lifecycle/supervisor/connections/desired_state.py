@@ -7,9 +7,9 @@ case of the first wiring, of a change and of making again what was lost. Pure.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Collection, Mapping
 
+from lifecycle import dataclasses
 from lifecycle.node import Operation
 from lifecycle.plan import ParticipantConnections, PlannedNode
 from lifecycle.verify import NOT_WIRED, Finding, NodeConfiguration, Outcome, node_of

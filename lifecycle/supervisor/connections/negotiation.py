@@ -12,9 +12,9 @@ that were given out earlier, and those are in the nodes' reports.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Collection, Iterable, Iterator, Mapping
 
+from lifecycle import dataclasses
 from lifecycle.manifest import Authority, DataLayerSource, EndpointKind, EndpointPolicy
 from lifecycle.network import CONNECTABLE, RMW_DEFAULT, UniqueRequirement, parse
 from lifecycle.plan import (

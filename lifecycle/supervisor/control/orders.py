@@ -10,10 +10,10 @@ are carried out is gate/sequence.py's, what differs `plan.comparison`'s. Must no
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 import enum
 from collections.abc import Collection, Iterable, Iterator
 
+from lifecycle import dataclasses
 from lifecycle.codec import to_plain
 from lifecycle.errors import BringUpError, ExitCode, UsageError
 from lifecycle.manifest import DataLayerSource, did_you_mean

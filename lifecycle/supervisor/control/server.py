@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import dataclasses
 import socket
 from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from lifecycle import dataclasses
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import UsageError
 from lifecycle.plan import Plan

@@ -8,9 +8,9 @@ by themselves (node/author/managed.py); others obey every client. Must not impor
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 from collections.abc import Iterable
 
+from lifecycle import dataclasses
 from lifecycle.errors import BringUpError
 from lifecycle.node import Operation
 from lifecycle.plan import Plan

@@ -9,11 +9,11 @@ sequence.py's, when to restart and what to do about a violation policy/'s. Must 
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 import enum
 from collections.abc import Awaitable, Callable
 from typing import Any
 
+from lifecycle import dataclasses
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest import Consequence
 from lifecycle.supervisor.control.orders import (
@@ -267,7 +267,7 @@ class Holding:
             await work()
         except OutrunError:
             pass
-        except VerificationError as error:
+        except (VerificationError, NotBegunError) as error:
             self._emit(Notice(message=str(error)))
         except StepFailedError as error:
             failure = error

@@ -12,10 +12,10 @@ import rclpy.
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Protocol
 
+from lifecycle import dataclasses
 from lifecycle.graph import set_within
 from lifecycle.manifest import EndpointKind
 from lifecycle.plan import Plan

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import dataclasses
 import logging
 import os
 from collections.abc import Callable, Iterator
 from typing import Protocol
 
+from lifecycle import dataclasses
 from lifecycle.manifest import DiscoveryRange, RunKind
 from lifecycle.middleware import machine_id
 from lifecycle.plan import (

@@ -8,11 +8,11 @@ that ended is not silent but dead, see process_monitor.py. Must not import rclpy
 
 from __future__ import annotations
 
-import dataclasses
 import enum
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING
 
+from lifecycle import dataclasses
 from lifecycle.middleware import Overdue
 from lifecycle.supervisor.run.events import (
     Emitter,

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import dataclasses
 from collections.abc import Callable, Coroutine, Iterable, Mapping
 from typing import Any, Protocol
 
+from lifecycle import dataclasses
 from lifecycle.errors import BringUpError
 from lifecycle.manifest import RunKind
 from lifecycle.node import Operation

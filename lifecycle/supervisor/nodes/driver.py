@@ -7,11 +7,11 @@ rclpy; the services come from middleware/ behind a Protocol.
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 import functools
 from collections.abc import Awaitable, Callable, Sequence
 from typing import Protocol
 
+from lifecycle import dataclasses
 from lifecycle.errors import BringUpError, MiddlewareError
 from lifecycle.node import Operation
 from lifecycle.plan import PlannedNode

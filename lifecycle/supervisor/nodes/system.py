@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import dataclasses
 from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Protocol
 
+from lifecycle import dataclasses
 from lifecycle.errors import BringUpError
 from lifecycle.manifest import Condition, OnSupervisorLost, RunKind, TargetState
 from lifecycle.node import INTERFACE_ON_DEMAND, Operation

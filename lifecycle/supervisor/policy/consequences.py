@@ -8,9 +8,9 @@ not import rclpy.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterable
 
+from lifecycle import dataclasses
 from lifecycle.manifest import BY_DEFAULT, Consequence, EndpointKind, OnViolation, Reaction, Restart
 from lifecycle.plan import Plan, PlannedFlow
 from lifecycle.supervisor.control.protocol import Reach

@@ -8,13 +8,13 @@ by hand. Must not import rclpy.
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 import datetime as dt
 import signal
 from collections.abc import Collection, Iterable
 
 import msgspec
 
+from lifecycle import dataclasses
 from lifecycle.errors import ExitCode
 from lifecycle.manifest import Restart
 from lifecycle.supervisor.control.protocol import Failed, ProcessState

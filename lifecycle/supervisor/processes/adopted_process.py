@@ -8,10 +8,10 @@ Must not import rclpy.
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 import os
 from collections.abc import Callable, Iterable
 
+from lifecycle import dataclasses
 from lifecycle.plan import PlannedNode
 from lifecycle.printable import one_line
 from lifecycle.supervisor.run.failure import StepFailedError

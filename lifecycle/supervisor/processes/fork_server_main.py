@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import dataclasses
 import gc
 import os
 import selectors
@@ -24,10 +23,11 @@ import sys
 import time
 import traceback
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
+from lifecycle import dataclasses
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware import (
@@ -416,6 +416,26 @@ def _reseed() -> None:
         numpy_random.seed()
 
 
+_BLAS_TIMEOUT = "OPENBLAS_THREAD_TIMEOUT"
+"""The logarithm of how many cycles a thread of OpenBLAS looks for work before it sleeps."""
+
+
+@contextlib.contextmanager
+def _idle_blas() -> Iterator[None]:
+    """Have threads that numpy starts when it is imported sleep at once, as nothing uses them yet.
+
+    Else they look for work for 26 ms and more, each of them, while all processors are needed. What
+    a node calculates wakes them, in microseconds.
+    """
+    before = os.environ.get(_BLAS_TIMEOUT)
+    os.environ.setdefault(_BLAS_TIMEOUT, "4")  # the least
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[_BLAS_TIMEOUT]
+
+
 def _preload(names: Iterable[str]) -> None:
     """Import what hosts need, and keep its pages shared: a first collection would touch them.
 
@@ -424,7 +444,8 @@ def _preload(names: Iterable[str]) -> None:
     from lifecycle.node import preload
 
     gc.disable()
-    preload(names)
+    with _idle_blas():
+        preload(names)
     fill_heap()
     gc.freeze()
     gc.enable()

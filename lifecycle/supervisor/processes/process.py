@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import dataclasses
 import functools
 import os
 import signal
@@ -19,6 +18,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
+from lifecycle import dataclasses
 from lifecycle.manifest import Output
 from lifecycle.plan import PlannedProcess
 from lifecycle.supervisor.control.protocol import ProcessState

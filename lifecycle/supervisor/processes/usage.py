@@ -5,10 +5,10 @@ Owns: reading that from proc(5). Must not import rclpy.
 
 from __future__ import annotations
 
-import dataclasses
 import os
 from pathlib import Path
 
+from lifecycle import dataclasses
 from lifecycle.codec import Count
 
 

@@ -6,13 +6,13 @@ order. Presentation lives in cli/. Must not import rclpy.
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Union, get_args
 
 import msgspec
 
+from lifecycle import dataclasses
 from lifecycle.codec import to_plain
 from lifecycle.node import Operation
 from lifecycle.supervisor.control.protocol import Failed, ProcessState, Reach
@@ -351,12 +351,14 @@ class ModeEntered:
         mode: its name.
         before: that of the mode that it was in.
         inactive: names of the nodes that it keeps inactive.
+        parameters: names of the nodes that have other parameters than in the mode before.
     """
 
     kind: ClassVar[str] = "mode"
     mode: str
     before: str
     inactive: tuple[str, ...]
+    parameters: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

@@ -8,11 +8,11 @@ Python 3.10 does not have; `failure_of`; `ended`; and `Worker`, a thread for wha
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 from collections.abc import Callable, Coroutine, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
+from lifecycle import dataclasses
 from lifecycle.errors import BringUpError, ExitCode
 from lifecycle.middleware import no_room_for_threads
 from lifecycle.supervisor.run.events import Failure

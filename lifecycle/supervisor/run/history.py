@@ -7,14 +7,13 @@ today (`replayed`). Needs no ROS.
 
 from __future__ import annotations
 
-import dataclasses
 import datetime as dt
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from lifecycle import codec
+from lifecycle import codec, dataclasses
 from lifecycle.errors import UsageError
 from lifecycle.plan import Plan
 from lifecycle.supervisor.processes.logs import JOURNAL_NAME

@@ -11,14 +11,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import dataclasses
 import os
 import time
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-from lifecycle import codec
+from lifecycle import codec, dataclasses
 from lifecycle.codec import Count, says
 from lifecycle.plan import Plan, without_secrets
 from lifecycle.supervisor.processes.logs import JOURNAL_NAME

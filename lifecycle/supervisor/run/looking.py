@@ -11,13 +11,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import dataclasses
 import logging
 import os
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
+from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError, UsageError
 from lifecycle.export import (
     CapturedParameter,

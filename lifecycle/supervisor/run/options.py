@@ -6,13 +6,13 @@ rclpy.
 
 from __future__ import annotations
 
-import dataclasses
 import enum
 import ipaddress
 import socket
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
+from lifecycle import dataclasses
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest import Machine, Manifest
 from lifecycle.network import Peer, parse

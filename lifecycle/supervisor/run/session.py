@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import dataclasses
 import os
 import signal
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterable, Iterator
 from typing import Any, Protocol
 
+from lifecycle import dataclasses
 from lifecycle.errors import ExitCode
 from lifecycle.plan import PlannedNode
 from lifecycle.run_directory import RunDirectory
@@ -274,6 +274,7 @@ class Session:
             system.plan.policy.ros_interface,
             min(system.machines or ("",)),
             observer_participant,
+            modes=() if system.remote else (each.name for each in system.plan.modes),
             status=self.status,
             verdict=lambda: self._judge.latest,
             order=self._holding.ordered,

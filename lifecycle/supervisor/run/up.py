@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import dataclasses
 import gc
 import os
 import traceback
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
 
+from lifecycle import dataclasses
 from lifecycle.errors import ExitCode, LifecycleError
 from lifecycle.manifest import Authority, DataLayerSource, EndpointPolicy, RunKind
 from lifecycle.middleware import (

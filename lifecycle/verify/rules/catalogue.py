@@ -6,9 +6,9 @@ rules and does not parse ids, subjects or messages. Pure.
 
 from __future__ import annotations
 
-import dataclasses
 import enum
 
+from lifecycle import dataclasses
 from lifecycle.manifest import EndpointKind, Position
 from lifecycle.plan import PlannedNode
 from lifecycle.verify.outcome import Outcome

@@ -6,10 +6,10 @@ end announces the hash of its definition (REP-2016), and rosidl installs the has
 
 from __future__ import annotations
 
-import dataclasses
 from collections import Counter
 from collections.abc import Iterator, Mapping
 
+from lifecycle import dataclasses
 from lifecycle.manifest import EndpointKind, EndpointPolicy, Position
 from lifecycle.verify.observation import ObservedEndpoint
 from lifecycle.verify.outcome import Outcome

@@ -15,10 +15,10 @@ reports nothing about its clients.
 
 from __future__ import annotations
 
-import dataclasses
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 
+from lifecycle import dataclasses
 from lifecycle.manifest import Certainty, EndpointKind, QosProfile, incompatibilities
 from lifecycle.verify.observation import EndpointReport, ObservedEndpoint
 from lifecycle.verify.outcome import Outcome

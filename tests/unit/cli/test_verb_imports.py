@@ -37,6 +37,7 @@ HEAVY = (
 )
 TO_ASK = {
     "lifecycle.codec",
+    "lifecycle.dataclasses",
     "lifecycle.errors",
     "lifecycle.printable",
     "lifecycle.run_directory",

@@ -8,11 +8,11 @@ declares it, and one name in `TARGETS`; it is imported on first use, so that its
 from __future__ import annotations
 
 import abc
-import dataclasses
 import importlib
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from lifecycle import dataclasses
 from lifecycle.errors import UsageError
 
 if TYPE_CHECKING:

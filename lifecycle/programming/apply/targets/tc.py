@@ -7,11 +7,11 @@ left alone.
 
 from __future__ import annotations
 
-import dataclasses
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from lifecycle import dataclasses
 from lifecycle.errors import UsageError
 from lifecycle.programming.apply.ledger import Entry, Ledger, TargetRecord, digest_of
 from lifecycle.programming.apply.target import (

@@ -1,0 +1,190 @@
+"""The standard library's dataclasses, whose methods are made when they are first looked up.
+
+Owns: `dataclass`, the decorator of this package's types; all else is the standard library's. Its
+own takes 0.4 ms a class to write and compile six methods, and several hundred classes are imported
+by a process that calls few of them. Imports nothing of the package.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import FrozenInstanceError, field, fields, is_dataclass, replace
+from typing import TYPE_CHECKING, Any, NoReturn
+
+__all__ = [
+    "FrozenInstanceError",
+    "dataclass",
+    "field",
+    "fields",
+    "is_dataclass",
+    "make_constructors",
+    "replace",
+]
+
+_ABSENT = dataclasses.MISSING
+_lock = threading.Lock()
+_classes: list[type] = []
+"""All whose methods are made so."""
+
+
+class _Method:
+    """A method of one class that is made when it is looked up, and then takes this one's place."""
+
+    def __init__(self, cls: type, name: str, *, frozen: bool) -> None:
+        self._cls = cls
+        self._name = name
+        self._frozen = frozen
+
+    def __get__(self, instance: object, owner: type | None = None) -> Any:
+        is_init = self._name == "__init__"
+        method = _init(self._cls, frozen=self._frozen) if is_init else _made(self._cls, self._name)
+        method.__qualname__ = f"{self._cls.__qualname__}.{self._name}"
+        method.__module__ = self._cls.__module__
+        setattr(self._cls, self._name, method)
+        return method if instance is None else method.__get__(instance, owner)
+
+
+def make_constructors(*prefixes: str) -> None:
+    """Make `__init__` of the types of some modules, for a process that forks those who call it.
+
+    Args:
+        prefixes: what the modules' names begin with.
+    """
+    for each in _classes:
+        if each.__module__.startswith(prefixes):
+            getattr(each, "__init__")  # noqa: B009 - looking it up is the point
+
+
+def _init(cls: Any, *, frozen: bool) -> Any:
+    """Return `__init__` as the standard library has it."""
+    taken: dict[bool, list[str]] = {False: [], True: []}
+    body: list[str] = []
+    known: dict[str, Any] = {"_absent": _ABSENT, "_set": object.__setattr__}
+    for each in fields(cls):
+        name, value = each.name, each.name
+        if each.default_factory is not _ABSENT:
+            known[f"_make_{name}"] = each.default_factory
+            value = f"_make_{name}()" + f" if {name} is _absent else {name}" * each.init
+        if each.default is not _ABSENT:
+            known[f"_default_{name}"] = each.default
+            value = name if each.init else f"_default_{name}"
+        if each.init:
+            default = f"=_default_{name}" * (each.default is not _ABSENT)
+            default += "=_absent" * (each.default_factory is not _ABSENT)
+            taken[bool(each.kw_only)].append(f"{name}{default}")
+        elif value == name:
+            continue
+        body.append(f" _set(self, {name!r}, {value})" if frozen else f" self.{name} = {value}")
+    if hasattr(cls, "__post_init__"):
+        body.append(" self.__post_init__()")
+    names = ", ".join(["self", *taken[False], *["*"][: len(taken[True])], *taken[True]])
+    exec("\n".join([f"def __init__({names}):", *body, " return"]), known)  # noqa: S102
+    made = known["__init__"]
+    made.__annotations__ = {each.name: each.type for each in fields(cls) if each.init}
+    made.__annotations__["return"] = None
+    return made
+
+
+def _made(cls: Any, name: str) -> Any:
+    """Have the standard library make another method, of a class with the same fields."""
+    namespace: dict[str, Any] = {each.name: each for each in fields(cls)}
+    namespace["__annotations__"] = {each.name: each.type for each in fields(cls)}
+    namespace["__module__"] = cls.__module__
+    namespace["__doc__"] = cls.__name__
+    twin: Any = dataclasses.dataclass(
+        init=False,
+        repr=name == "__repr__",
+        eq=name in {"__eq__", "__hash__"},
+        unsafe_hash=name == "__hash__",
+        match_args=False,
+    )(type(cls.__name__, (), namespace))
+    return vars(twin)[name]
+
+
+def _refuse_set(self: object, name: str, value: object) -> NoReturn:  # noqa: ARG001
+    raise FrozenInstanceError(f"cannot assign to field {name!r}")
+
+
+def _refuse_delete(self: object, name: str) -> NoReturn:  # noqa: ARG001
+    raise FrozenInstanceError(f"cannot delete field {name!r}")
+
+
+def _get_state(self: Any) -> list[Any]:
+    return [getattr(self, each.name) for each in fields(self)]
+
+
+def _set_state(self: Any, state: list[Any]) -> None:
+    for each, value in zip(fields(self), state, strict=True):
+        object.__setattr__(self, each.name, value)
+
+
+_FROZEN = {
+    "__setattr__": _refuse_set,
+    "__delattr__": _refuse_delete,
+    "__getstate__": _get_state,
+    "__setstate__": _set_state,
+}
+
+
+@contextlib.contextmanager
+def _as_if_not_frozen(bases: tuple[type, ...]) -> Iterator[None]:
+    """Let the standard library derive a class from frozen ones that it is not told is frozen."""
+    with _lock:
+        parameters = [
+            vars(each)["__dataclass_params__"]
+            for base in bases
+            for each in base.__mro__
+            if "__dataclass_params__" in vars(each)
+        ]
+        frozen = [each for each in parameters if each.frozen]
+        for each in frozen:
+            each.frozen = False
+        try:
+            yield
+        finally:
+            for each in frozen:
+                each.frozen = True
+
+
+def _decorate(cls: type, *, frozen: bool, kw_only: bool, eq: bool) -> type:
+    own = set(vars(cls))
+    if "__eq__" in own and vars(cls)["__hash__"] is None:
+        own.remove("__hash__")  # which Python has set, not its author
+    if cls.__doc__ is None:
+        cls.__doc__ = cls.__name__  # else it is made of the signature
+    with _as_if_not_frozen(cls.__bases__):
+        made: Any = dataclasses.dataclass(
+            init=False, repr=False, eq=False, slots=True, kw_only=kw_only
+        )(cls)
+    parameters = made.__dataclass_params__
+    parameters.init = parameters.repr = True
+    parameters.eq, parameters.frozen = eq, frozen
+    names = ["__init__", "__repr__", *["__eq__"] * eq, *["__hash__"] * (eq and frozen)]
+    for name in names:
+        if name not in own:
+            setattr(made, name, _Method(made, name, frozen=frozen))
+    if eq and not frozen and "__hash__" not in own:
+        made.__hash__ = None
+    if frozen:
+        for name, method in _FROZEN.items():
+            if name not in own:
+                setattr(made, name, method)
+    _classes.append(made)
+    return made  # type: ignore[no-any-return]
+
+
+if TYPE_CHECKING:
+    from dataclasses import dataclass
+else:
+
+    def dataclass(
+        *, frozen: bool = False, slots: bool = False, kw_only: bool = False, eq: bool = True, **more
+    ) -> Callable[[type], type]:
+        """As the standard library's decorator."""
+        if not slots or more:
+            options = {"frozen": frozen, "slots": slots, "kw_only": kw_only, "eq": eq, **more}
+            return dataclasses.dataclass(**options)
+        return lambda cls: _decorate(cls, frozen=frozen, kw_only=kw_only, eq=eq)
