@@ -9,7 +9,6 @@ lies there, too, and vanishes with the run. Must not import rclpy.
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import fcntl
 import json
 import os
@@ -24,6 +23,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 from typing import IO
 
+from lifecycle import dataclasses
 from lifecycle.codec import from_json, to_json, to_plain
 from lifecycle.errors import LifecycleError, UsageError
 from lifecycle.fleet.protocol import (

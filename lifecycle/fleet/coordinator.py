@@ -10,13 +10,13 @@ from __future__ import annotations
 import asyncio
 import collections
 import contextlib
-import dataclasses
 import enum
 import json
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple, Union, get_args
 
+from lifecycle import dataclasses
 from lifecycle.codec import from_json, to_plain
 from lifecycle.errors import ExitCode
 from lifecycle.fleet.protocol import (

@@ -5,13 +5,13 @@ Owns: `parts_of`, from a manifest and its plan. Pure but for reading files. Must
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from lifecycle import dataclasses
 from lifecycle.codec import to_json
 from lifecycle.errors import UsageError
 from lifecycle.fleet.protocol import Part, SentFile

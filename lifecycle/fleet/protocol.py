@@ -7,10 +7,10 @@ supervisor prints there travels between them as it is. Owns also `clock_offset`,
 
 from __future__ import annotations
 
-import dataclasses
 import enum
 from collections.abc import Iterable
 
+from lifecycle import dataclasses
 from lifecycle.codec import to_json
 
 PROTOCOL = 1

@@ -9,11 +9,11 @@ from __future__ import annotations
 import asyncio
 import collections
 import contextlib
-import dataclasses
 import shlex
 from collections.abc import Sequence
 from typing import Protocol
 
+from lifecycle import dataclasses
 from lifecycle.fleet.agent import COMMAND
 from lifecycle.fleet.protocol import LONGEST_LINE
 
