@@ -43,8 +43,10 @@ _EVENT = struct.Struct("iIII")
 _EVENT_BYTES = 65536
 
 _LOCK_FIELDS = 8
-_AGAIN_S = 0.02
 """Of a held lock in /proc/locks: number, FLOCK, ADVISORY, WRITE, pid, file, start, end."""
+
+_AGAIN_S = 0.02
+"""So often it is tried again to remove what others still use: no event says that they let go."""
 
 _Inode = tuple[int, int]
 """(device, inode number)."""

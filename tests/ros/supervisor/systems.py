@@ -108,6 +108,15 @@ class Stillborn(Talker):
             os.kill(os.getpid(), signal.SIGKILL)
 
 
+class Moody(Talker):
+    """Is well while the file MOOD is there, once it is active."""
+
+    def health(self):
+        if self.is_active and not Path(os.environ["MOOD"]).exists():
+            return "in a mood"
+        return None
+
+
 class Chatty(Talker):
     """Prints a megabyte a second, says how it is taken down, and has a child that nothing ends."""
 
