@@ -1,6 +1,6 @@
 """`make soak`: rounds of faults against a supervised system of ten nodes, judged from outside.
 
-    python -m tests.soak [--seed N] [--rounds N] [--only N] [--list] [--keep]
+    python -m tests.soak [--seed N] [--rounds N] [--first N] [--list] [--keep]
 
 A seed stands for a list of rounds, which `--list` prints. With root they run in network and mount
 namespaces of their own, so that links can be cut and disks filled; without, those rounds are
@@ -36,15 +36,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.soak")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--rounds", type=int, default=100)
-    parser.add_argument("--only", type=int, metavar="N", help="this round, in a fresh system")
+    parser.add_argument("--first", type=int, default=1, metavar="N", help="begin with this round")
     parser.add_argument("--list", action="store_true", help="print the rounds, and do nothing")
     parser.add_argument("--go-on", action="store_true", help="also after a round that failed")
     parser.add_argument("--keep", action="store_true", help="keep the logs in any case")
     options = parser.parse_args()
-    rounds = plan(options.seed, max(options.rounds, options.only or 0))
-    if options.only:
-        rounds = rounds[options.only - 1 :]
-        rounds = rounds[:1]
+    rounds = plan(options.seed, options.rounds)[options.first - 1 :]
     if options.list:
         print(*rounds, sep="\n")
         return 0

@@ -28,7 +28,7 @@ from tests.soak.system import COMPOSITION, NAME
 ACTIVE = "active"
 
 
-class Violated(AssertionError):
+class NotAsPromisedError(AssertionError):
     """Something that was promised did not hold."""
 
 
@@ -73,7 +73,7 @@ class Watched(Up):
                     looked += 1
                 left_s = deadline - time.monotonic()
                 if left_s <= 0:
-                    raise Violated(f"no {what} within {within_s:g} s")
+                    raise NotAsPromisedError(f"no {what} within {within_s:g} s")
                 self._came.wait(left_s)
 
     def close_streams(self) -> None:
@@ -127,7 +127,7 @@ def assert_gate_held(events: Sequence[Event]) -> None:
     """Assert that every activate request follows a gate that opened on a passing verdict.
 
     Raises:
-        Violated: one did not.
+        NotAsPromisedError: one did not.
     """
     verdict: Event | None = None
     let_through: set[str] = set()
@@ -139,11 +139,14 @@ def assert_gate_held(events: Sequence[Event]) -> None:
                 let_through = set()
         elif kind == "gate":
             if verdict is None or verdict["blocking"]:
-                raise Violated(f"the gate opened on {_short(verdict)}: {event}")
+                raise NotAsPromisedError(f"the gate opened on {_short(verdict)}: {event}")
             let_through = set(event["nodes"])
-        elif kind == "request" and event["operation"] == "activate":
-            if event["node"] not in let_through:
-                raise Violated(f"{event} came behind a closed gate: {_short(verdict)}")
+        elif (
+            kind == "request"
+            and event["operation"] == "activate"
+            and event["node"] not in let_through
+        ):
+            raise NotAsPromisedError(f"{event} came behind a closed gate: {_short(verdict)}")
 
 
 def assert_activated_on_request(
@@ -152,7 +155,7 @@ def assert_activated_on_request(
     """Assert that no node became active, by its own report, without a request of the supervisor.
 
     Raises:
-        Violated: one did.
+        NotAsPromisedError: one did.
     """
     asked: dict[str, int] = {}
     for at, event in zip(tuple(run.times), tuple(run.events), strict=False):
@@ -163,7 +166,7 @@ def assert_activated_on_request(
         became[node] = became.get(node, 0) + 1
     for name in names:
         if became.get(name, 0) > asked.get(name, 0):
-            raise Violated(
+            raise NotAsPromisedError(
                 f"{name} became active {became[name]} times, and was asked to "
                 f"{asked.get(name, 0)} times"
             )

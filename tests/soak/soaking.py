@@ -7,7 +7,6 @@ Owns: `Soaking`: brings the system up, does what a round says, asserts what must
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import shutil
 import signal
@@ -22,13 +21,12 @@ from pathlib import Path
 
 import psutil
 
-from lifecycle.middleware import leftovers
+from lifecycle.middleware import leftovers, segments_of
 from tests.ros.supervisor.running import ROOT, command, environment, left_of
 from tests.soak.model import (
     DIES,
     HANGS,
     NODES,
-    SAFE_INACTIVE,
     UNMANAGED,
     Condition,
     Expectation,
@@ -41,8 +39,8 @@ from tests.soak.model import (
 )
 from tests.soak.nodes import address
 from tests.soak.running import (
+    NotAsPromisedError,
     Transitions,
-    Violated,
     Watched,
     assert_activated_on_request,
     assert_gate_held,
@@ -131,26 +129,29 @@ class Soaking:
                 each.join(DOWN_S)
             if code not in codes:
                 last = [each for each in run.events if "run" in each][-1:]
-                raise Violated(f"exit code {code}, not {sorted(codes)}: {last} {run.said()}")
+                raise NotAsPromisedError(
+                    f"exit code {code}, not {sorted(codes)}: {last} {run.said()}"
+                )
             self._judge(run)
             self._assert_nothing_left(run)
         except subprocess.TimeoutExpired:
-            raise Violated(f"not ended within {DOWN_S:g} s: {run.events[-5:]}") from None
+            raise NotAsPromisedError(f"not ended within {DOWN_S:g} s: {run.events[-5:]}") from None
         finally:
             run.close()
             self.state = State()
 
     def _assert_nothing_left(self, run: Watched) -> None:
         if left := left_of(run.mark, within_s=2.0):
-            raise Violated(f"processes are left: {left}")
+            raise NotAsPromisedError(f"processes are left: {left}")
         if self.private and (segments := set(leftovers()) - set(self._spare)):
-            raise Violated(f"shared memory is left: {sorted(segments)}")
+            raise NotAsPromisedError(f"shared memory is left: {sorted(segments)}")
         if left := [str(each) for each in (self.runtime / "lifecycle").glob("*/*")]:
-            raise Violated(f"run directories are left: {left}")
+            raise NotAsPromisedError(f"run directories are left: {left}")
         if self.private and shutil.which("nft"):
-            listed = subprocess.run(["nft", "list", "tables"], capture_output=True, text=True)
+            words = ["nft", "list", "tables"]
+            listed = subprocess.run(words, capture_output=True, text=True, check=False)
             if listed.stdout:
-                raise Violated(f"nft tables are left: {listed.stdout}")
+                raise NotAsPromisedError(f"nft tables are left: {listed.stdout}")
 
     def close(self) -> None:
         """End everything, whatever happened."""
@@ -184,7 +185,7 @@ class Soaking:
         """Carry out one round.
 
         Raises:
-            Violated: what must follow did not.
+            NotAsPromisedError: what must follow did not.
         """
         run = self.up()
         for each in self.stumble.iterdir():
@@ -279,7 +280,7 @@ class Soaking:
             took_s = self.stalls.taken(at, seen)
             self.reported_s.append(took_s)
             if took_s > bound_s:
-                raise Violated(
+                raise NotAsPromisedError(
                     f"{fault} was reported after {seen - at:.3f} s, {took_s:.3f} s without what "
                     f"the machine's scheduler took; allowed are {bound_s:g} s"
                 )
@@ -322,7 +323,11 @@ class Soaking:
             if done.condition in (Condition.CUT, Condition.LINK_DOWN, Condition.DISK_FULL):
                 assert self.private
             if done.condition is Condition.CUT:
-                rules = "add table inet soak; add chain inet soak in {type filter hook input priority 0;}; add rule inet soak in meta l4proto udp drop"
+                rules = (
+                    "add table inet soak; "
+                    "add chain inet soak in {type filter hook input priority 0;}; "
+                    "add rule inet soak in meta l4proto udp drop"
+                )
                 subprocess.run(["nft", rules], check=True)
                 stack.callback(subprocess.run, ["nft", "delete table inet soak"], check=True)
             elif done.condition is Condition.LINK_DOWN:
@@ -362,8 +367,9 @@ class Soaking:
             opened = time.monotonic()
             time.sleep(0.1)
             if early := self.transitions.activated(closed + 0.3, opened):
-                raise Violated(f"became active while an intruder was there: {early}")
+                raise NotAsPromisedError(f"became active while an intruder was there: {early}")
         finally:
+            self._spare += tuple(segments_of([stranger.pid]))
             stranger.kill() if sys.exc_info()[0] else stranger.terminate()
             stranger.wait(DOWN_S)
             assert stranger.stdout is not None
@@ -378,9 +384,9 @@ class Soaking:
                 try:
                     _, said = each.communicate(timeout=BACK_S)
                 except subprocess.TimeoutExpired:
-                    raise Violated(f"lifecycle restart {node} did not end") from None
+                    raise NotAsPromisedError(f"lifecycle restart {node} did not end") from None
                 if each.returncode not in (0, 2, 6):
-                    raise Violated(f"lifecycle restart {node}: {each.returncode}: {said}")
+                    raise NotAsPromisedError(f"lifecycle restart {node}: {each.returncode}: {said}")
         finally:
             for each in orders:
                 if each.poll() is None:
@@ -399,7 +405,7 @@ class Soaking:
         finally:
             run.close_streams()
         if left := left_of(run.mark, within_s=5.0):
-            raise Violated(f"processes of the killed supervisor are left: {left}")
+            raise NotAsPromisedError(f"processes of the killed supervisor are left: {left}")
 
     # Verbs
 
@@ -418,7 +424,9 @@ class Soaking:
         try:
             out, error = asked.communicate(timeout=within_s)
         except subprocess.TimeoutExpired:
-            raise Violated(f"lifecycle {name} {words} did not end in {within_s:g} s") from None
+            raise NotAsPromisedError(
+                f"lifecycle {name} {words} did not end in {within_s:g} s"
+            ) from None
         finally:
             if asked.poll() is None:
                 asked.kill()
@@ -433,7 +441,7 @@ class Soaking:
             if code == 0 or (words == ("resume",) and "it is active" in said):
                 return
             if run.process.poll() is not None or time.monotonic() > deadline:
-                raise Violated(f"lifecycle {' '.join(words)}: {code}: {said}")
+                raise NotAsPromisedError(f"lifecycle {' '.join(words)}: {code}: {said}")
             time.sleep(0.2)
 
     # Judging
@@ -443,7 +451,7 @@ class Soaking:
         why = ""
         while time.monotonic() < deadline:
             if run.process.poll() is not None:
-                raise Violated(
+                raise NotAsPromisedError(
                     f"the run ended, exit code {run.process.returncode}: {run.events[-2:]}"
                     f" {run.said()}"
                 )
@@ -451,7 +459,7 @@ class Soaking:
             if not why:
                 return
             time.sleep(0.05)
-        raise Violated(f"not as it was within {within_s:g} s: {why}")
+        raise NotAsPromisedError(f"not as it was within {within_s:g} s: {why}")
 
     def _what_lacks(self, run: Watched) -> str:
         status = run.status()
@@ -485,9 +493,9 @@ class Soaking:
     ) -> None:
         again = {key for key in NODES if self.pids[key] != before[key]}
         if missing := expected.again - again:
-            raise Violated(f"did not come again in a new process: {sorted(missing)}")
+            raise NotAsPromisedError(f"did not come again in a new process: {sorted(missing)}")
         if more := again - expected.again - expected.may_again:
-            raise Violated(f"came again, and nothing was done to them: {sorted(more)}")
+            raise NotAsPromisedError(f"came again, and nothing was done to them: {sorted(more)}")
 
     def _assert_nobody_else_was_blamed(
         self, run: Watched, expected: Expectation, since: int
@@ -504,7 +512,7 @@ class Soaking:
             else:
                 continue
             if who.strip("/") not in names:
-                raise Violated(f"nothing was done to {who}: {event}")
+                raise NotAsPromisedError(f"nothing was done to {who}: {event}")
 
 
 def _finding(rule: str, subjects: set[str]) -> Callable[[dict], bool]:
