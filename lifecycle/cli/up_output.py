@@ -450,7 +450,8 @@ def _(event: ConsequenceTaken) -> str:
 @_describe.register
 def _(event: ModeEntered) -> str:
     without = f", without {', '.join(event.inactive)}" if event.inactive else ""
-    return f"mode {event.mode}{without}"
+    others = f", other parameters of {', '.join(event.parameters)}" if event.parameters else ""
+    return f"mode {event.mode}{without}{others}"
 
 
 @_describe.register

@@ -250,7 +250,10 @@ def _supervisor_profile(plan: Plan, machine: str) -> Profile:
         allowed |= {(kind, topic), (kind, f"{topic}_pulse")}
     several = len({each.machine for each in plan.nodes}) > 1
     allowed |= supervisor_endpoints(
-        plan.system, machine if several else "", plan.policy.ros_interface
+        plan.system,
+        machine if several else "",
+        plan.policy.ros_interface,
+        () if several else [each.name for each in plan.modes],
     )
     return Profile(namespace="/", name="_lifecycle_observer", allowed=frozenset(allowed))
 

@@ -46,6 +46,7 @@ from .model import Link as Link
 from .model import Machine as Machine
 from .model import Manifest as Manifest
 from .model import Mode as Mode
+from .model import ModeParameter as ModeParameter
 from .model import Node as Node
 from .model import NodeDeclaration as NodeDeclaration
 from .model import OnFailure as OnFailure

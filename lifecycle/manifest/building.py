@@ -11,7 +11,7 @@ from __future__ import annotations
 import ipaddress
 import os
 import shlex
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 
 from lifecycle.manifest.diagnostics import Diagnostic, Position
@@ -30,6 +30,8 @@ from lifecycle.manifest.model import (
     FlowNeed,
     Interface,
     Limits,
+    Mode,
+    ModeParameter,
     Node,
     OnViolation,
     ParameterDeclaration,
@@ -531,10 +533,33 @@ def _check_python_keys(cursor: Cursor, kind: RunKind, found: Findings) -> None:
             found.append(error("manifest.threads", at, message, hint))
 
 
+def build_modes(root: Cursor, found: Findings) -> tuple[Mode, ...]:
+    """Build the modes of a document."""
+    return tuple(
+        Mode(
+            name=name,
+            inactive=tuple(each.value.text for each in cursor.items("inactive")),
+            parameters=tuple(
+                ModeParameter(node=key, name=parameter, value=value, at=at)
+                for key, node in cursor.entries("parameters")
+                for parameter, (value, at) in _flat(node.entries(), found).items()
+            ),
+            at=cursor.key_at,
+        )
+        for name, cursor in root.entries("modes")
+    )
+
+
 def build_parameters(node: Cursor, found: Findings) -> dict[str, tuple[ParameterValue, Position]]:
     """Flatten `parameters:` of a node, group or document into dotted names, as rcl's files do."""
+    return _flat(node.entries("parameters"), found)
+
+
+def _flat(
+    entries: Iterable[tuple[str, Cursor]], found: Findings
+) -> dict[str, tuple[ParameterValue, Position]]:
     flat: dict[str, tuple[ParameterValue, Position]] = {}
-    pending = list(reversed(list(node.entries("parameters"))))
+    pending = list(reversed(list(entries)))
     while pending:
         name, cursor = pending.pop()
         if isinstance(cursor.value.data, Mapping):

@@ -22,6 +22,7 @@ from lifecycle.manifest.building import (
     Findings,
     build_data_layer,
     build_discovery,
+    build_modes,
     build_node,
     build_on_violation,
     quantities,
@@ -34,7 +35,6 @@ from lifecycle.manifest.model import (
     Link,
     Machine,
     Manifest,
-    Mode,
     Network,
     Node,
     Policy,
@@ -154,14 +154,7 @@ def build_manifest(
         data_layer=build_data_layer(root, found),
         policy=_policy(root),
         on_violation=build_on_violation(root),
-        modes=tuple(
-            Mode(
-                name=name,
-                inactive=tuple(each.value.text for each in cursor.items("inactive")),
-                at=cursor.key_at,
-            )
-            for name, cursor in root.entries("modes")
-        ),
+        modes=build_modes(root, found),
         nodes=nodes,
         links=tuple(_link(each) for each in root.items("links") if each.place not in unsound),
         positions=section_positions(root),
@@ -344,7 +337,9 @@ def _without_left_out(manifest: Manifest) -> Manifest:
     )
     modes = tuple(
         dataclasses.replace(
-            mode, inactive=tuple(key for key in mode.inactive if not is_left_out(key))
+            mode,
+            inactive=tuple(key for key in mode.inactive if not is_left_out(key)),
+            parameters=tuple(each for each in mode.parameters if not is_left_out(each.node)),
         )
         for mode in manifest.modes
     )

@@ -605,6 +605,7 @@ __all__ = [
     "Machine",
     "Manifest",
     "Mode",
+    "ModeParameter",
     "Network",
     "Node",
     "OnFailure",
@@ -759,15 +760,31 @@ class Link:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class ModeParameter:
+    """The value that a parameter of a node has in a mode.
+
+    Attributes:
+        node: its key.
+    """
+
+    node: str
+    name: str
+    value: ParameterValue
+    at: Position
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Mode:
-    """A named set of nodes that are active: all that are to be so, but these.
+    """A named set of nodes that are active, all that are to be so but these, and of parameters.
 
     Attributes:
         inactive: keys of the nodes that are kept inactive in it.
+        parameters: values that are other ones in it; all others are as they are given.
     """
 
     name: str
     inactive: tuple[str, ...] = ()
+    parameters: tuple[ModeParameter, ...] = ()
     at: Position
 
 

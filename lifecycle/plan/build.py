@@ -376,7 +376,7 @@ def _wired(
     """Plan nodes, flows and how they are connected."""
     prefixes = search_prefixes(variables)
     needs = FlowNeeds(manifest, prefixes)
-    files = ParameterFiles(manifest.path)
+    files = ParameterFiles(manifest.path, manifest.modes)
     hash_of = functools.cache(functools.partial(installed_hash, prefixes=prefixes))
     nodes = tuple(_planned_node(node, needs, hash_of, files) for node in manifest.nodes)
     return wire(
@@ -465,13 +465,15 @@ def _planned_node(
     groups: tuple[ParticipantGroup, ...] = needs.groups(node) if ours else ()
     endpoints, connected, groups = place_declared(node.name, endpoints, node.connections, groups)
     endpoints, participants = place_flows(node.name, endpoints, groups)
+    expected = files.expected(node)
     return PlannedNode(
         **declared(NodeDeclaration, node),
         process=process_name(node),
         held_by=_held_by(node),
         endpoints=endpoints,
         declared_parameters=node.interface.parameters,
-        expected_parameters=files.expected(node),
+        expected_parameters=expected,
+        mode_parameters=files.in_modes(node, expected),
         has_all_parameters=node.interface.has_all_parameters
         and node.endpoints is EndpointPolicy.DECLARED,
         unread_parameter_files=files.unread(node),

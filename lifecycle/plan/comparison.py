@@ -47,7 +47,8 @@ _NODE_DERIVED = (
     *("key", "at", "run", "endpoints", "declared_parameters", "parameters", "parameter_files"),
     *("remap", "participants", "after", "transports", "max_datagram_bytes", "connections"),
     *("authority", "events", "membership", "files", "held_by"),
-    *("expected_parameters", "unread_parameter_files", "supervision", "on_violation"),
+    *("mode_parameters", "expected_parameters", "unread_parameter_files"),
+    *("supervision", "on_violation"),
 )
 _ENDPOINT_DERIVED = (
     *("kind", "name", "resolved", "type", "qos", "participant", "at"),
@@ -132,7 +133,15 @@ def _document(plan: Plan) -> _Tree:
         "data_layer": _fields(plan.data_layer, "at"),
         "policy": _fields(plan.policy),
         "on_violation": _consequences(plan.on_violation),
-        "modes": {each.name: {"inactive": list(each.inactive)} for each in plan.modes},
+        "modes": {
+            each.name: {
+                "inactive": list(each.inactive),
+                "parameters": {
+                    f"{one.node}: {one.name}": to_plain(one.value) for one in each.parameters
+                },
+            }
+            for each in plan.modes
+        },
         "links": {
             f"{flow.topic} from {flow.publisher} to {flow.subscription}": {
                 **_fields(

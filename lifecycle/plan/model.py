@@ -199,8 +199,8 @@ class ExpectedParameter:
             type is declared nowhere, which fits every array.
         value: what it must be; None: anything of its type. Doubles that are not finite are ".nan",
             ".inf" and "-.inf", because JSON has no others.
-        source: what sets the value: "parameters", "default_value" or a parameter file; empty
-            without a value.
+        source: what sets the value: "parameters", "default_value", "mode safe" or a parameter file;
+            empty without a value.
         read_only: it must be so; False asks nothing.
         optional: only a section for many nodes gives it, so that a node need not have it.
     """
@@ -212,6 +212,31 @@ class ExpectedParameter:
     read_only: bool = False
     optional: bool = False
     at: Position
+
+    @property
+    def raw(self) -> Any:
+        """The value, also where JSON has no number for it."""
+        if isinstance(self.value, tuple):
+            return tuple(_raw(each, self.type) for each in self.value)
+        return _raw(self.value, self.type)
+
+
+def _raw(value: Any, type_: str) -> Any:
+    is_text = isinstance(value, str) and type_.startswith("double")
+    return float(value.replace(".", "")) if is_text else value
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class ModeParameters:
+    """What those parameters of a node are in one mode that some mode sets.
+
+    Attributes:
+        mode: its name.
+        parameters: where this mode says nothing of them, as they are given or declared.
+    """
+
+    mode: str
+    parameters: tuple[ExpectedParameter, ...]
 
 
 class HeldBy(enum.Enum):
@@ -232,6 +257,7 @@ class PlannedNode(NodeDeclaration):
         held_by: what holds it until the system is verified.
         expected_parameters: what its parameters must be once it is configured: those declared and
             those given, see lifecycle.plan.parameters.
+        mode_parameters: what of them modes change, for each mode; empty if none does.
         has_all_parameters: it may have no others than those, and those that ROS declares itself.
         unread_parameter_files: those whose values are not known here and so not expected.
         transports: all that the node's own participant may use, UDPV4, UDPV6; empty leaves it
@@ -260,9 +286,15 @@ class PlannedNode(NodeDeclaration):
     membership: bool = False
     files: tuple[PlannedFile, ...] = ()
     expected_parameters: tuple[ExpectedParameter, ...] = ()
+    mode_parameters: tuple[ModeParameters, ...] = ()
     has_all_parameters: bool = False
     unread_parameter_files: tuple[str, ...] = ()
     held_by: HeldBy = HeldBy.STATE_MACHINE
+
+    def in_mode(self, name: str) -> tuple[ExpectedParameter, ...]:
+        """Return what its parameters are in a mode that modes change; empty if none does."""
+        found = (each.parameters for each in self.mode_parameters if each.mode == name)
+        return next(found, ())
 
     @property
     def full_name(self) -> str:
@@ -384,12 +416,31 @@ def in_mode(plan: Plan, name: str) -> Plan:
     switched = {key for each in plan.modes for key in each.inactive}
 
     def as_in_mode(node: PlannedNode) -> PlannedNode:
+        if node.mode_parameters:
+            node = _with_parameters(node, node.in_mode(name))
         if node.key not in switched:
             return node
         state = TargetState.INACTIVE if node.key in mode.inactive else TargetState.ACTIVE
         return node if node.state is state else dataclasses.replace(node, state=state)
 
     return dataclasses.replace(plan, nodes=tuple(map(as_in_mode, plan.nodes)))
+
+
+def _with_parameters(node: PlannedNode, given: tuple[ExpectedParameter, ...]) -> PlannedNode:
+    """Return a node that is started with other values, and must have them."""
+    values = {each.name: each for each in given}
+    known = {each.name for each in node.expected_parameters}
+    return dataclasses.replace(
+        node,
+        expected_parameters=(
+            *(values.get(each.name, each) for each in node.expected_parameters),
+            *(each for each in given if each.name not in known),
+        ),
+        parameters=(
+            *(each for each in node.parameters if each[0] not in values),
+            *((each.name, each.raw) for each in given if each.value is not None),
+        ),
+    )
 
 
 _INDEXES: dict[int, tuple[tuple[PlannedNode, ...], dict[str, PlannedNode]]] = {}

@@ -18,8 +18,15 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, NamedTuple
 
 from lifecycle import dataclasses
-from lifecycle.manifest import Node, ParameterDeclaration, ParameterValue, Position
-from lifecycle.plan.model import ExpectedParameter
+from lifecycle.manifest import (
+    Mode,
+    ModeParameter,
+    Node,
+    ParameterDeclaration,
+    ParameterValue,
+    Position,
+)
+from lifecycle.plan.model import ExpectedParameter, ModeParameters
 
 if TYPE_CHECKING:
     from lifecycle.manifest import Section
@@ -52,10 +59,12 @@ class ParameterFiles:
 
     Args:
         manifest: path of the manifest, beside which files are named in messages.
+        modes: of that manifest.
     """
 
-    def __init__(self, manifest: str) -> None:
+    def __init__(self, manifest: str, modes: tuple[Mode, ...] = ()) -> None:
         self._manifest = manifest
+        self._modes = modes
         self._files: dict[str, _GivenFile] = {}
 
     def expected(self, node: Node) -> tuple[ExpectedParameter, ...]:
@@ -66,6 +75,38 @@ class ParameterFiles:
         )
         undeclared = (_undeclared(name, each) for name, each in given.items())
         return (*declared, *(each for each in undeclared if each is not None))
+
+    def in_modes(
+        self, node: Node, expected: tuple[ExpectedParameter, ...]
+    ) -> tuple[ModeParameters, ...]:
+        """Return what those parameters of a node are in each mode that some mode sets.
+
+        Args:
+            node: of the manifest.
+            expected: what `expected` returns of it.
+        """
+        known = {each.name: each for each in expected}
+        types = {each.name: each.type for each in node.interface.parameters}
+        found = {
+            mode.name: {
+                each.name: _in_mode(mode.name, each, types.get(each.name, ""))
+                for each in mode.parameters
+                if each.node == node.key
+            }
+            for mode in self._modes
+        }
+        names = dict.fromkeys(name for values in found.values() for name in values)
+        if not names:
+            return ()
+        return tuple(
+            ModeParameters(
+                mode=mode,
+                parameters=tuple(
+                    each for name in names if (each := values.get(name) or known.get(name))
+                ),
+            )
+            for mode, values in found.items()
+        )
 
     def unread(self, node: Node) -> tuple[str, ...]:
         """Return the files of a node whose values are not known here."""
@@ -131,6 +172,19 @@ def _declared(declaration: ParameterDeclaration, given: _Given | None) -> Expect
         source="" if given is None or given.value is None else given.source,
         read_only=declaration.read_only,
         at=declaration.at if given is None else given.at,
+    )
+
+
+def _in_mode(mode: str, given: ModeParameter, type_: str) -> ExpectedParameter:
+    from lifecycle.manifest import type_of
+
+    type_ = type_ or type_of(given.value)
+    return ExpectedParameter(
+        name=given.name,
+        type=type_,
+        value=portable(as_type(given.value, type_)),
+        source=f"mode {mode}",
+        at=given.at,
     )
 
 

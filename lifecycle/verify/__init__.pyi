@@ -50,6 +50,7 @@ from .rules.state import ACTIVATED_AT_CLOSED_GATE as ACTIVATED_AT_CLOSED_GATE
 from .rules.state import MISSING_REPORT as MISSING_REPORT
 from .tool_filter import DIAGNOSTICS_TOPIC as DIAGNOSTICS_TOPIC
 from .tool_filter import GRAPH_TOPIC as GRAPH_TOPIC
+from .tool_filter import MODE_SERVICE as MODE_SERVICE
 from .tool_filter import NO_NAMES as NO_NAMES
 from .tool_filter import NODE_SERVICES as NODE_SERVICES
 from .tool_filter import OUR_SERVICES as OUR_SERVICES

@@ -32,6 +32,8 @@ _DIAGNOSTICS = DIAGNOSTICS_TOPIC, "diagnostic_msgs/msg/DiagnosticArray"
 _SUPERVISORS = "/lifecycle/"
 _SUPERVISOR_TOPIC = "status", "std_msgs/msg/String"
 _READING = ("get_status",)
+MODE_SERVICE = "mode/"
+"""What the names of services begin with, below a supervisor's prefix, that enter a mode."""
 _ORDERING = ("pause", "resume", "restart", "down")
 _SUPERVISOR_SERVICE_TYPE = "std_srvs/srv/Trigger"
 
@@ -259,15 +261,24 @@ def supervisor_prefix(system: str, machine: str = "") -> str:
     return _SUPERVISORS + "/".join(each.replace("-", "_") for each in names)
 
 
-def supervisor_services(access: RosInterfaceAccess) -> tuple[str, ...]:
-    """Return the base names of the services that a supervisor offers."""
+def supervisor_services(access: RosInterfaceAccess, modes: Iterable[str] = ()) -> tuple[str, ...]:
+    """Return the names, below its prefix, of the services that a supervisor offers.
+
+    Args:
+        access: what the manifest allows.
+        modes: names of those that it may be asked to enter.
+    """
     if access is RosInterfaceAccess.OFF:
         return ()
-    return _READING if access is RosInterfaceAccess.READ_ONLY else (*_READING, *_ORDERING)
+    if access is RosInterfaceAccess.READ_ONLY:
+        return _READING
+    # Names of ROS hold no "__" and do not end with "_".
+    legal = (each for each in modes if "__" not in f"{each}_")
+    return (*_READING, *_ORDERING, *(f"{MODE_SERVICE}{each}" for each in legal))
 
 
 def supervisor_endpoints(
-    system: str, machine: str, access: RosInterfaceAccess
+    system: str, machine: str, access: RosInterfaceAccess, modes: Iterable[str] = ()
 ) -> frozenset[tuple[EndpointKind, str]]:
     """Return what a supervisor makes by `policy.ros_interface`; see `supervisor_prefix`."""
     if access is RosInterfaceAccess.OFF:
@@ -279,7 +290,7 @@ def supervisor_endpoints(
             (EndpointKind.PUBLISHER, f"{prefix}/{_SUPERVISOR_TOPIC[0]}"),
             *(
                 (EndpointKind.SERVICE_SERVER, f"{prefix}/{name}")
-                for name in supervisor_services(access)
+                for name in supervisor_services(access, modes)
             ),
         )
     )
@@ -292,7 +303,9 @@ def is_supervisor_endpoint(kind: EndpointKind, node: str, name: str, type_: str)
     base = name.rpartition("/")[2] if name.startswith(_SUPERVISORS) else ""
     if kind is EndpointKind.PUBLISHER:
         return (name, type_) == _DIAGNOSTICS or (base, type_) == _SUPERVISOR_TOPIC
-    serves = kind is EndpointKind.SERVICE_SERVER and base in (*_READING, *_ORDERING)
+    enters = name.startswith(_SUPERVISORS) and name.split("/")[-2] == MODE_SERVICE[:-1]
+    known = enters or base in (*_READING, *_ORDERING)
+    serves = kind is EndpointKind.SERVICE_SERVER and known
     return serves and type_ == _SUPERVISOR_SERVICE_TYPE
 
 

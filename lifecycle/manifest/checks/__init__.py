@@ -40,7 +40,11 @@ from lifecycle.manifest.checks.nodes import (
     check_programs,
     check_supervision,
 )
-from lifecycle.manifest.checks.parameters import check_parameter_files, check_parameters
+from lifecycle.manifest.checks.parameters import (
+    check_mode_parameters,
+    check_parameter_files,
+    check_parameters,
+)
 from lifecycle.manifest.checks.system import DeclaredSystem, Partial
 from lifecycle.manifest.checks.transport import check_discovery, check_middleware, check_transport
 from lifecycle.manifest.diagnostics import Diagnostic
@@ -129,6 +133,10 @@ CHECKS = (
         sections=frozenset({"modes"}),
     ),
     Check(run=lambda scope: check_modes(scope.system), parts=("run", "after")),
+    Check(
+        run=lambda scope: check_mode_parameters(scope.system),
+        parts=("run", "interface", "parameters", "parameter_files"),
+    ),
     Check(
         run=lambda scope: check_ports(scope.system, scope.needs, scope.environment),
         whole=True,

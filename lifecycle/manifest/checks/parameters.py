@@ -1,10 +1,11 @@
 """Checks of ROS parameters and parameter files (YAML) against the parameters an interface declares.
 
 Owns: check.parameter-undeclared, check.parameter-type, check.parameter-unused, also for values in
-files; check.parameter-file, check.parameter-file-unmatched; whether a value fits a type of
-rcl_interfaces/ParameterType, and what rcl makes of a scalar in a parameter file; the layout that
-rcl_yaml_param_parser reads (namespaces and node names down to `ros__parameters`, parameters nested
-with dots) and how rclcpp and rclpy match a section to a node. Reads the files.
+files; check.parameter-file, check.parameter-file-unmatched; check.mode for parameters of modes;
+whether a value fits a type of rcl_interfaces/ParameterType, and what rcl makes of a scalar in a
+parameter file; the layout that rcl_yaml_param_parser reads (namespaces and node names down to
+`ros__parameters`, parameters nested with dots) and how rclcpp and rclpy match a section to a node.
+Reads the files.
 
 An interface that declares no parameters leaves them open, so nothing is checked then.
 """
@@ -20,7 +21,7 @@ from pathlib import Path
 from lifecycle import dataclasses
 from lifecycle.manifest.checks.system import DeclaredSystem, full_name
 from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, Severity
-from lifecycle.manifest.model import Node, ParameterValue, RunKind
+from lifecycle.manifest.model import ModeParameter, Node, ParameterValue, RunKind
 from lifecycle.manifest.nodl import nearest_file
 from lifecycle.manifest.schema import did_you_mean
 from lifecycle.manifest.yaml.document import Document, Place, Value, error, warning
@@ -138,6 +139,66 @@ def _given(node: Node) -> Iterator[Diagnostic]:
             message = f"cannot set parameter {name!r}: the interface declares no such parameter"
             hint = did_you_mean(name, declared) or "declare it under 'interface.parameters'"
             yield error("check.parameter-undeclared", at, message, hint)
+
+
+def check_mode_parameters(system: DeclaredSystem) -> Iterator[Diagnostic]:
+    """Yield findings about parameters that modes cannot set, or not set back."""
+    modes = system.manifest.modes
+    for mode in modes:
+        for each in mode.parameters:
+            what = f"cannot set parameter {each.name!r} of {each.node!r} in mode {mode.name!r}"
+            node = system.nodes.get(each.node)
+            if not system.may_exist(each.node):
+                hint = did_you_mean(each.node, system.known)
+                yield error("check.mode", each.at, f"{what}: no such node", hint)
+            elif node is not None and (why := _never_set(node, each)):
+                yield error("check.mode", each.at, f"{what}{why[0]}", why[1])
+            elif node is not None and not _is_given(node, each.name):
+                others = [
+                    other.name
+                    for other in modes
+                    if all(
+                        (one.node, one.name) != (each.node, each.name) for one in other.parameters
+                    )
+                ]
+                if others:
+                    why_not = f"what it is in mode {others[0]!r} is not known"
+                    hint = f"give it there, or in 'nodes.{each.node}.parameters'"
+                    yield error("check.mode", each.at, f"{what}: {why_not}", hint)
+
+
+def _never_set(node: Node, given: ModeParameter) -> tuple[str, str] | None:
+    """Say why a mode cannot set a parameter, and what to do; None if it may."""
+    if node.run.kind is RunKind.ATTACH and not node.run.component:
+        return ": it is attached, and its parameters are only verified", "remove it from the mode"
+    declared = {each.name: each for each in node.interface.parameters}
+    declaration = declared.get(given.name)
+    if declaration is None:
+        if not declared or is_implicit(given.name):
+            return None
+        hint = did_you_mean(given.name, declared) or "declare it under 'interface.parameters'"
+        return ": its interface declares no such parameter", hint
+    if declaration.read_only:
+        return ": it is read-only", "remove it from the mode"
+    if problem := misfit(given.value, declaration.type):
+        return f" to {problem}", suggestion(given.value, declaration.type)
+    return None
+
+
+def _is_given(node: Node, name: str) -> bool:
+    """Return whether it is known what a parameter is in a mode that says nothing of it."""
+    if name in dict(node.parameters):
+        return True
+    if any(each.name == name and each.default is not None for each in node.interface.parameters):
+        return True
+    return any(
+        name == found
+        for path in node.parameter_files
+        if os.path.lexists(path)
+        for section in read_sections(path, shown=path)[0]
+        if section.matches(full_name(node))
+        for found, _, _ in section.parameters
+    )
 
 
 def _no_effect(node: Node) -> Iterator[Diagnostic]:

@@ -25,7 +25,7 @@ from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.rcl.graph import GraphObserver
 from lifecycle.middleware.services.parameters import read_parameters, report_parameters
 from lifecycle.middleware.services.service_calls import ServiceCalls, ServiceUnansweredError
-from lifecycle.plan import COMMAND, DEFAULT, NOT_FINITE, PlannedNode
+from lifecycle.plan import COMMAND, DEFAULT, PlannedNode
 from lifecycle.verify import (
     ConfigurationError,
     NodeConfiguration,
@@ -441,7 +441,7 @@ class NodeClients:
 def _given_values(node: PlannedNode) -> dict[str, Any]:
     """Return what a plan gives a node's parameters, as rclpy has it, but by its command line."""
     return {
-        each.name: _not_finite(each.value) if each.type.startswith("double") else each.value
+        each.name: [bytes((one,)) for one in each.raw] if each.type == "byte_array" else each.raw
         for each in node.expected_parameters
         if each.value is not None and each.source not in (DEFAULT, COMMAND)
     }
@@ -449,9 +449,3 @@ def _given_values(node: PlannedNode) -> dict[str, Any]:
 
 def _messages(values: Iterable[tuple[str, Any]]) -> list[Any]:
     return [RclpyParameter(name, value=value).to_parameter_msg() for name, value in values]
-
-
-def _not_finite(value: Any) -> Any:
-    if isinstance(value, tuple):
-        return tuple(map(_not_finite, value))
-    return float(value.replace(".", "")) if value in NOT_FINITE else value

@@ -105,7 +105,11 @@ def _rehearse() -> None:
     codec.to_json(Event(kind="ready"))
     LifecycleMachine().resolve(0, "configure")
     dataclasses.make_constructors(
-        "lifecycle.node", "lifecycle.middleware", "lifecycle.verify.o", "lifecycle.network.ports"
+        "lifecycle.node",
+        "lifecycle.middleware",
+        "lifecycle.verify.observation",
+        "lifecycle.verify.outcome",
+        "lifecycle.network.ports",
     )
 
 

@@ -19,7 +19,13 @@ from lifecycle.manifest import RosInterfaceAccess
 from lifecycle.supervisor.control.orders import Done, Order, OrderKind
 from lifecycle.supervisor.control.protocol import NodeStatus, SystemStatus
 from lifecycle.supervisor.run.events import Event, LogLine, SystemReached
-from lifecycle.verify import Outcome, Verdict, supervisor_prefix, supervisor_services
+from lifecycle.verify import (
+    MODE_SERVICE,
+    Outcome,
+    Verdict,
+    supervisor_prefix,
+    supervisor_services,
+)
 
 Entry = tuple[int, str, str, str, Sequence[tuple[str, str]]]
 """Level, name, message, hardware id and values of a diagnostic_msgs/DiagnosticStatus."""
@@ -64,6 +70,7 @@ class RosInterface:
     Args:
         access: what the manifest allows.
         machine: of this supervisor, where the system has several; else empty.
+        modes: names of those that it may be asked to enter.
         participant: makes topics and services.
         status: returns what is known now.
         verdict: returns the last one; None before the first.
@@ -77,6 +84,7 @@ class RosInterface:
         machine: str,
         participant: Offering,
         *,
+        modes: Iterable[str] = (),
         status: Callable[[], SystemStatus],
         verdict: Callable[[], Verdict | None],
         order: Callable[[Order], Awaitable[Done]],
@@ -84,6 +92,7 @@ class RosInterface:
     ) -> None:
         self._access = access
         self._machine = machine
+        self._modes = tuple(modes)
         self._participant = participant
         self._status = status
         self._verdict = verdict
@@ -124,7 +133,7 @@ class RosInterface:
                 loop.call_soon_threadsafe(self._called, name, answer)
 
         prefix = supervisor_prefix(self._status().system, self._machine)
-        services = supervisor_services(self._access)
+        services = supervisor_services(self._access, self._modes)
         self._offer = self._participant.ros_interface(prefix, services, called)
         self._publish()
 
@@ -150,18 +159,24 @@ class RosInterface:
         if name == _DOWN:
             answer(True, "the system is being taken down")
             self._down()
-        elif name in {each.value for each in OrderKind}:
-            task = asyncio.ensure_future(self._ordered(OrderKind(name), answer))
+        elif name.startswith(MODE_SERVICE) or name in {each.value for each in OrderKind}:
+            mode = name.removeprefix(MODE_SERVICE)
+            order = (
+                Order(kind=OrderKind(name))
+                if mode == name
+                else Order(kind=OrderKind.MODE, mode=mode)
+            )
+            task = asyncio.ensure_future(self._ordered(order, answer))
             self._orders.add(task)
             task.add_done_callback(self._orders.discard)
         else:
             status = self._status()
             answer(status.verdict is not Outcome.VIOLATED, to_json(status).decode())
 
-    async def _ordered(self, kind: OrderKind, answer: Answer) -> None:
+    async def _ordered(self, order: Order, answer: Answer) -> None:
         error = "cannot do this: the supervisor ends"
         try:
-            error = (await self._order(Order(kind=kind))).error
+            error = (await self._order(order)).error
         except LifecycleError as refused:
             error = str(refused)
         finally:

@@ -267,7 +267,7 @@ class Holding:
             await work()
         except OutrunError:
             pass
-        except VerificationError as error:
+        except (VerificationError, NotBegunError) as error:
             self._emit(Notice(message=str(error)))
         except StepFailedError as error:
             failure = error

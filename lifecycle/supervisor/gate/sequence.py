@@ -229,19 +229,21 @@ class GateSequence:
             self._reached(PAUSED)
 
     async def _switch(self, mode: str) -> None:
-        """Enter a mode: deactivate in reverse order, activate through the gate, or go back.
+        """Enter a mode: deactivate in reverse order, set parameters, activate through the gate.
+
+        If a node refuses a value, or the gate stays closed, it goes back to the mode before.
 
         What goes down needs no gate, so that a mode with less can be entered whatever is violated.
         """
         before = self._system.mode
         try:
             await self._enter(mode)
-        except VerificationError:
-            if self.phase not in (PAUSED, HELD):
+        except (VerificationError, NotBegunError) as error:
+            if isinstance(error, VerificationError) and self.phase not in (PAUSED, HELD):
                 raise
             self._emit(Notice(message=f"cannot enter mode {mode!r}: back to {before!r}"))
             # As far as the gate allows; what it does not let through waits at it.
-            with contextlib.suppress(VerificationError):
+            with contextlib.suppress(VerificationError, NotBegunError):
                 await self._enter(before)
             raise
 
@@ -249,9 +251,11 @@ class GateSequence:
         phase, before = self.phase, self._system.mode
         nodes = tuple(self._system.nodes.values())
         wanted = {each for each in nodes if each.is_to_be_active}
+        had = {each: each.planned.expected_parameters for each in nodes}
         self._gate.close()
         self.phase = "switching"
         self._system.enter(mode)
+        changed = [each for each in nodes if each.planned.expected_parameters != had[each]]
         going = [
             each
             for each in nodes
@@ -259,6 +263,7 @@ class GateSequence:
         ]
         try:
             await self._alive(self._bring_up.deactivate(going))
+            await self._set_parameters(mode, changed)
         finally:
             self.phase = phase
             self._judge.ahead = self.active()
@@ -269,6 +274,7 @@ class GateSequence:
                 inactive=tuple(
                     each.name for each in nodes if each.planned.state is TargetState.INACTIVE
                 ),
+                parameters=tuple(each.name for each in changed),
             )
         )
         self._system.touched.set()
@@ -278,6 +284,22 @@ class GateSequence:
             await self._through_the_gate()
         elif not self._inactive():
             self._reached(ACTIVE)
+
+    async def _set_parameters(self, mode: str, nodes: Iterable[NodeRun]) -> None:
+        """Set what a mode has of parameters; what does not run yet is started with it.
+
+        Raises:
+            NotBegunError: a node refuses a value, or does not answer.
+        """
+        running = [each for each in nodes if each.is_up and not each.is_gone]
+        if not running:
+            return
+        try:
+            await self._alive(self._bring_up.set_parameters(mode, running))
+        except StepFailedError:
+            raise
+        except BringUpError as error:
+            raise NotBegunError(f"cannot enter mode {mode!r}: {error.message}") from error
 
     async def _restart(self, order: Order) -> None:
         """Take one process or all down, and bring it up as far as the system was."""
@@ -702,12 +724,15 @@ class GateSequence:
             each.withheld = ""
         async with self._following():
             await self._alive(self._bring_up.activate(permit, behind_s(deadline), waiting))
-        self._judge.ahead = frozenset()
-        await self._alive(self._judge.until_clear(Stage.ACTIVE, behind_s(deadline)))
+        # Who waits at another gate, or was deactivated for a violation, is not to be active yet.
+        whole = not self._inactive()
+        self._judge.ahead = frozenset() if whole else self.active()
+        stage = Stage.ACTIVE if whole else Stage.CONNECTED
+        await self._alive(self._judge.until_clear(stage, behind_s(deadline)))
         # The same question as at the gate: what became active must be what was verified.
         assert self._judge.latest is not None
         self._gate.judge(self._judge.latest)
-        if nodes is None or not self._inactive():
+        if not self._inactive():
             self._reached(ACTIVE)
 
     async def _through_the_gate(self) -> None:

@@ -15,10 +15,11 @@ from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterable
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
+from lifecycle import dataclasses
 from lifecycle.errors import BringUpError, MiddlewareError
 from lifecycle.manifest import Condition, RosArguments, RunKind, TargetState
 from lifecycle.node import HostSpec, Operation
-from lifecycle.plan import PlannedNode
+from lifecycle.plan import GIVEN, PlannedNode
 from lifecycle.supervisor.control.protocol import ProcessState, Reach
 from lifecycle.supervisor.gate.gate import Permit
 from lifecycle.supervisor.nodes.driver import ACTIVE, ControlDriver, NodeCondition, NodeDriver
@@ -30,7 +31,7 @@ from lifecycle.supervisor.processes.control_channel import (
 )
 from lifecycle.supervisor.processes.process import ManagedProcess, Spawner, wait_under_load
 from lifecycle.supervisor.run.events import Notice
-from lifecycle.supervisor.run.failure import StepFailedError, ended
+from lifecycle.supervisor.run.failure import StepFailedError, ended, together
 from lifecycle.verify import (
     DEADLINE,
     NOT_WIRED,
@@ -223,6 +224,30 @@ class BringUp:
         )
         await self._side_by_side(self._deactivate(node, active) for node in active)
 
+    async def set_parameters(self, mode: str, nodes: Iterable[NodeRun]) -> None:
+        """Set what a mode has of parameters, on nodes that run.
+
+        Raises:
+            BringUpError: a node refuses a value or does not answer; others may have theirs.
+        """
+        gives = self._gives
+        if gives is None:
+            return
+        plans = [
+            dataclasses.replace(
+                node.planned,
+                # All of them, also those that it has by default.
+                expected_parameters=tuple(
+                    dataclasses.replace(each, source=GIVEN) for each in node.planned.in_mode(mode)
+                ),
+            )
+            for node in nodes
+        ]
+        try:
+            await together(_awaiting(gives(each)) for each in plans)
+        except MiddlewareError as error:
+            raise BringUpError(error.message) from error
+
     def _some(self, nodes: Iterable[NodeRun] | None) -> tuple[NodeRun, ...]:
         return tuple(self._system.nodes.values() if nodes is None else nodes)
 
@@ -401,6 +426,8 @@ class BringUp:
             return False
         if planned.run.ros_args is RosArguments.NONE:
             return bool(planned.parameters or planned.parameter_files)
+        if planned.mode_parameters:
+            return True  # it may come again in another mode
         shared = len(process.planned.nodes) > 1
         return shared and planned.namespace != "/" and bool(planned.parameters)
 
@@ -629,6 +656,10 @@ class BringUp:
             subject=culprit.name if culprit else self._system.plan.system,
             **(_process_of(culprit) if culprit else {}),
         )
+
+
+async def _awaiting(awaitable: Awaitable[None]) -> None:
+    await awaitable
 
 
 def manifest_folders(nodes: Iterable[PlannedNode]) -> tuple[str, ...]:

@@ -349,12 +349,14 @@ class ModeEntered:
         mode: its name.
         before: that of the mode that it was in.
         inactive: names of the nodes that it keeps inactive.
+        parameters: names of the nodes that have other parameters than in the mode before.
     """
 
     kind: ClassVar[str] = "mode"
     mode: str
     before: str
     inactive: tuple[str, ...]
+    parameters: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

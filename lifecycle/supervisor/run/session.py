@@ -274,6 +274,7 @@ class Session:
             system.plan.policy.ros_interface,
             min(system.machines or ("",)),
             observer_participant,
+            modes=() if system.remote else (each.name for each in system.plan.modes),
             status=self.status,
             verdict=lambda: self._judge.latest,
             order=self._holding.ordered,

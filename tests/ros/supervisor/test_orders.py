@@ -7,6 +7,7 @@ import gc
 import json
 import re
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -25,6 +26,7 @@ from std_srvs.srv import Trigger
 from lifecycle.errors import ExitCode
 from tests.ros.middleware.free_ports import free_ports
 from tests.ros.supervisor.running import BOUND_S, ENOUGH, Up, pair, up, verb
+from tests.ros.supervisor.test_parameters import ARM
 
 Intruders = Callable[[int], Callable[[], None]]
 _PORTS = 20
@@ -154,6 +156,7 @@ def test_a_panel_on_the_network_sees_the_system_and_pauses_it_without_a_shell(
 
         edit = {
             "policy/ros_interface": "full",
+            "modes": {"normal": {}, "quiet": {"inactive": ["talker"]}},
             "nodes/talker/run/no_new_privileges": True,
             "nodes/talker/run/limits": {"nofile": 200},
         }
@@ -181,6 +184,8 @@ def test_a_panel_on_the_network_sees_the_system_and_pauses_it_without_a_shell(
             assert "NoNewPrivs:\t1" in (talker / "status").read_text()
             assert "NoNewPrivs:\t0" in (listener / "status").read_text()
             assert re.search(r"Max open files +200 +200 ", (talker / "limits").read_text())
+            assert call("mode/quiet") == (True, "active")
+            assert json.loads(call("get_status")[1])["mode"] == "quiet"
             assert call("down")[0]
             assert run.finish() == ExitCode.OK
             run.assert_gate_held()
@@ -619,12 +624,27 @@ def test_a_parameter_file_that_changed_is_not_taken_in_silence(
 def test_a_mode_takes_a_node_out_and_another_brings_it_back_through_the_gate(
     tmp_path: Path, fresh_domain: int
 ) -> None:
-    modes = {"normal": {}, "quiet": {"inactive": ["talker"]}}
-    with up(pair(tmp_path, fresh_domain, edit={"modes": modes}), runtime=tmp_path) as run:
+    quiet = {
+        "inactive": ["talker"],
+        "parameters": {"listener": {"gain": 0.5}, "arm": {"gain": 2.0}},
+    }
+    arm = {"run": {"command": [sys.executable, ARM]}, "managed": False, "endpoints": "open"}
+    gain = {"gain": {"type": "double", "default_value": 1.0}}
+    edit = {
+        "modes": {"normal": {}, "quiet": quiet, "stuck": {"parameters": {"arm": {"joints": [1]}}}},
+        "nodes/listener/interface/parameters": gain,
+        "nodes/arm": {**arm, "parameters": {"gain": 1.0, "joints": ["a", "b"]}},
+    }
+    with up(pair(tmp_path, fresh_domain, edit=edit), runtime=tmp_path) as run:
         run.until("system", reached="active")
         since = len(run.events)
         assert verb("mode", "pair", "quiet", runtime=tmp_path).returncode == ExitCode.OK
-        assert run.met("mode", since=since)["inactive"] == ["/talker"]
+        entered = run.met("mode", since=since)
+        assert entered["inactive"] == ["/talker"]
+        assert entered["parameters"] == ["/arm", "/listener"]
+        refused = verb("mode", "pair", "stuck", runtime=tmp_path)
+        assert refused.returncode == ExitCode.BRING_UP_FAILED
+        assert "'stuck': cannot set parameter 'joints' of '/arm': it says" in refused.stderr
         status = verb("status", "pair", runtime=tmp_path)
         assert status.returncode == ExitCode.OK
         assert "pair: active, mode quiet, verdict ok" in status.stdout

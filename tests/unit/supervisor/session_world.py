@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from lifecycle.codec import from_json, to_json
+from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.model import Condition, RunKind
 from lifecycle.node.host.control import Operation
 from lifecycle.plan.model import ParticipantConnections, Plan, PlannedNode
@@ -177,6 +178,7 @@ class FakeParticipant:
         asked_for: services that have a client.
         while_looking: done once, when the next look has seen everything and is not over yet.
         ros: what ROS programs see of the supervisor; None before it is made.
+        refuses: value of a parameter that no node takes, `rate=5`.
     """
 
     def __init__(self, hosts: FakeForkServer) -> None:
@@ -191,6 +193,7 @@ class FakeParticipant:
         self.asked_for: set[str] = set()
         self.while_looking: Callable[[], None] | None = None
         self.ros: FakeRosInterface | None = None
+        self.refuses = ""
         self._hosts = hosts
         self._reports: dict[str, NodeConfiguration] = {}
         self._changed = asyncio.Event()
@@ -251,7 +254,11 @@ class FakeParticipant:
         """No container is in this world."""
 
     async def give(self, node: PlannedNode) -> None:
-        """No node of this world has parameter services."""
+        """Note what is set; a node may refuse."""
+        given = " ".join(f"{each.name}={each.value}" for each in node.expected_parameters)
+        self._hosts.log.append(f"{node.full_name} given {given}")
+        if self.refuses in given.split():
+            raise MiddlewareError(f"cannot set {self.refuses!r}")
 
     def driver(self, node: PlannedNode) -> NodeDriver:
         return ServiceDriver(self.services, node)

@@ -248,6 +248,35 @@ def test_a_node_that_is_being_restarted_has_no_consequence_and_one_withheld_come
     run(main())
 
 
+def test_who_comes_again_passes_its_gate_while_another_is_held_behind_it(tmp_path: Path) -> None:
+    async def main() -> None:
+        plan = plan_of(
+            dataclasses.replace(planned_node("camera"), on_violation=_said(((TWICE, DEACTIVATE),))),
+            planned_node("viewer", supervision=Supervision(restart=RestartWhen.ON_FAILURE)),
+        )
+        world = SessionWorld(plan, tmp_path, stop_after_s=60.0)
+
+        async def violate() -> None:
+            await world.story.until("[system] active")
+            world.double("/camera")
+            await world.story.until("[node] /camera connected (inactive)", 2)
+            world.double()
+            world.kill("viewer")
+            began = asyncio.get_running_loop().time()
+            await world.story.until("[restarted] viewer (1)")
+            assert asyncio.get_running_loop().time() - began < 2.0
+            camera, viewer = world.status().nodes
+            assert world.status().phase == "held"
+            assert (camera.state, viewer.state) == ("inactive", "active")
+            assert await world.order(ControlRequest.RESUME) == "0"
+            assert world.status().phase == "active"
+
+        await world.run(violate())
+        assert not [each for each in world.outline if each.startswith("[failure] run.transition")]
+
+    run(main())
+
+
 def test_a_violation_enters_a_mode_once_and_one_that_its_gate_refuses_is_left_again(
     tmp_path: Path,
 ) -> None:

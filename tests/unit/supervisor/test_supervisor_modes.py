@@ -6,11 +6,22 @@ import asyncio
 import dataclasses
 from pathlib import Path
 
-from lifecycle.manifest import Mode, Restart, Supervision, TargetState
+from lifecycle.manifest import (
+    Consequence,
+    Mode,
+    ModeParameter,
+    ParameterDeclaration,
+    Policy,
+    Reaction,
+    Restart,
+    RosInterfaceAccess,
+    Supervision,
+    TargetState,
+)
 from lifecycle.plan import in_mode
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.control.server import ControlRequest
-from tests.builders import HERE, plan_of, planned_node
+from tests.builders import HERE, node, plan_of, planned, planned_node
 from tests.unit.supervisor.fakes import run
 from tests.unit.supervisor.session_world import INTRUDED, SessionWorld
 
@@ -138,5 +149,97 @@ def test_a_paused_system_stays_paused_and_what_is_restarted_comes_back_as_its_mo
         assert world.outline.count("/camera activate") == 1
         assert world.outline.count("/base activate") == 3
         assert world.story[-1] == "[stopped] 0"
+
+    run(main())
+
+
+def _with_speeds() -> Plan:
+    """Two nodes with a speed, another one in mode `slow`, which keeps the camera inactive."""
+    speed = ParameterDeclaration(name="speed", type="double", default=1.0, at=HERE)
+    nodes = [node(each) for each in ("base", "camera")]
+    nodes[0] = dataclasses.replace(
+        nodes[0], interface=dataclasses.replace(nodes[0].interface, parameters=(speed,))
+    )
+    slow = ModeParameter(node="base", name="speed", value=0.2, at=HERE)
+    modes = (
+        Mode(name="normal", at=HERE),
+        Mode(name="slow", inactive=("camera",), parameters=(slow,), at=HERE),
+    )
+    return planned(*nodes, modes=modes)
+
+
+def test_a_mode_has_parameters_and_the_next_has_them_as_they_are_declared() -> None:
+    plan = _with_speeds()
+    assert plan.nodes[0].parameters == (("speed", 1.0),)
+    (expected,) = in_mode(plan, "slow").nodes[0].expected_parameters
+    assert (expected.name, expected.value, expected.source) == ("speed", 0.2, "mode slow")
+    assert in_mode(plan, "slow").nodes[0].parameters == (("speed", 0.2),)
+    assert in_mode(in_mode(plan, "slow"), "normal") == plan
+
+
+def test_parameters_are_set_before_what_comes_in_is_activated_and_set_back_if_one_is_refused(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        plan = dataclasses.replace(
+            _with_speeds(), policy=Policy(ros_interface=RosInterfaceAccess.FULL)
+        )
+        world = SessionWorld(plan, tmp_path, stop_after_s=10.0)
+
+        async def switch() -> None:
+            await world.story.until("[system] active")
+            await asyncio.sleep(0.1)
+            ros = world.graph.ros
+            assert ros is not None
+            assert ros.services[-2:] == ("mode/normal", "mode/slow")
+            assert await ros.call("mode/slow") == (True, "active")
+            assert await world.order(MODE, mode="normal") == "0"
+            world.graph.refuses = "speed=0.2"
+            assert await world.order(MODE, mode="slow") == (
+                "6 cannot enter mode 'slow': cannot set 'speed=0.2'"
+            )
+            status = world.status()
+            assert (status.mode, status.phase) == ("normal", "active")
+
+        await world.run(switch())
+        outline = [each for each in world.since("[system] active")[1:] if "[system]" not in each]
+        # Fake nodes report no parameters.
+        through = ["networks programmed (unverifiable)", "[gate] unverifiable: /camera"]
+        through.append("/camera activate")
+        assert outline[: outline.index("[stopping] at 10.0 s: done")] == [
+            "/camera deactivate",
+            "/base given speed=0.2",
+            "[mode] slow without /camera",
+            "/base given speed=1.0",
+            "[mode] normal",
+            *through,
+            "/camera deactivate",
+            "/base given speed=0.2",
+            "[notice] cannot enter mode 'slow': back to 'normal'",
+            "/base given speed=1.0",
+            "[mode] normal",
+            *through,
+        ]
+
+    run(main())
+
+
+def test_a_consequence_that_a_node_refuses_is_reported_and_the_system_goes_on(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        what = Reaction(rule="graph", what=Consequence.MODE, mode="slow")
+        world = SessionWorld(
+            dataclasses.replace(_with_speeds(), on_violation=(what,)), tmp_path, stop_after_s=10.0
+        )
+        world.graph.refuses = "speed=0.2"
+
+        async def intrude() -> None:
+            await world.story.until("[system] active")
+            world.intrude()
+            await world.story.until("[notice] cannot enter mode 'slow': cannot set")
+
+        await world.run(intrude())
+        assert world.status().mode == "normal"
 
     run(main())
