@@ -24,6 +24,7 @@ from .fastdds.participant_profile import ParticipantSettings as ParticipantSetti
 from .fastdds.profiles import discovery_environment as discovery_environment
 from .fastdds.settings import once_participant_is_made as once_participant_is_made
 from .fastdds.settings import participant_settings as participant_settings
+from .fastdds.settings import stop_listening as stop_listening
 from .fastdds.settings import unknown_versions as unknown_versions
 from .process.busy_timer import BusySign as BusySign
 from .process.busy_timer import Overdue as Overdue
