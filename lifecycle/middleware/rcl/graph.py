@@ -24,6 +24,7 @@ from lifecycle.manifest import EndpointKind, join
 from lifecycle.middleware.discovery.dead_peers import (
     PROCESS_DIGITS,
     give_up_dead_connections,
+    is_alone,
     is_of_process,
     is_used,
     remove_participants,
@@ -388,13 +389,18 @@ class GraphObserver:
             pid: of a process on this host.
             nodes: fully qualified names of nodes that it runs.
             reported: GUID prefixes that these nodes said are theirs. Of both only those count
-                that bear this host and this pid.
+                that bear this host and this pid. Where there are none, because the process ended
+                before its nodes' names were known, participants without any name count, unless
+                another process bears the same.
         """
         if self._destroyed:
             return frozenset()
         homes = self._stale_node_filter.homes()
         own = next(iter(homes.get(self.node.get_fully_qualified_name(), ())), "")
         claimed = {*reported, *(prefix for name in nodes for prefix in homes.get(name, ()))}
+        if not claimed and is_alone(pid):
+            named = {prefix for name, home in homes.items() if name for prefix in home}
+            claimed = set(self._stale_node_filter.shown()) - named
         processes = {
             each[:PROCESS_DIGITS] for each in claimed if own and is_of_process(each, pid, own)
         }

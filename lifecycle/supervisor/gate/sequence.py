@@ -194,8 +194,38 @@ class GateSequence:
             VerificationError: the gate stays closed, or closed again before every node was sent its
                 request, and what had become active is inactive again. In phase PAUSED or HELD the
                 system stays as it is and can be asked again; in any other the run is over.
-            StepFailedError: a step failed, or a network could not be programmed; the run is over.
+            StepFailedError: a step failed, or a network could not be programmed; the run is over,
+                unless what failed is put down to be started again.
         """
+        before = self.phase
+        try:
+            await self._carry_out(order)
+        except StepFailedError:
+            self._cut_short(before)
+            raise
+
+    def _cut_short(self, before: str) -> None:
+        """Leave a system whose order failed in a phase in which it is held, and takes orders.
+
+        What the order would have activated waits at its gate until all is back, and then passes;
+        a system that was paused stays so unless its gate had opened.
+
+        Args:
+            before: the phase before the order.
+        """
+        if self.phase in (ACTIVE, PAUSED, HELD):
+            return
+        if before == PAUSED and self.phase != "activating":
+            self.phase = PAUSED
+            return
+        self.phase = HELD
+        self._schedule.wait_at_gate(
+            key
+            for key, each in self._system.nodes.items()
+            if each.is_to_be_active and not each.withheld and each.reach is not Reach.ACTIVE
+        )
+
+    async def _carry_out(self, order: Order) -> None:
         if order.kind is OrderKind.PAUSE:
             await self._pause(order)
         elif order.kind is OrderKind.RESUME:
@@ -317,7 +347,10 @@ class GateSequence:
         self._gate.close()
         self.phase = "restarting"
         self._schedule.by_hand([each.planned.key for each in nodes])
-        await self._again(nodes, self._timeout_s, order.plan if order.reload else None)
+        await self._take_down(nodes)
+        await self._begin_again(nodes, order.plan if order.reload else None)
+        # Who waits for one that is started again later follows it.
+        await self._connect_unfinished(self._timeout_s)
         self._emit(SystemReached(reached="connected", elapsed_s=self._emit.elapsed_s))
         if was_paused:
             self._reached(PAUSED)
@@ -448,7 +481,7 @@ class GateSequence:
             return
         deadline = asyncio.get_running_loop().time() + self._timeout_s
         try:
-            permit = await self._unless_outrun(self.verify(self._timeout_s))
+            permit = await self._unless_outrun(self.verify(self._timeout_s), self._outrun())
             waiting = tuple(each for each in self._inactive() if each.name in names)
             await self.activate(permit, deadline, waiting)
         except VerificationError as error:
@@ -497,9 +530,11 @@ class GateSequence:
         ]
         return failures[0].joined(failures[1:])
 
-    async def _unless_outrun(self, judging: Coroutine[Any, Any, Permit]) -> Permit:
+    async def _unless_outrun(
+        self, judging: Coroutine[Any, Any, Permit], outrun: Coroutine[Any, Any, None]
+    ) -> Permit:
         running = asyncio.ensure_future(judging)
-        first = asyncio.ensure_future(self._outrun())
+        first = asyncio.ensure_future(outrun)
         try:
             waits: set[asyncio.Future[Any]] = {running, first}
             await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
@@ -603,18 +638,15 @@ class GateSequence:
         )
         return (*found, *components)
 
-    async def _again(
-        self, nodes: tuple[NodeRun, ...], timeout_s: float, plan: Plan | None = None
-    ) -> None:
+    async def _again(self, nodes: tuple[NodeRun, ...], timeout_s: float) -> None:
         """Take nodes down with all of their processes, and bring them up as far as connected.
 
         Args:
             nodes: with all of their processes.
             timeout_s: seconds, for bringing them up.
-            plan: another manifest's, to be taken meanwhile; None to keep this one.
         """
         await self._take_down(nodes)
-        nodes = await self._begin_again(nodes, plan)
+        nodes = await self._begin_again(nodes)
         self.phase = "connecting"
         self._judge.ahead = self.active()
         await self._alive(self._bring_up.connect(timeout_s, nodes))
@@ -740,7 +772,7 @@ class GateSequence:
         deadline = asyncio.get_running_loop().time() + self._timeout_s
         before = PAUSED if self.phase == PAUSED else HELD
         try:
-            permit = await self.verify(self._timeout_s)
+            permit = await self._verify_with_who_comes_again()
         except VerificationError:
             # What is active was verified before; what is not stays inactive until asked again.
             self.phase = before
@@ -753,6 +785,16 @@ class GateSequence:
                     await self._withdraw(permit)
                 self.phase = before
             raise
+
+    async def _verify_with_who_comes_again(self) -> Permit:
+        """Judge until the gate opens, and start again meanwhile what is due: it may wait for it."""
+        while True:
+            with contextlib.suppress(OutrunError):
+                return await self._unless_outrun(self.verify(self._timeout_s), self._schedule.due())
+            self.phase = "restarting"
+            keys = self._schedule.begin()
+            await self._begin_again(tuple(self._system.nodes[key] for key in keys))
+            await self._connect_unfinished(self._timeout_s)
 
     async def _withdraw(self, permit: Permit) -> None:
         """Deactivate again what was activated since the gate opened: the rest may not follow."""

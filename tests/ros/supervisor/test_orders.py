@@ -655,3 +655,32 @@ def test_a_mode_takes_a_node_out_and_another_brings_it_back_through_the_gate(
         assert verb("down", "pair", runtime=tmp_path).returncode == ExitCode.OK
         assert run.finish() == ExitCode.OK
         run.assert_gate_held()
+
+
+def test_health_holds_who_waits_for_it_and_has_consequences_when_it_is_lost(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    mood = tmp_path / "mood"
+    edit = {
+        "nodes/talker/run": {
+            "python": "tests.ros.supervisor.systems:Moody",
+            "environment": {"MOOD": str(mood)},
+        },
+        "nodes/talker/health": {"check": True, "interval_s": 0.1},
+        "nodes/listener/after": {"talker": "healthy"},
+        "on_violation": {"node.unhealthy": "deactivate"},
+    }
+    with up(pair(tmp_path, fresh_domain, edit=edit), runtime=tmp_path) as run:
+        run.until("node", node="/talker", reach="active")
+        status = verb("status", "pair", runtime=tmp_path).stdout
+        assert "waits to activate until /talker is healthy: in a mood" in status
+        mood.touch()
+        run.until("node", node="/listener", reach="active")
+        run.until("system", reached="active")
+        mood.unlink()
+        taken = run.until("consequence")
+        assert (taken["rule"], taken["nodes"]) == ("node.unhealthy", ["/talker"])
+        assert taken["message"] == "cannot accept node /talker: it is not healthy: in a mood"
+        mood.touch()
+        assert verb("resume", "pair", runtime=tmp_path).returncode == ExitCode.OK
+        run.until("system", reached="active")
