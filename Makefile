@@ -11,13 +11,14 @@ PYTEST  := $(BIN)/python -m pytest
 # Tests start hundreds of programs: where nothing may be compiled ahead, each compiles the whole package again.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test test-thorough check check-static soak bench bench-all hostile mutate docs schemas clean help
+.PHONY: demo test test-thorough check check-static soak soak-tests bench bench-all hostile mutate docs schemas clean help
 
 help:
 	@echo "make demo    bring up a small robot from its manifest, verified, then shut it down"
 	@echo "make test    set up and run the tests, real DDS included; no privilege needed; five minutes"
 	@echo "make check   everything CI runs: lint, types, import contracts, all tests"
-	@echo "make soak    the faults and the gate twenty times in a row; an hour"
+	@echo "make soak    a hundred rounds of seeded faults against supervision, judged from outside; a quarter of an hour"
+	@echo "make soak-tests  the faults and the gate twenty times in a row; an hour"
 	@echo "make bench   measure bring-up and data path against a floor and plain rclpy; one table, five minutes"
 	@echo "make bench-all  every benchmark, bring-up with up to 100 nodes; an hour"
 	@echo "make hostile attack everything that reads what others wrote, and list what was not handled"
@@ -51,9 +52,15 @@ check-static: $(STAMP)
 
 check: check-static test test-thorough docs
 
+# ROUNDS=20 SEED=7 chooses; `$(BIN)/python -m tests.soak --list --seed 7` prints what a seed stands for.
+ROUNDS ?= 100
+SEED   ?= 1
+soak: $(STAMP)
+	$(BIN)/python -m tests.soak --seed $(SEED) --rounds $(ROUNDS)
+
 # What holds must hold each time: the faults and the gate, TIMES over and without a second try, then bring-ups on a busy machine.
 TIMES ?= 20
-soak: $(STAMP)
+soak-tests: $(STAMP)
 	for each in $$(seq $(TIMES)); do \
 	  $(PYTEST) -n $(WORKERS) --dist worksteal -p no:rerunfailures tests/ros/faults tests/ros/supervisor/test_gate_holds.py || exit 1; \
 	done

@@ -46,6 +46,10 @@ LEDGER_NAME = "programmed.json"
 LEDGER_LOCK_NAME = "programmed.lock"
 """File beside it, locked while it is changed."""
 
+SENT_PREFIX = "sent-"
+"""Beginning of the name of a directory in a run directory that holds what another host sent: the
+manifest of this run, and the pipes of its supervisor, see fleet/agent.py."""
+
 
 OWN_CHILD = threading.Lock()
 """Held while a thread runs a program and waits for it. If that were reaped as an orphan first,
@@ -234,8 +238,8 @@ class RunDirectory:
         _refuse_unsafe_parents(self.path.parent)
         path = self.path / "lock"
         while True:
-            _private_directory(self.path.parent)
-            _private_directory(self.path)
+            private_directory(self.path.parent)
+            private_directory(self.path)
             _refuse_unless_run(self.path)
             try:
                 lock = os.open(path, os.O_RDWR | os.O_CREAT | _OURS, 0o600)
@@ -313,7 +317,11 @@ class RunDirectory:
         with contextlib.suppress(FileNotFoundError):
             for each in tuple(self.path.iterdir()):
                 # The lock last: who takes it must not find what is being removed.
-                if each.name not in (LEDGER_NAME, "lock"):
+                if each.name.startswith(SENT_PREFIX):
+                    import shutil  # loads decompressors, and few runs were sent
+
+                    shutil.rmtree(each, ignore_errors=True)
+                elif each.name not in (LEDGER_NAME, "lock"):
                     with contextlib.suppress(IsADirectoryError):
                         each.unlink(missing_ok=True)
             (self.path / "lock").unlink(missing_ok=True)
@@ -479,7 +487,7 @@ def connect(path: Path, timeout_s: float) -> socket.socket:
     return sock
 
 
-def _private_directory(path: Path) -> None:
+def private_directory(path: Path) -> None:
     """Make `path` if need be, and insist that no other user can put things into it.
 
     Raises:
@@ -520,8 +528,9 @@ def _refuse_unless_run(path: Path) -> None:
         return  # just removed by the run that had it
     # A run that ends removes its lock last, and leaves what is programmed still.
     marks = ("lock", LEDGER_NAME, LEDGER_LOCK_NAME)
-    if names and names.isdisjoint(marks) and read_record(path) is None:
-        raise _unusable(path, f"it holds {min(names)!r}, and was no run's")
+    others = {each for each in names if not each.startswith(SENT_PREFIX)}
+    if others and names.isdisjoint(marks) and read_record(path) is None:
+        raise _unusable(path, f"it holds {min(others)!r}, and was no run's")
 
 
 def _refuse_unsafe_parents(root: Path) -> None:

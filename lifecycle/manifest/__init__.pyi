@@ -16,6 +16,7 @@ from .flows import ResolvedNeed as ResolvedNeed
 from .installed_types import installed_hash as installed_hash
 from .installed_types import join as join
 from .installed_types import search_prefixes as search_prefixes
+from .loading import THIS_HOST as THIS_HOST
 from .loading import ArgumentDeclaration as ArgumentDeclaration
 from .loading import Loaded as Loaded
 from .loading import declared_arguments as declared_arguments
@@ -40,6 +41,7 @@ from .model import FlowIdentification as FlowIdentification
 from .model import FlowNeed as FlowNeed
 from .model import FlowTerms as FlowTerms
 from .model import FlowTransport as FlowTransport
+from .model import Health as Health
 from .model import Interface as Interface
 from .model import Limits as Limits
 from .model import Link as Link
@@ -91,4 +93,6 @@ from .qos import incompatibilities as incompatibilities
 from .schema import did_you_mean as did_you_mean
 from .yaml.document import error as error
 from .yaml.document import warning as warning
+from .yaml.source import is_outside as is_outside
+from .yaml.source import noting_files as noting_files
 from .yaml.source import read_bytes as read_bytes

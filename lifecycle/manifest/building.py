@@ -28,6 +28,7 @@ from lifecycle.manifest.model import (
     EndpointKind,
     Executor,
     FlowNeed,
+    Health,
     Interface,
     Limits,
     Mode,
@@ -384,7 +385,7 @@ __all__ = ["Findings", "build_node", "build_parameters", "quantities"]
 _PROGRAMS = ("python", "command", "package", "executable", "component", "container", "ros_args")
 _POSITIONED = (
     *("machine", "namespace", "name", "process", "run", "interface", "log_level"),
-    *("state", "may_end", *SUPERVISION_KEYS),
+    *("state", "may_end", "health", *SUPERVISION_KEYS),
 )
 
 
@@ -408,6 +409,7 @@ def build_node(
         found: findings are appended here.
     """
     namespace = cursor.text("namespace").strip("/")
+    health = cursor.get("health")
     parameters = build_parameters(cursor, found)
     interface = build_interface(cursor, base=base, environment=environment, found=found)
     return cursor.build(
@@ -429,6 +431,7 @@ def build_node(
         timeouts=_timeouts(cursor),
         supervision=cursor.build(Supervision),
         on_violation=build_on_violation(cursor),
+        health=None if health is None else _health(health),
         interface=interface,
         flows=tuple(_flows(cursor)),
         connections=build_connections(cursor, interface, found),
@@ -591,6 +594,13 @@ def _parameter(name: str, cursor: Cursor, found: Findings) -> ParameterValue | N
         hint = f'write {name}: {text.lstrip("+0") or "0"}, or {name}: "{text}"'
         found.append(warning("manifest.leading-zero", cursor.at, message, hint))
     return cursor.scalar
+
+
+def _health(cursor: Cursor) -> Health:
+    written = cursor.get("diagnostics")
+    if written is None or isinstance(written.value.data, tuple):
+        return cursor.build(Health)
+    return cursor.build(Health, diagnostics=(written.value.text,))
 
 
 def _timeouts(node: Cursor) -> Timeouts:

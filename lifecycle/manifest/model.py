@@ -94,7 +94,8 @@ class Condition(enum.Enum):
 
     The condition names the step that waits: `after: {b: configured}` lets this node start at once,
     but begins its configure only when b is configured; `connected` and `active` hold its connect
-    and its activate alike; `started` holds its start. A node that is not managed has only a start,
+    and its activate alike; `started` holds its start. `healthy` holds the activate, too, until b is
+    active and what its `health` names says so. A node that is not managed has only a start,
     so for it every condition holds the start, and `active` is refused: the gate needs it running.
     """
 
@@ -102,6 +103,7 @@ class Condition(enum.Enum):
     CONFIGURED = "configured"
     CONNECTED = "connected"
     ACTIVE = "active"
+    HEALTHY = "healthy"
 
 
 class DiscoveryMode(enum.Enum):
@@ -500,6 +502,24 @@ class ConnectionDeclaration:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Health:
+    """What shows whether a node is healthy, which it must be.
+
+    Attributes:
+        check: its own `health` method does.
+        diagnostics: patterns of the names of its entries on /diagnostics, which do, too;
+            `*` matches any characters, `?` one.
+        interval_s: between two calls of that, > 0.
+        timeout_s: until an `async` one must have returned, > 0.
+    """
+
+    check: bool = False
+    diagnostics: tuple[str, ...] = ()
+    interval_s: float = 1.0
+    timeout_s: float = 1.0
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class NodeDeclaration:
     """What a manifest declares of one node that its plan takes over as it is.
 
@@ -514,6 +534,7 @@ class NodeDeclaration:
         may_end: its process may end by itself with exit status 0.
         supervision: what is done when its process fails.
         on_violation: what is done about violations that concern it; before that of the system.
+        health: what shows that it is healthy; None if nothing is asked of it.
     """
 
     key: str
@@ -532,6 +553,7 @@ class NodeDeclaration:
     may_end: bool = False
     supervision: Supervision = Supervision()
     on_violation: OnViolation = ()
+    health: Health | None = None
     at: Position
 
     @property
@@ -599,6 +621,7 @@ __all__ = [
     "FlowIdentification",
     "FlowNeed",
     "FlowTransport",
+    "Health",
     "Interface",
     "Limits",
     "Link",

@@ -53,7 +53,13 @@ from lifecycle.node.endpoints.making import CLIENTS, wire_name
 from lifecycle.node.endpoints.mapping import Mapping, count_peers
 from lifecycle.node.lifecycle.machine import NodeState
 from lifecycle.plan import PARADIGMS, SERIALIZATIONS, PlannedEndpoint, PlannedNode
-from lifecycle.verify import ConnectionReport, EndpointReport, Identity, NodeConfiguration
+from lifecycle.verify import (
+    ConnectionReport,
+    EndpointReport,
+    HealthReport,
+    Identity,
+    NodeConfiguration,
+)
 
 if TYPE_CHECKING:
     from rclpy.node import Node
@@ -131,6 +137,8 @@ def collect(
     spec: PlannedNode,
     data_layer: NodeDataLayer,
     undeclared: Iterable[tuple[EndpointKind, Any]],
+    *,
+    health: HealthReport | None = None,
 ) -> NodeConfiguration:
     """Return the configuration of `node` as it is now.
 
@@ -140,6 +148,7 @@ def collect(
         spec: what it was planned to be.
         data_layer: its declared endpoints and their entities.
         undeclared: kind and rclpy object of endpoints that its code made by itself.
+        health: what it says of itself; None if it says nothing.
     """
     endpoints = (
         *(_report(node, mapping) for mapping in data_layer.mappings),
@@ -151,6 +160,7 @@ def collect(
         connected=state.connected,
         endpoints=endpoints,
         connections=connection_reports(spec, data_layer),
+        health=health,
     )
 
 
@@ -233,6 +243,7 @@ def _document(
     connected: bool,
     endpoints: tuple[EndpointReport, ...],
     connections: tuple[ConnectionReport, ...],
+    health: HealthReport | None = None,
 ) -> NodeConfiguration:
     name = node.get_fully_qualified_name()
     configuration = NodeConfiguration(
@@ -251,6 +262,7 @@ def _document(
         endpoints=endpoints,
         connections=connections,
         parameters=parameters.reports(node),
+        health=health,
     )
     return dataclasses.replace(configuration, checksum=checksum(configuration))
 

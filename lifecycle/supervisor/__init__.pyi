@@ -44,6 +44,7 @@ from .run.events import SystemReached as SystemReached
 from .run.events import VerdictChanged as VerdictChanged
 from .run.events import WiringChanged as WiringChanged
 from .run.events import WiringLost as WiringLost
+from .run.events import from_record as from_record
 from .run.events import to_record as to_record
 from .run.failure import ended_early as ended_early
 from .run.history import Explanation as Explanation
@@ -64,6 +65,7 @@ from .run.looking import running_plan as running_plan
 from .run.looking import supervised_picture as supervised_picture
 from .run.looking import supervised_pictures as supervised_pictures
 from .run.looking import supervisor_of as supervisor_of
+from .run.options import TIMEOUT_S as TIMEOUT_S
 from .run.options import Until as Until
 from .run.options import UpOptions as UpOptions
 from .run.options import UpResult as UpResult

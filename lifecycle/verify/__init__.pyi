@@ -7,6 +7,7 @@ from .matcher import lay_out as lay_out
 from .observation import SERVES_NONE as SERVES_NONE
 from .observation import ConfigurationError as ConfigurationError
 from .observation import EndpointReport as EndpointReport
+from .observation import HealthReport as HealthReport
 from .observation import Identity as Identity
 from .observation import NodeConfiguration as NodeConfiguration
 from .observation import NodeParameters as NodeParameters
@@ -28,6 +29,7 @@ from .rules import rule as rule
 from .rules.catalogue import About as About
 from .rules.catalogue import Heals as Heals
 from .rules.endpoints import DEFINITION_DIFFERS as DEFINITION_DIFFERS
+from .rules.health import health_of as health_of
 from .rules.matching import SERVER_OF as SERVER_OF
 from .rules.matching import MatchEnd as MatchEnd
 from .rules.matching import match as match

@@ -138,6 +138,19 @@ def digest_of(value: ParameterValue) -> str:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class HealthReport:
+    """What a node says of its own health, or /diagnostics of it.
+
+    Attributes:
+        ok: whether all is well; None if it has not said so in time.
+        message: what is wrong; empty if nothing is.
+    """
+
+    ok: bool | None
+    message: str = ""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class NodeConfiguration:
     """The node configuration interface's document.
 
@@ -152,6 +165,8 @@ class NodeConfiguration:
         checksum: of everything but state, matches, whether connections are established, and itself;
             changes exactly when a reader must read again. Hex SHA-256, 16 digits.
         parameters: all that are declared, sorted by name; None where the node does not report them.
+        health: what its health check last returned; None of a node that is not connected, or has
+            none.
     """
 
     identity: Identity
@@ -166,6 +181,7 @@ class NodeConfiguration:
     checksum: str = ""
     connections: tuple[ConnectionReport, ...] = ()
     parameters: tuple[ParameterReport, ...] | None = None
+    health: HealthReport | None = None
 
 
 class ConfigurationError(ValueError):
@@ -269,12 +285,14 @@ class ObservedNode:
         count: how many nodes carry this name; more than one is a duplicate.
         state: lifecycle_msgs/State label; None if it could not be learnt.
         managed: it offers the lifecycle services; None if unknown.
+        health: what /diagnostics says of it, where the manifest names entries; None if nothing.
     """
 
     full_name: str
     count: int = 1
     state: str | None = None
     managed: bool | None = None
+    health: HealthReport | None = None
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

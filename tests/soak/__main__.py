@@ -67,6 +67,7 @@ def _soak(options: argparse.Namespace, rounds: list, *, private: bool) -> int:
     directory = Path(tempfile.mkdtemp(prefix="soak-"))
     began_s = time.monotonic()
     with contextlib.ExitStack() as stack:
+        stack.callback(shutil.rmtree, directory, ignore_errors=True)
         soaking = stack.enter_context(_place(directory, private=private))
         failed = 0
         for done in [*rounds, None]:
@@ -96,6 +97,10 @@ def _soak(options: argparse.Namespace, rounds: list, *, private: bool) -> int:
             else:
                 print(f"  as expected, {time.monotonic() - started_s:.1f} s", flush=True)
         print(soaking.measured())
+        if options.keep:
+            kept = Path(tempfile.mkdtemp(prefix=f"soak-kept-{options.seed}-")) / "kept"
+            shutil.copytree(directory, kept, ignore=_sockets)
+            print(f"kept: {kept}")
     if failed:
         print(f"seed {options.seed}: {failed} failed, {time.monotonic() - began_s:.0f} s")
         return 1
@@ -105,7 +110,6 @@ def _soak(options: argparse.Namespace, rounds: list, *, private: bool) -> int:
         f"seed {options.seed}: {len(rounds)} rounds as expected ({what}), "
         f"{time.monotonic() - began_s:.0f} s"
     )
-    shutil.rmtree(directory, ignore_errors=True)
     return 0
 
 

@@ -157,11 +157,9 @@ class State:
 
     Attributes:
         starts: how often `fragile` was started as its limit counts; None: not known.
-        violated: whether a violation has lasted: True, False; None: perhaps.
     """
 
     starts: int | None = 1
-    violated: bool | None = False
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -259,19 +257,7 @@ def follows(state: State, done: Round) -> tuple[Expectation, State]:
     )
     if codes:
         return expected, State()
-    return expected, State(starts=starts, violated=_violated(state, done, found, silent))
-
-
-def _violated(
-    state: State, done: Round, found: Iterable[Fault], silent: Iterable[str]
-) -> bool | None:
-    if state.violated or done.condition is Condition.INTRUDER or tuple(found):
-        return True
-    # What is silent for a moment, or cut, may be violated for long enough.
-    unsure = (Condition.CUT, Condition.LINK_DOWN, Condition.FROZEN, Condition.STORM)
-    if tuple(silent) or done.condition in (*unsure, Condition.PAUSED, Condition.SAFE):
-        return None
-    return state.violated
+    return expected, State(starts=starts)
 
 
 def _consequence(done: Round, found: list[Fault]) -> tuple[tuple[tuple[str, ...], ...], str]:
@@ -307,7 +293,7 @@ def _round(dice: random.Random, number: int, state: State) -> Round:
     conditions = [Condition.NONE] * 8 + [each for each in Condition if each is not Condition.NONE]
     condition = dice.choice(conditions)
     targets = [each.name for each in PROCESSES]
-    ends = state.violated is not None and dice.random() < 0.08
+    ends = dice.random() < 0.08
     if state.starts is None:
         targets.remove("fragile")
     if condition in (Condition.STORM, Condition.PAUSED, Condition.SAFE, Condition.FROZEN):

@@ -14,8 +14,11 @@ import click
 from lifecycle.cli.common import (
     asking,
     assignments_argument,
+    check_hosts,
     completing,
     format_option,
+    hosts_options,
+    is_manifest,
     load_manifest,
     machine_option,
     say_differences,
@@ -253,13 +256,41 @@ def give_order(  # noqa: PLR0917 - in the order of the command line
 
 @click.command("down")
 @target_arguments
+@hosts_options
 @timeout_option(60.0, "How long it may take.")
-def down_command(target: str, assignments: tuple[str, ...], machine: str, timeout: float) -> int:
+def down_command(
+    *,
+    target: str,
+    assignments: tuple[str, ...],
+    machine: str,
+    hosts: bool,
+    chosen: tuple[str, ...],
+    remote_command: str,
+    timeout: float,
+) -> int:
     """End a running system in reverse order, and wait until nothing of it is left.
 
     TARGET is a manifest, or the name of a running system as `lifecycle status` shows it. Where the
-    supervisor itself was killed, what it left behind is ended too.
+    supervisor itself was killed, what it left behind is ended too. With --hosts, TARGET is a
+    manifest, and all its machines are ended at once.
     """
+    check_hosts(hosts, chosen)
+    if hosts:
+        if machine or not is_manifest(target):
+            why = "--machine" if machine else f"{target!r}, which is no manifest"
+            raise UsageError(
+                f"cannot use {why}, with --hosts",
+                hint="the manifest says where the machines are: lifecycle down MANIFEST --hosts",
+            )
+        from lifecycle.cli.hosts import down_on_hosts
+
+        return down_on_hosts(
+            target,
+            assignments,
+            chosen=chosen,
+            remote_command=remote_command,
+            timeout_s=timeout,
+        )
     path = target_run(os.environ, target, assignments, machine)
     from lifecycle.supervisor import down
 

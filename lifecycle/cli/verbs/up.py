@@ -10,8 +10,10 @@ import click
 
 from lifecycle.cli.common import (
     NetworkCommand,
+    check_hosts,
     completing,
     format_option,
+    hosts_options,
     load_manifest,
     machine_option,
     manifest_arguments,
@@ -55,6 +57,7 @@ if TYPE_CHECKING:
 @report_option
 @click.option("--strict", is_flag=True, help="What cannot be verified keeps the gate closed.")
 @machine_option("Run only this machine's nodes; default: all whose address is this host's.")
+@hosts_options
 @click.option(
     "--keep-going",
     is_flag=True,
@@ -102,6 +105,9 @@ def command(
     report: Path | None,
     strict: bool,
     machine: str,
+    hosts: bool,
+    chosen: tuple[str, ...],
+    remote_command: str,
     keep_going: bool,
     timings: bool,
     without: tuple[str, ...],
@@ -120,7 +126,28 @@ def command(
 
     --program tells networks which flows were verified before anything is activated, and takes it
     back in the end.
+
+    --hosts does so on all machines of the manifest, over ssh, and ends all in order. Should this
+    command be killed, its terminal be closed or a link be cut, they run on: the same command
+    follows them again, and `lifecycle down MANIFEST --hosts` ends them.
     """
+    check_hosts(hosts, chosen)
+    if hosts:
+        from lifecycle.cli.hosts import up_on_hosts
+
+        given: dict[str, Any] = {"until": until, "stop_after": stop_after, "timeout": timeout}
+        given |= {"report": report, "strict": strict, "machine": machine, "adopt": adopt}
+        given |= {"keep_going": keep_going, "timings": timings, "without": without}
+        given |= {"domain": domain, "targets": targets or bool(rest), "mapping": mapping}
+        given |= {"flow_labels": flow_labels}
+        return up_on_hosts(
+            manifest,
+            assignments,
+            chosen=chosen,
+            remote_command=remote_command,
+            format_=format_,
+            options=given,
+        )
     from lifecycle.supervisor import Ended, Ending
 
     try:

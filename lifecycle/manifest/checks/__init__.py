@@ -31,6 +31,7 @@ from lifecycle.manifest.checks.flows import (
 )
 from lifecycle.manifest.checks.names import check_names, check_remaps
 from lifecycle.manifest.checks.nodes import (
+    check_health,
     check_machines,
     check_modes,
     check_on_violation,
@@ -127,6 +128,7 @@ CHECKS = (
     Check(run=lambda scope: check_processes(scope.system), parts=("run",)),
     Check(run=lambda scope: check_programs(scope.system), parts=("run",)),
     Check(run=lambda scope: check_supervision(scope.system), parts=("run",)),
+    Check(run=lambda scope: check_health(scope.system)),
     Check(
         run=lambda scope: check_on_violation(scope.system),
         parts=("run",),

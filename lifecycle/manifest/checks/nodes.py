@@ -1,10 +1,10 @@
 """Checks of where and in which order nodes start: machines, processes, domain, ports, `after`.
 
 Owns: check.unknown-machine, check.process-machine, check.process-run, check.process-environment,
-check.process-name, check.ros-args, check.container, check.may-end, check.state,
-check.restart, check.start-limit, check.on-violation, check.mode, check.domain, check.ports,
-check.localhost,
-check.after-unknown, check.after-self, check.after-cycle, check.after-unmanaged, check.after-state.
+check.process-name, check.ros-args, check.container, check.may-end, check.state, check.restart,
+check.start-limit, check.health, check.on-violation, check.mode, check.domain, check.ports,
+check.localhost, check.after-unknown, check.after-self, check.after-cycle, check.after-unmanaged,
+check.after-state.
 Port arithmetic is in `lifecycle.network`. Pure.
 """
 
@@ -164,6 +164,21 @@ def check_supervision(system: DeclaredSystem) -> Iterator[Diagnostic]:
         yield from _delays(node, places)
 
 
+def check_health(system: DeclaredSystem) -> Iterator[Diagnostic]:
+    """Yield findings about health that nothing can report."""
+    for node in system.manifest.nodes:
+        if node.health is None:
+            continue
+        at = node.where("health")
+        if not node.health.check and not node.health.diagnostics:
+            message = f"cannot require that {node.key!r} is healthy: nothing says how that is known"
+            yield error("check.health", at, message, "write 'check: true', or remove 'health'")
+        elif node.health.check and not node.managed:
+            message = f"cannot ask {node.key!r} whether it is healthy: it is not managed"
+            hint = "its class must be a lifecycle.LifecycleNode; or name its 'diagnostics'"
+            yield error("check.health", at, message, hint)
+
+
 def check_on_violation(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about violations after which nodes are to be deactivated that never can be."""
     hint = "write 'pause' or 'stop', which are for the whole system"
@@ -220,10 +235,11 @@ def check_modes(system: DeclaredSystem) -> Iterator[Diagnostic]:
                 yield error("check.mode", mode.at, message, "remove it from the mode")
         for node in system.manifest.nodes:
             for after in node.after:
-                if after.condition is Condition.ACTIVE and after.node in mode.inactive:
+                beyond = after.condition in (Condition.ACTIVE, Condition.HEALTHY)
+                if beyond and after.node in mode.inactive:
                     message = (
-                        f"cannot wait until {after.node!r} is active: mode {mode.name!r} "
-                        f"({spell(mode.at)}) keeps it inactive"
+                        f"cannot wait until {after.node!r} is {after.condition.value}: mode "
+                        f"{mode.name!r} ({spell(mode.at)}) keeps it inactive"
                     )
                     hint = f"write '{after.node}: connected', or remove it from the mode"
                     yield error("check.mode", after.at, message, hint)
@@ -508,13 +524,19 @@ def check_order(system: DeclaredSystem) -> Iterator[Diagnostic]:
 def _unmanaged(node: Node, after: After, other: Node) -> Iterator[Diagnostic]:
     """Judge conditions of nodes that have nothing but a start (see `Condition`)."""
     key, condition = after.node, after.condition
-    if not node.managed and condition is Condition.ACTIVE:
+    if condition is Condition.HEALTHY and other.health is None:
+        message = f"cannot wait until {key!r} is healthy: nothing says how that is known"
+        yield error(
+            "check.health", after.at, message, f"write 'health: {{check: true}}' at {key!r}"
+        )
+    elif not node.managed and condition in (Condition.ACTIVE, Condition.HEALTHY):
         message = (
-            f"cannot hold the start of {node.key!r} until {key!r} is active: {node.key!r} is not "
+            f"cannot hold the start of {node.key!r} until {key!r} is {condition.value}: "
+            f"{node.key!r} is not "
             f"managed, and nothing is activated before every node runs"
         )
         yield error("check.after-unmanaged", after.at, message, f"write '{key}: connected'")
-    elif not other.managed and condition is not Condition.STARTED:
+    elif not other.managed and condition not in (Condition.STARTED, Condition.HEALTHY):
         message = (
             f"cannot wait until {key!r} is {condition.value}: it is not managed and only starts"
         )
@@ -524,7 +546,7 @@ def _unmanaged(node: Node, after: After, other: Node) -> Iterator[Diagnostic]:
 _FURTHEST = {
     TargetState.UNCONFIGURED: Condition.STARTED,
     TargetState.INACTIVE: Condition.CONNECTED,
-    TargetState.ACTIVE: Condition.ACTIVE,
+    TargetState.ACTIVE: Condition.HEALTHY,
 }
 """How far the supervisor brings a node that is kept in a state."""
 

@@ -30,6 +30,7 @@ import socket
 import struct
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 
 from lifecycle.middleware.discovery.probe import HEADER, ProbeTarget, probe_targets, send
 from lifecycle.middleware.fastdds.dscp import own_udp_socket, socket_descriptors
@@ -136,6 +137,13 @@ def is_of_process(prefix: str, pid: int, like: str) -> bool:
     return prefix[: _HOST_DIGITS.stop] == like[: _HOST_DIGITS.stop] and (
         prefix[_PID_DIGITS] == written
     )
+
+
+def is_alone(pid: int) -> bool:
+    """Return whether no other process of this host bears the same in its GUID prefixes."""
+    most = int(Path("/proc/sys/kernel/pid_max").read_text(encoding="ascii"))
+    others = (each for each in range(pid & 0xFFFF, most + 1, 0x10000) if each != pid)
+    return not any(Path(f"/proc/{each}").exists() for each in others)
 
 
 def disposal(prefix: str) -> bytes:

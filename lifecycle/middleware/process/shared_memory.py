@@ -26,6 +26,7 @@ import os
 import re
 import signal
 import struct
+import time
 from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path
 
@@ -43,6 +44,9 @@ _EVENT_BYTES = 65536
 
 _LOCK_FIELDS = 8
 """Of a held lock in /proc/locks: number, FLOCK, ADVISORY, WRITE, pid, file, start, end."""
+
+_AGAIN_S = 0.02
+"""So often it is tried again to remove what others still use: no event says that they let go."""
 
 _Inode = tuple[int, int]
 """(device, inode number)."""
@@ -207,16 +211,24 @@ def check_room() -> None:
             )
 
 
-def sweep(only: Collection[str]) -> tuple[str, ...]:
+def sweep(only: Collection[str], *, within_s: float = 0.0) -> tuple[str, ...]:
     """Remove the files of this user in the groups of these names that are proven to be unused.
 
     Args:
         only: names that processes which have ended were seen to own.
+        within_s: seconds to try again while others use some: they let go of the port of a
+            participant that left once they have read that, and after a kill none removes it.
 
     Returns:
         The names removed, sorted; empty where there is no /dev/shm.
     """
-    return _unused(only, remove=True)
+    removed = _unused(only, remove=True)
+    deadline = time.monotonic() + within_s
+    groups = {_group(name) for name in only} if within_s else set()
+    while still_there(groups) and time.monotonic() < deadline:
+        time.sleep(_AGAIN_S)
+        removed += _unused(only, remove=True)
+    return tuple(sorted(removed))
 
 
 def leftovers(*, only: Collection[str] | None = None) -> tuple[str, ...]:

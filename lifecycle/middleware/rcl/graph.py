@@ -24,12 +24,14 @@ from lifecycle.manifest import EndpointKind, join
 from lifecycle.middleware.discovery.dead_peers import (
     PROCESS_DIGITS,
     give_up_dead_connections,
+    is_alone,
     is_of_process,
     is_used,
     remove_participants,
 )
 from lifecycle.middleware.discovery.probe import probes_for
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
+from lifecycle.middleware.fastdds.settings import stop_listening
 from lifecycle.middleware.process.process_table import programs_of
 from lifecycle.middleware.rcl.graph_changes import GraphGuard, on_graph_change
 from lifecycle.middleware.rcl.graph_queries import (
@@ -387,13 +389,18 @@ class GraphObserver:
             pid: of a process on this host.
             nodes: fully qualified names of nodes that it runs.
             reported: GUID prefixes that these nodes said are theirs. Of both only those count
-                that bear this host and this pid.
+                that bear this host and this pid. Where there are none, because the process ended
+                before its nodes' names were known, participants without any name count, unless
+                another process bears the same.
         """
         if self._destroyed:
             return frozenset()
         homes = self._stale_node_filter.homes()
         own = next(iter(homes.get(self.node.get_fully_qualified_name(), ())), "")
         claimed = {*reported, *(prefix for name in nodes for prefix in homes.get(name, ()))}
+        if not claimed and is_alone(pid):
+            named = {prefix for name, home in homes.items() if name for prefix in home}
+            claimed = set(self._stale_node_filter.shown()) - named
         processes = {
             each[:PROCESS_DIGITS] for each in claimed if own and is_of_process(each, pid, own)
         }
@@ -445,6 +452,7 @@ class GraphObserver:
         self._unwatch()
         if self._context is not None:
             give_up_dead_connections()
+            stop_listening(self.node)
             self.node.destroy_node()
             self._context.try_shutdown()
             self._context.destroy()

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import threading
 from collections.abc import Awaitable, Callable
 from typing import Any
@@ -25,7 +24,6 @@ from rclpy.task import Future
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.rcl.graph import GraphObserver
 
-_logger = logging.getLogger(__name__)
 InvalidHandle = rclpy_implementation.InvalidHandle
 
 _FIRST_ATTEMPT_S = 0.1
@@ -211,19 +209,23 @@ class _Spinner:
         # Never EventsExecutor: on Jazzy's wheels it spins at full load and loses every call.
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
+        self._stopped = False
         self._thread = threading.Thread(target=self._spin, name=thread, daemon=True)
         self._thread.start()
 
     def stop(self) -> None:
         """End the thread; again is harmless."""
+        self._stopped = True
         self._executor.shutdown()
         self._thread.join()
 
     def _spin(self) -> None:
-        try:
-            self._executor.spin()
-        except (ExternalShutdownException, ShutdownException):
-            _logger.debug("the context was shut down")
+        with contextlib.suppress(ExternalShutdownException, ShutdownException):
+            while not self._stopped:
+                # Another thread may destroy something of the node while it is put in a wait set.
+                with contextlib.suppress(InvalidHandle):
+                    self._executor.spin()
+                    return
 
 
 def _deliver(answer: asyncio.Future[Any], pending: Future) -> None:

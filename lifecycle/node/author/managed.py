@@ -21,7 +21,7 @@ from rclpy.timer import Timer
 
 from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest import EndpointKind
+from lifecycle.manifest import EndpointKind, Health
 from lifecycle.node import configuration
 from lifecycle.node.author import parameters
 from lifecycle.node.author.declaring import DeclaredInCode
@@ -39,6 +39,7 @@ from lifecycle.node.host.control import INTERFACE_ON_DEMAND
 from lifecycle.node.lifecycle.controller import Controller
 from lifecycle.node.lifecycle.execution import SUCCESS, Result
 from lifecycle.node.lifecycle.gate import NodeGate
+from lifecycle.node.lifecycle.health import HealthCheck
 from lifecycle.node.lifecycle.machine import (
     CallbackOutcome,
     NodeState,
@@ -216,6 +217,7 @@ class Managed:
         supervisor: str = "",
         *,
         served: bool = True,
+        health: Callable[[], Any] | None = None,
     ) -> None:
         self._node = node
         self._supervisor = supervisor
@@ -234,6 +236,13 @@ class Managed:
         self.connection_events = ConnectionEvents(self.call_soon)
         self.configuration_changes = ConfigurationChanges(
             self.call_soon, self.get_configuration, failed=node.get_logger().error
+        )
+        self._health = HealthCheck(
+            health,
+            self._turns,
+            spec.health or Health(),
+            changed=self.configuration_changes.touch,
+            failed=node.get_logger().error,
         )
         node.add_post_set_parameters_callback(lambda _: self.configuration_changes.touch())
         self.undeclared = Undeclared(self.configuration_changes.touch)
@@ -389,7 +398,14 @@ class Managed:
         """Return this node's identity and its endpoints as they are."""
         # Whatever the policy: what a node says of itself is known before discovery shows it.
         undeclared = self.undeclared.beside(self.data_layer.entities)
-        return configuration.collect(self._node, self.state, self.spec, self.data_layer, undeclared)
+        return configuration.collect(
+            self._node,
+            self.state,
+            self.spec,
+            self.data_layer,
+            undeclared,
+            health=self._health.report,
+        )
 
     # What the controller asks for (controller.Node).
 
@@ -488,6 +504,7 @@ class Managed:
             self._services.publish(change.event)
         if self._member is not None:
             self._member.state_changed(change.goal)
+        self._health.follow(change.goal)
         for listener in self._listeners:
             listener(self)
 

@@ -433,6 +433,7 @@ class LifecycleNode(Declarations, LocalInterface, RclpyLifecycle, GatedFactories
             self._gate,
             supervisor,
             served=enable_communication_interface,
+            health=None if type(self).health is LifecycleNode.health else self.health,
         )
         self._take_rclpy_names()
         if construction is None and mode is Mode.AUTO:
@@ -544,6 +545,15 @@ class LifecycleNode(Declarations, LocalInterface, RclpyLifecycle, GatedFactories
     def on_shutdown(self, state: LifecycleState) -> CallbackReturn:
         """The last call, from any state; endpoints are removed after it."""
         return self._call_managed("on_shutdown", state)
+
+    @_any_signature
+    def health(self) -> Any:
+        """Return what is wrong, as text; None if all is well. May be `async def`.
+
+        Asked once a second while the node is connected or active, and at once after each change of
+        its state, if a class overrides it. An exception counts as unhealthy, no answer in time as
+        not known. The manifest says with `health` what follows.
+        """
 
     @_any_signature
     def on_error(self, state: LifecycleState) -> CallbackReturn:

@@ -219,6 +219,10 @@ class Turns:
         """Call back every `period_s` seconds, in every state, also while time is simulated."""
         return Node.create_timer(self._node, period_s, callback, self._group, clock=self._clock)
 
+    def end(self, timer: Timer) -> None:
+        """Have a timer call back no more."""
+        Node.destroy_timer(self._node, timer)
+
     def wake_at_deadline(self, deadline_s: float) -> Callable[[], None]:
         """Wake the executor in `deadline_s`, by a timer that is not gated."""
         timer = self.timer(deadline_s, _wake)

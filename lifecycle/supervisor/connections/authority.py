@@ -37,6 +37,9 @@ from lifecycle.supervisor.run.events import Emitter, Notice, WiringChanged, Wiri
 from lifecycle.supervisor.run.failure import ended
 from lifecycle.verify import Finding, NodeConfiguration, Observation
 
+_BEYOND = (Condition.CONNECTED, Condition.ACTIVE, Condition.HEALTHY)
+"""What needs the data layer."""
+
 
 def configured_before_any_connect(system: System) -> frozenset[str]:
     """Return the keys of this supervisor's managed nodes that no `after:` holds behind a connect.
@@ -58,7 +61,7 @@ def configured_before_any_connect(system: System) -> frozenset[str]:
             )
             target = system.nodes.get(after.node)
             managed = target is None or target.planned.managed
-            beyond = after.condition in (Condition.CONNECTED, Condition.ACTIVE) and managed
+            beyond = after.condition in _BEYOND and managed
             if waits and (beyond or is_held(after.node)):
                 held[key] = True
         return held[key]

@@ -200,7 +200,7 @@ class Holding:
                 what = await self._until_ordered(deadline, watching)
             finally:
                 await ended(watching)
-            if stage is Stage.ACTIVE:
+            if stage is Stage.ACTIVE or watch.due is not None:
                 self._violated = self._violated or watch.violated
             if what is None:
                 return self._violated

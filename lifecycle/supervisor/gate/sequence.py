@@ -19,7 +19,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections import Counter
-from collections.abc import Callable, Collection, Coroutine, Iterable, Mapping
+from collections.abc import AsyncIterator, Callable, Collection, Coroutine, Iterable, Mapping
 from typing import Any
 
 from lifecycle.errors import BringUpError
@@ -206,9 +206,39 @@ class GateSequence:
             VerificationError: the gate stays closed, or closed again before every node was sent its
                 request, and what had become active is inactive again. In phase PAUSED or HELD the
                 system stays as it is and can be asked again; in any other the run is over.
-            StepFailedError: a step failed, or a network could not be programmed; the run is over.
+            StepFailedError: a step failed, or a network could not be programmed; the run is over,
+                unless what failed is put down to be started again.
             RolledBackError: another manifest could not be applied.
         """
+        before = self.phase
+        try:
+            await self._carry_out(order)
+        except StepFailedError:
+            self._cut_short(before)
+            raise
+
+    def _cut_short(self, before: str) -> None:
+        """Leave a system whose order failed in a phase in which it is held, and takes orders.
+
+        What the order would have activated waits at its gate until all is back, and then passes;
+        a system that was paused stays so unless its gate had opened.
+
+        Args:
+            before: the phase before the order.
+        """
+        if self.phase in (ACTIVE, PAUSED, HELD):
+            return
+        if before == PAUSED and self.phase != "activating":
+            self.phase = PAUSED
+            return
+        self.phase = HELD
+        self._schedule.wait_at_gate(
+            key
+            for key, each in self._system.nodes.items()
+            if each.is_to_be_active and not each.withheld and each.reach is not Reach.ACTIVE
+        )
+
+    async def _carry_out(self, order: Order) -> None:
         if order.kind is OrderKind.PAUSE:
             await self._pause(order)
         elif order.kind is OrderKind.RESUME:
@@ -332,7 +362,11 @@ class GateSequence:
         self._gate.close()
         self.phase = "restarting"
         self._schedule.by_hand([each.planned.key for each in nodes])
-        await self._again(nodes, self._timeout_s, order.plan if order.reload else None)
+        async with self._watched():
+            await self.take_down(nodes)
+            await self.begin_again(nodes, order.plan if order.reload else None)
+            # Who waits for one that is started again later follows it.
+            await self.connect_unfinished(self._timeout_s)
         self._emit(SystemReached(reached="connected", elapsed_s=self._emit.elapsed_s))
         if was_paused:
             self.reached(PAUSED)
@@ -397,7 +431,8 @@ class GateSequence:
         down = tuple(
             each for key, each in self._system.nodes.items() if key in keys or key in interrupted
         )
-        await self.take_down(down)
+        async with self._watched():
+            await self.take_down(down)
         for node in down:
             node.renew(node.process)
             if node.process is not None:
@@ -407,6 +442,15 @@ class GateSequence:
         self._schedule.announce(keys)
         if self.phase == HELD and not self.inactive():
             self.phase = ACTIVE
+
+    @contextlib.asynccontextmanager
+    async def _watched(self) -> AsyncIterator[None]:
+        """Judge what stays active also while others are taken down or brought up."""
+        looking = asyncio.ensure_future(self._judge.keep_looking(self.active, self._away))
+        try:
+            yield
+        finally:
+            await ended(looking)
 
     def interrupted(self) -> frozenset[str]:
         """Return the keys of the nodes, with their processes, that were cut off in a step."""
@@ -435,8 +479,9 @@ class GateSequence:
         self._gate.close()
         self.phase = "restarting"
         try:
-            await self.begin_again(tuple(self._system.nodes[key] for key in keys))
-            await self.connect_unfinished(self._timeout_s)
+            async with self._watched():
+                await self.begin_again(tuple(self._system.nodes[key] for key in keys))
+                await self.connect_unfinished(self._timeout_s)
             self._emit(SystemReached(reached="connected", elapsed_s=self._emit.elapsed_s))
         except StepFailedError:
             self.phase = HELD if goes_on else before
@@ -463,7 +508,7 @@ class GateSequence:
             return
         deadline = asyncio.get_running_loop().time() + self._timeout_s
         try:
-            permit = await self._unless_outrun(self.verify(self._timeout_s))
+            permit = await self._unless_outrun(self.verify(self._timeout_s), self._outrun())
             waiting = tuple(each for each in self.inactive() if each.name in names)
             await self.activate(permit, deadline, waiting)
         except VerificationError as error:
@@ -512,9 +557,11 @@ class GateSequence:
         ]
         return failures[0].joined(failures[1:])
 
-    async def _unless_outrun(self, judging: Coroutine[Any, Any, Permit]) -> Permit:
+    async def _unless_outrun(
+        self, judging: Coroutine[Any, Any, Permit], outrun: Coroutine[Any, Any, None]
+    ) -> Permit:
         running = asyncio.ensure_future(judging)
-        first = asyncio.ensure_future(self._outrun())
+        first = asyncio.ensure_future(outrun)
         try:
             waits: set[asyncio.Future[Any]] = {running, first}
             await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
@@ -618,18 +665,15 @@ class GateSequence:
         )
         return (*found, *components)
 
-    async def _again(
-        self, nodes: tuple[NodeRun, ...], timeout_s: float, plan: Plan | None = None
-    ) -> None:
+    async def _again(self, nodes: tuple[NodeRun, ...], timeout_s: float) -> None:
         """Take nodes down with all of their processes, and bring them up as far as connected.
 
         Args:
             nodes: with all of their processes.
             timeout_s: seconds, for bringing them up.
-            plan: another manifest's, to be taken meanwhile; None to keep this one.
         """
         await self.take_down(nodes)
-        nodes = await self.begin_again(nodes, plan)
+        nodes = await self.begin_again(nodes)
         self.phase = "connecting"
         self._judge.ahead = self.active()
         await self._alive(self._bring_up.connect(timeout_s, nodes))
@@ -779,7 +823,7 @@ class GateSequence:
         deadline = asyncio.get_running_loop().time() + self._timeout_s
         before = PAUSED if self.phase == PAUSED else HELD
         try:
-            permit = await self.verify(self._timeout_s)
+            permit = await self._verify_with_who_comes_again()
         except VerificationError:
             # What is active was verified before; what is not stays inactive until asked again.
             self.phase = before
@@ -792,6 +836,17 @@ class GateSequence:
                     await self.withdraw(permit)
                 self.phase = before
             raise
+
+    async def _verify_with_who_comes_again(self) -> Permit:
+        """Judge until the gate opens, and start again meanwhile what is due: it may wait for it."""
+        while True:
+            with contextlib.suppress(OutrunError):
+                return await self._unless_outrun(self.verify(self._timeout_s), self._schedule.due())
+            self.phase = "restarting"
+            keys = self._schedule.begin()
+            async with self._watched():
+                await self.begin_again(tuple(self._system.nodes[key] for key in keys))
+                await self.connect_unfinished(self._timeout_s)
 
     async def withdraw(self, permit: Permit) -> None:
         """Deactivate again what was activated since the gate opened: the rest may not follow."""
@@ -821,6 +876,10 @@ class GateSequence:
             for each in self._system.nodes.values()
             if each.is_to_be_active and each.is_up and each.reach is not Reach.ACTIVE
         )
+
+    def _away(self) -> frozenset[str]:
+        """Return the names of the nodes that are not active and not at their gate either."""
+        return frozenset(each.name for each in self._system.nodes.values() if not each.is_up)
 
     def _withheld(self) -> frozenset[str]:
         return frozenset(each.name for each in self._system.nodes.values() if each.withheld)

@@ -74,7 +74,8 @@ class ProcessMonitor:
     async def during(self, phase: Coroutine[Any, Any, object]) -> None:
         """Run a phase; the end of any process of the system ends it.
 
-        A step in progress on a node of that process knows more, so it may fail first.
+        A step in progress on a node of that process knows more, so it may fail first; one on
+        another may be over in a moment.
 
         Raises:
             StepFailedError: a process ended.
@@ -84,7 +85,7 @@ class ProcessMonitor:
         try:
             waits: set[asyncio.Future[Any]] = {running, death}
             await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
-            if not running.done():
+            if not running.done() and any(each.doing for each in self._system.nodes.values()):
                 await asyncio.wait({running}, timeout=_SPEAK_S)
             if running.done():
                 running.result()
@@ -153,8 +154,8 @@ class StaleNodes:
     """Removes what processes of one system leave in the graph when they die.
 
     Only processes that this supervisor started or adopted count, once the kernel says that they
-    ended. Of each
-    only those participants count that bear its pid and that its nodes reported, or were seen on.
+    ended. Of each only those participants count that bear its pid and that its nodes reported, or
+    were seen on, or, where there are none of these, that nobody has a name for.
 
     Args:
         system: whose processes; `on_event` must be given its events.
@@ -232,13 +233,13 @@ class StaleNodes:
         names = [node.name for node in nodes]
         reported = frozenset(prefix for node in nodes for prefix in _reported(node))
         prefixes = self._graph.participants_of(pid, nodes=names, reported=reported)
-        if prefixes:
-            self._remove(pid, prefixes, prefixes, 0)
+        # What has no name yet may be discovered only now: it was just being made.
+        self._remove(pid, prefixes, prefixes, 0)
 
     def _remove(
         self, pid: int, every: frozenset[str], shown: frozenset[str], repetition: int
     ) -> None:
-        if repetition < _ALWAYS or shown:
+        if every and (repetition < _ALWAYS or shown):
             pids = [each.pid for each in self._system.living]
             pids += [each.pid for each in self._system.adopted if not each.ended.done()]
             self._graph.remove_participants(every, pids)
@@ -248,7 +249,7 @@ class StaleNodes:
         def again() -> None:
             self._later.discard(handle)
             left = self._graph.participants_of(pid, nodes=(), reported=every)
-            self._remove(pid, every, left & every, repetition + 1)
+            self._remove(pid, every or left, left & (every or left), repetition + 1)
 
         loop = asyncio.get_running_loop()
         handle = loop.call_later(AGAIN_S[repetition], again)

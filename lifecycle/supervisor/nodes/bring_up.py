@@ -487,7 +487,8 @@ class BringUp:
         await self._operate(node, Operation.CONNECT, Reach.CONNECTED)
 
     async def _activate(self, node: NodeRun, permit: Permit) -> None:
-        await self._system.reached(node, Condition.ACTIVE, "activate")
+        for condition in (Condition.ACTIVE, Condition.HEALTHY):
+            await self._system.reached(node, condition, "activate")
         node.doing = "waits to activate until what changed is verified"
         # Here, too: how long it takes is not the node's to answer for.
         # A gate that was closed fails the step itself.

@@ -29,7 +29,7 @@ from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.supervisor.processes.logs import LogDirectory
 from lifecycle.supervisor.processes.process import ManagedProcess, own_run_delay_s
 from lifecycle.supervisor.run.events import Emitter, NodeChanged, Notice, RequestSent
-from lifecycle.verify import NodeConfiguration, Observation
+from lifecycle.verify import HealthReport, NodeConfiguration, Observation, health_of
 
 ASK_AGAIN_S = 0.2
 """A remote node is asked again so long after, because the event that it connected may be missed:
@@ -59,11 +59,13 @@ class RemoteNode:
 
     Attributes:
         reached: every condition that holds as of the last look.
+        awaited: the last one that others may wait for.
         changed: replaced and set when `reached` changes.
     """
 
     def __init__(self, planned: PlannedNode) -> None:
         self.planned = planned
+        self.awaited = Condition.ACTIVE if planned.health is None else Condition.HEALTHY
         self.reached: frozenset[Condition] = frozenset()
         self.changed = asyncio.Event()
 
@@ -103,7 +105,7 @@ class RemoteNodes:
 
     async def follow(self) -> None:
         """Look at every change, until all have reached everything or this is cancelled."""
-        while not all(each.has_reached(Condition.ACTIVE) for each in self._nodes):
+        while not all(each.has_reached(each.awaited) for each in self._nodes):
             count = self._changes.count
             observation = await self._observer.observe(self._plan)
             for each in self._nodes:
@@ -111,6 +113,38 @@ class RemoteNodes:
             # One that was not there at all announces itself.
             there = any(each.reached for each in self._nodes)
             await self._changes.beyond(count, ASK_AGAIN_S if there else None)
+
+
+class AwaitedHealth:
+    """Takes from the graph the health that others wait for, where no host of ours reports all."""
+
+    def __init__(self, system: System, observer: ObservationSource, changes: ChangeSource) -> None:
+        self._system = system
+        self._observer = observer
+        self._changes = changes
+
+    async def follow(self) -> None:
+        """Look at every change, until this is cancelled; return at once if nobody waits so."""
+        nodes = self._system.nodes
+        keys = {
+            after.node
+            for node in nodes.values()
+            for after in node.planned.after
+            if after.condition is Condition.HEALTHY
+        }
+        awaited = [each for key, each in nodes.items() if key in keys and not each.tells_health]
+        if not awaited:
+            return
+        plan = dataclasses.replace(self._system.plan, nodes=tuple(each.planned for each in awaited))
+        while True:
+            count = self._changes.count
+            observation = await self._observer.observe(plan)
+            own = {each.name: each.health for each in observation.configurations}
+            published = {each.full_name: each.health for each in observation.nodes}
+            for each in awaited:
+                each.health = own.get(each.name), published.get(each.name)
+                each.wake()
+            await self._changes.beyond(count, ASK_AGAIN_S)
 
 
 class ServiceNames(Protocol):
@@ -184,12 +218,15 @@ def _conditions(planned: PlannedNode, observation: Observation) -> Iterable[Cond
     observed = next((each for each in observation.nodes if each.full_name == name), None)
     if observed is None:
         return ()
-    if not planned.managed:
-        return tuple(Condition)
     report = next((each for each in observation.configurations if each.name == name), None)
+    up_to_active = (Condition.STARTED, Condition.CONFIGURED, Condition.CONNECTED, Condition.ACTIVE)
+    said = health_of(planned, None if report is None else report.health, observed.health)
+    healthy = (Condition.HEALTHY,) if said.ok else ()
+    if not planned.managed:
+        return (*up_to_active, *healthy)
     state = observed.state or (report.state if report is not None else "")
     if state == ACTIVE:
-        return tuple(Condition)
+        return (*up_to_active, *healthy)
     if state != INACTIVE:
         return (Condition.STARTED,)
     # A node that is not ours makes its data layer in configure, and has no such report.
@@ -204,6 +241,7 @@ _CONDITIONS = {
     Condition.CONFIGURED: Reach.CONFIGURED,
     Condition.CONNECTED: Reach.CONNECTED,
     Condition.ACTIVE: Reach.ACTIVE,
+    Condition.HEALTHY: Reach.ACTIVE,
 }
 
 _QUIET_S = 0.05
@@ -261,6 +299,7 @@ class NodeRun:
         reports_changes: its host reports unasked when its configuration changes.
         unload: has its container unload a component; None for what is not loaded into one.
         is_up: it was started and brought as far as its gate; cleared when it goes down.
+        health: what it, and /diagnostics of it, was seen to say of it in the graph.
         withheld: why a consequence of a violation keeps it inactive, until a person lets it through
             the gate again; empty if none does.
     """
@@ -284,6 +323,7 @@ class NodeRun:
         self.unload: Callable[[], Awaitable[None]] | None = None
         self.is_up = False
         self.withheld = ""
+        self.health: tuple[HealthReport | None, HealthReport | None] = (None, None)
         self.changed = asyncio.Event()
         self._emit = emit
 
@@ -298,6 +338,7 @@ class NodeRun:
         self.reports_changes = False
         self.unload = None
         self.is_up = False
+        self.health = (None, None)
         self.doing = ""
         self.connected = False
         self.state = ""
@@ -331,9 +372,36 @@ class NodeRun:
         """Return the run delay of its process and ours, seconds: ready to run, but without CPU."""
         return own_run_delay_s() if self.process is None else self.process.run_delay_s()
 
+    @property
+    def tells_health(self) -> bool:
+        """Whether its host reports all that the manifest asks of its health."""
+        asked = self.planned.health
+        ours = self.process is not None and self.process.channel is not None
+        return asked is None or (ours and not asked.diagnostics)
+
+    @property
+    def _known_health(self) -> HealthReport:
+        own, published = self.health
+        if self.configuration is not None:
+            own = self.configuration.health
+        return health_of(self.planned, own, published)
+
+    @property
+    def is_healthy(self) -> bool:
+        """Whether it is known to be as healthy as its manifest asks."""
+        return self._known_health.ok is True
+
+    @property
+    def ails(self) -> str:
+        """What is wrong with it, for messages; empty if nothing, or it is not active."""
+        said = self._known_health.message
+        return f": {said}" if said and self.reach is Reach.ACTIVE else ""
+
     def has_reached(self, condition: Condition) -> bool:
         """Whether the condition holds; for a node that is not managed all follow its start."""
         if self.reach is Reach.STOPPED:
+            return False
+        if condition is Condition.HEALTHY and not self.is_healthy:
             return False
         if not self.planned.managed:
             return self.reach is not Reach.WAITING
@@ -388,6 +456,10 @@ class NodeRun:
                 node=self.name, reach=self.reach, state=self.state, connected=self.connected
             )
         )
+        self.wake()
+
+    def wake(self) -> None:
+        """Have those look again that wait for it."""
         self.changed.set()
         self.changed = asyncio.Event()
 
@@ -655,8 +727,11 @@ class System:
         if node is None:
             return
         if event.configuration is not None:
+            before = node.configuration
             node.configuration = event.configuration
             node.reports_changes = node.reports_changes or event.kind == "configuration"
+            if before is not None and before.health != event.configuration.health:
+                node.wake()
         if event.kind == "reply":
             return
         if event.state:
@@ -675,6 +750,8 @@ class System:
             other = self.nodes.get(after.node) or self.remote[after.node]
             while not other.has_reached(condition):
                 node.doing = f"waits to {step} until {other.name} is {condition.value}"
+                if condition is Condition.HEALTHY and isinstance(other, NodeRun):
+                    node.doing += other.ails
                 await other.changed.wait()
         node.doing = ""
 

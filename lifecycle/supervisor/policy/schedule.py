@@ -19,10 +19,18 @@ from lifecycle.errors import ExitCode
 from lifecycle.manifest import Restart
 from lifecycle.supervisor.control.protocol import Failed, ProcessState
 from lifecycle.supervisor.health.liveliness import Cause
+from lifecycle.supervisor.nodes.bring_up import died
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.policy.restart import RestartPolicy, group_of
 from lifecycle.supervisor.processes.process import ManagedProcess
-from lifecycle.supervisor.run.events import Emitter, GaveUp, Restarted, RestartScheduled
+from lifecycle.supervisor.run.events import (
+    Emitter,
+    Event,
+    GaveUp,
+    ProcessChanged,
+    Restarted,
+    RestartScheduled,
+)
 from lifecycle.supervisor.run.failure import StepFailedError
 from lifecycle.verify import GAVE_UP, PROCESS_DIED
 
@@ -82,9 +90,32 @@ class RestartSchedule:
         self._returning: set[str] = set()
         self._watchdogs: dict[str, asyncio.TimerHandle] = {}
         self._barked: dict[str, str] = {}
+        self._reported: set[ManagedProcess] = set()
+        self._closed = False
         system.liveliness.listen(self._look_at_silent)
+        emit.listen(self._on_event)
 
     # What fails
+
+    def _on_event(self, event: Event) -> None:
+        if isinstance(event, ProcessChanged) and event.state is ProcessState.EXITED:
+            process = self._system.processes.get(event.process)
+            if process is not None and process.pid == event.pid:
+                asyncio.get_running_loop().call_soon(self._report, process)
+
+    def _report(self, process: ManagedProcess) -> None:
+        """Report a death at once, also while something else is being taken down or started.
+
+        A step on one of its nodes says more about it, and is left to do so.
+        """
+        nodes = [self._system.nodes[key] for key in process.planned.nodes]
+        if self._closed or not process.died or any(each.doing for each in nodes):
+            return
+        failure = died(process, nodes[0] if len(nodes) == 1 else None)
+        if self.covers(failure):
+            self._reported.add(process)
+            for each in failure.every:
+                self._emit(each.event(ends_run=False))
 
     def covers(self, failure: StepFailedError) -> bool:
         """Whether all that failed is to be started again as far as the manifest says."""
@@ -113,7 +144,10 @@ class RestartSchedule:
             record.failed = process
             record.since_s = now_s if record.since_s is None else record.since_s
             due_s = record.policy.failed(now_s)
-            self._emit(cause.event(ends_run=False))
+            if process in self._reported:
+                self._reported.discard(process)
+            else:
+                self._emit(cause.event(ends_run=False))
             if due_s is None:
                 raise self._gave_up(process.name, record, failure)
             keys = frozenset(
@@ -203,6 +237,10 @@ class RestartSchedule:
                 record.since_s = None
         self._returning -= set(keys)
 
+    def wait_at_gate(self, keys: Iterable[str]) -> None:
+        """Have nodes activated with those that come again, as soon as their gate allows it."""
+        self._returning |= set(keys)
+
     def returned(self, keys: Collection[str]) -> None:
         """Note that nodes are as far again as they should be."""
         now_s = self._emit.elapsed_s
@@ -256,16 +294,22 @@ class RestartSchedule:
 
     def close(self) -> None:
         """Begin nothing any more."""
+        self._closed = True
         self._entries = []
         for each in self._watchdogs.values():
             each.cancel()
         self._watchdogs.clear()
 
     def _taken_by(self, cause: StepFailedError) -> ManagedProcess | None:
-        """Return the process that a failure is of, if that is to be started again after it."""
+        """Return the process that a failure is of, if that is to be started again after it.
+
+        A component that cannot be loaded, or fails in a step, is its container's failure.
+        """
         process = self._system.processes.get(cause.process)
         if process is None:
             node = self._system.node_named(cause.subject)
+            if node is not None and node.planned.run.component:
+                node = self._system.nodes.get(node.planned.run.container)
             process = None if node is None else node.process
         if process is None or not process.planned.nodes:
             return None

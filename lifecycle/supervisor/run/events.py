@@ -7,8 +7,10 @@ order. Presentation lives in cli/. Must not import rclpy.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from typing import ClassVar, Union
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, Union, get_args
+
+import msgspec
 
 from lifecycle import dataclasses
 from lifecycle.codec import to_plain
@@ -477,3 +479,16 @@ def to_record(event: Event) -> dict[str, object]:
 
         plain["verdict"]["findings"] = plain_findings(event.verdict)
     return {"event": event.kind, **plain}
+
+
+_KINDS: dict[str, type[Event]] = {each.kind: each for each in get_args(Event)}
+
+
+def from_record(record: Mapping[str, Any]) -> Event | None:
+    """Return the event that `to_record` wrote; None for a kind that this version does not know.
+
+    Raises:
+        ValueError: it is not what its kind has.
+    """
+    kind = _KINDS.get(str(record.get("event")))
+    return None if kind is None else msgspec.convert(record, kind)

@@ -11,15 +11,13 @@ import datetime as dt
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, get_args
-
-import msgspec
+from typing import Any
 
 from lifecycle import codec, dataclasses
 from lifecycle.errors import UsageError
 from lifecycle.plan import Plan
 from lifecycle.supervisor.processes.logs import JOURNAL_NAME
-from lifecycle.supervisor.run.events import Event, VerdictChanged
+from lifecycle.supervisor.run.events import Event, VerdictChanged, from_record
 from lifecycle.supervisor.run.journal import (
     JournaledRun,
     JournalLine,
@@ -32,8 +30,6 @@ from lifecycle.verify import Finding, Observation, Outcome, Verdict, verify
 
 LONGEST_LINE = 64 * 2**20
 """Bytes of a line that is read at all."""
-
-_KINDS: dict[str, type[Any]] = {each.kind: each for each in get_args(Event)}
 
 BEFORE_S = 2.0
 AFTER_S = 0.5
@@ -136,7 +132,7 @@ class _Reader:
         """Take one line."""
         try:
             line = codec.from_json(data, JournalLine, longest=LONGEST_LINE)
-            event = None if line.event is None else _event(line.event)
+            event = None if line.event is None else from_record(line.event)
         except ValueError as error:
             why = "it is incomplete" if not data.endswith(b"\n") else str(error)
             self.unreadable.append((place, why))
@@ -164,19 +160,6 @@ class _Reader:
                 text=data.decode("utf-8", errors="replace").rstrip("\n"),
             )
         )
-
-
-def _event(plain: dict[str, Any]) -> Event | None:
-    """Return an event as a type again.
-
-    Raises:
-        ValueError: it is not what its kind has.
-    """
-    kind = _KINDS.get(str(plain.get("event")))
-    if kind is None:
-        return None
-    found: Event = msgspec.convert(plain, kind)
-    return found
 
 
 def _after(before: Observation | None, look: Look) -> Observation:

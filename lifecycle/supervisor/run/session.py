@@ -51,6 +51,7 @@ from lifecycle.supervisor.nodes.adoption import SETTLE_S, Adoption, Census, ran_
 from lifecycle.supervisor.nodes.bring_up import BringUp
 from lifecycle.supervisor.nodes.driver import NodeDriver
 from lifecycle.supervisor.nodes.system import (
+    AwaitedHealth,
     InterfaceOnDemand,
     NodeRun,
     ObservedGraph,
@@ -251,6 +252,7 @@ class Session:
         self._remote_nodes = RemoteNodes(
             system.plan, system.awaited(), observer_participant, self._changes
         )
+        self._awaited_health = AwaitedHealth(system, observer_participant, self._changes)
         self._interfaces = InterfaceOnDemand(system, observer_participant, self._changes)
         self._gate_sequence = GateSequence(
             system,
@@ -545,6 +547,7 @@ class Session:
         """Keep looking at the nodes of others, and at ours that others may drive, too."""
         followers = (
             asyncio.ensure_future(self._remote_nodes.follow()),
+            asyncio.ensure_future(self._awaited_health.follow()),
             asyncio.ensure_future(self._guard.follow(self._observer_participant, self._changes)),
         )
         try:

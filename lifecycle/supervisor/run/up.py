@@ -234,7 +234,7 @@ def _up(
         return asyncio.run(_leaving_last(run, conclude))
     finally:
         forerunner.close()
-        _sweep(records)
+        _sweep(records, within_s=_LET_GO_S)
         directory.release()
 
 
@@ -305,9 +305,13 @@ def _preloading(
     return forerunner
 
 
-def _sweep(records: Records | None, emit: Emitter | None = None) -> None:
+_LET_GO_S = 0.5
+"""Others let go of what a participant used within milliseconds of its leaving."""
+
+
+def _sweep(records: Records | None, emit: Emitter | None = None, *, within_s: float = 0.0) -> None:
     """Remove the shared memory that processes of the run have left."""
-    swept = sweep(records.left()) if records else ()
+    swept = sweep(records.left(), within_s=within_s) if records else ()
     if swept and emit:
         emit(Notice(message=f"removed shared memory left in /dev/shm: {', '.join(swept)}"))
 

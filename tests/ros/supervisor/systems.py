@@ -16,6 +16,7 @@ import time
 from pathlib import Path
 
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.node import Node
 from std_msgs.msg import String
 
@@ -50,7 +51,7 @@ def misbehave(step: str) -> None:
         # Until a test says so, and bounded; its transition's limit is longer.
         end = time.monotonic() + 4.0
         while not Path(os.environ["MISBEHAVE_IF"]).exists() and time.monotonic() < end:
-            time.sleep(0.05)
+            time.sleep(0.1)
     if way == "fork":
         # A grandchild in a session of its own that outlives whoever made it.
         subprocess.Popen(["sleep", "300"], start_new_session=True)
@@ -94,6 +95,40 @@ class Counting(Talker):
     def _tick(self) -> None:
         self._count += 1
         self.publisher("chatter").publish(String(data=str(self._count)))
+
+
+class Stillborn(Talker):
+    """Is killed once before it has started, when others have discovered its endpoints."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        file = Path(os.environ["MISBEHAVE_IF"])
+        if file.exists():
+            file.unlink()
+            time.sleep(0.1)
+            os.kill(os.getpid(), signal.SIGKILL)
+
+
+class Moody(Talker):
+    """Is well while the file MOOD is there, once it is active."""
+
+    def health(self):
+        if self.is_active and not Path(os.environ["MOOD"]).exists():
+            return "in a mood"
+        return None
+
+
+class Diagnosed(Talker):
+    """Publishes what it is on /diagnostics: an error while the file MOOD is not there."""
+
+    def _tick(self) -> None:
+        well = Path(os.environ["MOOD"]).exists()
+        status = DiagnosticStatus(
+            name="talker: mood",
+            level=DiagnosticStatus.OK if well else DiagnosticStatus.ERROR,
+            message="well" if well else "in a mood",
+        )
+        self.publisher("diagnostics").publish(DiagnosticArray(status=[status]))
 
 
 class Chatty(Talker):
@@ -159,7 +194,7 @@ class Eager(Talker):
     def _from_thread(self) -> None:
         end = time.monotonic() + 10.0
         while not self.lifecycle.state.connected and time.monotonic() < end:
-            time.sleep(0.02)
+            time.sleep(0.1)
         asyncio.run(self._activate("thread"))
 
     async def _activate(self, whence: str) -> None:

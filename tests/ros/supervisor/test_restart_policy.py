@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import time
 from pathlib import Path
 
 import pytest
@@ -63,6 +64,25 @@ def test_a_killed_node_of_three_is_active_and_verified_again_and_the_others_go_o
         assert run.finish() == ExitCode.OK
         assert run.verdict["run"]["reason"] == "lifecycle down; restarted: 'talker' 1 time"
         run.assert_nothing_left()
+
+
+def test_a_node_that_is_killed_before_its_name_is_known_does_not_haunt_the_gate(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    once = tmp_path / "once"
+    once.touch()
+    edit = {
+        "restart": "on-failure",
+        "nodes/talker/run/python": "tests.ros.supervisor.systems:Stillborn",
+        "nodes/talker/run/environment": {"MISBEHAVE_IF": str(once)},
+    }
+    with up(pair(tmp_path, fresh_domain, edit=edit), runtime=tmp_path) as run:
+        assert not run.until("failure", process="talker")["ends_run"]
+        began = time.monotonic()
+        run.until("system", reached="active")
+        # Its endpoints would be there for the rest of its lease, 20 s, and nobody's.
+        assert time.monotonic() - began < 8.0
+        assert run.until("restarted")["process"] == "talker"
 
 
 def test_a_node_that_fails_each_time_is_given_up_with_exit_code_7_and_its_history(

@@ -8,6 +8,7 @@ import fcntl
 import mmap
 import os
 import select
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -185,6 +186,18 @@ def test_a_port_cannot_be_opened_while_it_is_being_removed(
     removed = sweep(ALL)
     monkeypatch.undo()
     assert removed == tuple(sorted(seen)) == tuple(sorted(GROUP))
+
+
+def test_what_others_let_go_of_a_moment_later_is_removed_then(directory: Path) -> None:
+    make(directory, *GROUP)
+    with contextlib.ExitStack() as peer:
+        peer.enter_context((directory / PORT).open("rb"))
+        letting_go = threading.Timer(0.1, peer.close)
+        letting_go.start()
+        assert sweep(ALL) == ()
+        assert sweep(ALL, within_s=5.0) == tuple(sorted(GROUP))
+        letting_go.join()
+    assert names(directory) == ()
 
 
 def test_the_creation_of_fast_ddss_files_is_noticed_and_of_nothing_else(directory: Path) -> None:

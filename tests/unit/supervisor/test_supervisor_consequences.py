@@ -15,6 +15,7 @@ from lifecycle.manifest import (
     Condition,
     Consequence,
     EndpointKind,
+    Health,
     Mode,
     OnViolation,
     Reaction,
@@ -22,11 +23,12 @@ from lifecycle.manifest import (
 )
 from lifecycle.manifest import Restart as RestartWhen
 from lifecycle.manifest.schema import MANIFEST, read_schema
+from lifecycle.node import Event as HostEvent
 from lifecycle.plan import PlannedFlow, in_mode
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.control.server import ControlRequest
 from lifecycle.supervisor.policy.consequences import reaction_of
-from lifecycle.verify import RULES, Finding, Outcome
+from lifecycle.verify import RULES, Finding, HealthReport, Outcome
 from tests.builders import HERE, plan_of, planned_node
 from tests.unit.supervisor.fakes import run
 from tests.unit.supervisor.session_world import DOWN, SessionWorld, over
@@ -315,5 +317,51 @@ def test_a_violation_enters_a_mode_once_and_one_that_its_gate_refuses_is_left_ag
             f"[consequence] mode  for {TWICE}",
             "[consequence] mode  for graph.undeclared-node",
         ]
+
+    run(main())
+
+
+def test_a_node_waits_until_another_is_healthy_and_one_that_no_longer_is_has_a_consequence(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        camera, viewer = (planned_node(each) for each in ("camera", "viewer"))
+        camera = dataclasses.replace(camera, health=Health(check=True))
+        viewer = planned_node("viewer", after={"camera": Condition.HEALTHY})
+        plan = plan_of(camera, viewer)
+        plan = dataclasses.replace(plan, on_violation=_said((("node", DEACTIVATE),)))
+        world = SessionWorld(plan, tmp_path, stop_after_s=10.0)
+
+        def report(health: HealthReport) -> None:
+            interfaces = world.hosts.interfaces
+            interfaces["/camera"] = dataclasses.replace(interfaces["/camera"], health=health)
+            world.system.on_host_event(
+                HostEvent(
+                    kind="configuration",
+                    node="/camera",
+                    state=interfaces["/camera"].state,
+                    connected=True,
+                    configuration=interfaces["/camera"],
+                )
+            )
+
+        async def change() -> None:
+            # What it does not say is taken on trust, but nobody activates by it.
+            await world.story.until("/camera activate")
+            await asyncio.sleep(3.0)
+            assert "/viewer activate" not in world.story
+            report(HealthReport(ok=True))
+            await world.story.until("[system] active")
+            await asyncio.sleep(1.0)
+            report(HealthReport(ok=False, message="too hot"))
+
+        await world.run(change())
+        at = world.outline.index("[system] active at 3.0 s")
+        assert world.outline[at + 1 : at + 4] == [
+            "[verdict] active violated node.unhealthy /camera",
+            "[consequence] deactivate /camera for node.unhealthy",
+            "/camera deactivate",
+        ]
+        assert "cannot accept node /camera: it is not healthy: too hot" in world.messages
 
     run(main())

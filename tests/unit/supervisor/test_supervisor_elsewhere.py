@@ -18,7 +18,7 @@ from lifecycle.verify.observation import Observation, ObservedNode
 from tests.builders import configuration, plan_of, planned_node
 from tests.unit.supervisor.fakes import World, run
 
-STARTED, CONFIGURED, CONNECTED, ACTIVE = Condition
+STARTED, CONFIGURED, CONNECTED, ACTIVE, HEALTHY = Condition
 
 
 def _seen(state: str | None, *, connected: bool | None = None) -> Observation:
@@ -40,7 +40,8 @@ def _seen(state: str | None, *, connected: bool | None = None) -> Observation:
         (_seen("inactive", connected=True), (STARTED, CONFIGURED, CONNECTED)),
         # Without a report it is not one of our nodes, whose data layer is made in configure.
         (_seen("inactive"), (STARTED, CONFIGURED, CONNECTED)),
-        (_seen("active"), (STARTED, CONFIGURED, CONNECTED, ACTIVE)),
+        # Nothing is asked of its health.
+        (_seen("active"), (STARTED, CONFIGURED, CONNECTED, ACTIVE, HEALTHY)),
         (_seen("finalized", connected=False), (STARTED,)),
     ],
 )

@@ -7,7 +7,10 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+from concurrent.futures import Future
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -21,8 +24,13 @@ from lifecycle.manifest import (
 )
 from lifecycle.plan.model import Plan, PlannedNode
 from lifecycle.supervisor.control.server import ControlRequest
+from lifecycle.supervisor.nodes.system import NodeRun
 from lifecycle.supervisor.policy.restart import RestartPolicy, delay_s, group_of
+from lifecycle.supervisor.policy.schedule import RestartSchedule
 from lifecycle.supervisor.processes.process import ProcessExit
+from lifecycle.supervisor.run.events import Emitter
+from lifecycle.supervisor.run.failure import StepFailedError
+from lifecycle.verify import rule
 from tests.builders import plan_of, planned_node
 from tests.unit.supervisor.fakes import run
 from tests.unit.supervisor.session_world import (
@@ -123,6 +131,8 @@ def _component(key: str, *, of: str) -> PlannedNode:
 
 # Sessions
 
+DEPENDENTS = dataclasses.replace(ON_FAILURE, on_failure=OnFailure.DEPENDENTS)
+
 
 def _chain(camera: Supervision = ON_FAILURE, viewer: Supervision = ON_FAILURE) -> Plan:
     return plan_of(
@@ -133,6 +143,7 @@ def _chain(camera: Supervision = ON_FAILURE, viewer: Supervision = ON_FAILURE) -
 
 GONE = "graph.missing-node /camera"
 VIEWER_GONE = "graph.missing-node /viewer"
+UNREPORTED = "state.unverifiable /camera, config.missing-report /camera"
 
 
 def _back(node: str, at_s: float) -> list[str]:
@@ -333,9 +344,10 @@ def test_what_fails_while_another_is_restarted_keeps_both_at_the_gate_until_the_
             world.kill("viewer")
 
         await world.run(die())
-        assert world.since("/camera connect", 2) == [
-            "/camera connect",
+        assert world.since("[failure] run.process-died /viewer") == [
             "[failure] run.process-died /viewer, and the run goes on",
+            f"[verdict] connected violated {VIEWER_GONE}, {UNREPORTED}",
+            "/camera connect",
             "[backoff] viewer in 1.0 s",
             f"[verdict] connected violated {VIEWER_GONE}",
             "viewer start",
@@ -540,5 +552,194 @@ def test_what_is_active_outlives_a_killed_supervisor_and_nothing_does_before_or_
             "[restarted]": ["camera", "driver", "viewer"],
             "[stopping]": [],
         }
+
+    run(main())
+
+
+@pytest.mark.parametrize(("restart", "taken"), [(Restart.ON_FAILURE, True), (Restart.NO, False)])
+def test_a_component_that_cannot_be_loaded_is_its_container_s_failure(
+    restart: Restart, taken: bool
+) -> None:
+    how = dataclasses.replace(ON_FAILURE, restart=restart)
+    helper = NodeRun(planned_node("helper", supervision=how), Emitter())
+    part = NodeRun(_component("part", of="helper"), Emitter())
+    process: Any = SimpleNamespace(
+        name="helper", planned=SimpleNamespace(nodes=("helper",)), started_s=0.0, ended=Future()
+    )
+    helper.process = process
+    nodes = {"helper": helper, "part": part}
+    system: Any = SimpleNamespace(
+        nodes=nodes,
+        processes={"helper": process},
+        liveliness=SimpleNamespace(listen=lambda _: None),
+        node_named=lambda name: nodes[name[1:]],
+    )
+    failure = StepFailedError("cannot load it", rule=rule("run.start-failed"), subject="/part")
+    assert RestartSchedule(system, Emitter()).covers(failure) is taken
+
+
+def test_a_death_is_reported_at_once_also_while_another_process_is_taken_down(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        plan = plan_of(
+            planned_node("camera", supervision=DEPENDENTS),
+            planned_node("viewer", supervision=ON_FAILURE, after={"camera": Condition.STARTED}),
+            planned_node("other", supervision=ON_FAILURE),
+        )
+        world = SessionWorld(plan, tmp_path, stop_after_s=20.0)
+
+        async def die() -> None:
+            await world.story.until("[system] active")
+            world.hosts.takes_s["/viewer deactivate"] = 2.0
+            world.kill("camera")
+            await world.story.until("/viewer deactivate")
+            await asyncio.sleep(0.5)
+            began = asyncio.get_running_loop().time()
+            world.kill("other")
+            await world.story.until("[failure] run.process-died /other")
+            assert asyncio.get_running_loop().time() - began < 0.1
+            await world.story.until("[restarted] other")
+
+        await world.run(die())
+        failures = [each for each in world.outline if each.startswith("[failure]")]
+        assert len(failures) == 2
+        assert world.story[-1] == "[stopped] 0"
+
+    run(main())
+
+
+@pytest.mark.parametrize(
+    ("asked", "node"), [(ControlRequest.RESTART, "viewer"), (ControlRequest.RESUME, "")]
+)
+def test_an_order_does_not_keep_others_from_coming_again_that_its_gate_waits_for(
+    tmp_path: Path, asked: ControlRequest, node: str
+) -> None:
+    async def main() -> None:
+        world = SessionWorld(_chain(), tmp_path, stop_after_s=30.0)
+
+        async def order() -> None:
+            await world.story.until("[system] active")
+            if asked is ControlRequest.RESUME:
+                assert await world.order(ControlRequest.PAUSE) == "0"
+            world.kill("camera")
+            await world.story.until("[backoff] camera in 1.0 s")
+            began = asyncio.get_running_loop().time()
+            assert await world.order(asked, node) == "0"
+            assert asyncio.get_running_loop().time() - began < 2.0
+            assert world.status().phase == "active"
+            assert {each.state for each in world.status().nodes} == {"active"}
+            await world.story.until("[restarted] camera (1)")
+
+        await world.run(order())
+
+    run(main())
+
+
+def test_what_becomes_wrong_while_another_node_is_restarted_is_found_within_a_second(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        plan = plan_of(
+            planned_node("camera", supervision=ON_FAILURE),
+            planned_node("viewer", supervision=ON_FAILURE),
+        )
+        world = SessionWorld(plan, tmp_path, stop_after_s=30.0)
+
+        async def intrude() -> None:
+            await world.story.until("[system] active")
+            world.hosts.takes_s["/camera configure"] = 5.0
+            world.kill("camera")
+            await world.story.until("/camera configure", 2)
+            await asyncio.sleep(1.0)
+            began = asyncio.get_running_loop().time()
+            world.intrude()
+            await world.story.until(f"[verdict] connected violated {INTRUDED}")
+            assert asyncio.get_running_loop().time() - began < 1.0
+            world.retreat()
+            await world.story.until("[restarted] camera (1)")
+
+        await world.run(intrude())
+        assert "state.wrong-state" not in " ".join(world.outline)
+
+    run(main())
+
+
+def test_a_resume_that_a_death_cuts_short_leaves_the_system_paused_and_open_to_orders(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        world = SessionWorld(_chain(), tmp_path, stop_after_s=30.0)
+
+        async def order() -> None:
+            await world.story.until("[system] active")
+            assert await world.order(ControlRequest.PAUSE) == "0"
+            world.intrude()
+            resuming = asyncio.ensure_future(world.order(ControlRequest.RESUME))
+            await world.story.until(f"[verdict] connected violated {INTRUDED}")
+            began = asyncio.get_running_loop().time()
+            world.kill("viewer")
+            assert (await resuming).startswith("6 cannot keep '/viewer' running")
+            # No step of its was under way: nobody else knows more about its death.
+            assert asyncio.get_running_loop().time() - began < 0.1
+            await world.story.until("[restarted] viewer (1)")
+            assert world.status().phase == "paused"
+            world.retreat()
+            assert await world.order(ControlRequest.RESUME) == "0"
+            assert world.status().phase == "active"
+
+        await world.run(order())
+
+    run(main())
+
+
+@pytest.mark.parametrize("node", ["", "camera"])
+def test_a_restart_by_hand_that_a_death_cuts_short_is_finished_once_all_are_back(
+    tmp_path: Path, node: str
+) -> None:
+    async def main() -> None:
+        plan = plan_of(
+            planned_node("camera", supervision=ON_FAILURE),
+            planned_node("viewer", supervision=ON_FAILURE),
+        )
+        world = SessionWorld(plan, tmp_path, stop_after_s=30.0)
+
+        async def order() -> None:
+            await world.story.until("[system] active")
+            world.hosts.takes_s["/camera configure"] = 2.0
+            restarting = asyncio.ensure_future(world.order(ControlRequest.RESTART, node))
+            await world.story.until("/camera configure", 2)
+            await asyncio.sleep(1.0)
+            world.kill("camera")
+            assert (await restarting).startswith("6 cannot keep '/camera' running")
+            await world.story.until("[restarted] camera (1)")
+            assert world.status().phase == "active"
+            assert {each.state for each in world.status().nodes} == {"active"}
+
+        await world.run(order())
+
+    run(main())
+
+
+def test_a_resume_that_a_death_cuts_short_behind_its_gate_is_finished_once_all_are_back(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        world = SessionWorld(_chain(), tmp_path, stop_after_s=30.0)
+
+        async def order() -> None:
+            await world.story.until("[system] active")
+            assert await world.order(ControlRequest.PAUSE) == "0"
+            world.hosts.takes_s["/camera activate"] = 2.0
+            resuming = asyncio.ensure_future(world.order(ControlRequest.RESUME))
+            await world.story.until("/camera activate", 2)
+            await asyncio.sleep(0.5)
+            world.kill("viewer")
+            assert (await resuming).startswith("6 cannot keep '/viewer' running")
+            await world.story.until("[restarted] viewer (1)")
+            assert world.status().phase == "active"
+            assert {each.state for each in world.status().nodes} == {"active"}
+
+        await world.run(order())
 
     run(main())

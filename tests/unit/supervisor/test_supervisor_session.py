@@ -739,7 +739,7 @@ def test_a_process_that_dies_while_the_system_is_judged_ends_the_run(tmp_path: P
         await world.run(die())
         assert world.since("[failure]") == [
             "[failure] run.process-died /camera",
-            "[stopping] at 3.2 s: rolling back",
+            "[stopping] at 2.0 s: rolling back",
             *VIEWER_DOWN,
             *over(6),
         ]

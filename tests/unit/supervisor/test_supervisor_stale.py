@@ -82,3 +82,16 @@ def test_nobody_is_removed_whom_discovery_does_not_show_or_who_lives() -> None:
     after(graph, ENDED, running, another, server)
     assert graph.removed == []
     assert len(graph.asked) == 1
+
+
+def test_what_a_process_made_just_before_its_end_is_removed_once_it_is_discovered() -> None:
+    class Late(Graph):
+        def participants_of(
+            self, pid: int, *, nodes: Iterable[str], reported: Iterable[str]
+        ) -> frozenset[str]:
+            shown = super().participants_of(pid, nodes=nodes, reported=reported)
+            return shown if len(self.asked) > 1 else frozenset()
+
+    graph = Late(removals=2)
+    after(graph, ENDED, seconds=0.3)
+    assert graph.removed[0] == (frozenset((PREFIX,)), (8,))

@@ -9,6 +9,7 @@ import pytest
 from lifecycle.manifest.model import (
     EndpointKind,
     EndpointPolicy,
+    Health,
     Policy,
     Quantity,
     Run,
@@ -33,6 +34,7 @@ from lifecycle.plan import Plan, build_plan
 from lifecycle.verify import (
     RULES,
     Finding,
+    HealthReport,
     Identity,
     NodeConfiguration,
     Observation,
@@ -540,9 +542,69 @@ def test_every_rule_has_a_case_in_which_it_fires():
     remote_nodes |= {each.id for each in RULES if each.id.startswith(("connection.", "param."))}
     remote_nodes |= {each.id for each in RULES if each.id.startswith("run.")}
     remote_nodes.add("graph.ended-node")  # in a test of its own: nothing of a graph says it
+    remote_nodes.add("node.unhealthy")  # likewise: no node of this plan is asked
     remote_nodes.add("state.activated-at-closed-gate")  # tests/unit/supervisor, it is the guard's
     fired = {rule for _, expected in FIRES.values() for rule, _, _ in expected}
     assert fired | remote_nodes == {rule.id for rule in RULES}
+
+
+_NO_HEALTH = (
+    "cannot verify that node /viewer is healthy: it reports no health; its class needs a method "
+    "'health'"
+)
+
+
+@pytest.mark.parametrize(
+    ("health", "found"),
+    [
+        (HealthReport(ok=True), ""),
+        (
+            HealthReport(ok=False, message="no scan"),
+            "violated cannot accept node /viewer: it is not healthy: no scan",
+        ),
+        (
+            HealthReport(ok=None, message="it is late"),
+            "unverifiable cannot verify that node /viewer is healthy: it is late",
+        ),
+        (
+            None,
+            f"unverifiable {_NO_HEALTH}",
+        ),
+    ],
+)
+def test_the_health_that_a_node_reports_is_judged_where_the_manifest_asks_it(
+    health: HealthReport | None, found: str
+):
+    edit = change_configuration("/viewer", health=health)
+    assert findings_after(edit) == []
+    nodes = tuple(
+        dataclasses.replace(each, health=Health(check=True)) if each.key == "viewer" else each
+        for each in PLAN.nodes
+    )
+    plan = dataclasses.replace(PLAN, nodes=nodes)
+    verdict = verify(plan, edit(perfect(plan, Stage.ACTIVE)), stage=Stage.ACTIVE)
+    assert "; ".join(f"{each.outcome.value} {each.message}" for each in verdict.findings) == found
+    # What /diagnostics says of it counts as well, once it may publish.
+    asked = Health(check=True, diagnostics=("viewer: *",))
+    nodes = tuple(
+        dataclasses.replace(each, health=asked) if each.key == "viewer" else each
+        for each in PLAN.nodes
+    )
+    both_ways = dataclasses.replace(PLAN, nodes=nodes)
+    said = HealthReport(ok=False, message="'viewer: lens': dirty")
+    (worse,) = verify(
+        both_ways,
+        both(edit, change_node("/viewer", health=said))(perfect(both_ways, Stage.ACTIVE)),
+        stage=Stage.ACTIVE,
+    ).findings
+    assert worse.outcome is Outcome.VIOLATED
+    assert worse.message.endswith("'viewer: lens': dirty")
+    early = findings_after(edit, plan=both_ways, stage=Stage.CONNECTED)
+    assert early == [("node.unhealthy", found.partition(" ")[0], "/viewer")] * bool(found)
+    # It is asked from when it is connected.
+    early = both(edit, change_configuration("/viewer", connected=False))
+    rules = {rule for rule, _, _ in findings_after(early, plan=plan)}
+    assert "node.unhealthy" not in rules
 
 
 def test_a_node_that_has_ended_as_it_may_is_unverifiable_and_not_missing():

@@ -1,0 +1,388 @@
+"""`--hosts` of `lifecycle up` and `down`: every machine of a manifest from one place.
+
+Owns: options as transports and parts, the run of a coordinator in this process, and its output:
+JSON lines, or plain lines with the host in front; live_view.py has the table.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import functools
+import json
+import os
+import signal
+import sys
+from collections.abc import Iterator, Mapping
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any, Protocol
+
+import click
+
+from lifecycle.cli.common import load_manifest
+from lifecycle.cli.standard_streams import Writer
+from lifecycle.cli.up_output import PlainLines, Sink, verdict_line
+from lifecycle.codec import from_json
+from lifecycle.errors import ExitCode, UsageError
+from lifecycle.fleet import (
+    Coordinator,
+    LocalTransport,
+    Place,
+    Record,
+    SshTransport,
+    Transport,
+    destinations,
+    down,
+    in_place,
+    parts_of,
+    ranks,
+    ssh_command,
+    worst,
+)
+from lifecycle.manifest import noting_files
+from lifecycle.plan import build_plan
+from lifecycle.printable import json_text, one_line
+from lifecycle.run_directory import run_name
+from lifecycle.supervisor import TIMEOUT_S, UpOptions, from_record, own_machines
+from lifecycle.verify import Outcome, Verdict, render_text
+
+if TYPE_CHECKING:
+    from lifecycle.fleet import Part
+    from lifecycle.plan import Plan
+    from lifecycle.supervisor import Event
+
+_MORE_S = TIMEOUT_S
+"""For supervisors to start, and to end by themselves at the deadline that they have, too."""
+
+
+def up_on_hosts(
+    manifest: str,
+    assignments: tuple[str, ...],
+    *,
+    chosen: tuple[str, ...],
+    remote_command: str,
+    format_: str,
+    options: Mapping[str, Any],
+) -> int:
+    """Start, follow and end the supervisors of all machines of a manifest.
+
+    Args:
+        manifest: its file.
+        assignments: `name:=value` of it.
+        chosen: `MACHINE=DESTINATION` of `--host`.
+        remote_command: of `--remote-command`.
+        format_: "text" or "json".
+        options: of `lifecycle up`, by name.
+
+    Raises:
+        UsageError: an option cannot be used so, or a machine is not declared.
+        ManifestError: the manifest has errors.
+    """
+    _refuse(options)
+    domain_id = options["domain"]
+    with noting_files() as files:
+        loaded = load_manifest(manifest, assignments, quiet=True)
+        plan = build_plan(loaded.manifest, domain_id=domain_id)
+    if domain_id is None and loaded.manifest.discovery.domain_id is None:
+        domain_id = plan.domain_id  # of our environment: the hosts' may have another
+    parts, unsent = parts_of(
+        plan,
+        files,
+        arguments=assignments,
+        options=tuple(_passed_on({**options, "domain": domain_id})),
+    )
+    for path in unsent:
+        click.echo(
+            f"not sent, because it is not in the folder of the manifest: {one_line(path)}; each "
+            "host needs it under the same path",
+            err=True,
+        )
+    transports = _transports(plan, chosen, remote_command)
+    order = ranks(plan)
+    with _output(format_, plan.system, tuple(each.machine for each in parts)) as output:
+        coordinator = Coordinator(
+            plan.system,
+            [
+                _place(part, transports[part.machine], order.get(part.machine, 0), manifest)
+                for part in parts
+            ],
+            output,
+            version=version("ros-lifecycle-manifests"),
+            bring_up_s=_bring_up_s(plan, parts, options["timeout"]) + _MORE_S,
+            again=tuple(f"lifecycle {verb} {manifest} --hosts" for verb in ("up", "down")),  # type: ignore[arg-type]
+            stop_after_s=options["stop_after"],
+            keep_going=options["keep_going"],
+        )
+        return asyncio.run(_run(coordinator))
+
+
+def _place(part: Part, transport: Transport, rank: int, manifest: str) -> Place:
+    is_here = isinstance(transport, LocalTransport)
+    return Place(in_place(part, manifest) if is_here else part, transport, rank)
+
+
+async def _run(coordinator: Coordinator) -> ExitCode:
+    loop = asyncio.get_running_loop()
+    for number, reason, code in (
+        (signal.SIGINT, "interrupted", ExitCode.INTERRUPTED),
+        (signal.SIGTERM, "terminated", ExitCode.TERMINATED),
+    ):
+        loop.add_signal_handler(number, coordinator.stop, reason, code)
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup(1)
+        loop.add_signal_handler(signal.SIGHUP, coordinator.leave, "the terminal was closed")
+    return await coordinator.run()
+
+
+def down_on_hosts(
+    target: str,
+    assignments: tuple[str, ...],
+    *,
+    chosen: tuple[str, ...],
+    remote_command: str,
+    timeout_s: float,
+) -> int:
+    """End the runs of all machines of a manifest, whoever started them; say how it went.
+
+    Raises:
+        UsageError: a machine is not declared.
+        ManifestError: the manifest has errors.
+    """
+    plan = build_plan(load_manifest(target, assignments, quiet=True).manifest)
+    transports = _transports(plan, chosen, remote_command)
+    used = sorted({each.machine for each in plan.processes})
+    names = {machine: run_name(plan, machine) for machine in used}
+    outcomes = asyncio.run(down(names, transports, timeout_s))
+    for machine, (code, message) in outcomes.items():
+        said = message or ("ended" if code is ExitCode.OK else f"exit code {int(code)}")
+        click.echo(f"{one_line(machine)} | {one_line(said)}", err=True)
+    return worst(code for code, _ in outcomes.values())
+
+
+_REFUSED = {
+    "until": "what is not to become active is verified by hand, machine by machine",
+    "report": "each host's verdict is in the output of --format json",
+    "machine": "all machines are started; leave it out",
+    "targets": "start that machine by itself: lifecycle up MANIFEST --machine NAME --program …",
+    "mapping": "start that machine by itself: lifecycle up MANIFEST --machine NAME --program …",
+    "flow_labels": "start that machine by itself: lifecycle up MANIFEST --machine NAME --program …",
+}
+_FLAGS = {"until": "--until", "mapping": "--dscp-from-5qi", "targets": "--program"}
+
+
+def _refuse(options: Mapping[str, Any]) -> None:
+    for name, hint in _REFUSED.items():
+        if options[name] and (name, options[name]) != ("until", "active"):
+            flag = _FLAGS.get(name, f"--{name.replace('_', '-')}")
+            raise UsageError(f"cannot use {flag} with --hosts", hint=hint)
+
+
+def _passed_on(options: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the options that each supervisor gets; when to end is the coordinator's to say."""
+    for name in ("strict", "keep_going", "timings", "adopt"):
+        if options[name]:
+            yield f"--{name.replace('_', '-')}"
+    for node in options["without"]:
+        yield f"--except={node}"
+    for name in ("timeout", "domain"):
+        if options[name] is not None:
+            yield f"--{name}={options[name]}"
+
+
+def _bring_up_s(plan: Plan, parts: tuple[Part, ...], timeout_s: float | None) -> float:
+    counts = [sum(each.machine == part.machine for each in plan.processes) for part in parts]
+    return UpOptions(timeout_s=timeout_s).bring_up_s(max(counts))
+
+
+def _transports(plan: Plan, chosen: tuple[str, ...], remote_command: str) -> dict[str, Transport]:
+    """Return the way to each machine.
+
+    Raises:
+        UsageError: what was chosen is no `MACHINE=DESTINATION`, or LIFECYCLE_SSH cannot be read.
+    """
+    try:
+        ssh = ssh_command(os.environ.get("LIFECYCLE_SSH", ""))
+    except ValueError as error:
+        raise UsageError(
+            f"cannot read LIFECYCLE_SSH: {error}", hint="write a command line: ssh -F FILE"
+        ) from error
+    by_hand: dict[str, str] = {}
+    for each in chosen:
+        name, equals, destination = each.partition("=")
+        if not name or not equals or not destination or destination.startswith("-"):
+            raise UsageError(f"cannot read --host {each!r}; write MACHINE=[USER@]HOST")
+        by_hand[name] = destination
+    local = own_machines(plan, "")
+    return {
+        machine: SshTransport(
+            machine=machine, destination=place, remote_command=remote_command, ssh=ssh
+        )
+        if place
+        else LocalTransport()
+        for machine, place in destinations(plan, by_hand, local.__contains__).items()
+    }
+
+
+class HostsOutput(Protocol):
+    """Takes what a coordinator says, see fleet.coordinator.Listener."""
+
+    def __call__(self, host: str, record: Record) -> None:
+        """Show one event of a host, or of all."""
+
+
+@contextlib.contextmanager
+def _output(format_: str, system: str, hosts: tuple[str, ...]) -> Iterator[HostsOutput]:
+    """Give the output for a format, and for text what suits the terminal."""
+    writer = Writer(
+        sys.stdout.fileno(),
+        "standard output",
+        marker=_json_notice if format_ == "json" else lambda text: f"{text}\n",
+        say=functools.partial(click.echo, err=True),
+        encoding=sys.stdout.encoding,
+    )
+    try:
+        if format_ == "json":
+            yield JsonHosts(writer)
+        elif sys.stdout.isatty():
+            from lifecycle.cli.live_view import LiveHosts
+
+            with LiveHosts(system, hosts, writer=writer) as live:
+                yield live
+        else:
+            yield PlainHosts(writer)
+    finally:
+        writer.close()
+
+
+def _json_notice(message: str) -> str:
+    return json.dumps({"host": "", "event": "notice", "message": message}) + "\n"
+
+
+class JsonHosts:
+    """One JSON object per line; `host` is whose it is, empty for what is about all."""
+
+    def __init__(self, sink: Sink) -> None:
+        self._sink = sink
+
+    def __call__(self, host: str, record: Record) -> None:
+        """Write one event."""
+        del host  # in the record
+        text = json.dumps(record, ensure_ascii=False, separators=(",", ":"))
+        self._sink.put(json_text(text) + "\n", kept=record.get("event") != "log")
+
+
+class PlainHosts:
+    """A line per event that has one for people, with its host in front."""
+
+    def __init__(self, sink: Sink) -> None:
+        self._sink = sink
+        self._hosts: dict[str, PlainLines] = {}
+
+    def __call__(self, host: str, record: Record) -> None:
+        """Write one event, if it has a line for people."""
+        if "event" not in record:
+            self._finish(host, record)
+            return
+        line = describe(record)
+        if line is not None:
+            self._sink.put((f"{host} | " if host else "") + one_line(line) + "\n")
+            return
+        event = event_of(record)
+        if event is None:
+            return
+        if host not in self._hosts:
+            self._hosts[host] = PlainLines(_Prefixed(self._sink, f"{one_line(host)} | "))
+        self._hosts[host](event)
+
+    def _finish(self, host: str, record: Record) -> None:
+        """Write the last verdict of a host, in full where it is not ok; its flows are many."""
+        try:
+            verdict = from_json(json.dumps({"blocking": False, **record}), Verdict)
+        except ValueError:  # not ours
+            _Prefixed(self._sink, f"{one_line(host)} | ").put("its last verdict cannot be read")
+            return
+        is_ok = verdict.verdict is Outcome.OK
+        text = verdict_line(verdict) if is_ok else render_text(verdict, flows=False)
+        _Prefixed(self._sink, f"{one_line(host)} | ").put(text)
+
+
+def event_of(record: Record) -> Event | None:
+    """Return the event of a host's supervisor; None for what is none, or none that we know."""
+    try:
+        return from_record({name: each for name, each in record.items() if name != "host"})
+    except ValueError:
+        return None
+
+
+class _Prefixed:
+    """A sink for the lines of one host."""
+
+    def __init__(self, sink: Sink, prefix: str) -> None:
+        self._sink = sink
+        self._prefix = prefix
+
+    def put(self, text: str, *, kept: bool = True) -> None:
+        for line in text.splitlines():
+            self._sink.put(f"{self._prefix}{line}\n", kept=kept)
+
+    def close(self) -> None:
+        """Leave it open for other hosts."""
+
+
+def describe(record: Record) -> str | None:
+    """Return the line for people about an event of the coordinator.
+
+    None for an event of a supervisor, and where there is nothing to say.
+    """
+    teller = _TELLERS.get(str(record.get("event")))
+    return None if teller is None else teller(record)
+
+
+def _hosts_found(record: Record) -> str:
+    places = ", ".join(f"{name} ({place})" for name, place in record["destinations"].items())
+    return f"{record['system']} on {places}"
+
+
+def _host_changed(record: Record) -> str:
+    state, message = record["state"], record["message"]
+    text = message or ("supervisor started" if state == "started" else state)
+    if state == "failed":
+        text = f"failed: {message}"
+    elif state == "ended":
+        text = f"supervisor ended, exit code {record['exit_code']}"
+        text += f": {message}" if message else ""
+    text += f" (pid {record['pid']})" if record["pid"] else ""
+    return text + (f"; {record['hint']}" if record["hint"] else "")
+
+
+def _clock(record: Record) -> str | None:
+    if not record["differs"]:
+        return None
+    where = "ahead of" if record["offset_s"] > 0 else "behind"
+    return (
+        f"its clock is {abs(record['offset_s']):.3f} s {where} this host's "
+        f"(± {record['uncertainty_s']:.3f} s): times in messages and logs differ by that; "
+        "synchronise them, with chrony or PTP"
+    )
+
+
+def _active(record: Record) -> str:
+    hosts = ", ".join(record["hosts"])
+    return f"system active on all hosts ({hosts}) after {record['elapsed_s']:.2f} s"
+
+
+def _end(record: Record) -> str:
+    codes = ", ".join(
+        f"{host} {'–' if code is None else code}" for host, code in record["exit_codes"].items()
+    )
+    return f"ended: {record['reason']}; exit code {record['exit_code']} ({codes})"
+
+
+_TELLERS = {
+    "hosts": _hosts_found,
+    "host": _host_changed,
+    "clock": _clock,
+    "stderr": lambda record: str(record["line"]),
+    "active": _active,
+    "ending": lambda record: f"ending all: {record['reason']}",
+    "end": _end,
+}

@@ -1,0 +1,9 @@
+"""Starts, watches and ends the supervisors of several hosts from one place, over ssh.
+
+Owns: `lifecycle up --hosts`: the coordinator, its transports, and the agent on each host. Public:
+what the command line uses of them.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,17 @@
+from .agent import COMMAND as COMMAND
+from .agent import serve as serve
+from .coordinator import Coordinator as Coordinator
+from .coordinator import LinkState as LinkState
+from .coordinator import Place as Place
+from .coordinator import Record as Record
+from .coordinator import down as down
+from .coordinator import worst as worst
+from .parts import destinations as destinations
+from .parts import in_place as in_place
+from .parts import parts_of as parts_of
+from .parts import ranks as ranks
+from .protocol import Part as Part
+from .transport import LocalTransport as LocalTransport
+from .transport import SshTransport as SshTransport
+from .transport import Transport as Transport
+from .transport import ssh_command as ssh_command

@@ -1,0 +1,133 @@
+"""Health of a node: its author's `health` method, asked at an interval, and what it last returned.
+
+Owns: `HealthCheck`: when the method is asked (from when the node is connected, at once after each
+change of state, then every `interval_s`), its deadline, and how an answer becomes a `HealthReport`,
+which is part of the node's configuration. What must be healthy, and what follows if it is not, is
+the manifest's matter (lifecycle.verify).
+"""
+
+from __future__ import annotations
+
+import inspect
+import time
+import traceback
+from collections.abc import Awaitable, Callable
+from typing import TYPE_CHECKING, Any
+
+from lifecycle.manifest import Health
+from lifecycle.node.lifecycle.machine import NodeState
+from lifecycle.verify import HealthReport
+
+if TYPE_CHECKING:
+    from rclpy.timer import Timer
+
+    from lifecycle.node.lifecycle.services import Turns
+
+_LONGEST = 200
+"""Characters of an answer that are passed on."""
+
+
+class HealthCheck:
+    """Asks one node how it is.
+
+    Args:
+        check: returns None, True or "" if all is well, else what is wrong; may be async. None for a
+            node without one.
+        turns: has it asked in the node's executor.
+        how: interval and deadline.
+        changed: called whenever `report` is another one.
+        failed: logs a traceback.
+
+    Attributes:
+        report: the last answer; None while the node is not connected, or has no check.
+    """
+
+    def __init__(
+        self,
+        check: Callable[[], Any] | None,
+        turns: Turns,
+        how: Health,
+        *,
+        changed: Callable[[], object],
+        failed: Callable[[str], object],
+    ) -> None:
+        self._check = check
+        self._turns = turns
+        self._how = how
+        self._changed = changed
+        self._failed = failed
+        self._timer: Timer | None = None
+        self._asked_s: float | None = None
+        self._round = 0
+        self.report: HealthReport | None = None
+
+    def follow(self, state: NodeState) -> None:
+        """Begin to ask, ask again or stop, as the node's new state says."""
+        if self._check is None or not state.steady:
+            return
+        if not state.connected:
+            self._stop()
+            return
+        if self._timer is None:
+            self._timer = self._turns.timer(self._how.interval_s, self._ask)
+        self._asked_s = None  # what it says of the state before counts no more
+        self._round += 1
+        self._ask()
+
+    def _stop(self) -> None:
+        if self._timer is not None:
+            self._turns.end(self._timer)
+            self._timer = None
+        self._round += 1
+        self._asked_s = self.report = None
+
+    def _ask(self) -> None:
+        assert self._check is not None
+        if self._asked_s is not None:
+            waited_s = time.monotonic() - self._asked_s
+            if waited_s >= self._how.timeout_s:
+                late = f"it has not answered within {self._how.timeout_s:g} s"
+                self._take(HealthReport(ok=None, message=late))
+            return
+        try:
+            answer = self._check()
+        except Exception as error:  # noqa: BLE001 - the user's code: reported
+            self._take(self._raised(error))
+            return
+        if not inspect.isawaitable(answer):
+            self._take(_report(answer))
+            return
+        self._asked_s = time.monotonic()
+        round_ = self._round
+
+        async def wait() -> None:
+            report = await self._awaited(answer)
+            if round_ == self._round:
+                self._asked_s = None
+                self._take(report)
+
+        self._turns.call_soon(wait)
+
+    async def _awaited(self, answer: Awaitable[Any]) -> HealthReport:
+        try:
+            return _report(await answer)
+        except Exception as error:  # noqa: BLE001 - the user's code: reported
+            return self._raised(error)
+
+    def _raised(self, error: Exception) -> HealthReport:
+        said = f"it raised {type(error).__name__}: {error}"[:_LONGEST]
+        if self.report is None or self.report.message != said:
+            self._failed("".join(traceback.format_exception(error)))
+        return HealthReport(ok=False, message=said)
+
+    def _take(self, report: HealthReport) -> None:
+        if report != self.report:
+            self.report = report
+            self._changed()
+
+
+def _report(answer: object) -> HealthReport:
+    if answer is None or answer is True or answer == "":
+        return HealthReport(ok=True)
+    said = "it is not" if answer is False else str(answer)
+    return HealthReport(ok=False, message=said[:_LONGEST])

@@ -1,0 +1,93 @@
+"""Rule about the health of nodes: what their `health` method and /diagnostics say. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from lifecycle import dataclasses
+from lifecycle.plan import PlannedNode
+from lifecycle.verify.observation import HealthReport
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.rules.catalogue import About, Heals, Rule
+from lifecycle.verify.verdict import Finding, Stage
+from lifecycle.verify.view import NodeFacts, View
+
+UNHEALTHY = Rule(
+    id="node.unhealthy",
+    meaning="a node says that it is not healthy, or does not say how it is",
+    outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
+    fix="the message says what is wrong; look at the node's log",
+    about=About.PROGRESS,
+    heals=Heals.WITH_TIME,
+)
+RULES = (UNHEALTHY,)
+
+_HEALTHY = "healthy"
+_NO_METHOD = HealthReport(
+    ok=None, message="it reports no health; its class needs a method 'health'"
+)
+
+
+def health_of(
+    node: PlannedNode, own: HealthReport | None, published: HealthReport | None
+) -> HealthReport:
+    """Return what is known of a node's health, of all that the manifest names.
+
+    Args:
+        node: as it is declared.
+        own: what its `health` method returned last.
+        published: what /diagnostics says of it.
+    """
+    said = []
+    if node.health is not None and node.health.check:
+        said.append(own or _NO_METHOD)
+    if node.health is not None and node.health.diagnostics:
+        names = ", ".join(map(repr, node.health.diagnostics))
+        silent = f"nothing on /diagnostics is called {names}"
+        said.append(published or HealthReport(ok=None, message=silent))
+    for ok in (False, None):
+        wrong = [each.message for each in said if each.ok is ok]
+        if wrong:
+            return HealthReport(ok=ok, message="; ".join(wrong))
+    return HealthReport(ok=True)
+
+
+def check(view: View) -> Iterator[Finding]:
+    """Judge the health of every node of which the manifest asks it."""
+    yield from view.by_node.each(_judge)
+
+
+def _judge(facts: NodeFacts) -> Iterator[Finding]:
+    node, frame, report = facts.node, facts.frame, facts.configuration
+    if node.health is None or facts.absent:
+        return
+    # A method is asked from when its node is connected, and a held node publishes nothing before it
+    # is active; until then its state, or the lack of a report, says enough.
+    asks = not frame.ours(node) or (report is not None and report.connected)
+    works = not node.holds or frame.stage is Stage.ACTIVE or facts.name in frame.ahead
+    asked = dataclasses.replace(
+        node.health,
+        check=node.health.check and asks,
+        diagnostics=node.health.diagnostics if works else (),
+    )
+    health = health_of(
+        dataclasses.replace(node, health=asked),
+        None if report is None else report.health,
+        None if facts.observed is None else facts.observed.health,
+    )
+    if health.ok is False:
+        yield UNHEALTHY.on_node(
+            Outcome.VIOLATED,
+            node,
+            expected=_HEALTHY,
+            observed=health.message,
+            message=f"cannot accept node {node.full_name}: it is not healthy: {health.message}",
+        )
+    elif health.ok is None:
+        yield UNHEALTHY.on_node(
+            Outcome.UNVERIFIABLE,
+            node,
+            expected=_HEALTHY,
+            observed="unknown",
+            message=f"cannot verify that node {node.full_name} is healthy: {health.message}",
+        )

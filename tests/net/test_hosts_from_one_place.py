@@ -1,0 +1,228 @@
+"""`lifecycle up --hosts` over real ssh: all hosts of a system from one place, cut off and killed.
+
+Host A has a part itself, which needs no ssh. The coordinator owns no supervisor: neither its death
+nor a cut link ends one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from lifecycle.errors import ExitCode
+from lifecycle.run_directory import is_held
+from lifecycle.supervisor.control.client import status
+from lifecycle.verify import Outcome
+from tests.net.hosts import Hosts
+from tests.net.running import article, run_directory
+from tests.net.sshd import Ssh, lacking
+from tests.ros.supervisor.running import BOUND_S, ROOT, Event, Up, left_of
+
+pytestmark = pytest.mark.skipif(bool(lacking()), reason=lacking() or "-")
+
+REMOTE = f"cd {shlex.quote(str(ROOT))} && {shlex.quote(sys.executable)} -m lifecycle.cli"
+_STRING = "std_msgs/msg/String"
+
+
+class Fleet:
+    """Hosts on one switch, an sshd on all but the first, and a manifest for them."""
+
+    def __init__(self, hosts: Hosts, directory: Path, names: str) -> None:
+        self.directory = directory
+        self.hosts = dict(zip(names, hosts.bridged(*names.upper()), strict=True))
+        self.ssh = Ssh(directory / "ssh")
+        for name, host in self.hosts.items():
+            host.environment(self.runtime(name))
+            if name != "a":
+                self.ssh.serve(host, self.runtime(name))
+        self._stack = contextlib.ExitStack()
+
+    def runtime(self, name: str) -> Path:
+        return self.directory / name
+
+    def manifest(self, **environment: str) -> Path:
+        """Write the manifest of the article; further hosts have a subscriber, too."""
+        folder = self.directory / "manifest"
+        folder.mkdir(exist_ok=True)
+        edit = {f"nodes/n2/run/environment/{key}": value for key, value in environment.items()}
+        addresses = [each.ipv4 for each in self.hosts.values()]
+        for name, address in list(zip(self.hosts, addresses, strict=True))[2:]:
+            edit[f"machines/{name}"] = {"address": address}
+            edit[f"nodes/n_{name}"] = {
+                "run": {"python": "tests.net.systems:Sink"},
+                "machine": name,
+                "interface": {
+                    "subscriptions": [
+                        {"name": topic, "type": _STRING, "qos": "sensor_data"}
+                        for topic in ("video", "battery")
+                    ]
+                },
+            }
+        return article(folder, *addresses[:2], edit=edit)
+
+    def up(self, manifest: Path, *options: str, remote: str = REMOTE) -> Up:
+        up = Up(
+            manifest,
+            *("--hosts", "--remote-command", remote),
+            *options,
+            runtime=self.runtime("a"),
+            through=self.hosts["a"].command(guarded=True),
+            variables={**self.hosts["a"].environment(self.runtime("a"), {}), **self.ssh.variables},
+        )
+        self._stack.callback(up.close)
+        return up
+
+    def down(self, manifest: Path) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            self.hosts["a"].command(
+                *(sys.executable, "-m", "lifecycle.cli", "down", str(manifest)),
+                *("--hosts", "--remote-command", REMOTE),
+            ),
+            env={
+                **self.hosts["a"].environment(self.runtime("a")),
+                **self.ssh.variables,
+            },
+            capture_output=True,
+            text=True,
+            timeout=BOUND_S,
+            check=False,
+        )
+
+    def runs(self, name: str) -> bool:
+        return is_held(run_directory(self.runtime(name), name))
+
+    def close(self) -> None:
+        self._stack.close()
+
+
+@pytest.fixture
+def two(hosts: Hosts, tmp_path: Path) -> Iterator[Fleet]:
+    with contextlib.closing(Fleet(hosts, tmp_path, "ab")) as fleet:
+        yield fleet
+
+
+@pytest.fixture
+def three(hosts: Hosts, tmp_path: Path) -> Iterator[Fleet]:
+    with contextlib.closing(Fleet(hosts, tmp_path, "abc")) as fleet:
+        yield fleet
+
+
+def _active(up: Up) -> Event:
+    return up.until("active")
+
+
+def _until_ok(fleet: Fleet, name: str) -> None:
+    """Wait until a host's supervisor sees nothing wrong."""
+    deadline = time.monotonic() + BOUND_S
+    while status(run_directory(fleet.runtime(name), name)).verdict is not Outcome.OK:
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def test_three_hosts_come_up_and_are_ended_from_one_place(three: Fleet) -> None:
+    up = three.up(three.manifest())
+    assert up.until("hosts")["destinations"] == {
+        "a": "this host",
+        **{name: three.hosts[name].ipv4 for name in "bc"},
+    }
+    assert sorted(_active(up)["hosts"]) == ["a", "b", "c"]
+    # The clocks of the hosts are one.
+    clocks = {each["host"]: each for each in up.of_kind("clock")}
+    assert sorted(clocks) == ["a", "b", "c"]
+    assert all(not each["differs"] for each in clocks.values())
+    assert all(abs(each["offset_s"]) <= each["uncertainty_s"] + 0.005 for each in clocks.values())
+    assert {each["host"] for each in up.of_kind("gate")} == {"a", "b", "c"}
+    up.signal(signal.SIGTERM)
+    assert up.finish() == ExitCode.OK, up.said()
+    end = up.events[-1]
+    assert (end["event"], end["exit_codes"]) == ("end", {"a": 0, "b": 0, "c": 0})
+    assert all("host" in each for each in up.events)
+    assert left_of(up.mark) == []
+    for name in "abc":
+        assert [*(three.runtime(name) / "lifecycle").iterdir()] == []
+
+
+@pytest.mark.parametrize("stage", ["configuring", "active"])
+def test_a_host_that_is_cut_off_runs_on_and_is_followed_once_it_is_back(
+    two: Fleet, stage: str
+) -> None:
+    go = two.directory / "go"
+    up = two.up(two.manifest(HOLD_CONFIGURE_FILE=str(go)))
+    if stage == "configuring":
+        up.until("request", host="b", operation="configure")
+    else:
+        go.touch()
+        _active(up)
+    pid = up.met("host", host="b", state="started")["pid"]
+    two.hosts["b"].ip("link", "set", "e0", "down")
+    up.until("host", host="b", state="cut")
+    assert two.runs("b")
+    two.hosts["b"].ip("link", "set", "e0", "up")
+    assert up.until("host", host="b", state="healed")["pid"] == pid
+    if stage == "configuring":
+        go.touch()
+        _active(up)
+    else:
+        for name in "ab":
+            _until_ok(two, name)
+    up.signal(signal.SIGTERM)
+    assert up.finish() == ExitCode.OK, (up.events[-1], up.said())
+    assert left_of(up.mark) == []
+
+
+@pytest.mark.parametrize("stage", ["configuring", "active"])
+def test_a_coordinator_that_is_killed_leaves_all_running_to_be_followed_and_ended(
+    two: Fleet, stage: str
+) -> None:
+    go = two.directory / "go"
+    manifest = two.manifest(HOLD_CONFIGURE_FILE=str(go))
+    first = two.up(manifest)
+    if stage == "configuring":
+        first.until("request", host="b", operation="configure")
+    else:
+        go.touch()
+        _active(first)
+    pids = {name: first.met("host", host=name, state="started")["pid"] for name in "ab"}
+    first.process.kill()  # nsenter and env became the coordinator by exec
+    first.process.wait(BOUND_S)
+    go.touch()
+    second = two.up(manifest)
+    attached = {name: second.until("host", state="attached") for name in "ab"}.values()
+    assert {each["host"]: each["pid"] for each in attached} == pids
+    _active(second)
+    second.signal(signal.SIGHUP)
+    assert second.finish() == ExitCode.HUNG_UP
+    assert two.runs("a")
+    assert two.runs("b")
+    done = two.down(manifest)
+    assert done.returncode == ExitCode.OK, done.stderr
+    assert left_of(first.mark) == []
+    assert left_of(second.mark) == []
+
+
+def test_what_is_wrong_with_a_host_is_one_error_with_the_next_step(two: Fleet) -> None:
+    manifest = two.manifest()
+
+    def failed(remote: str = REMOTE) -> Event:
+        up = two.up(manifest, remote=remote)
+        found = up.until("host", host="b", state="failed")
+        assert up.finish() == ExitCode.BRING_UP_FAILED
+        assert up.of_kind("run") == []
+        return found
+
+    absent = failed("/opt/nowhere/lifecycle")
+    assert "its shell cannot run '/opt/nowhere/lifecycle'" in absent["message"]
+    assert "--remote-command" in absent["hint"]
+    two.ssh.write_config("stranger")
+    assert "Permission denied" in failed()["message"]
+    two.ssh.write_config("user")
+    (two.directory / "ssh" / "known_hosts").write_text("")
+    assert "Host key verification failed" in failed()["message"]
