@@ -8,7 +8,8 @@ prints medians and the ratio of ours to plain rclpy:
   subscribed; and in an inactive node, where it is dropped
 - message: user and system time of the receiving process for each message, 1,000 a second
 - timer: how far intervals of 5 ms are off, mean and 99th percentile
-- image: 1 MB images from one process to another, up to four on the way, MB a second
+- image: 1 MB images from one process to another, up to four on the way: MB a second, and user and
+  system time of both processes for each
 """
 
 from __future__ import annotations
@@ -162,14 +163,26 @@ def timer(runs: int) -> list[Row]:
 
 
 def image(runs: int) -> list[Row]:
-    """Measure how fast images go from one process to another."""
-    found: dict[str, list[float]] = {name: [] for name in NAMES.values()}
+    """Measure how fast images go from one process to another, and what both use for each."""
+    found: dict[str, list[tuple[float, float]]] = {name: [] for name in NAMES.values()}
     for _ in range(runs):
         for whose, name in NAMES.items():
-            with program(whose, "take"), program(whose, "send", IMAGES) as sender:
-                found[name].append(json.loads(line_of(sender))["mb_s"])
-    medians = {name: statistics.median(each) for name, each in found.items()}
-    return [row("1 MB images, MB/s", medians)]
+            with program(whose, "take") as taker, program(whose, "send", IMAGES) as sender:
+                line_of(sender)
+                before_s = cpu_of(taker.pid) + cpu_of(sender.pid)
+                mb_s = json.loads(line_of(sender))["mb_s"]
+                used_s = cpu_of(taker.pid) + cpu_of(sender.pid) - before_s
+                found[name].append((mb_s, used_s / IMAGES * 1e6))
+    return [
+        row(
+            title,
+            {
+                name: statistics.median(each[which] for each in measured)
+                for name, measured in found.items()
+            },
+        )
+        for which, title in enumerate(("1 MB images, MB/s", "1 MB image, both, µs of CPU"))
+    ]
 
 
 PARTS = {"publish": publish, "message": message, "timer": timer, "image": image}

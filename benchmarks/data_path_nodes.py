@@ -3,8 +3,8 @@
     python benchmarks/data_path_nodes.py ours|plain publish|receive|tick|send|take NUMBER
 
 `publish` times calls, `receive` prints a line for each NUMBER messages, `tick` times NUMBER ticks
-of a timer, `send` sends NUMBER images to `take`, which acknowledges each, four of them on the way.
-Run by data_path.py.
+of a timer, `send` says when it begins and sends NUMBER images to `take`, which acknowledges each,
+four of them on the way. Run by data_path.py.
 """
 
 from __future__ import annotations
@@ -81,6 +81,7 @@ class Sender:
     def begin(self) -> None:
         """Start once somebody is there; called by a timer, harmless again."""
         if not self._began_s and self._publisher().get_subscription_count():
+            say("began")
             self._began_s = time.perf_counter()
             for _ in range(WINDOW):
                 self._send()

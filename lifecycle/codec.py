@@ -11,6 +11,7 @@ Imports nothing of the package.
 from __future__ import annotations
 
 import functools
+from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import msgspec
@@ -79,7 +80,5 @@ def read_table(name: str, type_: type[T]) -> T:
         FileNotFoundError: no such table.
         ValueError: the file does not fit `type_`.
     """
-    from importlib import resources  # late: a fork server reads no table
-
-    file = resources.files("lifecycle.network").joinpath("data").joinpath(f"{name}.json")
+    file = Path(__file__).parent / "network" / "data" / f"{name}.json"
     return from_json(file.read_bytes(), type_)

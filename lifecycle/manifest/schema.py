@@ -15,7 +15,7 @@ import itertools
 import json
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from importlib import resources
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lifecycle import dataclasses
@@ -260,7 +260,8 @@ _SUBSTITUTION = {"$ref": "#/$defs/substitution"}
 def read_schema(name: str) -> Mapping[str, Any]:
     """Return a shipped schema as it is in schemas/, for editors and for other programs."""
     # Wheels hold a copy of schemas/; a checkout holds a link to it.
-    text = (resources.files("lifecycle") / "_schemas" / name).read_text(encoding="utf-8")
+    # Found as `importlib.resources` finds it, which takes longer to import than to read it.
+    text = (Path(__file__).parents[1] / "_schemas" / name).read_text(encoding="utf-8")
     schema: Mapping[str, Any] = json.loads(text)
     return schema
 

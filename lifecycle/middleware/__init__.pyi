@@ -24,6 +24,7 @@ from .fastdds.participant_profile import ParticipantSettings as ParticipantSetti
 from .fastdds.profiles import discovery_environment as discovery_environment
 from .fastdds.settings import once_participant_is_made as once_participant_is_made
 from .fastdds.settings import participant_settings as participant_settings
+from .fastdds.settings import stop_listening as stop_listening
 from .fastdds.settings import unknown_versions as unknown_versions
 from .process.busy_timer import BusySign as BusySign
 from .process.busy_timer import Overdue as Overdue
@@ -32,6 +33,7 @@ from .process.control import check_threads as check_threads
 from .process.control import drop_network_administration as drop_network_administration
 from .process.control import exit_after as exit_after
 from .process.control import fill_heap as fill_heap
+from .process.control import interface_addresses as interface_addresses
 from .process.control import limit_resources as limit_resources
 from .process.control import machine_id as machine_id
 from .process.control import no_room_for_threads as no_room_for_threads

@@ -36,6 +36,7 @@ from lifecycle.middleware.fastdds.url_profile import (
     families,
     leaves_discovery_open,
 )
+from lifecycle.middleware.process.control import interface_addresses
 from lifecycle.network import (
     DG,
     PARTICIPANTS_PER_DOMAIN,
@@ -455,17 +456,9 @@ def addresses_of(kind: Medium, *, loopback: bool = False) -> dict[str, tuple[str
 
     Link-local ones of IPv6 mean nothing to others without an interface of theirs.
     """
-    import psutil
-
-    found = {}
-    for name, entries in sorted(psutil.net_if_addrs().items()):
-        texts = [each.address for each in entries if each.family is kind.socket_family]
-        addresses = [ipaddress.ip_address(text.partition("%")[0]) for text in texts]
-        kept = [
-            str(each)
-            for each in addresses
-            if (loopback or not each.is_loopback) and not (each.version == 6 and each.is_link_local)
-        ]
-        if kept:
-            found[name] = tuple(kept)
+    found: dict[str, tuple[str, ...]] = {}
+    for name, text in sorted(interface_addresses(kind.socket_family), key=lambda each: each[0]):
+        each = ipaddress.ip_address(text)
+        if (loopback or not each.is_loopback) and not (each.version == 6 and each.is_link_local):
+            found[name] = (*found.get(name, ()), str(each))
     return found

@@ -39,7 +39,7 @@ from lifecycle.middleware.fastdds.participant_profile import (
     endpoint_profiles,
     find_endpoint,
 )
-from lifecycle.middleware.fastdds.settings import with_endpoint_profiles
+from lifecycle.middleware.fastdds.settings import stop_listening, with_endpoint_profiles
 from lifecycle.middleware.fastdds.url_check import open_sockets
 from lifecycle.middleware.rcl import hidden_node
 from lifecycle.middleware.rcl.abi import is_known
@@ -404,6 +404,7 @@ class FlowParticipant:
         for entity in tuple(self._moved):
             self.destroy_endpoint(entity)
         forget_hidden(self.node)
+        stop_listening(self.node)
         self.node.destroy_node()
         if self._context is not None:
             self._context.try_shutdown()

@@ -3,7 +3,7 @@
 Owns: applying a ParticipantSettings at the only moment there is: while rmw_fastrtps makes the
 participant, which is when the first node of a context is constructed; and reading how far that
 participant looks for others (the discovery range that rmw gets), and taking it away from
-rmw_fastrtps.
+rmw_fastrtps; and `stop_listening`, before a participant is destroyed.
 
 Profiles are read from the environment once per process, and rmw_fastrtps gives every participant
 the factory's default QoS. So that default is changed for one participant at a time, by the few C++
@@ -31,6 +31,7 @@ from typing import Any
 
 import rclpy.node
 from rclpy.context import Context
+from rclpy.exceptions import InvalidHandle
 from rclpy.utilities import get_rmw_implementation_identifier
 
 from lifecycle.errors import MiddlewareError
@@ -133,6 +134,52 @@ class _FastDds:
 @functools.lru_cache(maxsize=1)
 def _library() -> _FastDds:
     return _FastDds()
+
+
+_SET_LISTENER = (
+    f"_ZN{_DDS}17DomainParticipant12set_listenerEPNS1_25DomainParticipantListenerE"
+    "NSt6chrono8durationIlSt5ratioILl1ELl1EEEE"
+)
+_PARTICIPANT_OF = "_ZN16rmw_fastrtps_cpp22get_domain_participantEP10rmw_node_s"
+_LISTENS_S = 1
+
+
+def stop_listening(node: rclpy.node.Node) -> None:
+    """Have the participant of a node notice no others any more; before it is destroyed, bounded.
+
+    rmw_fastrtps does this while it destroys a participant, and waits for callbacks that are running
+    until the end of time. In Fast DDS 2.14 that date overflows, into the past
+    (DomainParticipant::set_listener): it does not wait then but looks again and again, and hardly
+    ever lets go of the lock that the callback needs to end. One of about 1,000 hosts hung so, where
+    twenty left at once. What has no listener has no callback to wait for.
+    """
+    functions = _listener_functions()
+    if functions is None:
+        return
+    rmw_handle, participant_of, set_listener = functions
+    with contextlib.suppress(InvalidHandle), node.handle:
+        participant = participant_of(rmw_handle(node.handle.pointer))
+        if participant:
+            set_listener(participant, None, _LISTENS_S)
+
+
+@functools.lru_cache(maxsize=1)
+def _listener_functions() -> tuple[Any, Any, Any] | None:
+    """Return rcl_node_get_rmw_handle and the two functions above; None where they are others."""
+    if not abi.is_known() or get_rmw_implementation_identifier() != _RMW:
+        return None
+    pointer = ctypes.c_void_p
+    try:
+        set_listener = ctypes.CDLL(_LIBRARY)[_SET_LISTENER]
+        set_listener.restype = ctypes.c_uint32
+        set_listener.argtypes = (pointer, pointer, ctypes.c_int64)
+        return (
+            abi.bind("rcl", "rcl_node_get_rmw_handle", pointer, (pointer,)),
+            abi.bind(_RMW, _PARTICIPANT_OF, pointer, (pointer,)),
+            set_listener,
+        )
+    except (OSError, AttributeError, MiddlewareError):
+        return None
 
 
 def unknown_versions() -> str:

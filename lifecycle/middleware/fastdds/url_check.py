@@ -17,6 +17,7 @@ from pathlib import Path
 from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds.url_profile import UrlTransport, families
+from lifecycle.middleware.process.control import interface_addresses
 from lifecycle.network import CONNECTABLE, ConnectionUrl, Medium
 
 _KINDS = tuple(each for each in CONNECTABLE if each.is_network and not each.is_group)
@@ -46,14 +47,8 @@ def check_host(urls: Sequence[ConnectionUrl]) -> None:
     Raises:
         MiddlewareError: names the URL and what there is.
     """
-    import psutil
-
-    addresses, names = set(), set()
-    for name, entries in psutil.net_if_addrs().items():
-        names.add(name)
-        for entry in entries:
-            if entry.family in (socket.AF_INET, socket.AF_INET6):
-                addresses.add(entry.address.partition("%")[0])
+    names = {name for _, name in socket.if_nameindex()}
+    addresses = {text for _, text in interface_addresses(socket.AF_INET, socket.AF_INET6)}
     for url in urls:
         wanted = [each for each in url.interfaces if each not in names]
         group = url.transport.is_group

@@ -1,7 +1,8 @@
 """Linux process control through ctypes: prctl(2), the deadman timer, and the C library.
 
 Owns: prctl(2), the deadman timer of timer_create(2), loading the C library and its timers'
-arguments, and whether threads can be started: what Python's standard library lacks. Linux only.
+arguments, the heap that a fork shares, addresses of interfaces, and whether threads can be started:
+what Python's standard library lacks. Linux only.
 Must not import rclpy: a fork server uses it before rclpy is loaded.
 """
 
@@ -13,6 +14,7 @@ import functools
 import os
 import resource
 import signal
+import socket
 import threading
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -253,6 +255,51 @@ class _Timer:
     def _set(self, spec: TimerSpec) -> None:
         if self._arm(self._timer, 0, ctypes.byref(spec), None) != 0:
             raise _failed("timer_settime")
+
+
+class _InterfaceAddress(ctypes.Structure):
+    """`struct ifaddrs` of getifaddrs(3)."""
+
+
+_InterfaceAddress._fields_ = (
+    ("next", ctypes.POINTER(_InterfaceAddress)),
+    ("name", ctypes.c_char_p),
+    ("flags", ctypes.c_uint),
+    ("address", ctypes.c_void_p),
+    ("netmask", ctypes.c_void_p),
+    ("destination", ctypes.c_void_p),
+    ("data", ctypes.c_void_p),
+)
+_IN_SOCKADDR = {socket.AF_INET: (4, 4), socket.AF_INET6: (8, 16)}
+"""Where the address is in a `struct sockaddr_in` and `sockaddr_in6`, and how many bytes it has."""
+
+
+def interface_addresses(*families: socket.AddressFamily) -> tuple[tuple[str, str], ...]:
+    """Return the name of an interface and an address of it, for all that this host has.
+
+    Args:
+        families: AF_INET, AF_INET6 or both.
+
+    Raises:
+        MiddlewareError: the kernel refused.
+    """
+    first = ctypes.POINTER(_InterfaceAddress)()
+    if libc().getifaddrs(ctypes.byref(first)) != 0:
+        raise _failed("getifaddrs")
+    try:
+        found, each = [], first
+        while each:
+            entry = each.contents
+            if entry.address:
+                family = ctypes.c_uint16.from_address(entry.address).value
+                if family in families:
+                    at, length = _IN_SOCKADDR[socket.AddressFamily(family)]
+                    packed = ctypes.string_at(entry.address + at, length)
+                    found.append((os.fsdecode(entry.name), socket.inet_ntop(family, packed)))
+            each = entry.next
+        return tuple(found)
+    finally:
+        libc().freeifaddrs(first)
 
 
 def check_threads(count: int) -> None:

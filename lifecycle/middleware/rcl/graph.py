@@ -32,6 +32,7 @@ from lifecycle.middleware.discovery.dead_peers import (
 )
 from lifecycle.middleware.discovery.probe import probes_for
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
+from lifecycle.middleware.fastdds.settings import stop_listening
 from lifecycle.middleware.process.process_table import programs_of
 from lifecycle.middleware.rcl.graph_changes import GraphGuard, on_graph_change
 from lifecycle.middleware.rcl.graph_queries import (
@@ -455,6 +456,7 @@ class GraphObserver:
         self._unwatch()
         if self._context is not None:
             give_up_dead_connections()
+            stop_listening(self.node)
             self.node.destroy_node()
             self._context.try_shutdown()
             self._context.destroy()

@@ -28,6 +28,7 @@ from lifecycle.middleware import (
     follow_nodes,
     import_interface,
     participant_settings,
+    stop_listening,
     to_rclpy,
 )
 from lifecycle.node.author.spec import Mode
@@ -376,7 +377,10 @@ class NodeInProcess:
             for _, hosted in self._all:
                 if isinstance(hosted, ForeignNode):
                     hosted.close()
-            for each in (self.peer, *(node for node, _ in self._all)):
+            nodes = (self.peer, *(node for node, _ in self._all))
+            for each in nodes:
+                stop_listening(each)
+            for each in nodes:
                 each.destroy_node()
             for _, hosted in self._all:
                 if isinstance(hosted, ForeignNode):

@@ -9,10 +9,11 @@ import time
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
+import psutil
 import pytest
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware import exit_after, widen_discovery_buffers
+from lifecycle.middleware import exit_after, interface_addresses, widen_discovery_buffers
 from lifecycle.middleware.fastdds.profiles import discovery_environment, discovery_profile
 from lifecycle.network import participant_ports
 
@@ -160,3 +161,16 @@ print(len(gaps), len(gaps & later))
         [sys.executable, "-c", program], check=True, capture_output=True, text=True, timeout=30
     )
     assert done.stdout == "1500 0\n"
+
+
+def test_the_addresses_of_interfaces_are_those_that_psutil_knows() -> None:
+    families = socket.AF_INET, socket.AF_INET6
+    known = {
+        (name, entry.address.partition("%")[0])
+        for name, entries in psutil.net_if_addrs().items()
+        for entry in entries
+        if entry.family in families
+    }
+    assert ("lo", "127.0.0.1") in known
+    assert set(interface_addresses(*families)) == known
+    assert set(interface_addresses(socket.AF_INET)) == {each for each in known if "." in each[1]}
