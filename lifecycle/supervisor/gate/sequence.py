@@ -411,7 +411,7 @@ class GateSequence:
         if not self._schedule.covers(failure):
             raise failure
         keys = self._schedule.take(failure)
-        interrupted = self._interrupted() - keys
+        interrupted = interrupted_in(self._system.nodes) - keys
         self._schedule.again(interrupted)
         down = tuple(
             each for key, each in self._system.nodes.items() if key in keys or key in interrupted
@@ -436,18 +436,6 @@ class GateSequence:
             yield
         finally:
             await ended(looking)
-
-    def _interrupted(self) -> frozenset[str]:
-        """Return the keys of the nodes, with their processes, that were cut off in a step."""
-        nodes = self._system.nodes
-        processes = {
-            each.process
-            for each in nodes.values()
-            if each.process is not None
-            and not each.process.is_gone
-            and (each.stuck or (each.reach is Reach.WAITING and _is_in_step(each)))
-        }
-        return frozenset(key for key, each in nodes.items() if each.process in processes)
 
     async def _restart_by_policy(self, keys: tuple[str, ...]) -> None:
         """Bring what is down as far as the system is: through its gate, while the rest stays.
@@ -856,6 +844,32 @@ class GateSequence:
         self.phase = phase
         self._emit(SystemReached(reached=phase, elapsed_s=self._emit.elapsed_s))
         self._schedule.returned([key for key, each in self._system.nodes.items() if each.is_up])
+
+
+def interrupted_in(nodes: Mapping[str, NodeRun]) -> frozenset[str]:
+    """Return the keys of the nodes, with their processes, that were cut off in a step.
+
+    A component that was cut off may be loaded: only its container's end unloads it for certain.
+
+    Args:
+        nodes: by key, all that this supervisor brings up.
+    """
+    processes = set()
+    for each in nodes.values():
+        of = nodes.get(each.planned.run.container, each) if each.planned.run.component else each
+        if (
+            of.process is not None
+            and not of.process.is_gone
+            and (each.stuck or (each.reach is Reach.WAITING and _is_in_step(each)))
+        ):
+            processes.add(of.process)
+    keys = {key for key, each in nodes.items() if each.process in processes}
+    components = (
+        key
+        for key, each in nodes.items()
+        if each.planned.run.component and each.planned.run.container in keys
+    )
+    return frozenset((*keys, *components))
 
 
 def _is_in_step(node: NodeRun) -> bool:
