@@ -20,7 +20,13 @@ from collections.abc import Iterable, Mapping
 from lifecycle import dataclasses
 from lifecycle.manifest import EndpointKind, RunKind
 from lifecycle.plan import Plan, PlannedNode, PlannedProcess
-from lifecycle.verify import GRAPH_TOPIC, NODE_SERVICES, OUR_SERVICES, supervisor_endpoints
+from lifecycle.verify import (
+    DIAGNOSTICS_TOPIC,
+    GRAPH_TOPIC,
+    NODE_SERVICES,
+    OUR_SERVICES,
+    supervisor_endpoints,
+)
 
 OVERRIDE = "ROS_SECURITY_ENCLAVE_OVERRIDE"
 """The variable by which rcl takes an enclave for every context of a process."""
@@ -248,6 +254,8 @@ def _supervisor_profile(plan: Plan, machine: str) -> Profile:
         kind = EndpointKind.PUBLISHER if other.name == machine else EndpointKind.SUBSCRIPTION
         topic = f"/_lifecycle/{plan.system.replace('-', '_')}/{other.name}/alive"
         allowed |= {(kind, topic), (kind, f"{topic}_pulse")}
+    if any(node.health is not None and node.health.diagnostics for node in plan.nodes):
+        allowed.add((EndpointKind.SUBSCRIPTION, DIAGNOSTICS_TOPIC))
     several = len({each.machine for each in plan.nodes}) > 1
     allowed |= supervisor_endpoints(
         plan.system,

@@ -1,7 +1,8 @@
 """Updates the graph's state from discovery, nodes' services and parameters.
 
 Owns: what is asked of which node, and when; which of discovery's nodes are members of the graph,
-and what counts as the configuration of one that serves none; when a change is worth another look.
+and what counts as the configuration of one that serves none; what /diagnostics says of nodes; when
+a change is worth another look.
 It looks when it is asked to, and when something happened.
 """
 
@@ -9,10 +10,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import fnmatch
 import functools
 import logging
+import threading
+import time
 import typing
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Protocol
 
 from lifecycle import dataclasses
@@ -27,6 +31,7 @@ from lifecycle.verify import (
     NO_NAMES,
     DeclaredNames,
     EndpointReport,
+    HealthReport,
     Identity,
     NodeConfiguration,
     Observation,
@@ -50,6 +55,10 @@ _READ_S = 3.0
 
 _TOGETHER_S = 0.05
 """Changes of discovery come in bursts; who follows them looks once for all within so long."""
+
+
+Diagnostic = tuple[str, int, str]
+"""Name, level and message of a diagnostic_msgs/DiagnosticStatus."""
 
 
 class DiscoveredGraph(Protocol):
@@ -84,6 +93,9 @@ class NodeServices(ParameterServices, Protocol):
     ) -> NodeConfiguration | None:
         """Return the node's configuration; None where it is shown to have no such interface."""
 
+    def on_diagnostics(self, callback: Callable[[Sequence[Diagnostic]], None]) -> None:
+        """Call `callback` from any thread with entries of /diagnostics, and each second without."""
+
     def on_transition(self, node: str, callback: Callable[[], None]) -> None:
         """Call `callback` from any thread after each transition of the node, until `forget`."""
 
@@ -107,6 +119,91 @@ class _Shown:
     serves: bool
     endpoints: tuple[ObservedEndpoint, ...]
     beside: tuple[tuple[str, tuple[ObservedEndpoint, ...]], ...]
+
+
+_OF_ERROR, _OF_STALE = 2, 3
+"""Levels of that."""
+
+STALE_S = 5.0
+"""An entry that was not published for so long says nothing any more, as diagnostic_aggregator has
+it by default."""
+
+_LONGEST_MESSAGE = 200
+_MOST_ENTRIES = 1000
+
+
+class DiagnosticReadings:
+    """What /diagnostics says of some nodes.
+
+    Args:
+        clients: where it is subscribed to, once there is such a node.
+        wake: called, in any thread, when it says something else.
+        clock: seconds.
+    """
+
+    def __init__(
+        self,
+        clients: NodeServices,
+        wake: Callable[[], None],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._clients = clients
+        self._wake = wake
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._patterns: dict[str, tuple[str, ...]] = {}
+        self._entries: dict[str, tuple[int, str, float]] = {}
+        self._said: dict[str, HealthReport] = {}
+
+    def listen(self, patterns: Mapping[str, tuple[str, ...]]) -> None:
+        """Follow the entries of nodes from now on.
+
+        Args:
+            patterns: of the names of their entries, by full node name.
+        """
+        with self._lock:
+            # Looks at a part of the system go on beside those at all of it.
+            self._patterns.update(patterns)
+        if patterns:
+            self._clients.on_diagnostics(self._arrived)
+
+    def reports(self) -> dict[str, HealthReport]:
+        """Return what is known now, by full node name."""
+        with self._lock:
+            self._said = self._reports()
+            return self._said
+
+    def _arrived(self, entries: Sequence[Diagnostic]) -> None:
+        with self._lock:
+            wanted = {each for patterns in self._patterns.values() for each in patterns}
+            for name, level, message in entries:
+                known = name in self._entries or len(self._entries) < _MOST_ENTRIES
+                if known and any(fnmatch.fnmatchcase(name, each) for each in wanted):
+                    self._entries[name] = level, message[:_LONGEST_MESSAGE], self._clock()
+            changed = self._reports() != self._said
+        if changed:
+            self._wake()
+
+    def _reports(self) -> dict[str, HealthReport]:
+        found = {node: self._report(patterns) for node, patterns in self._patterns.items()}
+        return {node: each for node, each in found.items() if each is not None}
+
+    def _report(self, patterns: tuple[str, ...]) -> HealthReport | None:
+        wrong, unknown, ok = [], [], False
+        for name, (level, message, at_s) in sorted(self._entries.items()):
+            if not any(fnmatch.fnmatchcase(name, each) for each in patterns):
+                continue
+            if level == _OF_STALE or self._clock() - at_s > STALE_S:
+                old = f": {message}" if level == _OF_STALE else f" for {STALE_S:g} s"
+                unknown.append(f"{name!r} is stale{old}")
+            elif level == _OF_ERROR:
+                wrong.append(f"{name!r}: {message}")
+            else:
+                ok = True
+        if wrong or unknown:
+            said = "; ".join(wrong or unknown)[:_LONGEST_MESSAGE]
+            return HealthReport(ok=False if wrong else None, message=said)
+        return HealthReport(ok=True) if ok else None
 
 
 @typing.final
@@ -154,6 +251,7 @@ class Observer:
         self._shown: dict[str, _Shown] = {}
         self._readings: set[asyncio.Task[None]] = set()
         self._parameters = ParameterReadings(clients, self._wake)
+        self._diagnostics = DiagnosticReadings(clients, self._wake)
         self._changed = asyncio.Event()
         self._changed.set()  # nothing was looked at yet
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -202,6 +300,13 @@ class Observer:
             and node.full_name in self._seen - given.keys()
         }
         self._parameters.listen(judged)
+        self._diagnostics.listen(
+            {
+                node.full_name: node.health.diagnostics
+                for node in plan.nodes
+                if node.health is not None and node.health.diagnostics
+            }
+        )
         answers = await self._ask_all(plan, nodes, planned, given)
         asked = {name: configuration for name, (_, configuration) in answers.items()}
         self._checksums = {name: each.checksum for name, each in asked.items() if each is not None}
@@ -218,6 +323,7 @@ class Observer:
                 endpoints=endpoints,
                 answers=answers,
                 parameters=self._parameters.latest,
+                health=self._diagnostics.reports(),
             )
         )
         if not self._follows:

@@ -46,6 +46,7 @@ from lifecycle.graph.scheduler import Remove
 from lifecycle.manifest import EndpointKind
 from lifecycle.verify import (
     ConnectionReport,
+    HealthReport,
     NodeConfiguration,
     NodeParameters,
     Observation,
@@ -200,12 +201,14 @@ class Look:
         endpoints: of the graph.
         answers: of the nodes that were asked, by full name.
         parameters: of nodes that do not report them.
+        health: what /diagnostics says of nodes, by full name.
     """
 
     nodes: tuple[ObservedNode, ...] = ()
     endpoints: tuple[ObservedEndpoint, ...] = ()
     answers: Mapping[str, Answer] = dataclasses.field(default_factory=dict)
     parameters: tuple[NodeParameters, ...] = ()
+    health: Mapping[str, HealthReport] = dataclasses.field(default_factory=dict)
 
 
 Fetch = Callable[[str, Callable[[NodeConfiguration | None], None]], None]
@@ -421,8 +424,10 @@ class GraphState:
             name = each.full_name
             state = _state(name, look.answers, given)
             known = before.get(name)
-            if known is None or known[0] is not each or known[1].state != state:
-                known = each, dataclasses.replace(each, state=state)
+            health = look.health.get(name)
+            said = state, health
+            if known is None or known[0] is not each or (known[1].state, known[1].health) != said:
+                known = each, dataclasses.replace(each, state=state, health=health)
             self._stated[name] = known
             nodes.append(known[1])
         return Observation(

@@ -431,7 +431,7 @@ def build_node(
         timeouts=_timeouts(cursor),
         supervision=cursor.build(Supervision),
         on_violation=build_on_violation(cursor),
-        health=None if health is None else health.build(Health),
+        health=None if health is None else _health(health),
         interface=interface,
         flows=tuple(_flows(cursor)),
         connections=build_connections(cursor, interface, found),
@@ -594,6 +594,13 @@ def _parameter(name: str, cursor: Cursor, found: Findings) -> ParameterValue | N
         hint = f'write {name}: {text.lstrip("+0") or "0"}, or {name}: "{text}"'
         found.append(warning("manifest.leading-zero", cursor.at, message, hint))
     return cursor.scalar
+
+
+def _health(cursor: Cursor) -> Health:
+    written = cursor.get("diagnostics")
+    if written is None or isinstance(written.value.data, tuple):
+        return cursor.build(Health)
+    return cursor.build(Health, diagnostics=(written.value.text,))
 
 
 def _timeouts(node: Cursor) -> Timeouts:

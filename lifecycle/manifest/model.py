@@ -507,11 +507,14 @@ class Health:
 
     Attributes:
         check: its own `health` method does.
+        diagnostics: patterns of the names of its entries on /diagnostics, which do, too;
+            `*` matches any characters, `?` one.
         interval_s: between two calls of that, > 0.
         timeout_s: until an `async` one must have returned, > 0.
     """
 
     check: bool = False
+    diagnostics: tuple[str, ...] = ()
     interval_s: float = 1.0
     timeout_s: float = 1.0
 

@@ -29,7 +29,7 @@ from .rules import rule as rule
 from .rules.catalogue import About as About
 from .rules.catalogue import Heals as Heals
 from .rules.endpoints import DEFINITION_DIFFERS as DEFINITION_DIFFERS
-from .rules.health import is_healthy as is_healthy
+from .rules.health import health_of as health_of
 from .rules.matching import SERVER_OF as SERVER_OF
 from .rules.matching import MatchEnd as MatchEnd
 from .rules.matching import match as match

@@ -139,10 +139,10 @@ def digest_of(value: ParameterValue) -> str:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class HealthReport:
-    """What a node says of its own health.
+    """What a node says of its own health, or /diagnostics of it.
 
     Attributes:
-        ok: whether all is well; None if it has not answered within its deadline.
+        ok: whether all is well; None if it has not said so in time.
         message: what is wrong; empty if nothing is.
     """
 
@@ -285,12 +285,14 @@ class ObservedNode:
         count: how many nodes carry this name; more than one is a duplicate.
         state: lifecycle_msgs/State label; None if it could not be learnt.
         managed: it offers the lifecycle services; None if unknown.
+        health: what /diagnostics says of it, where the manifest names entries; None if nothing.
     """
 
     full_name: str
     count: int = 1
     state: str | None = None
     managed: bool | None = None
+    health: HealthReport | None = None
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

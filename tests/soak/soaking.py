@@ -16,7 +16,7 @@ import subprocess
 import sys
 import time
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import psutil
@@ -90,6 +90,7 @@ class Soaking:
         self.pids: dict[str, int] = {}
         self.back_s: list[float] = []
         self.reported_s: list[float] = []
+        self.stalled = 0
         self._began = 0.0
         self._spare = leftovers()
 
@@ -174,6 +175,10 @@ class Soaking:
             for what, found in (("reported", self.reported_s), ("back", self.back_s))
             if found
         ]
+        if self.stalled:
+            lines.append(
+                f"stalled and reported as hung for a moment, without a fault: {self.stalled}"
+            )
         return "; ".join(lines)
 
     # A round
@@ -505,10 +510,15 @@ class Soaking:
         blamed = expected.failed | expected.silent | expected.may_fail
         names = {name for each in blamed for name in (each, *process(each).nodes)}
         names |= expected.may_again
-        for event in run.events[since:]:
+        events = run.events[since:]
+        for number, event in enumerate(events):
             kind = event.get("event")
             if kind == "silent" and event["cause"] != "unserved":
                 who = event["node"]
+                if event["cause"] == "hung" and _came_back(who, events[number:]):
+                    # A thread that holds a lock of its process, or of Fast DDS, got no processor.
+                    self.stalled += who.strip("/") not in names
+                    continue
             elif kind == "failure":
                 who = event["subject"]
             else:
@@ -525,6 +535,10 @@ def _finding(rule: str, subjects: set[str]) -> Callable[[dict], bool]:
         )
 
     return is_it
+
+
+def _came_back(node: str, events: Sequence[dict]) -> bool:
+    return any(each.get("event") == "alive" and each["node"] == node for each in events)
 
 
 def _node_of(fault: Fault) -> str:

@@ -170,12 +170,12 @@ def check_health(system: DeclaredSystem) -> Iterator[Diagnostic]:
         if node.health is None:
             continue
         at = node.where("health")
-        if not node.health.check:
+        if not node.health.check and not node.health.diagnostics:
             message = f"cannot require that {node.key!r} is healthy: nothing says how that is known"
             yield error("check.health", at, message, "write 'check: true', or remove 'health'")
-        elif not node.managed:
+        elif node.health.check and not node.managed:
             message = f"cannot ask {node.key!r} whether it is healthy: it is not managed"
-            hint = "its class must be a lifecycle.LifecycleNode; or remove 'health'"
+            hint = "its class must be a lifecycle.LifecycleNode; or name its 'diagnostics'"
             yield error("check.health", at, message, hint)
 
 
@@ -536,7 +536,7 @@ def _unmanaged(node: Node, after: After, other: Node) -> Iterator[Diagnostic]:
             f"managed, and nothing is activated before every node runs"
         )
         yield error("check.after-unmanaged", after.at, message, f"write '{key}: connected'")
-    elif not other.managed and condition is not Condition.STARTED:
+    elif not other.managed and condition not in (Condition.STARTED, Condition.HEALTHY):
         message = (
             f"cannot wait until {key!r} is {condition.value}: it is not managed and only starts"
         )

@@ -16,9 +16,11 @@ from lifecycle_msgs.msg import TransitionEvent
 from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
 from rcl_interfaces.msg import Parameter, ParameterEvent, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
+from rclpy.clock import Clock, ClockType
 from rclpy.parameter import Parameter as RclpyParameter
-from rclpy.qos import qos_profile_parameter_events
+from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_parameter_events
 from rclpy.subscription import Subscription
+from rclpy.timer import Timer
 from std_srvs.srv import Trigger
 
 from lifecycle.errors import MiddlewareError
@@ -51,6 +53,9 @@ _GOALS = {
 }
 """Transition label → label of the state it leads to (lifecycle_msgs/Transition)."""
 
+_DIAGNOSTICS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""Matches whoever publishes them, reliably or not; they come again each second."""
+
 _PARAMETER_SERVICES = ("list_parameters", "describe_parameters", "get_parameters")
 
 
@@ -62,6 +67,8 @@ class NodeClients:
         self._calls = ServiceCalls(observer)
         self._transitions: dict[str, Subscription] = {}
         self._parameter_events: Subscription | None = None
+        self._diagnostics: Subscription | None = None
+        self._diagnostics_timer: Timer | None = None
 
     async def get_state(self, node: str, *, timeout_s: float = TIMEOUT_S) -> str:
         """Return the label of a managed node's state (lifecycle_msgs/State).
@@ -335,6 +342,27 @@ class NodeClients:
                 callback_group=self._calls.group,
             )
 
+    def on_diagnostics(self, callback: Callable[[Sequence[tuple[str, int, str]]], None]) -> None:
+        """Have `callback` called in the executor thread with each message on /diagnostics.
+
+        It is given name, level and message of each entry; and each second none, so that it sees
+        which are old. Once: asking again changes nothing.
+        """
+        if self._diagnostics is not None:
+            return
+        from diagnostic_msgs.msg import DiagnosticArray  # few systems have use for it
+
+        def arrived(message: Any) -> None:
+            callback([(each.name, each.level[0], each.message) for each in message.status])
+
+        node, group = self._observer.node, self._calls.group
+        self._diagnostics = node.create_subscription(
+            DiagnosticArray, "/diagnostics", arrived, _DIAGNOSTICS, callback_group=group
+        )
+        self._diagnostics_timer = node.create_timer(
+            1.0, lambda: callback(()), group, clock=Clock(clock_type=ClockType.STEADY_TIME)
+        )
+
     async def connect_to(
         self, node: str, name: str, urls: Sequence[str], *, timeout_s: float = TIMEOUT_S
     ) -> None:
@@ -424,6 +452,10 @@ class NodeClients:
         self._calls.destroy()
         for node in tuple(self._transitions):
             self.forget(node)
+        if self._diagnostics is not None and self._diagnostics_timer is not None:
+            self._observer.node.destroy_timer(self._diagnostics_timer)
+            self._observer.node.destroy_subscription(self._diagnostics)
+            self._diagnostics = None
         if self._parameter_events is not None:
             self._observer.node.destroy_subscription(self._parameter_events)
             self._parameter_events = None

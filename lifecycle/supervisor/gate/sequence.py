@@ -19,7 +19,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections import Counter
-from collections.abc import Callable, Collection, Coroutine, Iterable, Mapping
+from collections.abc import AsyncIterator, Callable, Collection, Coroutine, Iterable, Mapping
 from typing import Any
 
 from lifecycle.errors import BringUpError
@@ -347,10 +347,11 @@ class GateSequence:
         self._gate.close()
         self.phase = "restarting"
         self._schedule.by_hand([each.planned.key for each in nodes])
-        await self._take_down(nodes)
-        await self._begin_again(nodes, order.plan if order.reload else None)
-        # Who waits for one that is started again later follows it.
-        await self._connect_unfinished(self._timeout_s)
+        async with self._watched():
+            await self._take_down(nodes)
+            await self._begin_again(nodes, order.plan if order.reload else None)
+            # Who waits for one that is started again later follows it.
+            await self._connect_unfinished(self._timeout_s)
         self._emit(SystemReached(reached="connected", elapsed_s=self._emit.elapsed_s))
         if was_paused:
             self._reached(PAUSED)
@@ -415,7 +416,8 @@ class GateSequence:
         down = tuple(
             each for key, each in self._system.nodes.items() if key in keys or key in interrupted
         )
-        await self._take_down(down)
+        async with self._watched():
+            await self._take_down(down)
         for node in down:
             node.renew(node.process)
             if node.process is not None:
@@ -425,6 +427,15 @@ class GateSequence:
         self._schedule.announce(keys)
         if self.phase == HELD and not self._inactive():
             self.phase = ACTIVE
+
+    @contextlib.asynccontextmanager
+    async def _watched(self) -> AsyncIterator[None]:
+        """Judge what stays active also while others are taken down or brought up."""
+        looking = asyncio.ensure_future(self._judge.keep_looking(self.active, self._away))
+        try:
+            yield
+        finally:
+            await ended(looking)
 
     def _interrupted(self) -> frozenset[str]:
         """Return the keys of the nodes, with their processes, that were cut off in a step."""
@@ -453,8 +464,9 @@ class GateSequence:
         self._gate.close()
         self.phase = "restarting"
         try:
-            await self._begin_again(tuple(self._system.nodes[key] for key in keys))
-            await self._connect_unfinished(self._timeout_s)
+            async with self._watched():
+                await self._begin_again(tuple(self._system.nodes[key] for key in keys))
+                await self._connect_unfinished(self._timeout_s)
             self._emit(SystemReached(reached="connected", elapsed_s=self._emit.elapsed_s))
         except StepFailedError:
             self.phase = HELD if goes_on else before
@@ -793,8 +805,9 @@ class GateSequence:
                 return await self._unless_outrun(self.verify(self._timeout_s), self._schedule.due())
             self.phase = "restarting"
             keys = self._schedule.begin()
-            await self._begin_again(tuple(self._system.nodes[key] for key in keys))
-            await self._connect_unfinished(self._timeout_s)
+            async with self._watched():
+                await self._begin_again(tuple(self._system.nodes[key] for key in keys))
+                await self._connect_unfinished(self._timeout_s)
 
     async def _withdraw(self, permit: Permit) -> None:
         """Deactivate again what was activated since the gate opened: the rest may not follow."""
@@ -823,6 +836,10 @@ class GateSequence:
             for each in self._system.nodes.values()
             if each.is_to_be_active and each.is_up and each.reach is not Reach.ACTIVE
         )
+
+    def _away(self) -> frozenset[str]:
+        """Return the names of the nodes that are not active and not at their gate either."""
+        return frozenset(each.name for each in self._system.nodes.values() if not each.is_up)
 
     def _withheld(self) -> frozenset[str]:
         return frozenset(each.name for each in self._system.nodes.values() if each.withheld)

@@ -162,6 +162,9 @@ BURST_S = 0.05
 SETTLED_S = 0.5
 """A finding that time does not heal counts once it is unchanged for so long."""
 
+UNWATCHED_S = 0.4
+"""What happens to an active node while others are started or ended is reported within a second."""
+
 UNVERIFIABLE_S = 3.5
 """What cannot be verified may be unseen yet; Fast DDS announces a late participant every 3 s."""
 
@@ -344,6 +347,40 @@ class VerificationLoop:
         )
         self._stands(stage, verdict)
         return verdict, again_s
+
+    async def keep_looking(
+        self, ahead: Callable[[], frozenset[str]], away: Callable[[], frozenset[str]]
+    ) -> None:
+        """Judge at changes, until cancelled, who is active while others are started or ended.
+
+        It is begun late and looks seldom: what is over soon is judged at its end anyway. The
+        verdict changes only if it is worse by what is about none of those others. Nothing else may
+        judge meanwhile.
+
+        Args:
+            ahead: returns the names of the nodes that are active now.
+            away: returns the names of the nodes that are not as far as they should be.
+        """
+        loop = asyncio.get_running_loop()
+        while True:
+            await asyncio.sleep(UNWATCHED_S)
+            count = self._changes.count
+            self.ahead = ahead()
+            found = await self._look(Stage.CONNECTED)
+            _, again_s = self._grace_period.after(
+                self.latest, found, self._system.expected, loop.time()
+            )
+            if again_s is None and self._is_worse(found, away()):
+                self._stands(Stage.CONNECTED, found)
+            await self._changes.beyond(count, again_s)
+
+    def _is_worse(self, found: Verdict, away: frozenset[str]) -> bool:
+        known = () if self.latest is None else self.latest.findings
+        return any(
+            each.outcome is Outcome.VIOLATED and away.isdisjoint((*each.nodes, each.subject))
+            for each in found.findings
+            if _key(each) not in {_key(one) for one in known}
+        )
 
     def refuse(self, findings: tuple[Finding, ...]) -> Verdict:
         """Judge by what was found before anything was started; return the verdict."""

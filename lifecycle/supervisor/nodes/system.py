@@ -29,7 +29,7 @@ from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.supervisor.processes.logs import LogDirectory
 from lifecycle.supervisor.processes.process import ManagedProcess, own_run_delay_s
 from lifecycle.supervisor.run.events import Emitter, NodeChanged, Notice, RequestSent
-from lifecycle.verify import HealthReport, NodeConfiguration, Observation, is_healthy
+from lifecycle.verify import HealthReport, NodeConfiguration, Observation, health_of
 
 ASK_AGAIN_S = 0.2
 """A remote node is asked again so long after, because the event that it connected may be missed:
@@ -116,7 +116,7 @@ class RemoteNodes:
 
 
 class AwaitedHealth:
-    """Takes from the graph the health that others wait for and no host of ours reports."""
+    """Takes from the graph the health that others wait for, where no host of ours reports all."""
 
     def __init__(self, system: System, observer: ObservationSource, changes: ChangeSource) -> None:
         self._system = system
@@ -132,20 +132,17 @@ class AwaitedHealth:
             for after in node.planned.after
             if after.condition is Condition.HEALTHY
         }
-        awaited = [
-            each
-            for key, each in nodes.items()
-            if key in keys and (each.process is None or each.process.channel is None)
-        ]
+        awaited = [each for key, each in nodes.items() if key in keys and not each.tells_health]
         if not awaited:
             return
         plan = dataclasses.replace(self._system.plan, nodes=tuple(each.planned for each in awaited))
         while True:
             count = self._changes.count
             observation = await self._observer.observe(plan)
-            found = {each.name: each.health for each in observation.configurations}
+            own = {each.name: each.health for each in observation.configurations}
+            published = {each.full_name: each.health for each in observation.nodes}
             for each in awaited:
-                each.health = found.get(each.name)
+                each.health = own.get(each.name), published.get(each.name)
                 each.wake()
             await self._changes.beyond(count, ASK_AGAIN_S)
 
@@ -223,8 +220,8 @@ def _conditions(planned: PlannedNode, observation: Observation) -> Iterable[Cond
         return ()
     report = next((each for each in observation.configurations if each.name == name), None)
     up_to_active = (Condition.STARTED, Condition.CONFIGURED, Condition.CONNECTED, Condition.ACTIVE)
-    said = None if report is None else report.health
-    healthy = (Condition.HEALTHY,) if is_healthy(planned, said) else ()
+    said = health_of(planned, None if report is None else report.health, observed.health)
+    healthy = (Condition.HEALTHY,) if said.ok else ()
     if not planned.managed:
         return (*up_to_active, *healthy)
     state = observed.state or (report.state if report is not None else "")
@@ -302,7 +299,7 @@ class NodeRun:
         reports_changes: its host reports unasked when its configuration changes.
         unload: has its container unload a component; None for what is not loaded into one.
         is_up: it was started and brought as far as its gate; cleared when it goes down.
-        health: what it said of it in the graph, where no host of ours reports it.
+        health: what it, and /diagnostics of it, was seen to say of it in the graph.
         withheld: why a consequence of a violation keeps it inactive, until a person lets it through
             the gate again; empty if none does.
     """
@@ -326,7 +323,7 @@ class NodeRun:
         self.unload: Callable[[], Awaitable[None]] | None = None
         self.is_up = False
         self.withheld = ""
-        self.health: HealthReport | None = None
+        self.health: tuple[HealthReport | None, HealthReport | None] = (None, None)
         self.changed = asyncio.Event()
         self._emit = emit
 
@@ -341,7 +338,7 @@ class NodeRun:
         self.reports_changes = False
         self.unload = None
         self.is_up = False
-        self.health = None
+        self.health = (None, None)
         self.doing = ""
         self.connected = False
         self.state = ""
@@ -376,19 +373,29 @@ class NodeRun:
         return own_run_delay_s() if self.process is None else self.process.run_delay_s()
 
     @property
-    def _health(self) -> HealthReport | None:
-        return self.health if self.configuration is None else self.configuration.health
+    def tells_health(self) -> bool:
+        """Whether its host reports all that the manifest asks of its health."""
+        asked = self.planned.health
+        ours = self.process is not None and self.process.channel is not None
+        return asked is None or (ours and not asked.diagnostics)
+
+    @property
+    def _known_health(self) -> HealthReport:
+        own, published = self.health
+        if self.configuration is not None:
+            own = self.configuration.health
+        return health_of(self.planned, own, published)
 
     @property
     def is_healthy(self) -> bool:
-        """Whether it reports the health that its manifest asks of it, if it asks for any."""
-        return is_healthy(self.planned, self._health)
+        """Whether it is known to be as healthy as its manifest asks."""
+        return self._known_health.ok is True
 
     @property
     def ails(self) -> str:
-        """What it says is wrong with it, for messages; empty if nothing, or it is not active."""
-        said = self._health
-        return f": {said.message}" if said and said.message and self.reach is Reach.ACTIVE else ""
+        """What is wrong with it, for messages; empty if nothing, or it is not active."""
+        said = self._known_health.message
+        return f": {said}" if said and self.reach is Reach.ACTIVE else ""
 
     def has_reached(self, condition: Condition) -> bool:
         """Whether the condition holds; for a node that is not managed all follow its start."""

@@ -1,14 +1,15 @@
-"""Rule about the health that nodes report of themselves: their `health` method. Pure."""
+"""Rule about the health of nodes: what their `health` method and /diagnostics say. Pure."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
+from lifecycle import dataclasses
 from lifecycle.plan import PlannedNode
 from lifecycle.verify.observation import HealthReport
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
-from lifecycle.verify.verdict import Finding
+from lifecycle.verify.verdict import Finding, Stage
 from lifecycle.verify.view import NodeFacts, View
 
 UNHEALTHY = Rule(
@@ -22,11 +23,33 @@ UNHEALTHY = Rule(
 RULES = (UNHEALTHY,)
 
 _HEALTHY = "healthy"
+_NO_METHOD = HealthReport(
+    ok=None, message="it reports no health; its class needs a method 'health'"
+)
 
 
-def is_healthy(node: PlannedNode, report: HealthReport | None) -> bool:
-    """Return whether a node reports the health that its manifest asks of it, if it asks for any."""
-    return node.health is None or (report is not None and report.ok is True)
+def health_of(
+    node: PlannedNode, own: HealthReport | None, published: HealthReport | None
+) -> HealthReport:
+    """Return what is known of a node's health, of all that the manifest names.
+
+    Args:
+        node: as it is declared.
+        own: what its `health` method returned last.
+        published: what /diagnostics says of it.
+    """
+    said = []
+    if node.health is not None and node.health.check:
+        said.append(own or _NO_METHOD)
+    if node.health is not None and node.health.diagnostics:
+        names = ", ".join(map(repr, node.health.diagnostics))
+        silent = f"nothing on /diagnostics is called {names}"
+        said.append(published or HealthReport(ok=None, message=silent))
+    for ok in (False, None):
+        wrong = [each.message for each in said if each.ok is ok]
+        if wrong:
+            return HealthReport(ok=ok, message="; ".join(wrong))
+    return HealthReport(ok=True)
 
 
 def check(view: View) -> Iterator[Finding]:
@@ -35,35 +58,36 @@ def check(view: View) -> Iterator[Finding]:
 
 
 def _judge(facts: NodeFacts) -> Iterator[Finding]:
-    node, report = facts.node, facts.configuration
+    node, frame, report = facts.node, facts.frame, facts.configuration
     if node.health is None or facts.absent:
         return
-    if facts.frame.ours(node) and (report is None or not report.connected):
-        return  # it is asked once it is connected; until then its state or lack of report says it
-    health = None if report is None else report.health
-    if health is None:
-        yield _unknown(node, "it reports no health; its class needs a method 'health'")
+    # A method is asked from when its node is connected, and a held node publishes nothing before it
+    # is active; until then its state, or the lack of a report, says enough.
+    asks = not frame.ours(node) or (report is not None and report.connected)
+    works = not node.holds or frame.stage is Stage.ACTIVE or facts.name in frame.ahead
+    asked = dataclasses.replace(
+        node.health,
+        check=node.health.check and asks,
+        diagnostics=node.health.diagnostics if works else (),
+    )
+    health = health_of(
+        dataclasses.replace(node, health=asked),
+        None if report is None else report.health,
+        None if facts.observed is None else facts.observed.health,
+    )
+    if health.ok is False:
+        yield UNHEALTHY.on_node(
+            Outcome.VIOLATED,
+            node,
+            expected=_HEALTHY,
+            observed=health.message,
+            message=f"cannot accept node {node.full_name}: it is not healthy: {health.message}",
+        )
     elif health.ok is None:
-        yield _unknown(node, health.message)
-    elif not health.ok:
-        yield _violated(node, health)
-
-
-def _violated(node: PlannedNode, health: HealthReport) -> Finding:
-    return UNHEALTHY.on_node(
-        Outcome.VIOLATED,
-        node,
-        expected=_HEALTHY,
-        observed=health.message,
-        message=f"cannot accept node {node.full_name}: it is not healthy: {health.message}",
-    )
-
-
-def _unknown(node: PlannedNode, why: str) -> Finding:
-    return UNHEALTHY.on_node(
-        Outcome.UNVERIFIABLE,
-        node,
-        expected=_HEALTHY,
-        observed="unknown",
-        message=f"cannot verify that node {node.full_name} is healthy: {why}",
-    )
+        yield UNHEALTHY.on_node(
+            Outcome.UNVERIFIABLE,
+            node,
+            expected=_HEALTHY,
+            observed="unknown",
+            message=f"cannot verify that node {node.full_name} is healthy: {health.message}",
+        )

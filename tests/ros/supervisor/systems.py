@@ -16,6 +16,7 @@ import time
 from pathlib import Path
 
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.node import Node
 from std_msgs.msg import String
 
@@ -115,6 +116,19 @@ class Moody(Talker):
         if self.is_active and not Path(os.environ["MOOD"]).exists():
             return "in a mood"
         return None
+
+
+class Diagnosed(Talker):
+    """Publishes what it is on /diagnostics: an error while the file MOOD is not there."""
+
+    def _tick(self) -> None:
+        well = Path(os.environ["MOOD"]).exists()
+        status = DiagnosticStatus(
+            name="talker: mood",
+            level=DiagnosticStatus.OK if well else DiagnosticStatus.ERROR,
+            message="well" if well else "in a mood",
+        )
+        self.publisher("diagnostics").publish(DiagnosticArray(status=[status]))
 
 
 class Chatty(Talker):

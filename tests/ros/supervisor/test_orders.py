@@ -657,11 +657,12 @@ def test_a_mode_takes_a_node_out_and_another_brings_it_back_through_the_gate(
         run.assert_gate_held()
 
 
+@pytest.mark.parametrize("shown_by", ["check", "diagnostics"])
 def test_health_holds_who_waits_for_it_and_has_consequences_when_it_is_lost(
-    tmp_path: Path, fresh_domain: int
+    tmp_path: Path, fresh_domain: int, shown_by: str
 ) -> None:
     mood = tmp_path / "mood"
-    edit = {
+    edit: dict[str, Any] = {
         "nodes/talker/run": {
             "python": "tests.ros.supervisor.systems:Moody",
             "environment": {"MOOD": str(mood)},
@@ -670,17 +671,28 @@ def test_health_holds_who_waits_for_it_and_has_consequences_when_it_is_lost(
         "nodes/listener/after": {"talker": "healthy"},
         "on_violation": {"node.unhealthy": "deactivate"},
     }
+    said = "in a mood"
+    if shown_by == "diagnostics":
+        said = "'talker: mood': in a mood"
+        edit["nodes/talker/run"]["python"] = "tests.ros.supervisor.systems:Diagnosed"
+        edit["nodes/talker/health"] = {"diagnostics": "talker: *"}
+        edit["nodes/talker/interface/publishers"] = [
+            {"name": "chatter", "type": "std_msgs/msg/String"},
+            {"name": "diagnostics", "type": "diagnostic_msgs/msg/DiagnosticArray"},
+        ]
     with up(pair(tmp_path, fresh_domain, edit=edit), runtime=tmp_path) as run:
         run.until("node", node="/talker", reach="active")
-        status = verb("status", "pair", runtime=tmp_path).stdout
-        assert "waits to activate until /talker is healthy: in a mood" in status
+        deadline = time.monotonic() + BOUND_S
+        waits = f"waits to activate until /talker is healthy: {said}"
+        while waits not in (status := verb("status", "pair", runtime=tmp_path).stdout):
+            assert time.monotonic() < deadline, status
         mood.touch()
         run.until("node", node="/listener", reach="active")
         run.until("system", reached="active")
         mood.unlink()
         taken = run.until("consequence")
         assert (taken["rule"], taken["nodes"]) == ("node.unhealthy", ["/talker"])
-        assert taken["message"] == "cannot accept node /talker: it is not healthy: in a mood"
+        assert taken["message"] == f"cannot accept node /talker: it is not healthy: {said}"
         mood.touch()
         assert verb("resume", "pair", runtime=tmp_path).returncode == ExitCode.OK
         run.until("system", reached="active")

@@ -196,8 +196,10 @@ def test_what_cannot_be_meant_is_refused_before_anything_is_started(
     arguments: tuple[str, ...],
     message: str,
     tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
+    monkeypatch.chdir(tmp_path)
     manifest = tmp_path / "m.lifecycle.yaml"
     manifest.write_text(MANIFEST)
     assert main(["up", str(manifest), *arguments]) == ExitCode.USAGE

@@ -5,20 +5,21 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import logging
-from collections.abc import Awaitable, Callable, Collection
+from collections.abc import Awaitable, Callable, Collection, Sequence
 from typing import Any, TypeVar
 
 import pytest
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.graph import GraphEvents, ManualScheduler
-from lifecycle.graph.observer import Observer
+from lifecycle.graph.observer import Diagnostic, DiagnosticReadings, Observer
 from lifecycle.manifest.model import (
     EndpointKind,
     RunKind,
 )
 from lifecycle.plan.model import ExpectedParameter, Plan
 from lifecycle.verify.observation import (
+    HealthReport,
     NodeConfiguration,
     NodeParameters,
     Observation,
@@ -111,6 +112,9 @@ class FakeClients:
 
     def on_parameters(self, callback: Callable[[str, frozenset[str]], None]) -> None:
         self.listening = True
+
+    def on_diagnostics(self, callback: Callable[[Sequence[Diagnostic]], None]) -> None:
+        self.diagnose = callback
 
     def forget(self, node: str) -> None:
         self.forgotten.append(node)
@@ -371,3 +375,37 @@ def test_what_changed_while_parameters_were_read_is_seen(
     clients.while_read = more
     seen = run(observer.observe(with_parameter(plan("foreign"), "foreign")))
     assert [each.full_name for each in seen.nodes] == ["/foreign", "/late"]
+
+
+def test_what_diagnostics_say_of_a_node_is_its_worst_entry_until_that_is_stale() -> None:
+    now_s, woken = [0.0], []
+    clients = FakeClients()
+    readings = DiagnosticReadings(clients, lambda: woken.append(now_s[0]), lambda: now_s[0])
+    readings.listen({})
+    assert not hasattr(clients, "diagnose")  # nothing is subscribed to
+    readings.listen({"/arm": ("arm: *", "gripper")})
+    assert readings.reports() == {}
+    clients.diagnose([("arm: motor", 0, "fine"), ("arms", 2, "of another"), ("gripper", 1, "warm")])
+    assert readings.reports() == {"/arm": HealthReport(ok=True)}
+    assert len(woken) == 1
+    now_s[0] = 4.0
+    clients.diagnose([("arm: motor", 2, "stalled")])
+    stalled = HealthReport(ok=False, message="'arm: motor': stalled")
+    assert readings.reports() == {"/arm": stalled}
+    now_s[0] = 6.0
+    clients.diagnose([("arm: motor", 0, "fine")])
+    stale = HealthReport(ok=None, message="'gripper' is stale for 5 s")
+    assert readings.reports() == {"/arm": stale}
+    now_s[0] = 8.0
+    clients.diagnose([("gripper", 3, "no data")])
+    stale = HealthReport(ok=None, message="'gripper' is stale: no data")
+    assert readings.reports() == {"/arm": stale}
+    clients.diagnose([("gripper", 0, "")])
+    assert readings.reports() == {"/arm": HealthReport(ok=True)}
+    asleep = len(woken)
+    now_s[0] = 10.0
+    clients.diagnose([])
+    assert len(woken) == asleep
+    now_s[0] = 12.0
+    clients.diagnose([])  # as each second
+    assert len(woken) == asleep + 1

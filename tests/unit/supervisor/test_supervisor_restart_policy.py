@@ -143,6 +143,7 @@ def _chain(camera: Supervision = ON_FAILURE, viewer: Supervision = ON_FAILURE) -
 
 GONE = "graph.missing-node /camera"
 VIEWER_GONE = "graph.missing-node /viewer"
+UNREPORTED = "state.unverifiable /camera, config.missing-report /camera"
 
 
 def _back(node: str, at_s: float) -> list[str]:
@@ -345,6 +346,7 @@ def test_what_fails_while_another_is_restarted_keeps_both_at_the_gate_until_the_
         await world.run(die())
         assert world.since("[failure] run.process-died /viewer") == [
             "[failure] run.process-died /viewer, and the run goes on",
+            f"[verdict] connected violated {VIEWER_GONE}, {UNREPORTED}",
             "/camera connect",
             "[backoff] viewer in 1.0 s",
             f"[verdict] connected violated {VIEWER_GONE}",
@@ -630,6 +632,35 @@ def test_an_order_does_not_keep_others_from_coming_again_that_its_gate_waits_for
             await world.story.until("[restarted] camera (1)")
 
         await world.run(order())
+
+    run(main())
+
+
+def test_what_becomes_wrong_while_another_node_is_restarted_is_found_within_a_second(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        plan = plan_of(
+            planned_node("camera", supervision=ON_FAILURE),
+            planned_node("viewer", supervision=ON_FAILURE),
+        )
+        world = SessionWorld(plan, tmp_path, stop_after_s=30.0)
+
+        async def intrude() -> None:
+            await world.story.until("[system] active")
+            world.hosts.takes_s["/camera configure"] = 5.0
+            world.kill("camera")
+            await world.story.until("/camera configure", 2)
+            await asyncio.sleep(1.0)
+            began = asyncio.get_running_loop().time()
+            world.intrude()
+            await world.story.until(f"[verdict] connected violated {INTRUDED}")
+            assert asyncio.get_running_loop().time() - began < 1.0
+            world.retreat()
+            await world.story.until("[restarted] camera (1)")
+
+        await world.run(intrude())
+        assert "state.wrong-state" not in " ".join(world.outline)
 
     run(main())
 

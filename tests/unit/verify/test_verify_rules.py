@@ -584,6 +584,23 @@ def test_the_health_that_a_node_reports_is_judged_where_the_manifest_asks_it(
     plan = dataclasses.replace(PLAN, nodes=nodes)
     verdict = verify(plan, edit(perfect(plan, Stage.ACTIVE)), stage=Stage.ACTIVE)
     assert "; ".join(f"{each.outcome.value} {each.message}" for each in verdict.findings) == found
+    # What /diagnostics says of it counts as well, once it may publish.
+    asked = Health(check=True, diagnostics=("viewer: *",))
+    nodes = tuple(
+        dataclasses.replace(each, health=asked) if each.key == "viewer" else each
+        for each in PLAN.nodes
+    )
+    both_ways = dataclasses.replace(PLAN, nodes=nodes)
+    said = HealthReport(ok=False, message="'viewer: lens': dirty")
+    (worse,) = verify(
+        both_ways,
+        both(edit, change_node("/viewer", health=said))(perfect(both_ways, Stage.ACTIVE)),
+        stage=Stage.ACTIVE,
+    ).findings
+    assert worse.outcome is Outcome.VIOLATED
+    assert worse.message.endswith("'viewer: lens': dirty")
+    early = findings_after(edit, plan=both_ways, stage=Stage.CONNECTED)
+    assert early == [("node.unhealthy", found.partition(" ")[0], "/viewer")] * bool(found)
     # It is asked from when it is connected.
     early = both(edit, change_configuration("/viewer", connected=False))
     rules = {rule for rule, _, _ in findings_after(early, plan=plan)}
