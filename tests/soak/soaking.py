@@ -120,7 +120,7 @@ class Soaking:
         # What was violated meanwhile is over.
         self._ended(run, frozenset({130 if how == "interrupt" else 0}))
 
-    def _ended(self, run: Watched, codes: frozenset[int]) -> None:
+    def _ended(self, run: Watched, codes: frozenset[int], *, alone: bool = True) -> None:
         try:
             code = run.process.wait(DOWN_S)
             for each in run._readers:
@@ -131,6 +131,8 @@ class Soaking:
                     f"exit code {code}, not {sorted(codes)}: {last} {run.said()}"
                 )
             self._judge(run)
+            if not alone:
+                self._spare += leftovers()
             self._assert_nothing_left(run)
         except subprocess.TimeoutExpired:
             raise NotAsPromisedError(f"not ended within {DOWN_S:g} s: {run.events[-5:]}") from None
@@ -213,7 +215,8 @@ class Soaking:
             self._reports(run, done, expected, since, times, delayed_s)
         if expected.exit_codes:
             self.run = None
-            self._ended(run, expected.exit_codes)
+            # While the run ended the intruder may have used a port of the supervisor's.
+            self._ended(run, expected.exit_codes, alone=done.condition is not Condition.INTRUDER)
             return
         for words in expected.heal:
             self._insist(run, words)

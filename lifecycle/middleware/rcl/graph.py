@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import operator
 import os
+import re
 import threading
 import time
 import typing
@@ -165,6 +166,9 @@ _AGREED_S = 5.0
 
 _LOOK_S = 0.005
 _PREFIX_DIGITS = 24
+
+_REQUEST = re.compile(r"rq/.*Request")
+"""DDS names of the topics that carry the requests of services."""
 _CHANGE_STATE = "lifecycle_msgs/srv/ChangeState"
 _GET_STATE = "lifecycle_msgs/srv/GetState"
 
@@ -581,6 +585,8 @@ class GraphObserver:
 
     def _services(self, full_name: str) -> _Listed | None:
         """Return the services and clients of a node; None if rcl does not show them."""
+        if full_name in self._stale_node_filter.ghosts:
+            return self._services_by_topic(full_name)
         found = []
         for kind in (EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT):
             listed = endpoints_of_node(self.node, kind, full_name)
@@ -588,6 +594,27 @@ class GraphObserver:
                 return None
             found.append((kind, listed))
         return tuple(found)
+
+    def _services_by_topic(self, full_name: str) -> _Listed:
+        """Return what `_services` does of a node whose name a stale one has, too.
+
+        rcl takes the first of a name: its services would be those of a node that is gone.
+        """
+        servers, clients = EndpointKind.SUBSCRIPTION, EndpointKind.PUBLISHER
+        sides = ((EndpointKind.SERVICE_SERVER, servers), (EndpointKind.SERVICE_CLIENT, clients))
+        topics = [name for name, _ in self.node.get_topic_names_and_types(no_demangle=True)]
+        requests = sorted(each for each in topics if _REQUEST.fullmatch(each))
+        found: dict[EndpointKind, list[tuple[str, str]]] = {kind: [] for kind, _ in sides}
+        for topic in requests:
+            for kind, side in sides:
+                types = {
+                    _service_type(each.type)
+                    for each in endpoints_of(self.node, side, topic, no_mangle=True)
+                    if each.node == full_name and not self._stale_node_filter.ignores(each.gid)
+                }
+                service = topic.removeprefix("rq").removesuffix("Request")
+                found[kind] += [(service, each) for each in sorted(types)]
+        return tuple((kind, tuple(found[kind])) for kind, _ in sides)
 
     def _services_of(
         self, full_name: str, kept: _Kept, last: _Kept

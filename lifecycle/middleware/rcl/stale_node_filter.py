@@ -35,12 +35,17 @@ class StaleNodeFilter:
     """Counts the nodes that `node` sees; remembers where they were, so keep it.
 
     From any thread, one call at a time.
+
+    Attributes:
+        ghosts: full names that stale nodes had, too, when they were last counted: what rcl says of
+            such a name may be of a stale one.
     """
 
     def __init__(self, node: Node) -> None:
         self._node = node
         self._homes: dict[str, frozenset[str]] = {}
         self._dead: frozenset[str] = frozenset()
+        self.ghosts: frozenset[str] = frozenset()
 
     def ignore(self, prefixes: Iterable[str]) -> None:
         """Count no participants whose process is dead, for as long as discovery shows them.
@@ -60,7 +65,7 @@ class StaleNodeFilter:
 
     def count(self) -> Counter[str]:
         """Return by full name how many nodes there are; a name that is not known yet included."""
-        shown = Counter(node_names(self._node))
+        every = shown = Counter(node_names(self._node))
         homes = self.homes()
         if dead := self.shown() & self._dead if self._dead else frozenset():
             shown = without_dead(shown, homes, self._homes, dead)
@@ -72,6 +77,7 @@ class StaleNodeFilter:
             shown = without_ghosts(shown, homes, self._homes, self.participants(), known)
         for name, where in homes.items():
             self._homes[name] = self._homes.get(name, frozenset()) | where.keys()
+        self.ghosts = frozenset(name for name, count in shown.items() if count < every[name])
         return shown
 
     def homes(self) -> dict[str, Counter[str]]:

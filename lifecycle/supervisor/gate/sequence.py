@@ -443,6 +443,10 @@ class GateSequence:
         if self.phase == HELD and not self.inactive():
             self.phase = ACTIVE
 
+    def interrupted(self) -> frozenset[str]:
+        """Return the keys of the nodes, with their processes, that were cut off in a step."""
+        return interrupted_in(self._system.nodes)
+
     @contextlib.asynccontextmanager
     async def _watched(self) -> AsyncIterator[None]:
         """Judge what stays active also while others are taken down or brought up."""
@@ -451,18 +455,6 @@ class GateSequence:
             yield
         finally:
             await ended(looking)
-
-    def interrupted(self) -> frozenset[str]:
-        """Return the keys of the nodes, with their processes, that were cut off in a step."""
-        nodes = self._system.nodes
-        processes = {
-            each.process
-            for each in nodes.values()
-            if each.process is not None
-            and not each.process.is_gone
-            and (each.stuck or (each.reach is Reach.WAITING and _is_in_step(each)))
-        }
-        return frozenset(key for key, each in nodes.items() if each.process in processes)
 
     async def _restart_by_policy(self, keys: tuple[str, ...]) -> None:
         """Bring what is down as far as the system is: through its gate, while the rest stays.
@@ -897,6 +889,32 @@ class GateSequence:
         self.phase = phase
         self._emit(SystemReached(reached=phase, elapsed_s=self._emit.elapsed_s))
         self._schedule.returned([key for key, each in self._system.nodes.items() if each.is_up])
+
+
+def interrupted_in(nodes: Mapping[str, NodeRun]) -> frozenset[str]:
+    """Return the keys of the nodes, with their processes, that were cut off in a step.
+
+    A component that was cut off may be loaded: only its container's end unloads it for certain.
+
+    Args:
+        nodes: by key, all that this supervisor brings up.
+    """
+    processes = set()
+    for each in nodes.values():
+        of = nodes.get(each.planned.run.container, each) if each.planned.run.component else each
+        if (
+            of.process is not None
+            and not of.process.is_gone
+            and (each.stuck or (each.reach is Reach.WAITING and _is_in_step(each)))
+        ):
+            processes.add(of.process)
+    keys = {key for key, each in nodes.items() if each.process in processes}
+    components = (
+        key
+        for key, each in nodes.items()
+        if each.planned.run.component and each.planned.run.container in keys
+    )
+    return frozenset((*keys, *components))
 
 
 def _is_in_step(node: NodeRun) -> bool:

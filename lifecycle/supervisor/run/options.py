@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING
 from lifecycle import dataclasses
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest import Machine, Manifest
-from lifecycle.middleware import interface_addresses
 from lifecycle.network import Peer, parse
 from lifecycle.plan import ParticipantConnections, Plan, PlannedProcess, urls_of
 from lifecycle.verify import NodeConfiguration, Verdict, only_shared_memory
@@ -197,7 +196,14 @@ def _tcp_listeners(urls: Iterable[str]) -> Iterator[Peer]:
 
 
 def _own_addresses() -> set[str]:
-    return {text for _, text in interface_addresses(socket.AF_INET, socket.AF_INET6)}
+    import psutil  # which has them where a manifest is only checked, on other platforms, too
+
+    return {
+        address.address.partition("%")[0]
+        for addresses in psutil.net_if_addrs().values()
+        for address in addresses
+        if address.family in (socket.AF_INET, socket.AF_INET6)
+    }
 
 
 def _is_local(machine: Machine, own: set[str]) -> bool:

@@ -187,6 +187,42 @@ def test_a_ghost_is_not_counted_beside_participants_of_connections(
             claims.terminate()
 
 
+def test_a_node_that_comes_again_beside_a_ghost_of_its_name_has_its_own_services(
+    observer: GraphObserver, context: rclpy.Context, domain_id: int, wait_until: WaitUntil
+) -> None:
+    def homes() -> list[str]:
+        events = endpoints_of(observer.node, EndpointKind.PUBLISHER, "/parameter_events")
+        return [each.gid[:24] for each in events if each.node == "/twin"]
+
+    with a_node(domain_id, "twin"):
+        wait_until(homes)
+        gone = homes()[0]
+        wait_until(lambda: "/twin" in nodes(observer))
+    wait_until(lambda: "/twin" not in nodes(observer))
+    ghost = [
+        *(sys.executable, BARE_DDS, "--write", "rt/said:std_msgs::msg::dds_::String_"),
+        *("--node", "/", "bare", "--ghost", gone, "/", "twin"),
+    ]
+    with subprocess.Popen(
+        ghost, cwd=ROOT, env={**os.environ, "ROS_DOMAIN_ID": str(domain_id)}
+    ) as claims:
+        node = None
+        try:
+            wait_until(lambda: node_names(observer.node).count("/twin") == 1)
+            node = ManagedNode("twin", context=context)
+            wait_until(lambda: node_names(observer.node).count("/twin") == 2)
+            wait_until(
+                lambda: (
+                    nodes(observer).get("/twin")
+                    == ObservedNode(full_name="/twin", count=1, managed=True)
+                )
+            )
+        finally:
+            claims.terminate()
+            if node is not None:
+                node.destroy_node()
+
+
 def test_a_managed_node_is_told_by_its_services(
     observer: GraphObserver, context: rclpy.Context, wait_until: WaitUntil
 ) -> None:

@@ -10,7 +10,7 @@ import dataclasses
 from concurrent.futures import Future
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
@@ -23,7 +23,9 @@ from lifecycle.manifest import (
     Supervision,
 )
 from lifecycle.plan.model import Plan, PlannedNode
+from lifecycle.supervisor.control.protocol import Reach
 from lifecycle.supervisor.control.server import ControlRequest
+from lifecycle.supervisor.gate.sequence import interrupted_in
 from lifecycle.supervisor.nodes.system import NodeRun
 from lifecycle.supervisor.policy.restart import RestartPolicy, delay_s, group_of
 from lifecycle.supervisor.policy.schedule import RestartSchedule
@@ -576,6 +578,25 @@ def test_a_component_that_cannot_be_loaded_is_its_container_s_failure(
     )
     failure = StepFailedError("cannot load it", rule=rule("run.start-failed"), subject="/part")
     assert RestartSchedule(system, Emitter()).covers(failure) is taken
+
+
+def test_a_component_that_was_cut_off_while_it_was_loaded_comes_again_with_its_container() -> None:
+    helper = NodeRun(planned_node("helper"), Emitter())
+    part = NodeRun(_component("part", of="helper"), Emitter())
+    other = NodeRun(planned_node("other"), Emitter())
+
+    class Running:
+        is_gone = False
+
+    helper.process, other.process = cast("Any", Running()), cast("Any", Running())
+    helper.reach = other.reach = Reach.CONNECTED
+    nodes = {"helper": helper, "part": part, "other": other}
+    part.doing = "waits to be loaded until /helper has started"
+    assert interrupted_in(nodes) == frozenset()
+    part.doing = "starting"
+    assert interrupted_in(nodes) == {"helper", "part"}
+    part.doing, part.reach = "", Reach.CONNECTED
+    assert interrupted_in(nodes) == frozenset()
 
 
 def test_a_death_is_reported_at_once_also_while_another_process_is_taken_down(
