@@ -234,8 +234,7 @@ class Applying:
         await self._sequence.connect_unfinished(_left_s(deadline))
         if done.touched:
             self._emit(SystemReached(reached="connected", elapsed_s=self._emit.elapsed_s))
-        await self._alive(self._judge.reconciled(Stage.CONNECTED, _left_s(deadline)))
-        permit = await self._sequence.verify(_left_s(deadline))
+        permit = await self._verify(deadline)
         if before.phase == PAUSED:
             self._sequence.reached(PAUSED)
         elif self._sequence.inactive():
@@ -245,6 +244,18 @@ class Applying:
             await self._alive(self._sequence.program_flows(permit, deadline))
             await self._sequence.confirm(deadline)
             self._sequence.reached(ACTIVE)
+
+    async def _verify(self, deadline: float) -> Permit:
+        """Judge the system until its gate opens; not while its nodes are still being connected."""
+        while True:
+            await self._alive(self._judge.reconciled(Stage.CONNECTED, _left_s(deadline)))
+            try:
+                return await self._sequence.verify(_left_s(deadline))
+            except VerificationError:
+                # What was negotiated may have changed once more meanwhile.
+                late = asyncio.get_running_loop().time() >= deadline
+                if late or not self._judge.is_reconciling:
+                    raise
 
     async def _activate(
         self, permit: Permit, deadline: float, nodes: tuple[NodeRun, ...] | None = None
@@ -334,8 +345,7 @@ class Applying:
             )
         )
         await sequence.connect_unfinished(_left_s(deadline))
-        await self._alive(self._judge.reconciled(Stage.CONNECTED, _left_s(deadline)))
-        permit = await sequence.verify(_left_s(deadline))
+        permit = await self._verify(deadline)
         if before.phase == PAUSED:
             sequence.reached(PAUSED)
             return "paused and verified"

@@ -481,6 +481,11 @@ class VerificationLoop:
             if await self._changes.beyond(count, wait_s):
                 await self.quiet()
 
+    @property
+    def is_reconciling(self) -> bool:
+        """Whether the authority has still to make what running nodes lack."""
+        return self._looker is not None and self._looker.is_at_work()
+
     async def reconciled(self, stage: Stage, timeout_s: float) -> None:
         """Look until the authority has made what running nodes lack, gives it up, or time is up.
 
@@ -492,7 +497,7 @@ class VerificationLoop:
             count = self._changes.count
             await self._look(stage)
             left_s = deadline - loop.time()
-            if not self._looker.is_at_work() or left_s <= 0:
+            if not self.is_reconciling or left_s <= 0:
                 return
             if await self._changes.beyond(count, min(left_s, ASK_AGAIN_AT_MOST_S)):
                 await self.quiet()
