@@ -171,10 +171,6 @@ def test_a_running_node_is_connected_otherwise_where_the_supervisor_connects_it(
         assert (told.verdict, now) == (Outcome.OK, before)
         assert transitions(run, since) == set()
         run.met("wiring", since=since, operation="map_to", endpoint="publishers/chatter")
-        # It may also be another node's business.
-        nodes = {"nodes/second": listener(), "links": [link]}
-        report = apply(pair(tmp_path, fresh_domain, edit={**how, **nodes}))
-        assert (report["outcome"], report["added"]) == ("applied", ["/second"])
         assert apply(pair(tmp_path, fresh_domain, edit=how))["outcome"] == "applied"
         assert status(tmp_path)[1] == before
         assert verb("down", "pair", runtime=tmp_path).returncode == ExitCode.OK
