@@ -17,6 +17,7 @@ from typing import Any, get_args, get_type_hints
 
 import msgspec
 
+from lifecycle.cli.verbs.apply import ApplyReport
 from lifecycle.cli.verbs.check import CheckReport
 from lifecycle.export.picture.model import Picture
 from lifecycle.plan.model import Plan
@@ -61,6 +62,16 @@ class Result:
 
 
 RESULTS = {
+    "apply": Result(
+        type_=ApplyReport,
+        title="Report of lifecycle apply --format json, version 1",
+        always={
+            "ApplyReport": (
+                *("differences", "added", "removed", "restarted", "parameters"),
+                "error",
+            ),
+        },
+    ),
     "check": Result(
         type_=CheckReport,
         title="Report of lifecycle check --format json, version 1",

@@ -28,6 +28,7 @@ VERBS: dict[str, str] = {
     "resume": "verify a paused system again, and activate it",
     "restart": "take one node or all of a running system down, and up again through the gate",
     "mode": "enter another mode of a running system: who is active, through the gate",
+    "apply": "have a running system run by another manifest, through the gate, or back",
     "down": "end a running system in reverse order",
     "status": "show what a running supervisor sees",
     "verify": "judge a running system, started by anyone; for CI",
@@ -66,7 +67,7 @@ _ORDERLY = frozenset({ExitCode.OK, ExitCode.VIOLATED, ExitCode.UNVERIFIABLE})
 
 
 _LINUX = _PARTICIPANTS | {
-    *("pause", "resume", "restart", "mode", "down", "status"),
+    *("pause", "resume", "restart", "mode", "apply", "down", "status"),
     *("logs", "history", "explain", "replay"),
 }
 """Verbs that run nodes, or are about what runs or ran."""

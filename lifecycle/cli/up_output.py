@@ -29,6 +29,7 @@ from lifecycle.supervisor import (
     GaveUp,
     LogLine,
     MachineConnection,
+    ManifestApplied,
     ModeEntered,
     NodeAlive,
     NodeChanged,
@@ -452,6 +453,24 @@ def _(event: ModeEntered) -> str:
     without = f", without {', '.join(event.inactive)}" if event.inactive else ""
     others = f", other parameters of {', '.join(event.parameters)}" if event.parameters else ""
     return f"mode {event.mode}{without}{others}"
+
+
+@_describe.register
+def _(event: ManifestApplied) -> str:
+    what = {
+        "added": event.added,
+        "removed": event.removed,
+        "restarted": event.restarted,
+        "parameters of": event.parameters,
+    }
+    nodes = "".join(f"; {word} {', '.join(names)}" for word, names in what.items() if names)
+    said = {
+        "begun": f"applying {event.manifest}{nodes}",
+        "applied": f"{event.manifest} is in force, revision {event.revision}{nodes}",
+        "rolling_back": f"going back to the manifest before: {event.reason}",
+        "rolled_back": f"the manifest before is in force again, revision {event.revision}",
+    }
+    return said[event.stage]
 
 
 @_describe.register

@@ -5,6 +5,10 @@ from .build import effective_domain as effective_domain
 from .build import effective_range as effective_range
 from .build import started_by_others as started_by_others
 from .build import with_files_of_now as with_files_of_now
+from .change import GivenParameters as GivenParameters
+from .change import PlanChange as PlanChange
+from .change import change_between as change_between
+from .change import without_positions as without_positions
 from .comparison import PlanDifference as PlanDifference
 from .comparison import PlanNotice as PlanNotice
 from .comparison import PlanNoticeError as PlanNoticeError

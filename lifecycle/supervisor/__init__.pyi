@@ -3,6 +3,8 @@ from .control.client import differences as differences
 from .control.client import down as down
 from .control.client import order as order
 from .control.client import status as status
+from .control.protocol import Answer as Answer
+from .control.protocol import ChangedNodes as ChangedNodes
 from .control.protocol import ControlRequest as ControlRequest
 from .control.protocol import NodeStatus as NodeStatus
 from .control.protocol import ProcessState as ProcessState
@@ -25,6 +27,7 @@ from .run.events import GaveUp as GaveUp
 from .run.events import Listener as Listener
 from .run.events import LogLine as LogLine
 from .run.events import MachineConnection as MachineConnection
+from .run.events import ManifestApplied as ManifestApplied
 from .run.events import ModeEntered as ModeEntered
 from .run.events import NodeAlive as NodeAlive
 from .run.events import NodeChanged as NodeChanged

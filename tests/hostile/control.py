@@ -123,7 +123,7 @@ def _other_plan(change: str, verb: str, system: Running) -> None:
         plan["nodes"][0]["name"] = "\x1b[2J\nok"
     elif change == "twice the same":
         plan["nodes"] *= 2
-    question = {"ask": verb, "node": "", "plan": plan, "reload": False}
+    question = {"ask": verb, "node": "", "plan": plan, "reload": False, "dry_run": True}
     _sent(json.dumps(question).encode() + b"\n", "read", system)
 
 
@@ -222,6 +222,7 @@ def attacks(rng: random.Random) -> list[Attack]:
         *("domain 9999", "names of a terminal", "twice the same"),
     ):
         add(f"differences, {change}", _other_plan, change, "differences")
+        add(f"apply, {change}", _other_plan, change, "apply")
     for node in ("nobody", "", "\x1b[2J", "/" * 5000, "talker\n"):
         if node:
             add(f"restart of {node[:20]!r}", _ordered, node)

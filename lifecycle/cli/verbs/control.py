@@ -51,10 +51,11 @@ def status_text(status: SystemStatus) -> str:
     living = sum(not node.died and node.next_try_s is None for node in status.nodes)
     count = "" if living == len(status.nodes) else f" {living}/{len(status.nodes)}"
     mode = f", mode {status.mode}" if status.mode else ""
+    applied = f", revision {status.revision}: {status.manifest}" if status.revision > 1 else ""
     head = (
         f"{status.system}: {status.phase}{count}{mode}, verdict {verdict}, "
         f"domain {status.domain_id}, supervisor {status.supervisor}, "
-        f"up for {status.elapsed_s:.1f} s"
+        f"up for {status.elapsed_s:.1f} s{applied}"
     )
     text = [one_line(head)]
     for row, node in zip(rows, (None, *status.nodes), strict=True):

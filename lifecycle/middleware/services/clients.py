@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import asyncio
 import importlib
-from collections.abc import Awaitable, Callable, Collection, Iterable, Sequence
+from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from lifecycle_msgs.msg import TransitionEvent
 from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
 from rcl_interfaces.msg import Parameter, ParameterEvent, ParameterType, ParameterValue
-from rcl_interfaces.srv import SetParameters
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.clock import Clock, ClockType
 from rclpy.parameter import Parameter as RclpyParameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_parameter_events
@@ -297,6 +297,43 @@ class NodeClients:
                     f"cannot set parameter {name!r} of {node!r}: it says {result.reason!r}"
                 )
 
+    async def set_parameters(
+        self,
+        node: str,
+        values: Mapping[str, Any],
+        types: Mapping[str, str],
+        *,
+        timeout_s: float = TIMEOUT_S,
+    ) -> None:
+        """Set parameters of a running node, all or none (rcl_interfaces, SetParametersAtomically).
+
+        Args:
+            node: fully qualified name.
+            values: by parameter.
+            types: by parameter, names of rcl_interfaces: "int", "double_array".
+            timeout_s: seconds, > 0.
+
+        Raises:
+            ServiceUnansweredError: the node serves no parameters, or did not answer.
+            MiddlewareError: it refuses, with its reason.
+        """
+        parameters = [
+            RclpyParameter(name, _PARAMETER_TYPES[types[name]], value).to_parameter_msg()
+            for name, value in values.items()
+        ]
+        answer = await self._calls.call(
+            f"{node}/set_parameters_atomically",
+            SetParametersAtomically,
+            SetParametersAtomically.Request(parameters=parameters),
+            timeout_s=timeout_s,
+            repeat=True,
+        )
+        if not answer.result.successful:
+            names = ", ".join(map(repr, values))
+            raise MiddlewareError(
+                f"cannot set {names} of {node!r} while it runs: it says {answer.result.reason!r}"
+            )
+
     async def report_parameters(
         self, node: str, names: Collection[str] | None, *, timeout_s: float = TIMEOUT_S
     ) -> tuple[ParameterReport, ...]:
@@ -468,6 +505,18 @@ class NodeClients:
             return await self.get_state(node, timeout_s=_REREAD_S) == goal
         except ServiceUnansweredError:
             return False
+
+
+_PARAMETER_TYPES = {
+    "bool": RclpyParameter.Type.BOOL,
+    "int": RclpyParameter.Type.INTEGER,
+    "double": RclpyParameter.Type.DOUBLE,
+    "string": RclpyParameter.Type.STRING,
+    "bool_array": RclpyParameter.Type.BOOL_ARRAY,
+    "int_array": RclpyParameter.Type.INTEGER_ARRAY,
+    "double_array": RclpyParameter.Type.DOUBLE_ARRAY,
+    "string_array": RclpyParameter.Type.STRING_ARRAY,
+}
 
 
 def _given_values(node: PlannedNode) -> dict[str, Any]:

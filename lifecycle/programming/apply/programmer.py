@@ -144,6 +144,10 @@ class Programmer:
         self._applied: tuple[FlowRule, ...] | None = None
         self.left_out: tuple[LeftOut, ...] = ()
 
+    def replan(self, plan: Plan) -> None:
+        """Take another plan of the same system and machines: its flows are programmed next."""
+        self._plan = plan
+
     def rules(self, flows: Iterable[FlowReport]) -> RuleSet:
         """Return what may be programmed of these flows, and what may not."""
         return flow_rules(

@@ -230,6 +230,8 @@ class ConnectionAuthority:
 
     def replan(self, plan: Plan, names: Collection[str]) -> None:
         """Forget what these nodes were instructed: they are started again, by this plan."""
+        if self._dynamic:
+            self._early = configured_before_any_connect(self._system)
         self._source.replan(plan, names)
         for name in names:
             self._wirings.pop(name, None)
@@ -303,6 +305,18 @@ class ConnectionAuthority:
         system = self._system.plan.system
         found += [not_wired(system, each) for each in self._source.problems]
         return tuple(found)
+
+    def is_at_work(self) -> bool:
+        """Whether a running node lacks something that is still to be made."""
+        if not (self._dynamic or self._repairs):
+            return False
+        for name, _, _, configuration in self._wirable():
+            wiring = self._wirings.get(name) or _Wiring()
+            given_up = wiring.rounds >= TRIES and configuration.checksum == wiring.given_up
+            wanted = self._instructions[name]
+            if not given_up and steps(wanted, wired(configuration), ours=wiring.ours):
+                return True
+        return False
 
     def _negotiate(self) -> Mapping[str, Instructions]:
         known = dict(self._others)

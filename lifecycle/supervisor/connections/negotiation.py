@@ -165,14 +165,7 @@ class NegotiatedSource:
 
     def __init__(self, plan: Plan, *, before: DataLayerGraph | None = None) -> None:
         self._take(plan)
-        self._hosts = hosts_of(plan)
         self._terms = terms_of(plan)
-        self._wishes = wishes_of(plan.flows)
-        self._rmw = {
-            key: dict(process.environment).get(_RMW, plan.rmw)
-            for process in plan.processes
-            for key in process.nodes
-        }
         self.graph = DataLayerGraph() if before is None else before
         self._judged: frozenset[tuple[str, str]] | None = None
         self._instructions: Mapping[str, Instructions] = {}
@@ -211,15 +204,21 @@ class NegotiatedSource:
         """Negotiate again for nodes that are started again, and never the TCP ports they had.
 
         Fast DDS would not find them there (see lifecycle.plan.restart).
+
+        Args:
+            plan: as it is now; of another manifest, it has other nodes and flows.
+            names: of the nodes that are started again, of new ones and of those that are gone.
         """
-        keys = {self._planned[name].key for name in names}
+        keys = {self._planned[name].key for name in names if name in self._planned}
         taken = {host: set(ports) for host, ports in self._terms.taken}
-        hosts = {each.key: self._hosts.host(each.machine) for each in plan.nodes}
+        hosts = {each.key: self._hosts.host(each.machine) for each in self._plan.nodes}
         for each in self.graph.connections:
             if each.node in keys:
                 urls = (parse(text) for text in each.urls)
                 tcp = (url for url in urls if url.transport.is_tcp)
                 taken.setdefault(hosts[each.node], set()).update(ports_of(tcp))
+        for host, ports in terms_of(plan).taken:
+            taken.setdefault(host, set()).update(ports)
         self._terms = dataclasses.replace(
             self._terms,
             taken=tuple((host, tuple(sorted(ports))) for host, ports in sorted(taken.items())),
@@ -234,6 +233,13 @@ class NegotiatedSource:
     def _take(self, plan: Plan) -> None:
         self._plan = plan
         self._planned = {each.full_name: each for each in plan.nodes}
+        self._hosts = hosts_of(plan)
+        self._wishes = wishes_of(plan.flows)
+        self._rmw = {
+            key: dict(process.environment).get(_RMW, plan.rmw)
+            for process in plan.processes
+            for key in process.nodes
+        }
 
     def _takes_part(self, name: str) -> bool:
         is_open = self._plan.policy.undeclared_nodes is EndpointPolicy.OPEN

@@ -78,6 +78,10 @@ class Programs(Removes, Protocol):
         """Work again after a `cancel`."""
         ...
 
+    def replan(self, plan: Plan) -> None:
+        """From now on program flows of this plan; what is there already stays listed."""
+        ...
+
 
 class Keeper:
     """Programs the latest flows, in a thread.
@@ -113,6 +117,10 @@ class Keeper:
         self._flows = tuple(flows)
         await self._program(within_s)
         self.take(flows)  # from now on renewed in time
+
+    def replan(self, plan: Plan) -> None:
+        """Program by this plan from the next time on."""
+        self._programmer.replan(plan)
 
     def take(self, flows: Sequence[FlowReport]) -> None:
         """Take the flows as just verified; flows that came before and were not done are skipped."""
@@ -276,6 +284,11 @@ class Networks:
                 subject=self._system,
             ) from error
         self._begun = True
+
+    def replan(self, plan: Plan) -> None:
+        """Take the plan that runs from now on; its flows are programmed once they are verified."""
+        if self._keeper is not None:
+            self._keeper.replan(plan)
 
     async def close(self, hurry: asyncio.Event | None = None) -> None:
         """Remove everything of the system from networks, bounded; failures become notices.

@@ -1,9 +1,9 @@
-"""Orders to a supervisor that holds a system (pause, resume, restart), and reload of its manifest.
+"""Orders to a supervisor that holds a system (pause, resume, restart, mode, apply); its manifest.
 
 Owns: `Order`, which orders fit which phase, and the mailbox that gives them to the session one by
 one; and `Revisions`: whether a manifest is still the one that runs, and whether the running system
 can take a new one. An order with a plan that is not the one that runs is refused unless it says to
-reload it, and so is, with the reason, what cannot be reloaded while the supervisor runs. How orders
+take it, and so is, with the reason, what cannot be changed while the supervisor runs. How orders
 are carried out is gate/sequence.py's, what differs `plan.comparison`'s. Must not import rclpy.
 """
 
@@ -14,13 +14,22 @@ import enum
 from collections.abc import Collection, Iterable, Iterator
 
 from lifecycle import dataclasses
-from lifecycle.codec import to_plain
-from lifecycle.errors import BringUpError, ExitCode, UsageError
+from lifecycle.errors import BringUpError, ExitCode, LifecycleError, UsageError
 from lifecycle.manifest import DataLayerSource, did_you_mean
 from lifecycle.network import parse
-from lifecycle.plan import Plan, PlanDifference, PlannedNode, changes, with_files_of_now
-from lifecycle.supervisor.control.protocol import ProcessState
+from lifecycle.plan import (
+    Plan,
+    PlanChange,
+    PlanDifference,
+    PlannedNode,
+    change_between,
+    changes,
+    with_files_of_now,
+    without_positions,
+)
+from lifecycle.supervisor.control.protocol import ChangedNodes, ProcessState
 from lifecycle.supervisor.nodes.system import NodeRun, System
+from lifecycle.supervisor.run.failure import StepFailedError
 from lifecycle.supervisor.run.options import UpOptions, local_processes
 
 ACTIVE = "active"
@@ -37,11 +46,15 @@ class OrderKind(enum.Enum):
     RESUME = "resume"
     RESTART = "restart"
     MODE = "mode"
+    APPLY = "apply"
 
     @property
     def said(self) -> str:
         """How messages say it, after "cannot"."""
-        return "switch the mode of" if self is OrderKind.MODE else self.value
+        return _SAID.get(self, self.value)
+
+
+_SAID = {OrderKind.MODE: "switch the mode of", OrderKind.APPLY: "apply another manifest to"}
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,6 +69,10 @@ class Order:
             For PAUSE by policy, of the nodes that are deactivated; empty for all.
         reason: for PAUSE by policy, what it is for, as `lifecycle status` shows it.
         mode: for MODE, the one to enter.
+        dry_run: for APPLY, only say what would become of the system.
+        timeout_s: for APPLY, seconds until the system must be active by `plan`, else it goes back;
+            0 is as long as a bring-up may take.
+        change: for APPLY, what `plan` is for the running system.
     """
 
     kind: OrderKind
@@ -65,10 +82,28 @@ class Order:
     mode: str = ""
     plan: Plan | None = None
     reload: bool = False
+    dry_run: bool = False
+    timeout_s: float = 0.0
+    change: PlanChange | None = None
 
 
 class NotBegunError(BringUpError):
     """An order that could not be begun: the system is as it was."""
+
+
+class RolledBackError(LifecycleError):
+    """A manifest that could not be applied: what failed, and what the system is now.
+
+    Attributes:
+        ends: what failed beside it, which ends the run unless policy restarts it; None if nothing.
+    """
+
+    def __init__(
+        self, message: str, exit_code: ExitCode, ends: StepFailedError | None = None
+    ) -> None:
+        super().__init__(message)
+        self.exit_code = exit_code
+        self.ends = ends
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,10 +112,12 @@ class Done:
 
     Attributes:
         error: why it was not carried out; empty if it was.
+        change: of APPLY, what it is about; None where it was not taken.
     """
 
     exit_code: int = ExitCode.OK
     error: str = ""
+    change: ChangedNodes | None = None
 
 
 _PHASES = {
@@ -88,12 +125,14 @@ _PHASES = {
     OrderKind.RESUME: (PAUSED, HELD),
     OrderKind.RESTART: (ACTIVE, PAUSED, HELD),
     OrderKind.MODE: (ACTIVE, PAUSED, HELD),
+    OrderKind.APPLY: (ACTIVE, PAUSED, HELD),
 }
 _HINTS = {
     OrderKind.PAUSE: "only an active system can be paused",
     OrderKind.RESUME: "only a paused system can be resumed",
     OrderKind.RESTART: "only a system that is active or paused can be restarted",
     OrderKind.MODE: "only a system that is active or paused can enter another mode",
+    OrderKind.APPLY: "only a system that is active or paused can take another manifest",
 }
 
 
@@ -109,16 +148,22 @@ def check_order(order: Order, system: System, phase: str) -> None:
             hint=_HINTS[order.kind],
         )
     server = system.server
-    if order.kind is OrderKind.RESTART and server and server.state is ProcessState.EXITED:
+    starts = order.kind in (OrderKind.RESTART, OrderKind.APPLY)
+    if starts and server and server.state is ProcessState.EXITED:
         raise UsageError(
-            f"cannot restart {order.node or system.plan.system!r}: the discovery server has died, "
-            "and without it nobody who comes again is found",
+            f"cannot {order.kind.said} {order.node or system.plan.system!r}: the discovery server "
+            "has died, and without it nobody who comes again is found",
             hint="start the system again: lifecycle down, then lifecycle up",
         )
     if order.node:
         node_of(order, system)
     if order.kind is OrderKind.MODE:
         _check_mode(order, system)
+    if order.kind is OrderKind.APPLY and (order.plan is None or not order.timeout_s >= 0):
+        raise UsageError(
+            f"cannot apply a manifest to {system.plan.system!r} without one, or within "
+            f"{order.timeout_s:g} s"
+        )
 
 
 def _check_mode(order: Order, system: System) -> None:
@@ -231,14 +276,26 @@ class Revisions:
             and bool(changes(self._system.first, order.plan))
         )
 
+    def change(self, plan: Plan) -> PlanChange:
+        """Return what `plan` is for the system that runs."""
+        system = self._system
+        return change_between(system.first, plan, modes=(system.mode, system.mode_by(plan)))
+
+    def said(self, change: PlanChange, plan: Plan) -> ChangedNodes:
+        """Return a change in the words of the control socket, with the revision in force."""
+        return said(change, self._system.first, plan, self._system.revision)
+
     def check(self, order: Order) -> None:
         """Make sure that nothing but the manifest that the order means will run.
 
         Raises:
-            UsageError: the manifest has changed since the start, or cannot be reloaded.
+            UsageError: the manifest has changed since the start, or cannot be taken.
         """
         running = self._system.first
-        if order.plan is not None:
+        if order.kind is OrderKind.APPLY:
+            assert order.plan is not None
+            self._check_apply(order.plan)
+        elif order.plan is not None:
             found = changes(running, order.plan)
             if found and order.reload:
                 self._check_reload(order, order.plan, found)
@@ -263,7 +320,7 @@ class Revisions:
         what, said = order.kind.value, order.kind.said
         listed = "\n".join(_lines(found))
         path = (order.plan or self._system.first).manifest_path
-        take = f"lifecycle restart {path} --reload"
+        take = f"lifecycle apply {path}"
         same = f"; or keep what runs: lifecycle {what} {system}" if order.plan is not None else ""
         same = f"{same} {order.mode}" if same and order.mode else same
         return UsageError(
@@ -272,34 +329,57 @@ class Revisions:
         )
 
     def _check_reload(self, order: Order, plan: Plan, found: tuple[PlanDifference, ...]) -> None:
-        system, running = self._system, self._system.first
-
-        def refuse(why: str, lines: Iterable[str] = ()) -> UsageError:
-            listed = "".join(f"\n{each}" for each in lines)
-            return UsageError(
-                f"cannot reload the manifest of {running.system!r} while it runs: {why}{listed}",
-                hint="end it and start it anew: lifecycle down, then lifecycle up",
-            )
-
-        fixed = [
-            each
-            for each in found
-            if not f"{each.path}.".startswith(_RELOADED) or each.path in _NOT_RELOADED
-        ]
-        if fixed:
-            raise refuse("a running supervisor cannot change this:", _lines(fixed))
-        if (running.observers, running.server) != (plan.observers, plan.server):
-            raise refuse("its supervisor would be connected otherwise")
-        if system.remote or len(local_processes(plan, self._options.machine)) < len(plan.processes):
-            raise refuse("nodes on other machines run by it, too:", _lines(found))
+        running = self._system.first
+        what = f"cannot reload the manifest of {running.system!r} while it runs"
+        self._check_surroundings(plan, found, what)
         if running.data_layer.source is DataLayerSource.DYNAMIC:
-            raise refuse("its data layer is negotiated by the manifest that runs")
+            raise _refused_whole(what, "its data layer is negotiated by the manifest that runs")
         if self._options.program:
-            raise refuse("networks are programmed by the manifest that runs")
-        if any(parse(url).transport.is_tcp for each in (running, plan) for url in _urls(each)):
-            raise refuse("a TCP port that was used is not connected to again by who used it")
+            raise _refused_whole(what, "networks are programmed by the manifest that runs")
+        if _has_tcp(running, plan):
+            raise _refused_whole(what, _TCP)
         if order.node:
             self._check_node(order, plan, found)
+
+    def _check_apply(self, plan: Plan) -> None:
+        """Make sure that the running system can become that of another plan."""
+        system, running = self._system, self._system.first
+        what = f"cannot apply {plan.manifest_path} to {running.system!r} while it runs"
+        if not _is_whole(plan):
+            raise UsageError(f"{what}: it is no plan; its nodes and processes do not fit together")
+        change = self.change(plan)
+        # Whoever has other ports by that has other connections, too, and is started again.
+        found = tuple(each for each in change.differences if each.path != "order of nodes")
+        self._check_surroundings(plan, found, what)
+        if change.ends_or_starts and _has_tcp(running, plan):
+            raise _refused_whole(what, _TCP)
+        for key in (*change.restarted, *change.removed):
+            if system.nodes[key].running is not None:
+                name = system.nodes[key].name
+                raise UsageError(
+                    f"{what}: {name!r} would be taken down, and was adopted",
+                    hint="who started it ends it; then lifecycle down, and lifecycle up",
+                )
+
+    def _check_surroundings(self, plan: Plan, found: tuple[PlanDifference, ...], what: str) -> None:
+        """Make sure that another plan is for the same supervisor, in the same surroundings."""
+        running = self._system.first
+        elsewhere = any(each.path.startswith("discovery.") for each in found)
+        fixed = [
+            *_lines(
+                each
+                for each in found
+                if not f"{each.path}.".startswith(_RELOADED) or each.path in _NOT_RELOADED
+            ),
+            *(() if elsewhere else _places(running, plan)),
+        ]
+        if fixed:
+            raise _refused_whole(what, "a running supervisor cannot change this:", fixed)
+        if (running.observers, running.server) != (plan.observers, plan.server):
+            raise _refused_whole(what, "its supervisor would be connected otherwise")
+        own = local_processes(plan, self._options.machine)
+        if self._system.remote or len(own) < len(plan.processes):
+            raise _refused_whole(what, "nodes on other machines run by it, too:", _lines(found))
 
     def _check_node(self, order: Order, plan: Plan, found: tuple[PlanDifference, ...]) -> None:
         """Make sure that only the nodes that restart are to change."""
@@ -327,6 +407,70 @@ class Revisions:
                 )
 
 
+def _is_whole(plan: Plan) -> bool:
+    """Whether a plan, which a client sent, names no nodes but its own, each once."""
+    nodes = {each.key: each.process for each in plan.nodes}
+    placed = [(key, each.name) for each in plan.processes for key in each.nodes]
+    named = {after.node for each in plan.nodes for after in each.after}
+    named.update(key for flow in plan.flows for key in (flow.publisher, flow.subscription))
+    named.update(key for level in plan.levels for key in level)
+    named.update(key for mode in plan.modes for key in mode.inactive)
+    return (
+        len(nodes) == len(plan.nodes) == len({each.full_name for each in plan.nodes})
+        and sorted(placed) == sorted(nodes.items())
+        and named <= nodes.keys()
+    )
+
+
+_TCP = "a TCP port that was used is not connected to again by who used it"
+
+
+def _refused_whole(what: str, why: str, lines: Iterable[str] = ()) -> UsageError:
+    listed = "".join(f"\n{each}" for each in lines)
+    return UsageError(
+        f"{what}: {why}{listed}",
+        hint="end it and start it anew: lifecycle down, then lifecycle up",
+    )
+
+
+def _places(running: Plan, plan: Plan) -> Iterator[str]:
+    """Yield how the environments differ in which two plans were made that declare the same."""
+    for what, old, new in (
+        ("ROS_DOMAIN_ID", running.domain_id, plan.domain_id),
+        (
+            "ROS_AUTOMATIC_DISCOVERY_RANGE",
+            running.discovery_range.name,
+            plan.discovery_range.name,
+        ),
+        ("RMW_IMPLEMENTATION", running.rmw, plan.rmw),
+    ):
+        if old != new:
+            yield f"{what}: was {old}, is {new}"
+
+
+def _has_tcp(*plans: Plan) -> bool:
+    return any(parse(url).transport.is_tcp for each in plans for url in _urls(each))
+
+
+def said(change: PlanChange, running: Plan, plan: Plan, revision: int) -> ChangedNodes:
+    """Return a change by the full names of nodes.
+
+    Args:
+        change: see above.
+        running: what runs, or ran.
+        plan: what it becomes.
+        revision: of the manifest in force.
+    """
+    return ChangedNodes(
+        differences=_lines(change.differences),
+        added=tuple(plan.node(key).full_name for key in change.added),
+        removed=tuple(running.node(key).full_name for key in change.removed),
+        restarted=tuple(plan.node(key).full_name for key in change.restarted),
+        parameters=tuple(plan.node(key).full_name for key in change.parameters),
+        revision=revision,
+    )
+
+
 def _lines(found: Iterable[PlanDifference]) -> tuple[str, ...]:
     """Phrase differences with their places in the new manifest, at most 20 of them."""
     every = tuple(found)
@@ -350,12 +494,4 @@ def _urls(plan: Plan) -> Iterator[str]:
 
 def _bare(node: PlannedNode) -> object:
     """Return a planned node without positions."""
-
-    def bare(value: object) -> object:
-        if isinstance(value, dict):
-            return {key: bare(each) for key, each in value.items() if key != "at"}
-        if isinstance(value, list):
-            return [bare(each) for each in value]
-        return value
-
-    return bare(to_plain(dataclasses.replace(node, files=())))
+    return without_positions(dataclasses.replace(node, files=()))

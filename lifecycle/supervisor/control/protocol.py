@@ -133,11 +133,14 @@ class SystemStatus(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         phase: "connecting", "verifying", "activating", "active", "pausing", "paused", "held" (some
             nodes wait at a gate that stayed or was closed), "restarting",
-            "switching" (to another mode) or "stopping".
+            "switching" (to another mode), "applying" (another manifest), "rolling back" (to the
+            manifest before) or "stopping".
         verdict: of the last judgement; None before the first.
         not_ok: what keeps it from being ok, in one line; empty where nothing does.
         supervisor: pid.
         mode: name of the one that it is in; empty for a system without modes.
+        manifest: path of the manifest in force, as it was given; empty where it is not known.
+        revision: number of it in this run; 1 for the one that it began with.
     """
 
     system: str
@@ -149,6 +152,8 @@ class SystemStatus(msgspec.Struct, frozen=True, kw_only=True):
     nodes: tuple[NodeStatus, ...]
     not_ok: str = ""
     mode: str = ""
+    manifest: str = ""
+    revision: int = 1
 
 
 class ControlRequest(enum.Enum):
@@ -162,6 +167,7 @@ class ControlRequest(enum.Enum):
     RESUME = "resume"
     RESTART = "restart"
     MODE = "mode"
+    APPLY = "apply"
     DIFFERENCES = "differences"
 
 
@@ -174,6 +180,9 @@ class Question(msgspec.Struct, frozen=True, kw_only=True):
             it was given none. What reads it knows its type, see server.py.
         reload: for RESTART, `plan` is to run from now on.
         mode: for MODE, the name of the one to enter.
+        dry_run: for APPLY, only say what would become of the system.
+        timeout_s: for APPLY, seconds until the system must be active by `plan`; else it goes back.
+            0 is as long as a bring-up may take.
     """
 
     ask: ControlRequest
@@ -181,6 +190,28 @@ class Question(msgspec.Struct, frozen=True, kw_only=True):
     plan: object = None
     reload: bool = False
     mode: str = ""
+    dry_run: bool = False
+    timeout_s: float = 0.0
+
+
+class ChangedNodes(msgspec.Struct, frozen=True, kw_only=True):
+    """What another manifest is for the nodes of a system; all others stay as they are.
+
+    Attributes:
+        differences: between the manifests, one line each.
+        added: full names of nodes, likewise of the others.
+        removed: are taken down, and their processes end.
+        restarted: their processes are started again.
+        parameters: are given parameters while they run, and are restarted if they refuse them.
+        revision: of the manifest that is in force in the end.
+    """
+
+    differences: tuple[str, ...] = ()
+    added: tuple[str, ...] = ()
+    removed: tuple[str, ...] = ()
+    restarted: tuple[str, ...] = ()
+    parameters: tuple[str, ...] = ()
+    revision: int = 1
 
 
 class Answer(msgspec.Struct, frozen=True, kw_only=True):
@@ -192,12 +223,14 @@ class Answer(msgspec.Struct, frozen=True, kw_only=True):
             an order, what came of it.
         error: why an order was not carried out; empty if it was.
         differences: for DIFFERENCES, how the plan of the question differs from what runs.
+        change: for APPLY, what it is about.
     """
 
     status: SystemStatus | None = None
     exit_code: int | None = None
     error: str = ""
     differences: tuple[str, ...] = ()
+    change: ChangedNodes | None = None
 
 
 A = TypeVar("A", bound=Answer)

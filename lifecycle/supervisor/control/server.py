@@ -157,9 +157,11 @@ class ControlServer:
                 plan=question.plan,
                 reload=question.reload,
                 mode=question.mode,
+                dry_run=question.dry_run,
+                timeout_s=question.timeout_s,
             )
             done = await self._order(order)
-            return Answer(exit_code=done.exit_code, error=done.error)
+            return Answer(exit_code=done.exit_code, error=done.error, change=done.change)
         if question.ask is ControlRequest.DIFFERENCES and question.plan is not None:
             return Answer(differences=self._differences(question.plan))
         return Answer(status=self._status())

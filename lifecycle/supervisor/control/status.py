@@ -126,4 +126,6 @@ def system_status(
         ),
         not_ok="" if verdict is None else not_ok(verdict),
         mode=system.mode,
+        manifest=system.first.manifest_path,
+        revision=system.revision,
     )

@@ -1,9 +1,10 @@
 """Holds a system that is up: judges it at every change, and carries out orders.
 
 Owns: `Watch`, which judges again and again, and `Holding`: for how long, what ends it, how orders
-(pause, resume, restart, mode) are received and answered, and that what fails is restarted, and what
-is violated has its consequence, when policy says so, by the same orders. What an order does is
-sequence.py's, when to restart and what to do about a violation policy/'s. Must not import rclpy.
+(pause, resume, restart, mode, apply) are received and answered, and that what fails is restarted,
+and what is violated has its consequence, when policy says so, by the same orders. What an order
+does is sequence.py's, when to restart and what to do about a violation policy/'s. Must not import
+rclpy.
 """
 
 from __future__ import annotations
@@ -27,8 +28,11 @@ from lifecycle.supervisor.control.orders import (
     OrderKind,
     Pending,
     Revisions,
+    RolledBackError,
     check_order,
+    said,
 )
+from lifecycle.supervisor.control.protocol import ChangedNodes
 from lifecycle.supervisor.gate.gate import VerificationError
 from lifecycle.supervisor.gate.sequence import GateSequence, OutrunError
 from lifecycle.supervisor.gate.verification_loop import SETTLED_S, ChangeCounter, VerificationLoop
@@ -216,6 +220,10 @@ class Holding:
             self._check(order)
         except UsageError as error:
             return Done(exit_code=error.exit_code, error=str(error))
+        if order.dry_run and order.plan is not None:
+            change = self._revisions.said(self._revisions.change(order.plan), order.plan)
+            differs = ExitCode.VIOLATED if change.differences else ExitCode.OK
+            return Done(exit_code=differs, change=change)
         return await self._mailbox.place(order)
 
     async def outrun(self) -> None:
@@ -297,19 +305,23 @@ class Holding:
 
     async def _carry_out(self, pending: Pending) -> None:
         """Carry an order out and report to its client; what ends the run is raised."""
+        change = None
         try:
             # Another order may have come first.
             self._check(pending.order)
-            if self._revisions.takes(pending.order):
-                assert pending.order.plan is not None
-                for line in self._revisions.differences(pending.order.plan):
-                    self._emit(Notice(message=f"takes the changed manifest: {line}"))
+            if pending.order.kind is OrderKind.APPLY:
+                change = await self._apply(pending.order)
             else:
-                pending.order = dataclasses.replace(pending.order, plan=None, reload=False)
-            await self._carry_out_in_spite(pending.order)
+                await self._carry_out_in_spite(self._taking(pending.order))
             await self._note_segments()
         except (UsageError, NotBegunError) as error:
             pending.finish(Done(exit_code=error.exit_code, error=str(error)))
+        except RolledBackError as error:
+            pending.finish(Done(exit_code=error.exit_code, error=str(error)))
+            self._emit(Notice(message=str(error)))
+            await self._note_segments()
+            if error.ends is not None:
+                raise error.ends from error
         except StepFailedError as error:
             pending.finish(Done(exit_code=error.exit_code, error=str(error)))
             await self._gate_sequence.put_down(error)
@@ -319,7 +331,24 @@ class Holding:
                 raise
             self._emit(Notice(message=str(error)))
         else:
-            pending.finish(Done())
+            pending.finish(Done(change=change))
+
+    def _taking(self, order: Order) -> Order:
+        """Return an order without a plan that is the one that runs; say what is taken otherwise."""
+        if not self._revisions.takes(order):
+            return dataclasses.replace(order, plan=None, reload=False)
+        assert order.plan is not None
+        for line in self._revisions.differences(order.plan):
+            self._emit(Notice(message=f"takes the changed manifest: {line}"))
+        return order
+
+    async def _apply(self, order: Order) -> ChangedNodes:
+        """Have the system run by another manifest; return what that was for its nodes."""
+        assert order.plan is not None
+        running, change = self._system.first, self._revisions.change(order.plan)
+        if change.differences:
+            await self._carry_out_in_spite(dataclasses.replace(order, change=change))
+        return said(change, running, order.plan, self._system.revision)
 
     async def _carry_out_in_spite(self, order: Order) -> None:
         """Carry an order out; a pause is not given up because something fails meanwhile."""

@@ -1,4 +1,4 @@
-"""The gate sequence up to activation, and the orders by it: pause, resume, restart, mode.
+"""The gate sequence up to activation, and the orders by it: pause, resume, restart, mode, apply.
 
 Owns: the one way from a connected to an active system: judge, permit, networks, activate, judge
 again; the steps of each order, given by a person or by policy; and `undiscovered`, which reads from
@@ -36,6 +36,7 @@ from lifecycle.supervisor.control.orders import (
     node_of,
 )
 from lifecycle.supervisor.control.protocol import ProcessState, Reach
+from lifecycle.supervisor.gate.applying import Alive, Applying, SetsParameters
 from lifecycle.supervisor.gate.gate import (
     Gate,
     Permit,
@@ -104,10 +105,6 @@ def undiscovered(
     return max(lacks, key=lambda name: (lacks[name], -tries.get(name, 0), name), default=None)
 
 
-Alive = Callable[[Coroutine[Any, Any, object]], Coroutine[Any, Any, None]]
-"""Runs a step; the unexpected end of any process ends it."""
-
-
 class OutrunError(Exception):
     """What was restarted by policy was still waiting for its gate when something else came first.
 
@@ -132,6 +129,7 @@ class GateSequence:
         outrun: returns once something is to be done before a gate that stays closed.
         spawner: must be able to start processes before any is ended to be started again.
         timeout_s: for bringing up again what an order took down.
+        sets: sets parameters of a running node.
 
     Attributes:
         phase: as people read it; see orders.py and SystemStatus.
@@ -159,6 +157,7 @@ class GateSequence:
         outrun: Callable[[], Coroutine[Any, Any, None]],
         hurry: asyncio.Event,
         timeout_s: float,
+        sets: SetsParameters,
     ) -> None:
         self._spawner = spawner
         self._system = system
@@ -180,6 +179,19 @@ class GateSequence:
         self._timeout_s = timeout_s
         self.phase = "connecting"
         self.trusted = ""
+        self._applying = Applying(
+            self,
+            system=system,
+            bring_up=bring_up,
+            schedule=schedule,
+            gate=gate,
+            judge=judge,
+            emit=emit,
+            alive=alive,
+            sets=sets,
+            spawner=spawner,
+            timeout_s=timeout_s,
+        )
 
     @property
     def stage(self) -> Stage:
@@ -196,6 +208,7 @@ class GateSequence:
                 system stays as it is and can be asked again; in any other the run is over.
             StepFailedError: a step failed, or a network could not be programmed; the run is over,
                 unless what failed is put down to be started again.
+            RolledBackError: another manifest could not be applied.
         """
         before = self.phase
         try:
@@ -232,6 +245,8 @@ class GateSequence:
             await self._through_the_gate()
         elif order.kind is OrderKind.MODE:
             await self._switch(order.mode)
+        elif order.kind is OrderKind.APPLY:
+            await self._applying.apply(order)
         elif order.keys:
             await self._restart_by_policy(order.keys)
         else:
@@ -256,7 +271,7 @@ class GateSequence:
             if order.keys:
                 self.phase = HELD
         if not order.keys:
-            self._reached(PAUSED)
+            self.reached(PAUSED)
 
     async def _switch(self, mode: str) -> None:
         """Enter a mode: deactivate in reverse order, set parameters, activate through the gate.
@@ -310,10 +325,10 @@ class GateSequence:
         self._system.touched.set()
         if phase == PAUSED:
             return
-        if any(each not in wanted for each in self._inactive()):
+        if any(each not in wanted for each in self.inactive()):
             await self._through_the_gate()
-        elif not self._inactive():
-            self._reached(ACTIVE)
+        elif not self.inactive():
+            self.reached(ACTIVE)
 
     async def _set_parameters(self, mode: str, nodes: Iterable[NodeRun]) -> None:
         """Set what a mode has of parameters; what does not run yet is started with it.
@@ -336,7 +351,7 @@ class GateSequence:
         was_paused = self.phase == PAUSED
         nodes = tuple(self._system.nodes.values())
         if order.node:
-            nodes = self._with_process_of(node_of(order, self._system))
+            nodes = self.with_process_of(node_of(order, self._system))
         try:
             await self._spawner.ready()
         except BringUpError as error:
@@ -348,13 +363,13 @@ class GateSequence:
         self.phase = "restarting"
         self._schedule.by_hand([each.planned.key for each in nodes])
         async with self._watched():
-            await self._take_down(nodes)
-            await self._begin_again(nodes, order.plan if order.reload else None)
+            await self.take_down(nodes)
+            await self.begin_again(nodes, order.plan if order.reload else None)
             # Who waits for one that is started again later follows it.
-            await self._connect_unfinished(self._timeout_s)
+            await self.connect_unfinished(self._timeout_s)
         self._emit(SystemReached(reached="connected", elapsed_s=self._emit.elapsed_s))
         if was_paused:
-            self._reached(PAUSED)
+            self.reached(PAUSED)
         else:
             await self._through_the_gate()
 
@@ -396,8 +411,8 @@ class GateSequence:
         await self._alive(self._schedule.due())
         self.phase = "restarting"
         keys = self._schedule.begin()
-        await self._begin_again(tuple(self._system.nodes[key] for key in keys))
-        await self._connect_unfinished(timeout_s)
+        await self.begin_again(tuple(self._system.nodes[key] for key in keys))
+        await self.connect_unfinished(timeout_s)
 
     async def put_down(self, failure: StepFailedError) -> None:
         """Take down what failed, and what goes down with it, to be started again later.
@@ -411,13 +426,13 @@ class GateSequence:
         if not self._schedule.covers(failure):
             raise failure
         keys = self._schedule.take(failure)
-        interrupted = interrupted_in(self._system.nodes) - keys
+        interrupted = self.interrupted() - keys
         self._schedule.again(interrupted)
         down = tuple(
             each for key, each in self._system.nodes.items() if key in keys or key in interrupted
         )
         async with self._watched():
-            await self._take_down(down)
+            await self.take_down(down)
         for node in down:
             node.renew(node.process)
             if node.process is not None:
@@ -425,8 +440,12 @@ class GateSequence:
         self._judge.ahead = self.active()
         self._system.touched.set()
         self._schedule.announce(keys)
-        if self.phase == HELD and not self._inactive():
+        if self.phase == HELD and not self.inactive():
             self.phase = ACTIVE
+
+    def interrupted(self) -> frozenset[str]:
+        """Return the keys of the nodes, with their processes, that were cut off in a step."""
+        return interrupted_in(self._system.nodes)
 
     @contextlib.asynccontextmanager
     async def _watched(self) -> AsyncIterator[None]:
@@ -453,8 +472,8 @@ class GateSequence:
         self.phase = "restarting"
         try:
             async with self._watched():
-                await self._begin_again(tuple(self._system.nodes[key] for key in keys))
-                await self._connect_unfinished(self._timeout_s)
+                await self.begin_again(tuple(self._system.nodes[key] for key in keys))
+                await self.connect_unfinished(self._timeout_s)
             self._emit(SystemReached(reached="connected", elapsed_s=self._emit.elapsed_s))
         except StepFailedError:
             self.phase = HELD if goes_on else before
@@ -482,13 +501,13 @@ class GateSequence:
         deadline = asyncio.get_running_loop().time() + self._timeout_s
         try:
             permit = await self._unless_outrun(self.verify(self._timeout_s), self._outrun())
-            waiting = tuple(each for each in self._inactive() if each.name in names)
+            waiting = tuple(each for each in self.inactive() if each.name in names)
             await self.activate(permit, deadline, waiting)
         except VerificationError as error:
             if not error.again and self.phase == "activating":
                 raise self._not_as_verified(names, error) from error
             if error.again and self.phase == "activating":
-                await self._withdraw(permit)
+                await self.withdraw(permit)
             raise
         finally:
             if self.phase != ACTIVE:
@@ -547,7 +566,7 @@ class GateSequence:
     def _keys(self, names: Collection[str]) -> tuple[str, ...]:
         return tuple(key for key, each in self._system.nodes.items() if each.name in names)
 
-    async def _connect_unfinished(self, timeout_s: float) -> None:
+    async def connect_unfinished(self, timeout_s: float) -> None:
         """Bring every node that is not down, and waits for none that is, as far as its gate."""
         down = self._schedule.down
         held = {key for key, each in self._system.nodes.items() if each.name in down}
@@ -609,7 +628,7 @@ class GateSequence:
             )
             node = self._system.node_named(name)
             assert node is not None
-            await self._again(self._with_process_of(node), left_s)
+            await self._again(self.with_process_of(node), left_s)
             self.phase = phase
 
     def _restartable(self) -> frozenset[str]:
@@ -627,7 +646,7 @@ class GateSequence:
             and each.process not in active
         )
 
-    def _with_process_of(self, node: NodeRun) -> tuple[NodeRun, ...]:
+    def with_process_of(self, node: NodeRun) -> tuple[NodeRun, ...]:
         """Return all that comes and goes with a node: a container's components with it."""
         if node.process is None:
             return (node,)
@@ -645,13 +664,14 @@ class GateSequence:
             nodes: with all of their processes.
             timeout_s: seconds, for bringing them up.
         """
-        await self._take_down(nodes)
-        nodes = await self._begin_again(nodes)
+        await self.take_down(nodes)
+        nodes = await self.begin_again(nodes)
         self.phase = "connecting"
         self._judge.ahead = self.active()
         await self._alive(self._bring_up.connect(timeout_s, nodes))
 
-    async def _take_down(self, nodes: tuple[NodeRun, ...]) -> None:
+    async def take_down(self, nodes: tuple[NodeRun, ...]) -> None:
+        """Take nodes down, in reverse order, with all of their processes."""
         self._leaves({each.process.name for each in nodes if each.process is not None})
         for node in nodes:
             container = self._system.nodes.get(node.planned.run.container)
@@ -662,17 +682,29 @@ class GateSequence:
         for node in nodes:
             self._forget(node.name)
 
-    async def _begin_again(
-        self, nodes: tuple[NodeRun, ...], plan: Plan | None = None
+    async def begin_again(
+        self,
+        nodes: tuple[NodeRun, ...],
+        plan: Plan | None = None,
+        revision: int | None = None,
     ) -> tuple[NodeRun, ...]:
-        """Make nodes that are down ready to be brought up; return those to bring up."""
+        """Make nodes that are down ready to be brought up; return those to bring up.
+
+        Args:
+            nodes: with all of their processes.
+            plan: another manifest's, to be taken now; None to keep this one.
+            revision: of that manifest, if it was in force before.
+
+        Raises:
+            StepFailedError: a process ended.
+        """
         names = {each.process.name for each in nodes if each.process is not None}
         # A participant that was killed haunts the graph; who comes back would be taken for two.
         gone = [
             each.name for each in nodes if each.process is not None or each.planned.run.component
         ]
         if plan is not None:
-            nodes = self._reload(plan, nodes)
+            nodes = self._reload(plan, nodes, revision)
         else:
             self._replan(nodes)
             self._system.renew(nodes)
@@ -680,10 +712,12 @@ class GateSequence:
         await self._alive(together(self._vanishes(name) for name in gone))
         return nodes
 
-    def _reload(self, plan: Plan, nodes: tuple[NodeRun, ...]) -> tuple[NodeRun, ...]:
+    def _reload(
+        self, plan: Plan, nodes: tuple[NodeRun, ...], revision: int | None
+    ) -> tuple[NodeRun, ...]:
         """Take another manifest's plan for nodes that are down; return those to bring up."""
         names = {each.name for each in nodes}
-        fresh = self._system.reload(plan, plan.processes, nodes)
+        fresh = self._system.reload(plan, plan.processes, nodes, revision)
         self._replanned(names | {each.name for each in fresh})
         return fresh
 
@@ -741,10 +775,10 @@ class GateSequence:
                 their requests (`again`), or what became active is not what was verified.
         """
         # What comes again sends from other ports: their rules come before its first message.
-        await self._alive(self._program_flows(permit, deadline))
+        await self._alive(self.program_flows(permit, deadline))
         self.trusted = taken_on_trust(permit.verdict)
         self.phase = "activating"
-        waiting = self._inactive() if nodes is None else nodes
+        waiting = self.inactive() if nodes is None else nodes
         self._emit(
             GateOpened(
                 outcome=permit.verdict.verdict.value,
@@ -756,16 +790,25 @@ class GateSequence:
             each.withheld = ""
         async with self._following():
             await self._alive(self._bring_up.activate(permit, behind_s(deadline), waiting))
+        await self.confirm(deadline)
+        if not self.inactive():
+            self.reached(ACTIVE)
+
+    async def confirm(self, deadline: float) -> None:
+        """Judge what a system has become that is as active as it is to be.
+
+        Raises:
+            StepFailedError: a process ended.
+            VerificationError: it is not what was verified.
+        """
         # Who waits at another gate, or was deactivated for a violation, is not to be active yet.
-        whole = not self._inactive()
+        whole = not self.inactive()
         self._judge.ahead = frozenset() if whole else self.active()
         stage = Stage.ACTIVE if whole else Stage.CONNECTED
         await self._alive(self._judge.until_clear(stage, behind_s(deadline)))
         # The same question as at the gate: what became active must be what was verified.
         assert self._judge.latest is not None
         self._gate.judge(self._judge.latest)
-        if not self._inactive():
-            self._reached(ACTIVE)
 
     async def _through_the_gate(self) -> None:
         """Judge the system as it is, and activate what is not active."""
@@ -782,7 +825,7 @@ class GateSequence:
         except VerificationError as error:
             if error.again:
                 if self.phase == "activating":
-                    await self._withdraw(permit)
+                    await self.withdraw(permit)
                 self.phase = before
             raise
 
@@ -794,13 +837,13 @@ class GateSequence:
             self.phase = "restarting"
             keys = self._schedule.begin()
             async with self._watched():
-                await self._begin_again(tuple(self._system.nodes[key] for key in keys))
-                await self._connect_unfinished(self._timeout_s)
+                await self.begin_again(tuple(self._system.nodes[key] for key in keys))
+                await self.connect_unfinished(self._timeout_s)
 
-    async def _withdraw(self, permit: Permit) -> None:
+    async def withdraw(self, permit: Permit) -> None:
         """Deactivate again what was activated since the gate opened: the rest may not follow."""
         begun = tuple(each for each in self._system.nodes.values() if each.name in permit.sent)
-        for each in self._inactive():
+        for each in self.inactive():
             if each not in begun:
                 each.undo = [one for one in each.undo if one is not Operation.ACTIVATE]
         if begun:
@@ -809,7 +852,7 @@ class GateSequence:
         await self._alive(self._bring_up.deactivate(begun))
         self._judge.ahead = self.active()
 
-    async def _program_flows(self, permit: Permit, deadline: float) -> None:
+    async def program_flows(self, permit: Permit, deadline: float) -> None:
         """Program networks with the flows of the verdict that nodes are activated on."""
         programmed = None
         while permit.verdict.flows != programmed:
@@ -818,7 +861,8 @@ class GateSequence:
             # A network may take seconds: what changed meanwhile is judged before the gate opens.
             await permit.renewed()
 
-    def _inactive(self) -> tuple[NodeRun, ...]:
+    def inactive(self) -> tuple[NodeRun, ...]:
+        """Return the nodes that wait for the gate."""
         return tuple(
             each
             for each in self._system.nodes.values()
@@ -840,7 +884,8 @@ class GateSequence:
             if each.planned.holds and each.reach is Reach.ACTIVE
         )
 
-    def _reached(self, phase: str) -> None:
+    def reached(self, phase: str) -> None:
+        """Note that the system is active, or paused."""
         self.phase = phase
         self._emit(SystemReached(reached=phase, elapsed_s=self._emit.elapsed_s))
         self._schedule.returned([key for key, each in self._system.nodes.items() if each.is_up])

@@ -247,6 +247,9 @@ class Looker(Protocol):
     def findings(self) -> tuple[Finding, ...]:
         """Return what the observation alone does not show."""
 
+    def is_at_work(self) -> bool:
+        """Whether something is missing, as of the last observation, that is still to be made."""
+
 
 class Recorder(Protocol):
     """What keeps what was seen and found, see run/journal.py."""
@@ -476,6 +479,27 @@ class VerificationLoop:
             if self._waits_for_match(verdict) or self._waits_for_others(verdict):
                 wait_s, again = min(wait_s, again), min(again * 2, ASK_AGAIN_AT_MOST_S)
             if await self._changes.beyond(count, wait_s):
+                await self.quiet()
+
+    @property
+    def is_reconciling(self) -> bool:
+        """Whether the authority has still to make what running nodes lack."""
+        return self._looker is not None and self._looker.is_at_work()
+
+    async def reconciled(self, stage: Stage, timeout_s: float) -> None:
+        """Look until the authority has made what running nodes lack, gives it up, or time is up.
+
+        What a verdict would find until then is on its way.
+        """
+        loop = asyncio.get_running_loop()
+        deadline = loop.time() + timeout_s
+        while self._looker is not None:
+            count = self._changes.count
+            await self._look(stage)
+            left_s = deadline - loop.time()
+            if not self.is_reconciling or left_s <= 0:
+                return
+            if await self._changes.beyond(count, min(left_s, ASK_AGAIN_AT_MOST_S)):
                 await self.quiet()
 
     def _waits_for_match(self, verdict: Verdict) -> bool:

@@ -179,10 +179,12 @@ class StaleNodes:
                 asyncio.get_running_loop().call_soon(self._ended, process)
 
     def _came_again(self, name: str, reach: Reach, repetition: int = 0) -> None:
-        """Introduce a process that was started again to the others, while it is so far."""
+        """Introduce a process that was started again, or added, to the others, while so far."""
         node = self._system.node_named(name)
         process = None if node is None else node.process
-        if node is None or process is None or not process.is_restarted or not process.pid:
+        if node is None or process is None or not process.pid:
+            return
+        if not (process.is_restarted or process.joins):
             return
         if self._closed or node.reach is not reach or process.is_gone:
             return
@@ -215,7 +217,9 @@ class StaleNodes:
             task.cancel()
 
     def _ended(self, process: ManagedProcess) -> None:
-        self.forget(process.pid, [self._system.nodes[key] for key in process.planned.nodes])
+        nodes = self._system.nodes
+        # Another manifest may have been taken meanwhile.
+        self.forget(process.pid, [nodes[key] for key in process.planned.nodes if key in nodes])
 
     def forget(self, pid: int, nodes: Sequence[NodeRun]) -> None:
         """Remove what a process left that is known to have ended.

@@ -10,8 +10,8 @@ import asyncio
 import contextlib
 import os
 import shlex
-from collections.abc import Awaitable, Callable, Collection, Iterable
-from typing import TYPE_CHECKING
+from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
+from typing import TYPE_CHECKING, Any
 
 from lifecycle.graph import set_within
 from lifecycle.plan import ParticipantConnections, Plan, PlannedNode
@@ -115,6 +115,21 @@ class ObserverParticipant:
             MiddlewareError: it does not answer, or refuses.
         """
         await self._graph.clients.give_parameters(node)
+
+    async def set_parameters(
+        self, node: str, values: Mapping[str, Any], types: Mapping[str, str]
+    ) -> None:
+        """Set parameters of a running node, by full name, all or none.
+
+        Args:
+            node: see above.
+            values: by name.
+            types: likewise, see plan.ExpectedParameter.
+
+        Raises:
+            MiddlewareError: it does not answer, or refuses.
+        """
+        await self._graph.clients.set_parameters(node, values, types)
 
     async def running(self, wait_s: float) -> tuple[tuple[RunningNode, ...], str]:
         """Return the nodes in the graph once discovery has settled, and what it lacked in the end.

@@ -482,7 +482,9 @@ class System:
         mode: name of the one that it is in, or is on its way to; empty for a plan without modes.
         liveliness: which nodes are silent.
         present: names of the nodes that are in the graph; None before it was first looked at.
-        first: the plan as the run began with it.
+        first: the plan as it was made from the manifest in force, without what became of it since.
+        revision: number of that manifest, 1 for the one that the run began with; one that is taken
+            later has a number of its own, also if it is given back.
         server: the discovery server, where this supervisor runs one.
         expected: the plan as it must be seen now; where the data layer is negotiated while the
             system runs, it follows.
@@ -498,6 +500,7 @@ class System:
         variables: tuple[tuple[str, str], ...] = (),
     ) -> None:
         self.first = plan
+        self.revision = self._last_revision = 1
         self.plan = plan
         self.expected = plan
         self.mode = plan.modes[0].name if plan.modes else ""
@@ -526,6 +529,10 @@ class System:
         self.present: frozenset[str] | None = None
         self.liveliness = SilenceMonitor(emit, self.touched.set, self._is_there)
 
+    def _may_end(self, planned: PlannedProcess) -> bool:
+        nodes = [self.plan.node(key) for key in planned.nodes]
+        return bool(nodes) and all(each.may_end for each in nodes)
+
     def _process(self, planned: PlannedProcess) -> ManagedProcess:
         nodes = [self.plan.node(key) for key in planned.nodes]
         return ManagedProcess(
@@ -534,7 +541,7 @@ class System:
             emit=self.emit,
             variables=self._variables,
             nodes={each.full_name: each.key for each in nodes},
-            may_end=bool(nodes) and all(each.may_end for each in nodes),
+            may_end=self._may_end(planned),
             # A host of ours deactivates its nodes itself.
             outlives=planned.run.kind is RunKind.PYTHON
             or all(each.supervision.on_supervisor_lost is _KEEP for each in nodes),
@@ -602,15 +609,25 @@ class System:
         self.mode = mode
         self.replan(in_mode(self.plan, mode))
 
+    def mode_by(self, plan: Plan) -> str:
+        """Return the mode that it would be in by another manifest: the same, if that has it."""
+        names = [each.name for each in plan.modes]
+        return self.mode if self.mode in names else next(iter(names), "")
+
     def reload(
-        self, plan: Plan, processes: Iterable[PlannedProcess], nodes: Collection[NodeRun]
+        self,
+        plan: Plan,
+        processes: Iterable[PlannedProcess],
+        nodes: Collection[NodeRun],
+        revision: int | None = None,
     ) -> tuple[NodeRun, ...]:
-        """Take another manifest's plan; only nodes that were taken down may differ in it.
+        """Take another manifest's plan; what of it reaches processes may differ for `nodes` alone.
 
         Args:
             plan: of which all nodes are this supervisor's.
             processes: of that plan.
             nodes: those that were taken down, with all of their processes.
+            revision: of one that was in force before; None for a new one.
 
         Returns:
             The nodes to bring up in their place.
@@ -621,12 +638,15 @@ class System:
             for key, node in self.nodes.items()
             if node.running is not None and names.get(key) == node.name
         }
-        self.first = plan
-        if self.mode not in {each.name for each in plan.modes}:
-            self.mode = plan.modes[0].name if plan.modes else ""
-        self.plan = self.expected = attached_to(in_mode(plan, self.mode), adopted)
+        if revision is None:
+            revision = self._last_revision = self._last_revision + 1
+        self.revision = revision
+        ran, self.first = self.first, plan
+        self.mode = self.mode_by(plan)
         down = {each.planned.key: each for each in nodes}
         stay = {key: each for key, each in self.nodes.items() if key not in down}
+        taken = _connected_as(attached_to(in_mode(plan, self.mode), adopted), stay, ran)
+        self.plan = self.expected = taken
         kept = {each.process.name: each.process for each in stay.values() if each.process}
         self.nodes, self.processes = {}, {}
         for process in processes:
@@ -636,6 +656,11 @@ class System:
             )
             if managed is None and not others:
                 managed = self._process(process)
+                managed.joins = bool(kept)
+            elif managed is not None:
+                # What it would be started with again: parameters may have been set since.
+                managed.planned = process
+                managed.may_end = self._may_end(process)
             if managed is not None:
                 self.processes[process.name] = managed
             for key in process.nodes:
@@ -771,3 +796,25 @@ class System:
         except (BringUpError, asyncio.TimeoutError):
             return
         node.learn(fresh)
+
+
+def _connected_as(plan: Plan, running: Mapping[str, NodeRun], before: Plan) -> Plan:
+    """Return a plan with the connections that running nodes have: a restart may have moved them.
+
+    Args:
+        plan: of another manifest.
+        running: nodes that stay, by key.
+        before: the plan of the manifest by which they were started.
+    """
+    planned = {each.key: each for each in before.nodes}
+
+    def connected(node: PlannedNode) -> PlannedNode:
+        was, run = planned.get(node.key), running.get(node.key)
+        if was is None or run is None:
+            return node
+        if (was.connections, was.participants) != (node.connections, node.participants):
+            return node
+        now = run.planned
+        return dataclasses.replace(node, connections=now.connections, participants=now.participants)
+
+    return dataclasses.replace(plan, nodes=tuple(map(connected, plan.nodes)))

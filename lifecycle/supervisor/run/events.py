@@ -362,6 +362,32 @@ class ModeEntered:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class ManifestApplied:
+    """A running system is to run by another manifest, does so, or goes back to the one before.
+
+    Attributes:
+        stage: "begun", "applied", "rolling_back" or "rolled_back".
+        manifest: path of the one that is, or was, to be applied.
+        revision: number of the one that is in force at this moment.
+        differences: from the manifest in force before, one line each.
+        added: names of nodes, likewise of the others; of those that stay none is there.
+        parameters: that are only given parameters.
+        reason: why the system goes back; else empty.
+    """
+
+    kind: ClassVar[str] = "apply"
+    stage: str
+    manifest: str
+    revision: int
+    differences: tuple[str, ...] = ()
+    added: tuple[str, ...] = ()
+    removed: tuple[str, ...] = ()
+    restarted: tuple[str, ...] = ()
+    parameters: tuple[str, ...] = ()
+    reason: str = ""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Notice:
     """Something a person should know that changes nothing: orphans swept, a step forced."""
 
@@ -409,6 +435,7 @@ Event = Union[  # noqa: UP007 - a run-time alias on Python 3.10
     GaveUp,
     ConsequenceTaken,
     ModeEntered,
+    ManifestApplied,
     Notice,
     Stopping,
     Stopped,

@@ -10,7 +10,15 @@ import asyncio
 import contextlib
 import os
 import signal
-from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterable, Iterator
+from collections.abc import (
+    AsyncIterator,
+    Awaitable,
+    Callable,
+    Coroutine,
+    Iterable,
+    Iterator,
+    Mapping,
+)
 from typing import Any, Protocol
 
 from lifecycle import dataclasses
@@ -129,6 +137,15 @@ class SessionParticipant(
 
     async def give(self, node: PlannedNode) -> None:
         """Set the parameters that a running node has with other values than its plan gives it."""
+
+    async def set_parameters(
+        self, node: str, values: Mapping[str, Any], types: Mapping[str, str]
+    ) -> None:
+        """Set parameters of a running node, by full name, all or none.
+
+        Raises:
+            MiddlewareError: it does not answer, or refuses.
+        """
 
     def driver(self, node: PlannedNode) -> NodeDriver:
         """Return the driver of a managed node that is not in a host of ours."""
@@ -256,6 +273,7 @@ class Session:
             spawner=fork_server,
             hurry=self._hurry,
             timeout_s=options.bring_up_s(len(system.processes)),
+            sets=observer_participant.set_parameters,
         )
         self._revisions = Revisions(system, options)
         self._holding = Holding(
@@ -624,6 +642,7 @@ class Session:
     def _replanned(self, nodes: Iterable[str]) -> None:
         if self._authority is not None:
             self._authority.replan(self._system.plan, frozenset(nodes))
+        self._networks.replan(self._system.plan)
         self._peer_supervisors.renew()
         self._agreement.announce(self._system.first)
 

@@ -417,7 +417,7 @@ def test_a_changed_manifest_is_neither_restarted_nor_resumed_in_silence(
             f"{manifest}:{line_of(manifest, '  talker:')}:3: nodes.talker.log_level: "
             'was not set, is "warn"\n'
         )
-        take = f"take the new one: lifecycle restart {manifest} --reload"
+        take = f"take the new one: lifecycle apply {manifest}"
         for words in (("restart",), ("restart", "listener")):
             refused = verb(words[0], str(manifest), *words[1:], runtime=tmp_path)
             assert refused.returncode == ExitCode.USAGE

@@ -42,6 +42,7 @@ from lifecycle.supervisor.run.events import (
     Failure,
     GateOpened,
     GaveUp,
+    ManifestApplied,
     ModeEntered,
     NodeChanged,
     NodeJoined,
@@ -179,6 +180,7 @@ class FakeParticipant:
         while_looking: done once, when the next look has seen everything and is not over yet.
         ros: what ROS programs see of the supervisor; None before it is made.
         refuses: value of a parameter that no node takes, `rate=5`.
+        refuses_live: why nodes do not take parameters while they run.
     """
 
     def __init__(self, hosts: FakeForkServer) -> None:
@@ -194,6 +196,7 @@ class FakeParticipant:
         self.while_looking: Callable[[], None] | None = None
         self.ros: FakeRosInterface | None = None
         self.refuses = ""
+        self.refuses_live: dict[str, str] = {}
         self._hosts = hosts
         self._reports: dict[str, NodeConfiguration] = {}
         self._changed = asyncio.Event()
@@ -259,6 +262,15 @@ class FakeParticipant:
         self._hosts.log.append(f"{node.full_name} given {given}")
         if self.refuses in given.split():
             raise MiddlewareError(f"cannot set {self.refuses!r}")
+
+    async def set_parameters(
+        self, node: str, values: Mapping[str, Any], types: Mapping[str, str]
+    ) -> None:
+        assert values.keys() == types.keys()
+        self._hosts.log.append(f"{node} set {values}")
+        await asyncio.sleep(self._hosts.takes_s.get(f"{node} set", 0.0))
+        if node in self.refuses_live:
+            raise MiddlewareError(self.refuses_live[node])
 
     def driver(self, node: PlannedNode) -> NodeDriver:
         return ServiceDriver(self.services, node)
@@ -393,6 +405,9 @@ class FakeNetworks(Networks):
         self.fails = ""
         self._log = log
 
+    def replan(self, plan: Plan) -> None:
+        """What it programs is of no account."""
+
     async def begin(self, verdict: Verdict, timeout_s: float | None = None) -> None:
         del timeout_s
         self._log.append(f"networks programmed ({verdict.verdict.value})")
@@ -487,6 +502,15 @@ def _line(event: Event, now_s: float) -> str:
         return f"[gave_up] {event.process} ({len(event.history)} failures)"
     if isinstance(event, ModeEntered):
         return f"[mode] {event.mode} without {' '.join(event.inactive)}".removesuffix(" without ")
+    if isinstance(event, ManifestApplied):
+        what = {
+            "added": event.added,
+            "removed": event.removed,
+            "restarted": event.restarted,
+            "parameters of": event.parameters,
+        }
+        said = "".join(f", {word} {' '.join(names)}" for word, names in what.items() if names)
+        return f"[apply] {event.stage} revision {event.revision}{said}"
     if isinstance(event, ConsequenceTaken):
         return f"[consequence] {event.action} {' '.join(event.nodes)} for {event.rule}"
     return f"[{event.kind}]"
@@ -609,15 +633,29 @@ class SessionWorld:
         self, ask: ControlRequest, node: str = "", *, reload: Plan | None = None, mode: str = ""
     ) -> str:
         """Order something through the control socket; return the answer, `0` or `4 cannot …`."""
+        question = Question(ask=ask, node=node, plan=reload, reload=reload is not None, mode=mode)
+        answer = await self._asked(question)
+        return f"{answer.exit_code} {answer.error}".rstrip()
+
+    async def apply(self, plan: Plan, *, dry_run: bool = False, timeout_s: float = 0.0) -> Answer:
+        """Have the system run by another manifest, which declares these nodes."""
+        for node in plan.nodes:
+            if node.managed and node.run.kind is not RunKind.ATTACH:
+                report = interface_of(node.full_name)
+                self.hosts.interfaces.setdefault(node.full_name, report)
+        return await self._asked(
+            Question(ask=ControlRequest.APPLY, plan=plan, dry_run=dry_run, timeout_s=timeout_s)
+        )
+
+    async def _asked(self, question: Question) -> Answer:
         assert self._directory is not None
         with short_path(self._directory.socket_path) as path:
             reader, writer = await asyncio.open_unix_connection(path)
-        question = Question(ask=ask, node=node, plan=reload, reload=reload is not None, mode=mode)
         writer.write(to_json(question) + b"\n")
         answer = from_json(await reader.readline(), Answer)
         writer.close()
         await writer.wait_closed()
-        return f"{answer.exit_code} {answer.error}".rstrip()
+        return answer
 
     def intrude(self) -> None:
         """Let a node appear that nobody declared."""

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from lifecycle.errors import ExitCode
+from lifecycle.plan import Plan
 from lifecycle.programming.apply.target import (
     ChangeKind,
     FlowChange,
@@ -41,6 +42,7 @@ class FakePrograms:
     def __init__(self) -> None:
         self.seen: list[tuple[str, ...]] = []
         self.fail = 0
+        self.plans: list[Plan] = []
         self.asked = asyncio.Event()
         self._loop = asyncio.get_running_loop()
 
@@ -76,6 +78,9 @@ class FakePrograms:
     def resume(self) -> None:
         pass
 
+    def replan(self, plan: Plan) -> None:
+        self.plans.append(plan)
+
 
 def verdict(*topics: str) -> Verdict:
     flows = tuple(report(each) for each in topics)
@@ -110,6 +115,8 @@ def test_flows_are_programmed_at_the_gate_followed_afterwards_and_removed_in_the
         told.emit(heard("/before"))
         await networks.begin(verdict("/gate"))
         assert programs.seen == [("/gate",)]
+        networks.replan(plan())
+        assert programs.plans == [plan()]
         programs.asked.clear()
         told.emit(heard("/later"))
         await asyncio.wait_for(programs.asked.wait(), _BOUND_S)

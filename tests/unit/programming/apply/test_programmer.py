@@ -71,6 +71,22 @@ def test_flows_are_programmed_once_and_again_only_when_they_change(tmp_path: Pat
     assert target.applied == 2
 
 
+def test_another_plan_gives_the_same_flows_another_treatment(tmp_path: Path) -> None:
+    target = FakeTarget()
+    programs = programmer(tmp_path, target)
+    programs.update([report()], hold=True)
+    before = plan()
+    camera = before.node("camera")
+    video = dataclasses.replace(camera.endpoints[0], five_qi=82)
+    camera = dataclasses.replace(camera, endpoints=(video, *camera.endpoints[1:]))
+
+    programs.replan(dataclasses.replace(before, nodes=(camera, *before.nodes[1:])))
+    (changed,) = programs.update([report()], hold=True)
+
+    assert [each.kind for each in changed.changes] == [ChangeKind.UPDATE]
+    assert [each.five_qi for each in target.rules] == [82]
+
+
 def test_a_flow_that_is_not_verified_is_not_programmed_and_the_reason_is_kept(
     tmp_path: Path,
 ) -> None:

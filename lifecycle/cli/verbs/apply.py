@@ -1,0 +1,218 @@
+"""`lifecycle apply`: another manifest for a running system, through the gate, or back.
+
+Owns: the verb, `ApplyReport` and how it is said, and which running system a manifest is for.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import click
+
+from lifecycle import dataclasses
+from lifecycle.cli.common import (
+    assignments_argument,
+    completing,
+    format_option,
+    load_manifest,
+    machine_option,
+    timeout_option,
+)
+from lifecycle.codec import Count, says, to_json
+from lifecycle.errors import BringUpError, ExitCode, UsageError
+from lifecycle.printable import json_text, lines
+
+if TYPE_CHECKING:
+    from lifecycle.plan import Plan
+    from lifecycle.supervisor import Answer, ChangedNodes
+
+_SHOWN_S = 10.0
+"""For a supervisor to say what would change: it only compares two plans."""
+
+_SPARE_S = 30.0
+"""For nodes to be taken down, beside the time that becoming active and going back may take."""
+
+
+_OUTCOMES = ("applied", "unchanged", "would_apply", "refused", "rolled_back")
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class ApplyReport:
+    """What became of a manifest that was applied (schemas/apply.v1.schema.json).
+
+    Attributes:
+        outcome: "applied"; "unchanged": it is what runs; "would_apply" of a dry run; "refused":
+            nothing was touched; "rolled_back": it could not be applied, `error` says why, and what
+            the system is since.
+        exit_code: of the command.
+        manifest: path of the one that was to be applied.
+        revision: number of the manifest in force, 1 for the one that the run began with; 0 where it
+            is not known.
+        differences: from what runs, or ran, one line each.
+        added: full names of nodes, likewise of the others; what is in none stays as it is.
+        removed: are taken down, and their processes end.
+        restarted: their processes are started again.
+        parameters: are given parameters while they run; who refuses them is started again.
+        error: why it was not applied; else empty.
+    """
+
+    outcome: Annotated[str, says(enum=[*_OUTCOMES])]
+    exit_code: Count
+    system: str
+    manifest: str
+    revision: Count
+    differences: tuple[str, ...] = ()
+    added: tuple[str, ...] = ()
+    removed: tuple[str, ...] = ()
+    restarted: tuple[str, ...] = ()
+    parameters: tuple[str, ...] = ()
+    error: str = ""
+
+
+@click.command("apply")
+@click.argument("manifest", metavar="MANIFEST", shell_complete=completing("manifests"))
+@assignments_argument
+@machine_option("As it was given to `lifecycle up`.")
+@click.option("--dry-run", is_flag=True, help="Say what would change; exits with 4 if anything.")
+@timeout_option(
+    60.0, "Until the system must be active by it; else it goes back to the manifest before."
+)
+@format_option("text", "json")
+def command(
+    *,
+    manifest: str,
+    assignments: tuple[str, ...],
+    machine: str,
+    dry_run: bool,
+    timeout: float,
+    format_: str,
+) -> int:
+    """Have a running system run by MANIFEST, and touch nothing that is the same in it.
+
+    Nodes are added, removed, restarted where what differs reaches their process, and given
+    parameters while they run; where only rules differ nothing is but judged again. What is new is
+    activated only if the gate opens on the whole of the new manifest; all else stays active
+    meanwhile. If anything fails the system goes back to the manifest before, and this exits with
+    4 or 5 for a verdict, with 6 for a step. Exits with 2 where a running supervisor cannot take
+    it, and with 0 once the system is active and verified by it.
+    """
+    from lifecycle.plan import build_plan
+
+    plan = build_plan(load_manifest(manifest, assignments, machine=machine).manifest)
+    path = _run_of(plan, machine)
+    said = _asked(path, plan, dry_run=True, timeout_s=0.0, wait_s=_SHOWN_S)
+    as_text = format_ == "text"
+    if said.error or said.change is None:
+        return _end(_report("refused", path, plan, said), as_text=as_text)
+    if not said.change.differences:
+        return _end(_report("unchanged", path, plan, said), as_text=as_text)
+    if as_text:
+        click.echo(lines("\n".join(_change(said.change))))
+    if dry_run:
+        return _end(_report("would_apply", path, plan, said), as_text=as_text)
+    wait_s = 2 * timeout + _SPARE_S
+    done = _asked(path, plan, dry_run=False, timeout_s=timeout, wait_s=wait_s)
+    outcome = "applied"
+    if done.error:
+        outcome = "refused" if done.exit_code == ExitCode.USAGE else "rolled_back"
+    report = _report(outcome, path, plan, done, said.change)
+    return _end(report, as_text=as_text)
+
+
+def _run_of(plan: Plan, machine: str) -> Path:
+    """Return the directory of the run that a manifest is for.
+
+    Raises:
+        UsageError: nothing of this name runs in its domain.
+    """
+    from lifecycle.run_directory import find_run, run_name, running, runtime_root
+
+    root = runtime_root(os.environ)
+    name = run_name(plan, machine)
+    try:
+        return find_run(root, name)
+    except UsageError:
+        others = [each for each in running(root) if _is_by(root / each, plan)]
+        if len(others) != 1:
+            raise
+    raise UsageError(
+        f"cannot apply {plan.manifest_path} to {others[0]!r}: a running system keeps its name, its "
+        f"domain and its machine, and this is a manifest of {name!r}",
+        hint=f"end it and start it anew: lifecycle down {others[0]}, then lifecycle up",
+    )
+
+
+def _is_by(path: Path, plan: Plan) -> bool:
+    """Whether a run is of a system of the same name, or began with the same file."""
+    if path.name.rpartition("@")[0] == plan.system:
+        return True
+    from lifecycle.supervisor import status
+
+    try:
+        manifest = status(path).manifest
+    except (UsageError, TimeoutError, OSError):
+        return False
+    return bool(manifest) and Path(manifest).absolute() == Path(plan.manifest_path).absolute()
+
+
+def _asked(path: Path, plan: Plan, *, dry_run: bool, timeout_s: float, wait_s: float) -> Answer:
+    from lifecycle.supervisor import ControlRequest, Question, order
+
+    question = Question(ask=ControlRequest.APPLY, plan=plan, dry_run=dry_run, timeout_s=timeout_s)
+    try:
+        return order(path, question, wait_s)
+    except TimeoutError as error:
+        raise BringUpError(
+            f"cannot apply {plan.manifest_path} to {path.name!r} within {wait_s:g} s; it is still "
+            "at it",
+            hint=f"see what it does: lifecycle status {path.name}",
+        ) from error
+
+
+def _report(
+    outcome: str, path: Path, plan: Plan, answer: Answer, change: ChangedNodes | None = None
+) -> ApplyReport:
+    from lifecycle.supervisor import ChangedNodes
+
+    shown = answer.change or change or ChangedNodes(revision=0)
+    return ApplyReport(
+        outcome=outcome,
+        exit_code=answer.exit_code or ExitCode.OK,
+        system=path.name,
+        manifest=plan.manifest_path,
+        revision=shown.revision,
+        differences=shown.differences,
+        added=shown.added,
+        removed=shown.removed,
+        restarted=shown.restarted,
+        parameters=shown.parameters,
+        error=answer.error,
+    )
+
+
+def _end(report: ApplyReport, *, as_text: bool) -> int:
+    if not as_text:
+        click.echo(json_text(to_json(report).decode()))
+    elif report.error:
+        click.echo(lines(report.error), err=True)
+    elif report.outcome == "unchanged":
+        click.echo(f"{report.manifest} is what {report.system} runs, revision {report.revision}")
+    elif report.outcome == "applied":
+        click.echo(
+            f"{report.system} runs by {report.manifest}, verified, revision {report.revision}"
+        )
+    return report.exit_code
+
+
+def _change(change: ChangedNodes) -> list[str]:
+    """Return how the manifests differ, and what becomes of which node."""
+    what = {
+        "added": change.added,
+        "removed": change.removed,
+        "restarted": change.restarted,
+        "given parameters": change.parameters,
+    }
+    done = [f"{word}: {', '.join(names)}" for word, names in what.items() if names]
+    return [*change.differences, *(done or ["no node is touched: rules are judged by again"])]
