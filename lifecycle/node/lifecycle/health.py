@@ -35,7 +35,7 @@ class HealthCheck:
             node without one.
         turns: has it asked in the node's executor.
         how: interval and deadline.
-        changed: called whenever `report` is another one.
+        changed: called whenever `report` is another one, or the first in another state.
         failed: logs a traceback.
 
     Attributes:
@@ -59,6 +59,7 @@ class HealthCheck:
         self._timer: Timer | None = None
         self._asked_s: float | None = None
         self._round = 0
+        self._is_stale = False
         self.report: HealthReport | None = None
 
     def follow(self, state: NodeState) -> None:
@@ -71,6 +72,7 @@ class HealthCheck:
         if self._timer is None:
             self._timer = self._turns.timer(self._how.interval_s, self._ask)
         self._asked_s = None  # what it says of the state before counts no more
+        self._is_stale = True
         self._round += 1
         self._ask()
 
@@ -98,6 +100,8 @@ class HealthCheck:
             self._take(_report(answer))
             return
         self._asked_s = time.monotonic()
+        if self._is_stale:
+            self._take(HealthReport(ok=None, message="it has not answered since its state changed"))
         round_ = self._round
 
         async def wait() -> None:
@@ -121,7 +125,8 @@ class HealthCheck:
         return HealthReport(ok=False, message=said)
 
     def _take(self, report: HealthReport) -> None:
-        if report != self.report:
+        is_stale, self._is_stale = self._is_stale, False
+        if is_stale or report != self.report:
             self.report = report
             self._changed()
 

@@ -139,7 +139,7 @@ class AwaitedHealth:
         while True:
             count = self._changes.count
             observation = await self._observer.observe(plan)
-            own = {each.name: each.health for each in observation.configurations}
+            own = {each.name: _own_health(each) for each in observation.configurations}
             published = {each.full_name: each.health for each in observation.nodes}
             for each in awaited:
                 each.health = own.get(each.name), published.get(each.name)
@@ -220,7 +220,7 @@ def _conditions(planned: PlannedNode, observation: Observation) -> Iterable[Cond
         return ()
     report = next((each for each in observation.configurations if each.name == name), None)
     up_to_active = (Condition.STARTED, Condition.CONFIGURED, Condition.CONNECTED, Condition.ACTIVE)
-    said = health_of(planned, None if report is None else report.health, observed.health)
+    said = health_of(planned, _own_health(report), observed.health)
     healthy = (Condition.HEALTHY,) if said.ok else ()
     if not planned.managed:
         return (*up_to_active, *healthy)
@@ -236,6 +236,16 @@ def _conditions(planned: PlannedNode, observation: Observation) -> Iterable[Cond
 
 
 _ORDER = list(Reach)
+
+
+_NOT_ANSWERED = HealthReport(ok=None, message="it has not answered since its state changed")
+
+
+def _own_health(report: NodeConfiguration | None) -> HealthReport | None:
+    """Return what a node says of itself; what it said while it was inactive is no answer."""
+    return None if report is None or report.state == INACTIVE else report.health
+
+
 _CONDITIONS = {
     Condition.STARTED: Reach.STARTED,
     Condition.CONFIGURED: Reach.CONFIGURED,
@@ -388,8 +398,11 @@ class NodeRun:
 
     @property
     def is_healthy(self) -> bool:
-        """Whether it is known to be as healthy as its manifest asks."""
-        return self._known_health.ok is True
+        """Whether it is known to be as healthy as its manifest asks, active as it is."""
+        own, published = self.health
+        if self.configuration is not None:
+            own = _own_health(self.configuration)
+        return health_of(self.planned, own, published).ok is True
 
     @property
     def ails(self) -> str:
@@ -445,9 +458,13 @@ class NodeRun:
 
     def _take(self, state: str, *, connected: bool) -> None:
         self.state, self.connected = state, connected
-        if self.configuration is not None:
+        known = self.configuration
+        if known is not None:
+            # What it said of itself in another state is no answer; its host reports the new one.
+            stale = known.health is not None and known.state != state
+            health = _NOT_ANSWERED if stale else known.health
             self.configuration = dataclasses.replace(
-                self.configuration, state=state, connected=connected
+                known, state=state, connected=connected, health=health
             )
 
     def _tell(self) -> None:

@@ -69,7 +69,8 @@ def test_it_is_asked_while_connected_at_each_change_of_state_and_at_intervals(
     for _ in range(5):
         bench.tick()
     no_scan = HealthReport(ok=False, message="no scan")
-    assert bench.changes == [OK, no_scan, OK, HealthReport(ok=False, message="it is not"), OK]
+    wrong = HealthReport(ok=False, message="it is not")
+    assert bench.changes == [OK, OK, no_scan, OK, wrong, OK]  # said anew in another state
     bench.check.follow(NodeState.INACTIVE_DISCONNECTED)
     assert (bench.check.report, bench.ticks, answers) == (None, [], [])
 
@@ -94,21 +95,25 @@ def test_an_async_one_is_not_known_once_it_is_late_until_it_returns(
     bench = Bench(monkeypatch, check)
     bench.check.follow(NodeState.INACTIVE_CONNECTED)
     bench.tick()
-    assert bench.changes == []
+    asked = HealthReport(ok=None, message="it has not answered since its state changed")
+    assert bench.changes == [asked]
     bench.tick()
     late = HealthReport(ok=None, message="it has not answered within 3 s")
-    assert bench.changes == [late]
+    assert bench.changes == [asked, late]
     (task,) = bench.tasks  # it is not asked again while it is
     asyncio.run(task())
-    assert bench.changes == [late, HealthReport(ok=False, message="too hot")]
-    # What it says of a state that is over counts no more.
+    hot = HealthReport(ok=False, message="too hot")
+    assert bench.changes == [asked, late, hot]
+    # What it says of a state that is over counts no more, nor what it had said of it.
     bench.tasks.clear()
     bench.tick()
     bench.check.follow(NodeState.ACTIVE)
+    assert bench.check.report == asked
     old, new = bench.tasks
     asyncio.run(old())
-    assert len(bench.changes) == 2
+    assert bench.changes == [asked, late, hot, asked]
     asyncio.run(new())
+    assert bench.check.report == hot
 
 
 def test_a_node_without_one_is_asked_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
