@@ -34,7 +34,7 @@ VERBS: dict[str, str] = {
     "verify": "judge a running system, started by anyone; for CI",
     "flows": "show every network flow and how unique it is",
     "graph": "picture of what runs, beside what was declared",
-    "export": "write a manifest as files of another system: access control of sros2",
+    "export": "write a manifest for other systems: systemd, containers' engines, sros2",
     "import": "write a manifest from a ROS 2 launch file, gaps marked; starts nothing",
     "capture": "write a manifest from a running system, gaps marked",
     "logs": "show what the processes of the latest run have written, or follow it",
