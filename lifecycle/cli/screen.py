@@ -142,6 +142,8 @@ class Screen:
 
     def _read(self) -> None:
         """Scroll by what is pressed and draw after signals, in a thread, until it is closed."""
+        # A signal that this thread took would not wake the main one, which alone runs handlers.
+        signal.pthread_sigmask(signal.SIG_BLOCK, (*self._handlers, signal.SIGINT))
         woken = self._wake[0]
         watched, pressed = [woken, *([sys.stdin.fileno()] if self._keys else [])], b""
         while True:
