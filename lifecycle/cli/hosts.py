@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import functools
 import json
 import os
 import signal
@@ -20,8 +19,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import click
 
 from lifecycle.cli.common import load_manifest
-from lifecycle.cli.standard_streams import Writer
-from lifecycle.cli.up_output import PlainLines, Sink, verdict_line
+from lifecycle.cli.up_output import PlainLines, Sink, stdout_writer, verdict_line
 from lifecycle.codec import from_json
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.fleet import (
@@ -232,14 +230,7 @@ class HostsOutput(Protocol):
 @contextlib.contextmanager
 def _output(format_: str, system: str, hosts: tuple[str, ...]) -> Iterator[HostsOutput]:
     """Give the output for a format, and for text what suits the terminal."""
-    writer = Writer(
-        sys.stdout.fileno(),
-        "standard output",
-        marker=_json_notice if format_ == "json" else lambda text: f"{text}\n",
-        say=functools.partial(click.echo, err=True),
-        encoding=sys.stdout.encoding,
-    )
-    try:
+    with stdout_writer(_json_notice if format_ == "json" else None) as writer:
         if format_ == "json":
             yield JsonHosts(writer)
         elif sys.stdout.isatty():
@@ -249,8 +240,6 @@ def _output(format_: str, system: str, hosts: tuple[str, ...]) -> Iterator[Hosts
                 yield live
         else:
             yield PlainHosts(writer)
-    finally:
-        writer.close()
 
 
 def _json_notice(message: str) -> str:

@@ -387,13 +387,13 @@ class _Walk:
         )
         self._settings(node, described.parameters, described.remappings)
         if described.extra_arguments:
-            told: dict[str, Tree] = {}
+            extra: dict[str, Tree] = {}
             for each in self._evaluated(described.extra_arguments):
                 if isinstance(each, Mapping):
-                    told.update(each)
+                    extra.update(each)
                 else:
                     node.gaps.append("extra_arguments: those of a file are missing")
-            node.run["extra_arguments"] = told
+            node.run["extra_arguments"] = extra
         self.found.nodes.append(node)
 
     # -- values

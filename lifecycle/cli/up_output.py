@@ -87,25 +87,36 @@ def output(format_: str, timings_until: str = "") -> Iterator[RunOutput]:
     A run neither waits for who reads it nor ends with him: what happens is in the control socket,
     the log files, the exit code and the report, too.
     """
+    with contextlib.ExitStack() as stack:
+        writer = stack.enter_context(stdout_writer(_json_notice if format_ == "json" else None))
+        shown: RunOutput
+        if format_ == "json":
+            shown = JsonLines(writer)
+        elif sys.stdout.isatty():
+            from lifecycle.cli.live_view import Live  # rich, which nothing else needs
+
+            shown = stack.enter_context(Live(writer=writer))
+        else:
+            shown = PlainLines(writer)
+        yield Timings(shown, until=timings_until) if timings_until else shown
+
+
+@contextlib.contextmanager
+def stdout_writer(notice: Callable[[str], str] | None) -> Iterator[Writer]:
+    """Give what writes to standard output without holding a run up.
+
+    Args:
+        notice: a line of the output that says what of it is missing; None for plain text.
+    """
     writer = Writer(
         sys.stdout.fileno(),
         "standard output",
-        marker=_json_notice if format_ == "json" else lambda text: f"{text}\n",
+        marker=notice or (lambda text: f"{text}\n"),
         say=functools.partial(click.echo, err=True),
         encoding=sys.stdout.encoding,
     )
     try:
-        with contextlib.ExitStack() as stack:
-            shown: RunOutput
-            if format_ == "json":
-                shown = JsonLines(writer)
-            elif sys.stdout.isatty():
-                from lifecycle.cli.live_view import Live  # rich, which nothing else needs
-
-                shown = stack.enter_context(Live(writer=writer))
-            else:
-                shown = PlainLines(writer)
-            yield Timings(shown, until=timings_until) if timings_until else shown
+        yield writer
     finally:
         writer.close()
 

@@ -230,7 +230,7 @@ class _Host:
         self.was_killed = False
         self.exit_code: int | None = None
         self.reached = ""
-        self.heard_s = 0.0
+        self.last_received_s = 0.0
         self.cut_s = 0.0
         self.starts = 0
         self.asked_s: float | None = None
@@ -595,7 +595,7 @@ class Coordinator:
                 "install the same version on all hosts",
             )
             return "another version"
-        host.channel, host.heard_s = channel, self._now_s
+        host.channel, host.last_received_s = channel, self._now_s
         host.pings.clear()
         if not host.is_ready:
             host.is_ready = True
@@ -613,8 +613,8 @@ class Coordinator:
                 if host.is_over:
                     return "over"
                 now_s = self._now_s
-                if now_s - host.heard_s > CUT_S:
-                    return f"nothing came for {now_s - host.heard_s:.1f} s"
+                if now_s - host.last_received_s > CUT_S:
+                    return f"nothing came for {now_s - host.last_received_s:.1f} s"
                 if host.asked_s is not None and now_s - host.asked_s > ANSWER_S:
                     return f"no answer within {ANSWER_S:g} s"
         finally:
@@ -626,7 +626,7 @@ class Coordinator:
     async def _read(self, host: _Host, channel: Channel) -> None:
         while not host.is_over:
             data = await channel.receive()
-            host.heard_s = self._now_s
+            host.last_received_s = self._now_s
             if data.startswith(AGENT_MARK):
                 try:
                     said = from_json(data, Said, longest=LONGEST_LINE)

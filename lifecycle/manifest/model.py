@@ -213,7 +213,7 @@ class Run:
         environment: extra variables, (name, value).
         component: `package/Plugin` that `container` loads; the node's kind is ATTACH then.
         container: full name of the container's node.
-        extra_arguments: (name, value) that the container is told of the component besides.
+        extra_arguments: (name, value) of the request that loads the component (LoadNode.srv).
         ros_args: of a COMMAND.
         prefix: words before the command line of the process.
         output: where goes what the process prints.

@@ -132,7 +132,7 @@ class AwaitedHealth:
             for after in node.planned.after
             if after.condition is Condition.HEALTHY
         }
-        awaited = [each for key, each in nodes.items() if key in keys and not each.tells_health]
+        awaited = [each for key, each in nodes.items() if key in keys and not each.reports_health]
         if not awaited:
             return
         plan = dataclasses.replace(self._system.plan, nodes=tuple(each.planned for each in awaited))
@@ -383,7 +383,7 @@ class NodeRun:
         return own_run_delay_s() if self.process is None else self.process.run_delay_s()
 
     @property
-    def tells_health(self) -> bool:
+    def reports_health(self) -> bool:
         """Whether its host reports all that the manifest asks of its health."""
         asked = self.planned.health
         ours = self.process is not None and self.process.channel is not None
@@ -398,14 +398,11 @@ class NodeRun:
 
     @property
     def is_healthy(self) -> bool:
-        """Whether it is known to be as healthy as its manifest asks, active as it is."""
-        own, published = self.health
-        if self.configuration is not None:
-            own = _own_health(self.configuration)
-        return health_of(self.planned, own, published).ok is True
+        """Whether it is known to be as healthy as its manifest asks, in its present state."""
+        return self._known_health.ok is True
 
     @property
-    def ails(self) -> str:
+    def unhealthy_reason(self) -> str:
         """What is wrong with it, for messages; empty if nothing, or it is not active."""
         said = self._known_health.message
         return f": {said}" if said and self.reach is Reach.ACTIVE else ""
@@ -768,7 +765,7 @@ class System:
             while not other.has_reached(condition):
                 node.doing = f"waits to {step} until {other.name} is {condition.value}"
                 if condition is Condition.HEALTHY and isinstance(other, NodeRun):
-                    node.doing += other.ails
+                    node.doing += other.unhealthy_reason
                 await other.changed.wait()
         node.doing = ""
 

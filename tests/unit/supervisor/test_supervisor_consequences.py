@@ -26,10 +26,14 @@ from lifecycle.manifest.schema import MANIFEST, read_schema
 from lifecycle.node import Event as HostEvent
 from lifecycle.plan import PlannedFlow, in_mode
 from lifecycle.plan.model import Plan
+from lifecycle.supervisor.control.protocol import Reach
 from lifecycle.supervisor.control.server import ControlRequest
+from lifecycle.supervisor.nodes.driver import NodeCondition
+from lifecycle.supervisor.nodes.system import NodeRun
 from lifecycle.supervisor.policy.consequences import reaction_of
+from lifecycle.supervisor.run.events import Emitter
 from lifecycle.verify import RULES, Finding, HealthReport, Outcome
-from tests.builders import HERE, plan_of, planned_node
+from tests.builders import HERE, configuration, plan_of, planned_node
 from tests.unit.supervisor.fakes import run
 from tests.unit.supervisor.session_world import DOWN, SessionWorld, over
 
@@ -319,6 +323,21 @@ def test_a_violation_enters_a_mode_once_and_one_that_its_gate_refuses_is_left_ag
         ]
 
     run(main())
+
+
+def test_what_a_node_said_of_its_health_while_it_was_inactive_lets_nobody_through() -> None:
+    camera = dataclasses.replace(planned_node("camera"), health=Health(check=True))
+    node = NodeRun(camera, Emitter())
+    well = configuration("/camera", health=HealthReport(ok=True))
+    node.advance(
+        Reach.CONNECTED, NodeCondition(state="inactive", connected=True, configuration=well)
+    )
+    node.advance(Reach.ACTIVE, NodeCondition(state="active", connected=True))
+    assert node.has_reached(Condition.ACTIVE)
+    assert not node.has_reached(Condition.HEALTHY)
+    assert node.unhealthy_reason == ": it has not answered since its state changed"
+    node.learn(dataclasses.replace(well, state="active"))
+    assert node.has_reached(Condition.HEALTHY)
 
 
 def test_a_node_waits_until_another_is_healthy_and_one_that_no_longer_is_has_a_consequence(
