@@ -383,15 +383,12 @@ def _take_lock(descriptor: int) -> None:
         BlockingIOError: a supervisor has it.
     """
     deadline = time.monotonic() + _LOOK_S
-    while True:
-        try:
+    while time.monotonic() < deadline:
+        with contextlib.suppress(BlockingIOError):
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            if time.monotonic() >= deadline:
-                raise
-            time.sleep(_LOOK_S / 10)
-        else:
             return
+        time.sleep(_LOOK_S / 10)
+    raise BlockingIOError(errno.EWOULDBLOCK, os.strerror(errno.EWOULDBLOCK))
 
 
 _LOOK_S = 0.1
