@@ -62,6 +62,7 @@ from .rcl.matched_peers import matched_with as matched_with
 from .rcl.qos import UnknownInterfaceError as UnknownInterfaceError
 from .rcl.qos import from_rclpy as from_rclpy
 from .rcl.qos import import_interface as import_interface
+from .rcl.qos import load_type_support as load_type_support
 from .rcl.qos import to_rclpy as to_rclpy
 from .rcl.rclpy_nodes import RCLError as RCLError
 from .rcl.rclpy_nodes import RclpyStateMachine as RclpyStateMachine

@@ -169,15 +169,7 @@ def _load(name: str) -> None:
     if "/" not in name:
         importlib.import_module(name)
         return
-    from rclpy.type_support import check_is_valid_msg_type, check_is_valid_srv_type
-
-    from lifecycle.middleware import import_interface
-
-    found = import_interface(name)
-    if "/msg/" in name:
-        check_is_valid_msg_type(found)
-    elif "/srv/" in name:
-        check_is_valid_srv_type(found)
+    middleware.load_type_support(name)
 
 
 def needed_by(nodes: Iterable[PlannedNode]) -> tuple[str, ...]:
