@@ -69,6 +69,7 @@ from .rcl.rclpy_nodes import follow_nodes as follow_nodes
 from .rcl.rclpy_nodes import interface_of as interface_of
 from .rcl.rclpy_nodes import is_rclpy_managed as is_rclpy_managed
 from .rcl.rmw_choice import check_rmw as check_rmw
+from .rcl.timers import NodeTimers as NodeTimers
 from .services.actions import GoalClient as GoalClient
 from .services.actions import GoalServer as GoalServer
 from .services.clients import NodeClients as NodeClients
