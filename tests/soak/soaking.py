@@ -27,7 +27,10 @@ from lifecycle.middleware import leftovers, segments_of
 from tests.ros.supervisor.running import ROOT, command, environment, left_of
 from tests.soak.model import (
     DIES,
+    EXTRA,
     HANGS,
+    NODES,
+    PROCESSES,
     UNMANAGED,
     Condition,
     Expectation,
@@ -65,6 +68,9 @@ FLOWS_S = 5.0
 APPLY_S = 15.0
 """`lifecycle apply --timeout`."""
 
+REPORTING = (*(each for each in NODES if each not in ("pool", "part")), EXTRA)
+"""Nodes whose own reports of their states are compared with what was requested."""
+
 _SIGNALS = {"term": signal.SIGTERM, "interrupt": signal.SIGINT}
 _BRIEFLY_S = 0.4
 
@@ -91,7 +97,7 @@ class Soaking:
         self.clock = None if LACKS else WallClock(directory)
         self.manifest = manifest(directory, domain_id, self.mark, Manifest())
         self.in_force = self.manifest
-        self.transitions = Transitions(domain_id)
+        self.transitions = Transitions(domain_id, (f"/{each}" for each in REPORTING))
         self.domain_id = domain_id
         self.stalls = Stalls()
         self.state = State()
@@ -118,6 +124,9 @@ class Soaking:
             variables = {} if self.clock is None else self.clock.variables
             self.run = Watched(self.manifest, runtime=self.runtime, variables=variables)
             self._until_as_it_was(self.run, UP_S)
+            # What is compared with the requests later must not be empty.
+            if not self.transitions.activated(self._began, time.monotonic()):
+                raise NotAsPromisedError("no node published that it became active")
         return self.run
 
     def end(self, how: str) -> None:
@@ -226,7 +235,10 @@ class Soaking:
             self._reports(run, done, expected, since, times, delayed_s)
         if done.manifest is not None and self._end_of_apply(run, expected) == "applied":
             after = dataclasses.replace(after, manifest=done.manifest)
-        if expected.exit_codes:
+        if expected.may_go_on and self._goes_on(run):
+            most = max(each.burst or 0 for each in PROCESSES)
+            after = dataclasses.replace(self.state, starts=most)
+        elif expected.exit_codes:
             self.run = None
             # While the run ended the intruder may have used a port of the supervisor's.
             self._ended(run, expected.exit_codes, alone=done.condition is not Condition.INTRUDER)
@@ -545,6 +557,15 @@ class Soaking:
             time.sleep(0.05)
         raise NotAsPromisedError(f"not as it was within {within_s:g} s: {why}")
 
+    def _goes_on(self, run: Watched) -> bool:
+        """Whether the system comes to be as it was, and does not end."""
+        deadline = time.monotonic() + BACK_S
+        while run.process.poll() is None and time.monotonic() < deadline:
+            if not self._what_lacks(run):
+                return True
+            time.sleep(0.05)
+        return False
+
     def _what_lacks(self, run: Watched) -> str:
         status = run.status()
         if status is None:
@@ -600,7 +621,7 @@ class Soaking:
 
     def _judge(self, run: Watched) -> None:
         assert_gate_held(tuple(run.events))
-        names = [f"/{each}" for each in self.state.nodes if each not in ("pool", "part")]
+        names = [f"/{each}" for each in REPORTING]
         until = time.monotonic()
         assert_activated_on_request(run, self.transitions, self._began, until, names)
 
