@@ -12,8 +12,10 @@
 #include <stdint.h>
 #include <stdlib.h>
 #include <sys/mman.h>
+#include <poll.h>
 #include <sys/syscall.h>
 #include <sys/time.h>
+#include <sys/timerfd.h>
 #include <time.h>
 #include <unistd.h>
 
@@ -24,9 +26,19 @@
 static const volatile int64_t zero, *ahead = &zero;
 static int (*clock_of)(clockid_t, struct timespec *);
 static int (*condition_of)(pthread_cond_t *, pthread_mutex_t *, clockid_t, const struct timespec *);
+static int (*signal_of)(pthread_cond_t *);
+static int (*broadcast_of)(pthread_cond_t *);
 static int (*semaphore_of)(sem_t *, clockid_t, const struct timespec *);
 static int (*mutex_of)(pthread_mutex_t *, clockid_t, const struct timespec *);
+static int (*timer_of)(int, int, const struct itimerspec *, struct itimerspec *);
+static ssize_t (*read_of)(int, void *, size_t);
 static int (*sleep_of)(clockid_t, int, const struct timespec *, struct timespec *);
+
+/* x86_64 has an older one, too, for other conditions. */
+static void *newest(const char *name) {
+  void *found = dlvsym(RTLD_NEXT, name, "GLIBC_2.3.2");
+  return found ? found : dlsym(RTLD_NEXT, name);
+}
 
 __attribute__((constructor)) static void begin(void) {
   const char *path = getenv("WALL_CLOCK");
@@ -36,9 +48,13 @@ __attribute__((constructor)) static void begin(void) {
     if (found != MAP_FAILED) ahead = found;
     close(file);
   }
+  signal_of = newest("pthread_cond_signal");
+  broadcast_of = newest("pthread_cond_broadcast");
   condition_of = dlsym(RTLD_NEXT, "pthread_cond_clockwait");
   semaphore_of = dlsym(RTLD_NEXT, "sem_clockwait");
   mutex_of = dlsym(RTLD_NEXT, "pthread_mutex_clocklock");
+  timer_of = dlsym(RTLD_NEXT, "timerfd_settime");
+  read_of = dlsym(RTLD_NEXT, "read");
   sleep_of = dlsym(RTLD_NEXT, "clock_nanosleep");
   clock_of = dlsym(RTLD_NEXT, "clock_gettime");
 }
@@ -90,13 +106,36 @@ int timespec_get(struct timespec *now, int base) {
   return base == TIME_UTC && !clock_gettime(CLOCK_REALTIME, now) ? base : 0;
 }
 
+/* Who waits in slices misses a signal between two of them, and looks here whether there was one. */
+static unsigned *signals_of(const pthread_cond_t *condition) {
+  static unsigned signals[4096];
+  return &signals[((uintptr_t)condition >> 3) % 4096];
+}
+
+static unsigned signalled(const pthread_cond_t *condition) {
+  return __atomic_load_n(signals_of(condition), __ATOMIC_SEQ_CST);
+}
+
+int pthread_cond_signal(pthread_cond_t *condition) {
+  __atomic_add_fetch(signals_of(condition), 1, __ATOMIC_SEQ_CST);
+  return signal_of(condition);
+}
+
+int pthread_cond_broadcast(pthread_cond_t *condition) {
+  __atomic_add_fetch(signals_of(condition), 1, __ATOMIC_SEQ_CST);
+  return broadcast_of(condition);
+}
+
 int pthread_cond_clockwait(pthread_cond_t *condition, pthread_mutex_t *mutex, clockid_t clock,
                            const struct timespec *at) {
-  int due;
+  int due, result;
   if (clock != CLOCK_REALTIME) return condition_of(condition, mutex, clock, at);
-  struct timespec end = until(at, &due);
-  int result = condition_of(condition, mutex, CLOCK_MONOTONIC, &end);
-  return result == ETIMEDOUT && !due ? 0 : result; /* woken without a reason, as may always be */
+  unsigned before = signalled(condition);
+  do {
+    struct timespec end = until(at, &due);
+    result = condition_of(condition, mutex, CLOCK_MONOTONIC, &end);
+  } while (result == ETIMEDOUT && !due && signalled(condition) == before);
+  return result == ETIMEDOUT && !due ? 0 : result;
 }
 
 int pthread_cond_timedwait(pthread_cond_t *restrict condition, pthread_mutex_t *restrict mutex,
@@ -141,4 +180,32 @@ int clock_nanosleep(clockid_t clock, int flags, const struct timespec *at, struc
     result = sleep_of(CLOCK_MONOTONIC, TIMER_ABSTIME, &end, NULL);
   } while (!result && !due);
   return result;
+}
+
+/* Who reads a timer that is cancelled when the clock is set: EXPECTS of it what the clock is ahead. */
+static struct { int timer; int64_t expects; } watches[64];
+
+static int watch_of(int timer) {
+  for (int each = 0; each < 64; each++)
+    if (watches[each].timer == timer + 1) return each;
+  return -1;
+}
+
+int timerfd_settime(int timer, int flags, const struct itimerspec *when, struct itimerspec *old) {
+  int found = watch_of(timer), cancels = flags & TFD_TIMER_CANCEL_ON_SET;
+  if (found < 0 && cancels) found = watch_of(-1);
+  if (found >= 0) watches[found].timer = cancels ? timer + 1 : 0, watches[found].expects = *ahead;
+  return timer_of(timer, flags, when, old);
+}
+
+ssize_t read(int file, void *data, size_t length) {
+  int found = watch_of(file);
+  struct pollfd readable = {.fd = file, .events = POLLIN};
+  while (found >= 0 && watches[found].timer == file + 1 && poll(&readable, 1, SLICE / 1000000) == 0)
+    if (watches[found].expects != *ahead) {
+      watches[found].expects = *ahead;
+      errno = ECANCELED;
+      return -1;
+    }
+  return read_of ? read_of(file, data, length) : syscall(SYS_read, file, data, length);
 }

@@ -8,13 +8,33 @@ import signal
 from pathlib import Path
 
 import pytest
+import yaml
 
 from lifecycle.errors import ExitCode
 from tests.ros.supervisor.running import pair, up, verb
 from tests.wall_clock import LACKS, WallClock
 
+pytestmark = pytest.mark.skipif(bool(LACKS), reason=LACKS)
 
-@pytest.mark.skipif(bool(LACKS), reason=LACKS)
+
+def test_a_node_that_nothing_else_wakes_goes_on_when_the_clock_is_set_back(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    clock = WallClock(tmp_path)
+    manifest = pair(tmp_path, fresh_domain)
+    document = yaml.safe_load(manifest.read_text())
+    ticking = {"run": {"python": "tests.ros.supervisor.systems:Ticking"}, "interface": {}}
+    document |= {"nodes": {"ticking": ticking}, "links": []}
+    manifest.write_text(yaml.safe_dump(document))
+    with up(manifest, runtime=tmp_path, variables=clock.variables) as run:
+        run.until("system", reached="active")
+        for number, ahead_s in enumerate((-3600.0, -7200.0, -10_800.0), start=1):
+            run.until("log", line=f"tick {2 * number}")
+            clock.set(ahead_s)
+        run.until("log", line="tick 9")
+
+
+@pytest.mark.thorough
 def test_timers_restarts_and_the_journal_go_on_when_the_clock_is_set(
     tmp_path: Path, fresh_domain: int
 ) -> None:
