@@ -85,7 +85,6 @@ def _soak(options: argparse.Namespace, rounds: list, *, private: bool) -> int:
             if done is None and soaking.run is None:
                 break
             print(done or "down", flush=True)
-            since = time.strftime("%Y-%m-%dT%H:%M:%S")
             started_s = time.monotonic()
             try:
                 if done is None:
@@ -98,7 +97,7 @@ def _soak(options: argparse.Namespace, rounds: list, *, private: bool) -> int:
                 traceback.print_exc(limit=-2, file=sys.stdout)
                 kept = Path(tempfile.mkdtemp(prefix=f"soak-failed-{options.seed}-")) / "kept"
                 shutil.copytree(directory, kept, ignore=_sockets)
-                _history(soaking, since, kept / "history.txt")
+                _history(soaking, kept / "history.txt")
                 upto = done.number if done else options.rounds
                 again = f"python -m tests.soak --seed {options.seed} --rounds {upto}"
                 print(f"  history of it: {kept}/history.txt; again: {again}", flush=True)
@@ -132,11 +131,11 @@ def _sockets(directory: str, names: list[str]) -> list[str]:
     ]
 
 
-def _history(soaking, since: str, file: Path) -> None:
+def _history(soaking, file: Path) -> None:
     from tests.ros.supervisor.running import command, environment
 
     done = subprocess.run(
-        [*command("history"), "--since", since],
+        command("history"),
         env=environment(soaking.runtime, ""),
         capture_output=True,
         text=True,
