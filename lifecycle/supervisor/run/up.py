@@ -37,6 +37,7 @@ from lifecycle.run_directory import (
 from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.connections.networks import open_networks, token_variables
 from lifecycle.supervisor.control.protocol import SystemStatus
+from lifecycle.supervisor.control.ros_interface import check_installed
 from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.forerunner import Forerunner
@@ -177,6 +178,7 @@ def _up(
         with ending.raised() if options.program else contextlib.nullcontext():
             networks = open_networks(plan, options, directory, emit, environment=os.environ)
         check_log_root(os.environ)
+        check_installed(plan.policy)
         _enter_graph(plan, options, directory)
 
         async def run(leaving: contextlib.AsyncExitStack) -> UpResult:
