@@ -213,7 +213,7 @@ class Expectation:
 
     Attributes:
         exit_codes: the run ends with one of these; empty: it goes on.
-        may_go_on: it may go on all the same; then a limit of starts is reached, and no more.
+        goes_on: what is left where it goes on all the same; None: it ends for sure.
         failed: processes of which a failure is reported.
         may_fail: processes of which one may be, or that they are silent.
         silent: processes whose nodes are reported as silent.
@@ -226,7 +226,7 @@ class Expectation:
     """
 
     exit_codes: frozenset[int] = frozenset()
-    may_go_on: bool = False
+    goes_on: State | None = None
     failed: frozenset[str] = frozenset()
     may_fail: frozenset[str] = frozenset()
     silent: frozenset[str] = frozenset()
@@ -246,8 +246,17 @@ def follows(state: State, done: Round) -> tuple[Expectation, State]:
     again: set[str] = set()
     silent: set[str] = set()
     codes: set[int] = set()
+    may_end: set[int] = set()
     starts = state.starts
-    may_go_on = False
+    # Who goes down with another may be down before it fails itself.
+    covered = {
+        each.target
+        for each in done.faults
+        for other in done.faults
+        if other.target != each.target
+        and other.kind in DIES | HANGS
+        and set(process(each.target).nodes) <= set(process(other.target).takes_down)
+    }
     for fault in done.faults:
         own = process(fault.target)
         if fault.kind in HANGS or fault.kind is Kind.STOP_BRIEFLY:
@@ -256,7 +265,7 @@ def follows(state: State, done: Round) -> tuple[Expectation, State]:
             continue
         failed.add(own.name)
         if own.restart == "no" or (own.restart == "on-failure" and fault.kind is Kind.EXIT_0):
-            codes.add(ENDED_6)
+            (may_end if own.name in covered else codes).add(ENDED_6)
             continue
         again |= set(state.nodes if own.takes_down is _ALL else own.takes_down)
         for limited in (each for each in PROCESSES if each.burst is not None):
@@ -269,22 +278,12 @@ def follows(state: State, done: Round) -> tuple[Expectation, State]:
             assert starts is not None
             assert limited.burst is not None
             fails = 1 + (fault.kind is Kind.STUMBLE)
-            if starts + fails > limited.burst:
-                codes.add(ENDED_7)
             # Another's failure may cut off the start that was to fail; it begins anew then.
-            others = [each for each in done.faults if each is not fault]
-            cut_off = any(each.kind in DIES | HANGS for each in others)
-            may_go_on = starts < limited.burst and cut_off
+            others = (each.kind for each in done.faults if each is not fault)
+            cut_off = starts < limited.burst and not (DIES | HANGS).isdisjoint(others)
+            if starts + fails > limited.burst:
+                (may_end if cut_off else codes).add(ENDED_7)
             starts += fails
-    # Who goes down with another may be down before it fails itself.
-    covered = {
-        each.target
-        for each in done.faults
-        for other in done.faults
-        if other.target != each.target
-        and other.kind in DIES | HANGS
-        and set(process(each.target).nodes) <= set(process(other.target).takes_down)
-    }
     found = [each for each in done.faults if each.kind in VIOLATES]
     violated = {
         (
@@ -309,8 +308,8 @@ def follows(state: State, done: Round) -> tuple[Expectation, State]:
         if "fragile" in may:
             starts = None
     expected = Expectation(
-        exit_codes=frozenset(codes),
-        may_go_on=may_go_on and codes == {ENDED_7},
+        exit_codes=frozenset(codes | may_end),
+        goes_on=State(starts=starts, manifest=state.manifest) if may_end and not codes else None,
         failed=frozenset(failed) - covered,
         may_fail=frozenset(covered),
         silent=frozenset(silent) - covered,
@@ -321,7 +320,7 @@ def follows(state: State, done: Round) -> tuple[Expectation, State]:
         consequence=consequence,
         outcomes=outcomes,
     )
-    if codes:
+    if expected.exit_codes:
         return expected, State()
     # What is in force where more than one outcome is allowed the system itself says.
     taken = done.manifest is not None and outcomes == {"applied"}

@@ -27,10 +27,8 @@ from lifecycle.middleware import leftovers, segments_of
 from tests.ros.supervisor.running import ROOT, command, environment, left_of
 from tests.soak.model import (
     DIES,
-    EXTRA,
     HANGS,
     NODES,
-    PROCESSES,
     UNMANAGED,
     Condition,
     Expectation,
@@ -55,8 +53,8 @@ from tests.stalls import Stalls
 from tests.wall_clock import LACKS, WallClock
 
 REPORTED_S = 1.0
-"""From a fault to the event that names its subject; the time that the machine's scheduler took from
-us meanwhile is not counted (tests.stalls)."""
+"""From a fault to the event that names its subject; the time that the scheduler took from us or from
+the supervisor meanwhile is not counted (tests.stalls)."""
 HANG_TAKEN_S = 0.1
 """A node looks for orders each 0.05 s: so much later it hangs."""
 BACK_S = 40.0
@@ -68,7 +66,7 @@ FLOWS_S = 5.0
 APPLY_S = 15.0
 """`lifecycle apply --timeout`."""
 
-REPORTING = (*(each for each in NODES if each not in ("pool", "part")), EXTRA)
+REPORTING = tuple(each for each in NODES if each not in ("pool", "part"))
 """Nodes whose own reports of their states are compared with what was requested."""
 
 _SIGNALS = {"term": signal.SIGTERM, "interrupt": signal.SIGINT}
@@ -107,6 +105,8 @@ class Soaking:
         self.reported_s: list[float] = []
         self.stalled = 0
         self._began = 0.0
+        self._reporters: tuple[int, ...] = ()
+        self._late_s = 0.0
         self._spare = leftovers()
 
     # A run
@@ -124,9 +124,12 @@ class Soaking:
             variables = {} if self.clock is None else self.clock.variables
             self.run = Watched(self.manifest, runtime=self.runtime, variables=variables)
             self._until_as_it_was(self.run, UP_S)
-            # What is compared with the requests later must not be empty.
-            if not self.transitions.activated(self._began, time.monotonic()):
-                raise NotAsPromisedError("no node published that it became active")
+            # What is compared with the requests must not be empty because nothing is received.
+            deadline = time.monotonic() + DOWN_S
+            while missing := self.transitions.not_received():
+                if time.monotonic() > deadline:
+                    raise NotAsPromisedError(f"transition events are not received of: {missing}")
+                time.sleep(0.02)
         return self.run
 
     def end(self, how: str) -> None:
@@ -219,6 +222,8 @@ class Soaking:
         expected, after = follows(self.state, done)
         with self._condition(run, done) as told:
             delayed_s = {each: _run_delay_s(before[_node_of(each)]) for each in done.faults}
+            self._reporters = _reporters(run.process.pid)
+            self._late_s = sum(map(_run_delay_s, self._reporters))
             times = self._inject(done, before)
             if done.condition is Condition.SUPERVISOR_KILLED:
                 self._supervisor_killed(run, done)
@@ -235,16 +240,16 @@ class Soaking:
             self._reports(run, done, expected, since, times, delayed_s)
         if done.manifest is not None and self._end_of_apply(run, expected) == "applied":
             after = dataclasses.replace(after, manifest=done.manifest)
-        if expected.may_go_on and self._goes_on(run):
-            most = max(each.burst or 0 for each in PROCESSES)
-            after = dataclasses.replace(self.state, starts=most)
+        if expected.goes_on is not None and self._goes_on(run, expected):
+            after = expected.goes_on
         elif expected.exit_codes:
             self.run = None
             # While the run ended the intruder may have used a port of the supervisor's.
             self._ended(run, expected.exit_codes, alone=done.condition is not Condition.INTRUDER)
             return
-        for words in expected.heal:
-            self._insist(run, words)
+        else:
+            for words in expected.heal:
+                self._insist(run, words)
         self.state = after
         self._until_as_it_was(run, BACK_S)
         self.back_s.append(time.monotonic() - healed)
@@ -289,8 +294,8 @@ class Soaking:
     ) -> None:
         """Assert that each fault is reported with its subject, in time."""
         # Who is stopped briefly must go on before its watchdog ends it.
-        briefly_first = sorted(times.items(), key=lambda each: each[0].kind is not Kind.STOP_BRIEFLY)
-        for fault, at in briefly_first:
+        briefly = {each for each in times if each.kind is Kind.STOP_BRIEFLY}
+        for fault, at in sorted(times.items(), key=lambda each: each[0] not in briefly):
             own = process(fault.target)
             if own.name in expected.may_fail:
                 continue
@@ -312,7 +317,9 @@ class Soaking:
             what = f"report of {fault}"
             _, seen = run.wait(is_it, since=since, within_s=15.0, what=what)
             bound_s = REPORTED_S + (HANG_TAKEN_S if fault.kind in _ORDERS else 0.0)
-            took_s = self.stalls.taken(at, seen)
+            # Who reports may have got no processor, and not we.
+            late_s = sum(map(_run_delay_s, self._reporters)) - self._late_s
+            took_s = min(self.stalls.taken(at, seen), seen - at - late_s)
             if fault.kind in HANGS:
                 # A callback that gets no processor does not hang: docs/liveliness.md.
                 took_s -= max(0.0, _run_delay_s(self.pids[own.nodes[0]]) - delayed_s[fault])
@@ -559,8 +566,11 @@ class Soaking:
             time.sleep(0.05)
         raise NotAsPromisedError(f"not as it was within {within_s:g} s: {why}")
 
-    def _goes_on(self, run: Watched) -> bool:
+    def _goes_on(self, run: Watched, expected: Expectation) -> bool:
         """Whether the system comes to be as it was, and does not end."""
+        for words in expected.heal:
+            with contextlib.suppress(NotAsPromisedError):  # it ended
+                self._insist(run, words)
         deadline = time.monotonic() + BACK_S
         while run.process.poll() is None and time.monotonic() < deadline:
             if not self._what_lacks(run):
@@ -684,6 +694,13 @@ def _run_delay_s(pid: int) -> float:
         return int(Path(f"/proc/{pid}/schedstat").read_text().split()[1]) / 1e9
     except OSError:
         return 0.0
+
+
+def _reporters(supervisor: int) -> tuple[int, ...]:
+    """Return the pids of a supervisor and of its fork server, which sees its nodes die first."""
+    family = psutil.Process(supervisor).children()
+    servers = (each.pid for each in family if any("fork_server" in word for word in each.cmdline()))
+    return (supervisor, *servers)
 
 
 def _runs(pid: int) -> bool:

@@ -70,14 +70,21 @@ def test_a_start_counts_that_another_s_failure_made_necessary() -> None:
 def test_a_start_that_is_to_fail_may_be_cut_off_by_another_s_failure() -> None:
     stumble = Fault(Kind.STUMBLE, "fragile", "construct sleep")
     pool = Fault(Kind.KILL, "pool")
-    assert not _after(stumble)[0].may_go_on
-    assert not _after(stumble, Fault(Kind.STOP_BRIEFLY, "pool"))[0].may_go_on
-    expected, _ = _after(stumble, pool)
-    assert (expected.exit_codes, expected.may_go_on) == ({7}, True)
+    assert _after(stumble)[0].goes_on is None
+    assert _after(stumble, Fault(Kind.STOP_BRIEFLY, "pool"))[0].goes_on is None
+    expected, state = _after(stumble, pool)
+    assert (expected.exit_codes, expected.goes_on, state) == ({7}, State(starts=3), State())
     # Killed once more it is given up, whatever would come of its next start.
-    assert not _after(stumble, pool, state=State(starts=2))[0].may_go_on
+    assert _after(stumble, pool, state=State(starts=2))[0].goes_on is None
     ends, _ = _after(stumble, Fault(Kind.KILL, "lone"))
-    assert not ends.may_go_on
+    assert (ends.exit_codes, ends.goes_on) == ({6, 7}, None)
+
+
+def test_who_goes_down_with_another_may_be_down_before_it_would_end_the_run() -> None:
+    exits = Fault(Kind.EXIT_0, "base")
+    expected, _ = _after(Fault(Kind.KILL, "core"), exits)
+    assert (expected.exit_codes, expected.goes_on) == ({6}, State(starts=2))
+    assert _after(Fault(Kind.KILL, "camera"), exits)[0].goes_on is None
 
 
 def test_a_hang_is_reported_as_silent_and_then_as_a_failure() -> None:
