@@ -53,8 +53,8 @@ from tests.stalls import Stalls
 from tests.wall_clock import LACKS, WallClock
 
 REPORTED_S = 1.0
-"""From a fault to the event that names its subject; the time that the scheduler took from us or from
-the supervisor meanwhile is not counted (tests.stalls)."""
+"""From a fault to the event that names its subject; the time that the scheduler took from us or
+from the supervisor meanwhile is not counted (tests.stalls)."""
 HANG_TAKEN_S = 0.1
 """A node looks for orders each 0.05 s: so much later it hangs."""
 BACK_S = 40.0
