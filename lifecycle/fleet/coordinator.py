@@ -234,7 +234,7 @@ class _Host:
         self.cut_s = 0.0
         self.starts = 0
         self.asked_s: float | None = None
-        self.pings: dict[int, float] = {}
+        self.pings: dict[int, tuple[float, float]] = {}
         self.readings: collections.deque[RoundTrip] = collections.deque(maxlen=READINGS)
         self.clock: ClockOffset | None = None
         self._said_code: int | None = None
@@ -735,21 +735,24 @@ class Coordinator:
 
     def _ping(self, host: _Host) -> None:
         self._numbers += 1
-        host.pings[self._numbers] = self._clock()
+        host.pings[self._numbers] = (self._clock(), self._now_s)
         self._send(host, Order(do=Do.PING, number=self._numbers))
 
     def _pong(self, host: _Host, said: Said) -> None:
-        sent_s = host.pings.pop(said.number, None)
-        if sent_s is None:
+        sent = host.pings.pop(said.number, None)
+        if sent is None:
             return
-        host.readings.append(
-            RoundTrip(
-                sent_s=sent_s,
-                there_s=said.received_s,
-                answered_s=said.sent_s,
-                back_s=self._clock(),
-            )
+        sent_s, asked_s = sent
+        back_s = self._clock()
+        if abs((back_s - sent_s) - (self._now_s - asked_s)) > NOTABLE_S:
+            host.readings.clear()  # our own clock was set: they tell how far it was off before
+            return
+        reading = RoundTrip(
+            sent_s=sent_s, there_s=said.received_s, answered_s=said.sent_s, back_s=back_s
         )
+        if reading.delay_s < -NOTABLE_S:
+            return  # theirs was set while they answered
+        host.readings.append(reading)
         if len(host.readings) < READINGS:
             return
         found, known = clock_offset(host.readings), host.clock

@@ -12,7 +12,7 @@ import json
 import os
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -41,11 +41,11 @@ class NotAsPromisedError(AssertionError):
 class Watched(Up):
     """A `lifecycle up` whose events can be waited for together with their times."""
 
-    def __init__(self, manifest: Path, *, runtime: Path) -> None:
+    def __init__(self, manifest: Path, *, runtime: Path, variables: Mapping[str, str]) -> None:
         self.times: list[float] = []
         self._came = threading.Condition()
-        variables = {"PYTHONPATH": str(COMPOSITION)}
-        super().__init__(manifest, runtime=runtime, variables=variables)
+        more = {"PYTHONPATH": str(COMPOSITION), **variables}
+        super().__init__(manifest, runtime=runtime, variables=more)
 
     def _read(self) -> None:
         assert self.process.stdout is not None

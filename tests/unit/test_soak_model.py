@@ -10,6 +10,7 @@ from tests.soak.model import (
     Expectation,
     Fault,
     Kind,
+    Manifest,
     Round,
     State,
     follows,
@@ -144,3 +145,34 @@ def test_a_seed_stands_for_the_same_rounds_whatever_their_number_and_tries_every
         state = State() if each.ends else state
         codes |= expected.exit_codes
     assert codes == {4, 6, 7}
+
+
+def _applied(manifest: Manifest, *faults: Fault, before: Manifest | None = None) -> Expectation:
+    done = Round(number=1, condition=Condition.APPLY, faults=faults, manifest=manifest)
+    return follows(State(manifest=before or Manifest()), done)[0]
+
+
+def test_a_manifest_that_is_applied_restarts_only_what_differs() -> None:
+    given = _applied(Manifest(tint=1))
+    assert (given.outcomes, given.may_again) == ({"applied"}, set())
+    restarted = _applied(Manifest(issue=1))
+    assert (restarted.outcomes, restarted.may_again) == ({"applied"}, {"filter", "detector"})
+    assert _applied(Manifest(tint=1), before=Manifest(tint=1)).outcomes == {"unchanged"}
+
+
+def test_a_manifest_is_rolled_back_where_a_node_of_it_fails_and_maybe_where_another_does() -> None:
+    assert _applied(Manifest(bad="configure raise")).outcomes == {"rolled_back"}
+    met = _applied(Manifest(extra=True), Fault(Kind.KILL, "base"))
+    assert (met.outcomes, met.again) == ({"applied", "rolled_back"}, {"base", "arm"})
+
+
+def test_a_node_that_was_added_goes_down_with_all_and_is_in_force_until_the_run_ends() -> None:
+    state = State(manifest=Manifest(extra=True))
+    everybody, after = _after(Fault(Kind.KILL, "core"), state=state)
+    assert everybody.again == {*NODES, "extra"}
+    assert after.manifest == Manifest(extra=True)
+    assert _after(Fault(Kind.KILL, "lone"), state=state)[1] == State()
+
+
+def test_setting_the_clock_alone_changes_nothing() -> None:
+    assert _after(condition=Condition.CLOCK)[0] == Expectation()

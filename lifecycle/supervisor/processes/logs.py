@@ -105,13 +105,20 @@ def _named(system: str) -> re.Pattern[str]:
 
 
 def runs_of(root: Path, system: str = "") -> list[Path]:
-    """Return the log directories of runs of a system, or of all, the newest first."""
+    """Return the log directories of runs of a system, or of all, the newest first.
+
+    That is by their names, except that the one that began last is the first: the clock may have
+    been set back since the others.
+    """
     named = _named(system)
     entries: list[Path] = []
+    last = ""
     with contextlib.suppress(OSError):
         entries = list(root.iterdir())
+        last = (root / LATEST).readlink().name
     found = (each for each in entries if named.fullmatch(each.name) and not each.is_symlink())
-    return sorted((each for each in found if each.is_dir()), reverse=True)
+    there = (each for each in found if each.is_dir())
+    return sorted(there, key=lambda each: (each.name == last, each), reverse=True)
 
 
 def is_running(run: Path) -> bool:

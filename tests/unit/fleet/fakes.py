@@ -173,6 +173,8 @@ class FakeTransport:
     def _answer(self, channel: FakeChannel, order: Order) -> Said | None:
         if order.do is Do.PING:
             now_s = self.world.now_s + self.ahead_s
+            self.world.is_set_s += self.world.sets_s
+            self.world.sets_s = 0.0
             return Said(agent=Word.PONG, number=order.number, received_s=now_s, sent_s=now_s)
         if order.do is Do.END:
             if self.supervisor is not None:
@@ -199,9 +201,11 @@ class World:
 
     Attributes:
         ended: names of hosts in the order in which their supervisors ended.
+        sets_s: by so much the coordinator's clock is set while its next ping is on its way.
     """
 
     def __init__(self) -> None:
+        self.sets_s = self.is_set_s = 0.0
         self.hosts: dict[str, FakeTransport] = {}
         self.said: list[Record] = []
         self.ended: list[str] = []
@@ -233,7 +237,7 @@ class World:
             again=("lifecycle up m.yaml --hosts", "lifecycle down m.yaml --hosts"),
             stop_after_s=stop_after_s,
             keep_going=keep_going,
-            clock=lambda: self.now_s,
+            clock=lambda: self.now_s + self.is_set_s,
         )
 
     async def run(

@@ -313,6 +313,20 @@ def test_a_clock_that_jumps_is_said_again() -> None:
     assert world.of("clock", "a")[-1]["offset_s"] == pytest.approx(-1.0, abs=0.01)
 
 
+@pytest.mark.parametrize("set_s", [3600.0, -3600.0])
+def test_a_clock_of_ours_that_is_set_makes_no_difference_that_there_is_not(set_s: float) -> None:
+    world = World()
+    world.host("a")
+
+    async def main() -> None:
+        asyncio.get_running_loop().call_later(5.0, setattr, world, "sets_s", set_s)
+        await world.run(at=(60.0, _stop))
+
+    run(main())
+    offsets_s = [each["offset_s"] for each in world.of("clock", "a")]
+    assert offsets_s == [pytest.approx(0.0, abs=0.01), pytest.approx(-set_s, abs=0.01)]
+
+
 @pytest.mark.parametrize(
     ("codes", "expected"),
     [
