@@ -22,9 +22,11 @@ from lifecycle.manifest import (
     SUPERVISOR_STATUS,
     SUPERVISORS,
     TOLERATED_NODES,
+    Certainty,
     Durability,
     EndpointKind,
     History,
+    Liveliness,
     QosProfile,
     Reliability,
     RosInterfaceAccess,
@@ -51,6 +53,7 @@ _DIAGNOSTICS_QOS = QosProfile(
     depth=10,
     reliability=Reliability.RELIABLE,
     durability=Durability.VOLATILE,
+    liveliness=Liveliness.AUTOMATIC,
 )
 """What a supervisor's publisher offers."""
 _SUPERVISOR_TOPIC = SUPERVISOR_STATUS, "std_msgs/msg/String"
@@ -363,7 +366,10 @@ def takes_diagnostics(plan: Plan) -> bool:
         and (
             each.kind is not EndpointKind.SUBSCRIPTION
             or each.qos is None
-            or not incompatibilities(_DIAGNOSTICS_QOS, each.qos)
+            or all(
+                found.severity is not Certainty.CERTAIN
+                for found in incompatibilities(_DIAGNOSTICS_QOS, each.qos)
+            )
         )
         for each in ends
     )
