@@ -118,7 +118,7 @@ def _history(node: NodeStatus) -> str:
 @click.option(
     "--probe",
     type=click.Choice(["live", "ready"]),
-    help="For health checks: print nothing, exit with 0 while the supervisor answers (live), or "
+    help="For health checks: print no status, exit with 0 while the supervisor answers (live), or "
     "while the system is active and not violated (ready), else with 6.",
 )
 def status_command(

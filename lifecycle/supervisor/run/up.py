@@ -308,7 +308,9 @@ def _preloading(
 
 
 _LET_GO_S = 0.5
-"""Others let go of what a participant used within milliseconds of its leaving."""
+"""Others let go of the port of a participant that left when they next send over shared memory: most
+within milliseconds, one that sends nothing perhaps never. Then the port stays for who uses it next.
+"""
 
 
 def _sweep(records: Records | None, emit: Emitter | None = None, *, within_s: float = 0.0) -> None:
