@@ -235,7 +235,7 @@ def test_without_being_asked_it_only_says_how_it_is_and_nobody_says_it_in_its_pl
         }
         judged = verb("verify", str(manifest), *ENOUGH, runtime=tmp_path)
         assert judged.returncode == ExitCode.OK, judged.stdout
-        assert "/lifecycle/pair" not in judged.stdout
+        assert "_lifecycle_observer" not in judged.stdout
         assert run.of_kind("verdict")[-1]["verdict"]["verdict"] == "ok"
         begun = run.catch_up()
         false = [
