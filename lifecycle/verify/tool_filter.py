@@ -163,7 +163,7 @@ def tolerating_pattern(full_name: str, patterns: Collection[str] = TOLERATED_NOD
     """
     base = full_name.rpartition("/")[2]
     for pattern in (OUR_NODES, *patterns):
-        if _matches(full_name if "/" in pattern else base, pattern):
+        if matches(full_name if "/" in pattern else base, pattern):
             return pattern
     return ""
 
@@ -174,7 +174,8 @@ def is_noise_node(full_name: str) -> bool:
     return bool(tolerating_pattern(full_name))
 
 
-def _matches(name: str, pattern: str) -> bool:
+def matches(name: str, pattern: str) -> bool:
+    """Return whether a name is as a pattern of a manifest has it: `*`, `?`, all else as it is."""
     return _compiled(pattern).fullmatch(name) is not None
 
 
@@ -430,7 +431,7 @@ def of_supervisors(
 
 def is_supervisor_endpoint(kind: EndpointKind, node: str, name: str, type_: str) -> bool:
     """Return whether an endpoint is one that `policy.ros_interface` has a supervisor make."""
-    if not _matches(node.rpartition("/")[2], OUR_NODES):
+    if not matches(node.rpartition("/")[2], OUR_NODES):
         return False
     base = name.rpartition("/")[2] if name.startswith(SUPERVISORS) else ""
     if kind is EndpointKind.PUBLISHER:
