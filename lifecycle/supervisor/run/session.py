@@ -387,6 +387,7 @@ class Session:
     async def _until_over(self) -> UpResult:
         """Run the phases; whatever ends them becomes an exit code and a verdict."""
         reason = stopping = "done"
+        failed = ""
         end = _RunEnd()
         try:
             end = await self._unless_stopped(self._phases())
@@ -397,6 +398,7 @@ class Session:
             for each in failure.every:
                 self._emit(each.event())
             reason, stopping = failure.reason, "rolling back"
+            failed = "; ".join(each.message for each in failure.every)
             verdict = with_failure(self._judge.latest or NOT_JUDGED, failure)
             end = _RunEnd(exit_code=failure.exit_code, verdict=verdict)
         except VerificationError as error:
@@ -412,7 +414,7 @@ class Session:
             reason = f"{reason}; {restarted}"
         self._gate.close()
         self._gate_sequence.phase = _STOPPING
-        self._ends, self._reason = stopping, reason
+        self._ends, self._reason = stopping, failed or reason
         self._emit(Stopping(reason=stopping))
         run = RunEnd(
             reason=reason,

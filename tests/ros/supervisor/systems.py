@@ -168,6 +168,13 @@ class Chatty(Talker):
         print("\n".join(["x" * 5000] * 4), flush=True)
 
 
+class Monitor(LifecycleNode):
+    @on_message("/diagnostics")
+    def _diagnosed(self, message: DiagnosticArray) -> None:
+        for each in message.status:
+            print(f"diagnosed {each.name} as {each.message}", flush=True)
+
+
 class Listener(LifecycleNode):
     _heard = ""
 
