@@ -1,7 +1,8 @@
-"""`--hosts` of `lifecycle up` and `down`: every machine of a manifest from one place.
+"""`--hosts` of `lifecycle up`, `status` and `down`: every machine of a manifest from one place.
 
 Owns: options as transports and parts, the run of a coordinator in this process, and its output:
-JSON lines, or plain lines with the host in front; live_view.py has the table.
+JSON lines, or plain lines with the host in front; live_view.py has the table. Owns also the status
+of all hosts as one.
 """
 
 from __future__ import annotations
@@ -12,18 +13,21 @@ import json
 import os
 import signal
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Protocol
 
 import click
 
+from lifecycle import dataclasses
 from lifecycle.cli.common import load_manifest
 from lifecycle.cli.up_output import PlainLines, Sink, stdout_writer, verdict_line
-from lifecycle.codec import from_json
+from lifecycle.codec import from_json, to_plain
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.fleet import (
+    NOTABLE_S,
     Coordinator,
+    HostStatus,
     LocalTransport,
     Place,
     Record,
@@ -35,19 +39,19 @@ from lifecycle.fleet import (
     parts_of,
     ranks,
     ssh_command,
+    statuses,
     worst,
 )
 from lifecycle.manifest import noting_files
 from lifecycle.plan import build_plan
 from lifecycle.printable import json_text, one_line
-from lifecycle.run_directory import run_name
 from lifecycle.supervisor import TIMEOUT_S, UpOptions, from_record, own_machines
 from lifecycle.verify import Outcome, Verdict, render_text
 
 if TYPE_CHECKING:
     from lifecycle.fleet import Part
     from lifecycle.plan import Plan
-    from lifecycle.supervisor import Event
+    from lifecycle.supervisor import Event, SystemStatus
 
 _MORE_S = TIMEOUT_S
 """For supervisors to start, and to end by themselves at the deadline that they have, too."""
@@ -147,13 +151,119 @@ def down_on_hosts(
     """
     plan = build_plan(load_manifest(target, assignments, quiet=True).manifest)
     transports = _transports(plan, chosen, remote_command)
-    used = sorted({each.machine for each in plan.processes})
-    names = {machine: run_name(plan, machine) for machine in used}
-    outcomes = asyncio.run(down(names, transports, timeout_s))
+    parts, _ = parts_of(plan, {})
+    outcomes = asyncio.run(down(parts, transports, timeout_s))
     for machine, (code, message) in outcomes.items():
         said = message or ("ended" if code is ExitCode.OK else f"exit code {int(code)}")
         click.echo(f"{one_line(machine)} | {one_line(said)}", err=True)
     return worst(code for code, _ in outcomes.values())
+
+
+def status_of_hosts(
+    target: str,
+    assignments: tuple[str, ...],
+    *,
+    chosen: tuple[str, ...],
+    remote_command: str,
+    format_: str,
+    probe: str | None,
+) -> int:
+    """Show how a system is on all machines of a manifest, or exit as a probe does.
+
+    Raises:
+        UsageError: a machine is not declared, or the system runs on none of them.
+        ManifestError: the manifest has errors.
+    """
+    plan = build_plan(load_manifest(target, assignments, quiet=True).manifest)
+    transports = _transports(plan, chosen, remote_command)
+    parts, _ = parts_of(plan, {})
+    asked = statuses(parts, transports, version=version("ros-lifecycle-manifests"))
+    found = tuple(map(_readable, asyncio.run(asked)))
+    if all(each.is_absent for each in found):
+        raise UsageError(
+            f"cannot find a running system {plan.system!r} on {', '.join(e.host for e in found)}",
+            hint=f"start it: lifecycle up {target} --hosts",
+        )
+    verdict = _verdict_of(found)
+    if probe is not None:
+        phases = [_system(each) for each in found]
+        answers = all(each is not None for each in phases)
+        is_active = all(each is not None and each.phase == "active" for each in phases)
+        is_ready = is_active and verdict is not Outcome.VIOLATED
+        return ExitCode.OK if answers and (is_ready or probe == "live") else _NOT_READY
+    if format_ == "json":
+        hosts = [_host_record(each) for each in found]
+        record = {"system": plan.system, "domain_id": plan.domain_id}
+        record |= {"verdict": verdict and verdict.value, "hosts": hosts}
+        click.echo(json_text(json.dumps(record, ensure_ascii=False, separators=(",", ":"))))
+    else:
+        click.echo("\n".join(_status_lines(plan.system, verdict, found)))
+    if verdict is Outcome.VIOLATED:
+        return ExitCode.VIOLATED
+    is_known = all(each.status is not None for each in found)
+    return ExitCode.OK if is_known else ExitCode.UNVERIFIABLE
+
+
+_NOT_READY = ExitCode.BRING_UP_FAILED
+
+
+def _readable(host: HostStatus) -> HostStatus:
+    if host.status is None or _system(host) is not None:
+        return host
+    return dataclasses.replace(host, status=None, message="its status cannot be read")
+
+
+def _system(host: HostStatus) -> SystemStatus | None:
+    from lifecycle.supervisor import SystemStatus
+
+    try:
+        return None if host.status is None else from_json(json.dumps(host.status), SystemStatus)
+    except ValueError:
+        return None
+
+
+def _verdict_of(hosts: Iterable[HostStatus]) -> Outcome | None:
+    """Return the worst of all; who does not answer is unverifiable. None: not judged yet."""
+    systems = [_system(each) for each in hosts]
+    found = [Outcome.UNVERIFIABLE if each is None else each.verdict for each in systems]
+    for each in (Outcome.VIOLATED, Outcome.UNVERIFIABLE, None):
+        if each in found:
+            return each
+    return Outcome.OK
+
+
+def _host_record(host: HostStatus) -> Record:
+    plain = to_plain(host)
+    assert isinstance(plain, dict)
+    if host.clock is not None:
+        plain["clock"]["differs"] = host.clock.differs(NOTABLE_S)
+    return plain
+
+
+def _status_lines(
+    system: str, verdict: Outcome | None, hosts: tuple[HostStatus, ...]
+) -> Iterator[str]:
+    """Yield a line for all, and each host's own status with its name in front."""
+    from lifecycle.cli.verbs.control import status_text
+
+    judged = "not judged yet" if verdict is None else verdict.value
+    silent = [f"{each.host} ({each.message})" for each in hosts if each.status is None]
+    unverifiable = f"; unverifiable: {', '.join(silent)}" if silent else ""
+    yield one_line(
+        f"{system} on {', '.join(e.host for e in hosts)}: verdict {judged}{unverifiable}"
+    )
+    for host in hosts:
+        prefix = f"{one_line(host.host)} | "
+        seen = _system(host)
+        if seen is not None:
+            yield from (prefix + each for each in status_text(seen).splitlines())
+        else:
+            hint = f"; {host.hint}" if host.hint else ""
+            yield prefix + one_line(
+                f"cannot be verified at {host.destination}: {host.message}{hint}"
+            )
+        if host.clock is not None and host.clock.differs(NOTABLE_S):
+            yield prefix + clock_text(host.clock.offset_s, host.clock.uncertainty_s)
 
 
 _REFUSED = {
@@ -344,13 +454,15 @@ def _host_changed(record: Record) -> str:
 
 
 def _clock(record: Record) -> str | None:
-    if not record["differs"]:
-        return None
-    where = "ahead of" if record["offset_s"] > 0 else "behind"
+    return clock_text(record["offset_s"], record["uncertainty_s"]) if record["differs"] else None
+
+
+def clock_text(offset_s: float, uncertainty_s: float) -> str:
+    """Say in one line that the clock of a host differs from ours."""
+    where = "ahead of" if offset_s > 0 else "behind"
     return (
-        f"its clock is {abs(record['offset_s']):.3f} s {where} this host's "
-        f"(± {record['uncertainty_s']:.3f} s): times in messages and logs differ by that; "
-        "synchronise them, with chrony or PTP"
+        f"its clock is {abs(offset_s):.3f} s {where} this host's (± {uncertainty_s:.3f} s): times "
+        "in messages and logs differ by that; synchronise them, with chrony or PTP"
     )
 
 

@@ -1,6 +1,6 @@
 """Starts, watches and ends the supervisors of all hosts of one system: `lifecycle up --hosts`.
 
-Owns: `Coordinator`, its events, and `down`. It owns no supervisor: what runs on a host goes on if
+Owns: `Coordinator` and its events. It owns no supervisor: what runs on a host goes on if
 this process dies or a link is cut, and is followed again. Every wait has a deadline. Must not
 import rclpy.
 """
@@ -19,9 +19,19 @@ from typing import Any, ClassVar, NamedTuple, Union, get_args
 from lifecycle import dataclasses
 from lifecycle.codec import from_json, to_plain
 from lifecycle.errors import ExitCode
+from lifecycle.fleet.asking import (
+    ANSWER_S,
+    HEARTBEAT_S,
+    HELLO_S,
+    READINGS,
+    down_one,
+    hello,
+    worst,
+)
 from lifecycle.fleet.protocol import (
     AGENT_MARK,
     LONGEST_LINE,
+    NOTABLE_S,
     PROTOCOL,
     ClockOffset,
     Do,
@@ -35,16 +45,9 @@ from lifecycle.fleet.protocol import (
 )
 from lifecycle.fleet.transport import Channel, Transport
 
-HELLO_S = 30.0
-"""For a connection, the login shell there, and the start of the agent."""
-
 AGAIN_HELLO_S = 15.0
 """The same, of a host that answered before."""
 
-ANSWER_S = 20.0
-"""For an agent to start a supervisor, or follow one."""
-
-HEARTBEAT_S = 1.0
 CUT_S = 4.0
 """A link on which nothing came for so long is cut."""
 
@@ -59,12 +62,6 @@ CLEAN_S = 30.0
 
 CUT_END_S = 10.0
 """How long a host that cannot be reached is waited for when it is to end."""
-
-READINGS = 8
-"""Round trips that a clock's offset is the best of."""
-
-NOTABLE_S = 0.01
-"""Clocks that differ by less are not worth a line."""
 
 Record = dict[str, Any]
 Listener = Callable[[str, Record], None]
@@ -458,7 +455,7 @@ class Coordinator:
             await asyncio.gather(*(self._clean_up(each) for each in hosts if each.was_killed))
 
     async def _clean_up(self, host: _Host) -> None:
-        code, message = await _down(host.part.name, host.transport, CLEAN_S)
+        code, message = await down_one(host.part, host.transport, CLEAN_S)
         if code is not ExitCode.OK:
             self._emit(
                 HostChanged(
@@ -585,7 +582,7 @@ class Coordinator:
         """Follow a host over one channel; return why that is over, empty if its end says."""
         try:
             limit_s = AGAIN_HELLO_S if host.is_ready else HELLO_S
-            said = await asyncio.wait_for(_hello(channel, noise), limit_s)
+            said = await asyncio.wait_for(hello(channel, noise), limit_s)
         except (asyncio.TimeoutError, EOFError):
             return ""
         if (said.version, said.protocol) != (self._version, PROTOCOL):
@@ -777,108 +774,8 @@ class Coordinator:
         self._changed.set()
 
 
-_SEVERITY = (
-    ExitCode.OK,
-    ExitCode.HUNG_UP,
-    ExitCode.INTERRUPTED,
-    ExitCode.TERMINATED,
-    ExitCode.UNVERIFIABLE,
-    ExitCode.VIOLATED,
-    ExitCode.SUPERVISION_GAVE_UP,
-    ExitCode.BRING_UP_FAILED,
-    ExitCode.MANIFEST_INVALID,
-    ExitCode.USAGE,
-    ExitCode.INTERNAL,
-)
-_CUT_SHORT = frozenset(_SEVERITY[:4])
-
-
-def worst(codes: Iterable[int]) -> ExitCode:
-    """Return the exit code that says most of several; one that is none of ours is our bug."""
-    known = {int(each): each for each in _SEVERITY}
-    found = (known.get(each, ExitCode.INTERNAL) for each in codes)
-    return max(found, key=_SEVERITY.index, default=ExitCode.OK)
+_CUT_SHORT = frozenset((ExitCode.OK, ExitCode.HUNG_UP, ExitCode.INTERRUPTED, ExitCode.TERMINATED))
 
 
 def _code(value: object) -> int | None:
     return value if isinstance(value, int) else None
-
-
-async def _hello(channel: Channel, noise: list[str]) -> Said:
-    """Return the first word of an agent, after what login shells print.
-
-    Raises:
-        EOFError: there is none.
-    """
-    while True:
-        data = await channel.receive()
-        if data.startswith(AGENT_MARK):
-            with contextlib.suppress(ValueError):
-                return from_json(data, Said, longest=LONGEST_LINE)
-        noise.append(data.decode(errors="replace"))
-        del noise[:-READINGS]
-
-
-async def down(
-    names: Mapping[str, str], transports: Mapping[str, Transport], timeout_s: float
-) -> dict[str, tuple[ExitCode, str]]:
-    """End the runs of all hosts at once, whoever started them.
-
-    Args:
-        names: of the runs, by machine.
-        transports: by machine.
-        timeout_s: for each.
-
-    Returns:
-        The exit code of each, and what there is to say.
-    """
-    outcomes = await asyncio.gather(
-        *(_down(name, transports[machine], timeout_s) for machine, name in names.items())
-    )
-    return dict(zip(names, outcomes, strict=True))
-
-
-async def _down(name: str, transport: Transport, timeout_s: float) -> tuple[ExitCode, str]:
-    try:
-        channel = await transport.open()
-    except OSError as error:
-        return ExitCode.BRING_UP_FAILED, f"cannot start {error.filename}: {error.strerror}"
-    noise: list[str] = []
-    said: Said | None = None
-    try:
-        await asyncio.wait_for(_hello(channel, noise), HELLO_S)
-        channel.send(line(Order(do=Do.DOWN, name=name, timeout_s=timeout_s)))
-        said = await asyncio.wait_for(_outcome(channel), timeout_s + ANSWER_S)
-    except (asyncio.TimeoutError, EOFError):
-        pass
-    finally:
-        closed = await asyncio.shield(asyncio.ensure_future(channel.close()))
-    if said is None:
-        why, hint = transport.explained(closed, "\n".join(noise))
-        return ExitCode.BRING_UP_FAILED, f"{why}; {hint}" if hint else why
-    if said.agent is Word.ABSENT:
-        return ExitCode.OK, "did not run"
-    if said.agent is Word.DONE and said.exit_code is not None:
-        return worst([said.exit_code]), said.message
-    return ExitCode.BRING_UP_FAILED, said.message
-
-
-async def _outcome(channel: Channel) -> Said:
-    """Return what came of a DOWN; asks meanwhile, because a silent coordinator is left."""
-    reading = asyncio.ensure_future(_answered(channel))
-    try:
-        while not reading.done():
-            channel.send(line(Order(do=Do.PING)))
-            await asyncio.wait({reading}, timeout=HEARTBEAT_S)
-        return reading.result()
-    finally:
-        reading.cancel()
-
-
-async def _answered(channel: Channel) -> Said:
-    while True:
-        data = await channel.receive()
-        if data.startswith(AGENT_MARK):
-            said = from_json(data, Said, longest=LONGEST_LINE)
-            if said.agent in (Word.DONE, Word.ABSENT, Word.REFUSED):
-                return said

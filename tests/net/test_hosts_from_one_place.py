@@ -7,6 +7,7 @@ nor a cut link ends one.
 from __future__ import annotations
 
 import contextlib
+import json
 import shlex
 import signal
 import subprocess
@@ -80,11 +81,11 @@ class Fleet:
         self._stack.callback(up.close)
         return up
 
-    def down(self, manifest: Path) -> subprocess.CompletedProcess[str]:
+    def verb(self, name: str, manifest: Path, *options: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
             self.hosts["a"].command(
-                *(sys.executable, "-m", "lifecycle.cli", "down", str(manifest)),
-                *("--hosts", "--remote-command", REMOTE),
+                *(sys.executable, "-m", "lifecycle.cli", name, str(manifest)),
+                *("--hosts", "--remote-command", REMOTE, *options),
             ),
             env={
                 **self.hosts["a"].environment(self.runtime("a")),
@@ -140,6 +141,17 @@ def test_three_hosts_come_up_and_are_ended_from_one_place(three: Fleet) -> None:
     assert all(not each["differs"] for each in clocks.values())
     assert all(abs(each["offset_s"]) <= each["uncertainty_s"] + 0.005 for each in clocks.values())
     assert {each["host"] for each in up.of_kind("gate")} == {"a", "b", "c"}
+    for name in "abc":
+        _until_ok(three, name)
+    shown = three.verb("status", up.manifest, "--format", "json")
+    assert shown.returncode == ExitCode.OK, shown.stderr
+    found = json.loads(shown.stdout)
+    assert (found["system"], found["verdict"]) == ("article", "ok")
+    hosts = {each["host"]: each for each in found["hosts"]}
+    assert [*hosts] == ["a", "b", "c"]
+    assert {each["node"] for each in hosts["c"]["status"]["nodes"]} == {"/n_c"}
+    assert {each["status"]["phase"] for each in hosts.values()} == {"active"}
+    assert not any(each["clock"]["differs"] for each in hosts.values())
     up.signal(signal.SIGTERM)
     assert up.finish() == ExitCode.OK, up.said()
     end = up.events[-1]
@@ -202,7 +214,7 @@ def test_a_coordinator_that_is_killed_leaves_all_running_to_be_followed_and_ende
     assert second.finish() == ExitCode.HUNG_UP
     assert two.runs("a")
     assert two.runs("b")
-    done = two.down(manifest)
+    done = two.verb("down", manifest)
     assert done.returncode == ExitCode.OK, done.stderr
     assert left_of(first.mark) == []
     assert left_of(second.mark) == []

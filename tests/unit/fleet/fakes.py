@@ -178,6 +178,12 @@ class FakeTransport:
             if self.supervisor is not None:
                 self.supervisor.terminate()
             return None
+        if order.do is Do.STATUS:
+            if self.refuses:
+                return Said(agent=Word.REFUSED, message=self.refuses, hint="end it")
+            if self.supervisor is None:
+                return Said(agent=Word.ABSENT)
+            return Said(agent=Word.STATUS, status={"phase": "active"})
         if order.do is Do.DOWN:
             self.downs += 1
             return Said(agent=Word.DONE, exit_code=0)

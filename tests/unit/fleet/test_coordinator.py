@@ -7,9 +7,10 @@ import asyncio
 import pytest
 
 from lifecycle.errors import ExitCode
-from lifecycle.fleet.coordinator import Coordinator, worst
-from lifecycle.fleet.protocol import Do
-from tests.unit.fleet.fakes import CUT_S, World
+from lifecycle.fleet.asking import statuses, worst
+from lifecycle.fleet.coordinator import Coordinator
+from lifecycle.fleet.protocol import Do, Part
+from tests.unit.fleet.fakes import CUT_S, VERSION, Supervisor, World
 from tests.unit.supervisor.fakes import run
 
 
@@ -326,3 +327,37 @@ def test_a_clock_that_jumps_is_said_again() -> None:
 )
 def test_the_worst_exit_code_is_the_one_of_all(codes: tuple[int, ...], expected: ExitCode) -> None:
     assert worst(codes) is expected
+
+
+def test_every_host_is_asked_how_it_is_and_one_that_does_not_say_is_an_answer(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async def test() -> None:
+        world = World()
+        monkeypatch.setattr("time.time", lambda: world.now_s)  # of the loop that jumps
+        world.host("a", ahead_s=2.5)
+        world.host("b")
+        world.host("c", stderr="Connection refused", exit_code=255)
+        world.host("d", version="0.9")
+        world.host("e", refuses="cannot ask 'patrol@7.e': its supervisor does not answer")
+        world.host("f", is_cut=True, heals_s=None)
+        world.hosts["a"].supervisor = Supervisor(world.hosts["a"])
+        parts = [Part(name=f"patrol@7.{e}", machine=e, manifest="", files=()) for e in "abcdef"]
+        found = await statuses(parts, world.hosts, version=VERSION)
+        assert [each.host for each in found] == [*"abcdef"]
+        assert found[0].status == {"phase": "active"}
+        assert found[0].clock is not None
+        assert found[0].clock.offset_s == pytest.approx(2.5, abs=0.01)
+        assert [each.is_absent for each in found] == [False, True, False, False, False, False]
+        assert [each.message for each in found[1:]] == [
+            "no supervisor runs there",
+            "Connection refused",
+            f"its lifecycle is version 0.9, and here it is {VERSION}",
+            "cannot ask 'patrol@7.e': its supervisor does not answer",
+            "no answer in time",
+        ]
+        assert all(each.status is None for each in found[1:])
+        channels = [each.channel for each in world.hosts.values()]
+        assert all(each is not None and each.is_closed for each in channels)
+
+    run(test())
