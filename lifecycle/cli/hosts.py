@@ -21,6 +21,7 @@ import click
 
 from lifecycle import dataclasses
 from lifecycle.cli.common import load_manifest
+from lifecycle.cli.report import ReportFile, written_or_said
 from lifecycle.cli.up_output import PlainLines, Sink, stdout_writer, verdict_line
 from lifecycle.codec import from_json, to_plain
 from lifecycle.errors import ExitCode, UsageError
@@ -46,7 +47,7 @@ from lifecycle.manifest import noting_files
 from lifecycle.plan import build_plan
 from lifecycle.printable import json_text, one_line
 from lifecycle.supervisor import TIMEOUT_S, UpOptions, from_record, own_machines
-from lifecycle.verify import Outcome, Verdict, render_text
+from lifecycle.verify import Finding, FlowReport, Outcome, RunEnd, Verdict, render_text
 
 if TYPE_CHECKING:
     from lifecycle.fleet import Part
@@ -80,6 +81,19 @@ def up_on_hosts(
         UsageError: an option cannot be used so, or a machine is not declared.
         ManifestError: the manifest has errors.
     """
+    with ReportFile(options["report"], strict=options["strict"]) as written:
+        return _up(manifest, assignments, chosen, remote_command, format_, options, written)
+
+
+def _up(  # noqa: PLR0917 - as of up_on_hosts
+    manifest: str,
+    assignments: tuple[str, ...],
+    chosen: tuple[str, ...],
+    remote_command: str,
+    format_: str,
+    options: Mapping[str, Any],
+    written: ReportFile,
+) -> int:
     _refuse(options)
     domain_id = options["domain"]
     with noting_files() as files:
@@ -101,21 +115,29 @@ def up_on_hosts(
         )
     transports = _transports(plan, chosen, remote_command)
     order = ranks(plan)
-    with _output(format_, plan.system, tuple(each.machine for each in parts)) as output:
+    machines = tuple(each.machine for each in parts)
+    written.begin(plan)
+    with _output(format_, plan.system, machines) as output:
+        last = LastVerdicts(machines, output)
         coordinator = Coordinator(
             plan.system,
             [
                 _place(part, transports[part.machine], order.get(part.machine, 0), manifest)
                 for part in parts
             ],
-            output,
+            last,
             version=version("ros-lifecycle-manifests"),
             bring_up_s=_bring_up_s(plan, parts, options["timeout"]) + _MORE_S,
             again=tuple(f"lifecycle {verb} {manifest} --hosts" for verb in ("up", "down")),  # type: ignore[arg-type]
+            until=options["until"],
             stop_after_s=options["stop_after"],
             keep_going=options["keep_going"],
         )
-        return asyncio.run(_run(coordinator))
+        code = asyncio.run(_run(coordinator))
+        unwritten = written_or_said(
+            lambda: written.end(last.combined(), plan, machines=last.verdicts)
+        )
+        return code or unwritten
 
 
 def _place(part: Part, transport: Transport, rank: int, manifest: str) -> Place:
@@ -267,19 +289,17 @@ def _status_lines(
 
 
 _REFUSED = {
-    "until": "what is not to become active is verified by hand, machine by machine",
-    "report": "each host's verdict is in the output of --format json",
     "machine": "all machines are started; leave it out",
     "targets": "start that machine by itself: lifecycle up MANIFEST --machine NAME --program …",
     "mapping": "start that machine by itself: lifecycle up MANIFEST --machine NAME --program …",
     "flow_labels": "start that machine by itself: lifecycle up MANIFEST --machine NAME --program …",
 }
-_FLAGS = {"until": "--until", "mapping": "--dscp-from-5qi", "targets": "--program"}
+_FLAGS = {"mapping": "--dscp-from-5qi", "targets": "--program"}
 
 
 def _refuse(options: Mapping[str, Any]) -> None:
     for name, hint in _REFUSED.items():
-        if options[name] and (name, options[name]) != ("until", "active"):
+        if options[name]:
             flag = _FLAGS.get(name, f"--{name.replace('_', '-')}")
             raise UsageError(f"cannot use {flag} with --hosts", hint=hint)
 
@@ -291,6 +311,8 @@ def _passed_on(options: Mapping[str, Any]) -> Iterator[str]:
             yield f"--{name.replace('_', '-')}"
     for node in options["without"]:
         yield f"--except={node}"
+    if options["until"] != "active":
+        yield from (f"--until={options['until']}", "--hold")
     for name in ("timeout", "domain"):
         if options[name] is not None:
             yield f"--{name}={options[name]}"
@@ -328,6 +350,97 @@ def _transports(plan: Plan, chosen: tuple[str, ...], remote_command: str) -> dic
         else LocalTransport()
         for machine, place in destinations(plan, by_hand, local.__contains__).items()
     }
+
+
+class LastVerdicts:
+    """Keeps the last verdict of each host on its way to the output, and makes one of all.
+
+    Args:
+        machines: of all.
+        output: what all events are passed on to.
+
+    Attributes:
+        verdicts: by machine; None of one whose supervisor gave none.
+    """
+
+    def __init__(self, machines: Iterable[str], output: HostsOutput) -> None:
+        self.verdicts: dict[str, Verdict | None] = dict.fromkeys(machines)
+        self._output = output
+        self._messages: dict[str, str] = {}
+        self._reached: str | None = None
+        self._end: Record = {"reason": "", "exit_code": int(ExitCode.INTERNAL)}
+
+    def __call__(self, host: str, record: Record) -> None:
+        """Take one event, see fleet.coordinator.Listener."""
+        kind = record.get("event")
+        if kind is None:
+            self.verdicts[host] = _verdict_in(record)
+        elif kind == "end" and not host:
+            self._end = record
+        elif kind in {"active", "reached"} and not host:
+            self._reached = str(record.get("reached", "active"))
+        elif kind == "host" and record["message"]:
+            self._messages[host] = str(record["message"])
+        self._output(host, record)
+
+    def combined(self) -> Verdict:
+        """Return the verdict of all: what any found, and who found it where not all did."""
+        found = {name: each for name, each in self.verdicts.items() if each is not None}
+        lacking = [name for name in self.verdicts if name not in found]
+        reason = str(self._end["reason"])
+        if lacking:
+            why = (f"{name} ({self._messages.get(name, 'it did not run')})" for name in lacking)
+            reason += f"; no verdict of {', '.join(why)}"
+        run = RunEnd(reason=reason, reached=self._reached, exit_code=self._end["exit_code"])
+        outcomes = {each.verdict for each in found.values()}
+        outcomes |= {Outcome.UNVERIFIABLE} if lacking else set[Outcome]()
+        worst_first = (Outcome.VIOLATED, Outcome.UNVERIFIABLE, Outcome.OK)
+        return Verdict(
+            verdict=next(each for each in worst_first if each in outcomes),
+            blocking=bool(lacking) or any(each.blocking for each in found.values()),
+            findings=tuple(self._findings(found)),
+            flows=_flows(found.values()),
+            open_endpoints=tuple(
+                dict.fromkeys(e for v in found.values() for e in v.open_endpoints)
+            ),
+            tolerated=tuple(dict.fromkeys(e for v in found.values() for e in v.tolerated)),
+            judged=not lacking and all(each.judged for each in found.values()),
+            run=run,
+        )
+
+    def _findings(self, found: Mapping[str, Verdict]) -> Iterator[Finding]:
+        seen: dict[tuple[object, ...], tuple[Finding, list[str]]] = {}
+        for name, verdict in found.items():
+            for each in verdict.findings:
+                key = (each.rule, each.outcome, each.subject, each.node, each.endpoint)
+                seen.setdefault(key, (each, []))[1].append(name)
+        for finding, by in seen.values():
+            if len(by) == len(self.verdicts):
+                yield finding
+            else:
+                message = f"{finding.message} (found by the supervisor of {', '.join(by)})"
+                yield dataclasses.replace(finding, message=message)
+
+
+def _flows(verdicts: Iterable[Verdict]) -> tuple[FlowReport, ...]:
+    """Return each flow once, as the worst of its reports has it."""
+    order = (Outcome.OK, Outcome.UNVERIFIABLE, Outcome.VIOLATED)
+    found: dict[tuple[str, str, str], FlowReport] = {}
+    for verdict in verdicts:
+        for each in verdict.flows:
+            known = found.setdefault((each.topic, each.publisher, each.subscription), each)
+            if order.index(each.outcome) > order.index(known.outcome):
+                found[each.topic, each.publisher, each.subscription] = each
+    return tuple(found.values())
+
+
+def _verdict_in(record: Record) -> Verdict | None:
+    """Return the last verdict of a host's supervisor; None for what is none of ours."""
+    try:
+        found = from_json(json.dumps({"blocking": False, **record}), Verdict)
+    except ValueError:
+        return None
+    return dataclasses.replace(found, blocking=found.verdict is Outcome.VIOLATED)
 
 
 class HostsOutput(Protocol):
@@ -394,9 +507,8 @@ class PlainHosts:
 
     def _finish(self, host: str, record: Record) -> None:
         """Write the last verdict of a host, in full where it is not ok; its flows are many."""
-        try:
-            verdict = from_json(json.dumps({"blocking": False, **record}), Verdict)
-        except ValueError:  # not ours
+        verdict = _verdict_in(record)
+        if verdict is None:
             _Prefixed(self._sink, f"{one_line(host)} | ").put("its last verdict cannot be read")
             return
         is_ok = verdict.verdict is Outcome.OK
@@ -471,6 +583,11 @@ def _active(record: Record) -> str:
     return f"system active on all hosts ({hosts}) after {record['elapsed_s']:.2f} s"
 
 
+def _reached(record: Record) -> str:
+    hosts = ", ".join(record["hosts"])
+    return f"system {record['reached']} on all hosts ({hosts}) after {record['elapsed_s']:.2f} s"
+
+
 def _end(record: Record) -> str:
     codes = ", ".join(
         f"{host} {'–' if code is None else code}" for host, code in record["exit_codes"].items()
@@ -484,6 +601,7 @@ _TELLERS = {
     "clock": _clock,
     "stderr": lambda record: str(record["line"]),
     "active": _active,
+    "reached": _reached,
     "ending": lambda record: f"ending all: {record['reason']}",
     "end": _end,
 }

@@ -63,6 +63,8 @@ CLEAN_S = 30.0
 CUT_END_S = 10.0
 """How long a host that cannot be reached is waited for when it is to end."""
 
+_ACTIVE = "active"
+
 Record = dict[str, Any]
 Listener = Callable[[str, Record], None]
 """Takes the host, empty for all of them, and an event as `--format json` has it."""
@@ -152,6 +154,20 @@ class HostsActive:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class HostsReached:
+    """The system has come as far as it is to come, short of active, on all hosts.
+
+    Attributes:
+        reached: "connected" or "verified".
+    """
+
+    kind: ClassVar[str] = "reached"
+    reached: str
+    hosts: tuple[str, ...]
+    elapsed_s: float
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class HostsEnding:
     """All are being taken down; with a reason, `interrupted`, `done`, or what failed."""
 
@@ -176,7 +192,14 @@ class HostsEnded:
 
 
 HostEvent = Union[  # noqa: UP007 - a run-time alias on Python 3.10
-    HostsFound, HostChanged, ClockMeasured, HostStderr, HostsActive, HostsEnding, HostsEnded
+    HostsFound,
+    HostChanged,
+    ClockMeasured,
+    HostStderr,
+    HostsActive,
+    HostsReached,
+    HostsEnding,
+    HostsEnded,
 ]
 
 
@@ -210,6 +233,8 @@ class _Host:
         is_begun: it has a supervisor, ours or found.
         is_ours: which we started.
         is_taken: which another coordinator follows now.
+        until: how far it is to come.
+        is_up: it has come so far, at least once.
         is_cut: its link is.
         starts: how often we asked for a supervisor.
         asked_s: since when an answer is due to START or ATTACH.
@@ -218,12 +243,13 @@ class _Host:
         has_failed: there will be no supervisor.
     """
 
-    def __init__(self, place: Place) -> None:
+    def __init__(self, place: Place, until: str) -> None:
+        self.until = until
         self.part, self.transport, self.rank = place
         self.name = place.part.machine
         self.channel: Channel | None = None
         self.is_ready = self.is_begun = self.is_ours = self.is_taken = False
-        self.is_active = self.is_cut = self.is_ending = self.has_failed = False
+        self.is_up = self.is_cut = self.is_ending = self.has_failed = False
         self.was_killed = False
         self.exit_code: int | None = None
         self.reached = ""
@@ -251,7 +277,7 @@ class _Host:
         kind = record.get("event")
         if kind == "system":
             self.reached = str(record.get("reached"))
-            self.is_active = self.reached == "active" or self.is_active
+            self.is_up = self.reached == self.until or self.is_up
         elif kind == "stopped":
             self._said_code = _code(record.get("exit_code"))
         elif kind is None and isinstance(run := record.get("run"), dict):
@@ -275,7 +301,9 @@ class Coordinator:
         listener: takes every event, in this loop, and does not block.
         version: of this package: agents have the same.
         bring_up_s: from the start of the supervisors to all of them being active.
-        stop_after_s: hold it so long; None for until it is asked to end.
+        until: how far to bring it: "connected", "verified" or "active".
+        stop_after_s: hold it so long; None for until it is asked to end, and not at all where it is
+            only connected or verified.
         keep_going: a supervisor that fails does not end the others.
         again: what a person types to follow it again, and to end it.
         clock: seconds since the epoch.
@@ -290,16 +318,19 @@ class Coordinator:
         version: str,
         bring_up_s: float,
         again: tuple[str, str],
+        until: str = _ACTIVE,
         stop_after_s: float | None = None,
         keep_going: bool = False,
         clock: Callable[[], float] = time.time,
     ) -> None:
         self._system = system
-        self._hosts = tuple(_Host(each) for each in places)
+        self._hosts = tuple(_Host(each, until) for each in places)
+        self._until_reached = until
         self._listener = listener
         self._version = version
         self._bring_up_s = bring_up_s
-        self._stop_after_s = stop_after_s
+        is_brief = stop_after_s is None and until != _ACTIVE
+        self._stop_after_s = 0.0 if is_brief else stop_after_s
         self._keep_going = keep_going
         self._again = again
         self._clock = clock
@@ -307,7 +338,7 @@ class Coordinator:
         self._goes = False
         self._reason = ""
         self._wanted: ExitCode | None = None
-        self._leaves = self._was_active = False
+        self._leaves = self._was_up = False
         self._numbers = 0
         self._began_s = 0.0
 
@@ -373,7 +404,7 @@ class Coordinator:
         for each in self._hosts:
             if each.channel is not None:
                 self._ask(each)
-        failure = await self._become_active()
+        failure = await self._come_up()
         if self._leaves:
             return ""
         if failure:
@@ -399,15 +430,15 @@ class Coordinator:
     def _elapsed_s(self) -> float:
         return self._now_s - self._began_s
 
-    async def _become_active(self) -> str:
-        """Wait until all are active; return what failed, if anything."""
-        hosts = self._hosts
+    async def _come_up(self) -> str:
+        """Wait until all are as far as they are to come; return what failed, if anything."""
+        hosts, until = self._hosts, self._until_reached
 
         def is_over() -> bool:
             return self._is_asked or any(each.is_over for each in hosts)
 
         in_time = await self._until(
-            lambda: is_over() or all(each.is_active for each in hosts), self._bring_up_s
+            lambda: is_over() or all(each.is_up for each in hosts), self._bring_up_s
         )
         if self._is_asked:
             return ""
@@ -415,13 +446,17 @@ class Coordinator:
             lacking = ", ".join(
                 f"{each.name} ({'its link is cut' if each.is_cut else each.reached or 'started'})"
                 for each in hosts
-                if not each.is_active
+                if not each.is_up
             )
-            return f"not active on all hosts within {self._bring_up_s:g} s: {lacking}"
+            return f"not {until} on all hosts within {self._bring_up_s:g} s: {lacking}"
         if over := [each.name for each in hosts if each.is_over]:
-            return f"not active, and over on {', '.join(over)}"
-        self._was_active = True
-        self._emit(HostsActive(hosts=tuple(each.name for each in hosts), elapsed_s=self._elapsed_s))
+            return f"not {until}, and over on {', '.join(over)}"
+        self._was_up = True
+        names = tuple(each.name for each in hosts)
+        if until == _ACTIVE:
+            self._emit(HostsActive(hosts=names, elapsed_s=self._elapsed_s))
+        else:
+            self._emit(HostsReached(reached=until, hosts=names, elapsed_s=self._elapsed_s))
         return ""
 
     async def _hold(self) -> str:
@@ -505,7 +540,7 @@ class Coordinator:
             code = worst(each for each in codes.values() if each is not None)
             wanted = self._wanted
             if wanted is not None and code in _CUT_SHORT:
-                is_done = self._was_active and code is ExitCode.OK
+                is_done = self._was_up and code is ExitCode.OK
                 code = code if is_done and wanted is not ExitCode.INTERRUPTED else wanted
             if failure:
                 code = ExitCode.BRING_UP_FAILED if code in _CUT_SHORT else code
@@ -642,10 +677,10 @@ class Coordinator:
         if not isinstance(record, dict) or str(record.get("event")) in _OURS:
             self._emit(HostStderr(line=data.decode(errors="replace")), host)
             return
-        was_active, was_reached = host.is_active, host.reached
+        was_up, was_reached = host.is_up, host.reached
         host.note(record)
         self._listener(host.name, {"host": host.name, **record} | {"host": host.name})
-        if (host.is_active, host.reached) != (was_active, was_reached):
+        if (host.is_up, host.reached) != (was_up, was_reached):
             self._notify()
 
     def _take(self, host: _Host, said: Said) -> None:
@@ -680,6 +715,14 @@ class Coordinator:
 
     def _follows(self, host: _Host, said: Said) -> None:
         host.asked_s = None
+        was_there = said.agent is Word.ATTACHED and not host.is_begun and host.starts <= 1
+        if was_there and host.until != _ACTIVE:
+            self._fail(
+                host,
+                "its supervisor runs already, and is left as it is",
+                f"verify what runs, on that host: lifecycle verify {self._system}",
+            )
+            return
         state = LinkState.ATTACHED if said.agent is Word.ATTACHED else LinkState.STARTED
         message = ""
         lost_s = self._now_s - host.cut_s if host.is_cut else 0.0
@@ -691,8 +734,8 @@ class Coordinator:
         if not host.is_begun:  # the answer to an earlier START may have been lost
             host.is_ours = said.agent is Word.STARTED or host.starts > 1
         host.is_begun, host.is_cut = True, False
-        if isinstance(said.status, dict) and said.status.get("phase") == "active":
-            host.is_active = True
+        if isinstance(said.status, dict) and _is_up(said.status, host.until):
+            host.is_up = True
         self._emit(
             HostChanged(
                 state=state, pid=said.pid, message=message, lost_s=lost_s, status=said.status
@@ -775,6 +818,15 @@ class Coordinator:
 
 
 _CUT_SHORT = frozenset((ExitCode.OK, ExitCode.HUNG_UP, ExitCode.INTERRUPTED, ExitCode.TERMINATED))
+
+
+def _is_up(status: Mapping[str, Any], until: str) -> bool:
+    """Whether a status shows what an event said that may be lost: how far the system came."""
+    if status.get("phase") == _ACTIVE or until == _ACTIVE:
+        return status.get("phase") == _ACTIVE
+    nodes = status.get("nodes", ())
+    connected = all(each["reach"] in {"connected", _ACTIVE} for each in nodes)
+    return connected and (until == "connected" or status.get("verdict") == "ok")
 
 
 def _code(value: object) -> int | None:

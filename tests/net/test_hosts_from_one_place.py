@@ -162,6 +162,24 @@ def test_three_hosts_come_up_and_are_ended_from_one_place(three: Fleet) -> None:
         assert [*(three.runtime(name) / "lifecycle").iterdir()] == []
 
 
+def test_what_is_only_to_be_verified_waits_for_all_hosts_and_is_in_one_report(two: Fleet) -> None:
+    report = two.directory / "report.json"
+    up = two.up(two.manifest(), "--until", "verified", "--report", str(report))
+    assert up.finish() == ExitCode.OK, (up.events[-1], up.said())
+    (reached,) = up.of_kind("reached")
+    assert (reached["reached"], sorted(reached["hosts"])) == ("verified", ["a", "b"])
+    assert up.of_kind("gate") == []
+    found = json.loads(report.read_text())
+    assert found["verdict"] == "ok"
+    assert found["run"] == {"reason": "done", "reached": "verified", "exit_code": 0}
+    assert {name: each["verdict"] for name, each in found["machines"].items()} == {
+        "a": "ok",
+        "b": "ok",
+    }
+    assert len(found["flows"]) == 2
+    assert left_of(up.mark) == []
+
+
 @pytest.mark.parametrize("stage", ["configuring", "active"])
 def test_a_host_that_is_cut_off_runs_on_and_is_followed_once_it_is_back(
     two: Fleet, stage: str

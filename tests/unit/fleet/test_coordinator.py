@@ -163,6 +163,40 @@ def test_an_active_system_is_ended_after_the_time_that_was_asked_for() -> None:
     assert world.of("ending")[0]["reason"] == "done"
 
 
+@pytest.mark.parametrize("until", ["connected", "verified"])
+@pytest.mark.parametrize("is_cut", [False, True])
+def test_what_is_not_to_become_active_waits_on_each_host_for_all_and_then_ends(
+    until: str, is_cut: bool
+) -> None:
+    world = World()
+    world.host("a", reaches=until, active_s=1.0)
+    # What it said while its link was cut is lost; its status shows it.
+    cut = {"cut_at": Do.START, "heals_s": CUT_S + 3} if is_cut else {}
+    world.host("b", reaches=until, active_s=3.0, **cut)
+    assert run(world.run(until=until)) is ExitCode.OK
+    (reached,) = world.of("reached")
+    assert (reached["reached"], [*reached["hosts"]]) == (until, ["a", "b"])
+    assert reached["elapsed_s"] >= 3.0
+    assert world.of("active") == []
+    assert world.of("end")[0]["exit_codes"] == {"a": 0, "b": 0}
+
+
+def test_what_runs_already_is_not_ended_for_having_been_verified() -> None:
+    async def test() -> None:
+        world = World()
+        for name in "ab":
+            world.host(name)
+        running = world.hosts["a"].supervisor = Supervisor(world.hosts["a"])
+        running.activate()
+        assert await world.run(until="verified") is ExitCode.BRING_UP_FAILED
+        assert "a" not in world.ended
+        assert world.of("host", "a")[-1]["message"] == (
+            "its supervisor runs already, and is left as it is"
+        )
+
+    run(test())
+
+
 @pytest.mark.parametrize(
     ("at_s", "by", "code"),
     [
