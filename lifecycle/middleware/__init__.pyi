@@ -38,6 +38,7 @@ from .process.control import limit_resources as limit_resources
 from .process.control import machine_id as machine_id
 from .process.control import no_room_for_threads as no_room_for_threads
 from .process.control import refuse_new_privileges as refuse_new_privileges
+from .process.control import rename_process as rename_process
 from .process.process_table import note_ended as note_ended
 from .process.shared_memory import Creations as Creations
 from .process.shared_memory import check_room as check_room
@@ -61,6 +62,7 @@ from .rcl.matched_peers import matched_with as matched_with
 from .rcl.qos import UnknownInterfaceError as UnknownInterfaceError
 from .rcl.qos import from_rclpy as from_rclpy
 from .rcl.qos import import_interface as import_interface
+from .rcl.qos import load_type_support as load_type_support
 from .rcl.qos import to_rclpy as to_rclpy
 from .rcl.rclpy_nodes import RCLError as RCLError
 from .rcl.rclpy_nodes import RclpyStateMachine as RclpyStateMachine

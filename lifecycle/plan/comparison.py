@@ -131,7 +131,7 @@ def _document(plan: Plan) -> _Tree:
         "discovery": _fields(plan.discovery, "at"),
         "network": _fields(plan.network, "at"),
         "data_layer": _fields(plan.data_layer, "at"),
-        "policy": _fields(plan.policy),
+        "policy": _fields(plan.policy, "ros_interface_required"),
         "on_violation": _consequences(plan.on_violation),
         "modes": {
             each.name: {

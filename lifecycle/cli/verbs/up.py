@@ -22,6 +22,7 @@ from lifecycle.cli.common import (
     treatment_options,
 )
 from lifecycle.cli.report import ReportFile, report_option, written_or_said
+from lifecycle.cli.standard_streams import are_own
 from lifecycle.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
@@ -160,10 +161,12 @@ def command(
         ):
             from lifecycle.supervisor import Forerunner
 
-            # Its imports and ours, and reading the manifest, take as long as each other: side by
-            # side.
+            # What it alone imports, and what we alone do and reading the manifest, take as long as
+            # each other: side by side.
             program = _networks(targets, **rest)
-            forerunner = Forerunner(without=_tokens(program), programs=bool(program))
+            forerunner = Forerunner(
+                without=_tokens(program), programs=bool(program), forks=are_own()
+            )
             try:
                 from lifecycle.cli.up_output import output
                 from lifecycle.plan import build_plan, started_by_others
