@@ -360,13 +360,17 @@ class LastVerdicts:
         output: what all events are passed on to.
 
     Attributes:
-        verdicts: by machine; None of one whose supervisor gave none.
+        verdicts: by machine; None of one whose supervisor gave none. Of one that ended well it is
+            what it found when all were asked to end: it may be the last to go, and the absence of
+            those before it is no finding on the system.
     """
 
     def __init__(self, machines: Iterable[str], output: HostsOutput) -> None:
         self.verdicts: dict[str, Verdict | None] = dict.fromkeys(machines)
         self._output = output
         self._messages: dict[str, str] = {}
+        self._judged: dict[str, Verdict | None] = {}
+        self._at_end: dict[str, Verdict | None] = {}
         self._reached: str | None = None
         self._end: Record = {"reason": "", "exit_code": int(ExitCode.INTERNAL)}
 
@@ -374,7 +378,11 @@ class LastVerdicts:
         """Take one event, see fleet.coordinator.Listener."""
         kind = record.get("event")
         if kind is None:
-            self.verdicts[host] = _verdict_in(record)
+            self.verdicts[host] = self._last(_verdict_in(record), self._at_end.get(host))
+        elif kind == "verdict" and isinstance(record.get("verdict"), dict):
+            self._judged[host] = _verdict_in(record["verdict"])
+        elif kind == "ending" and not host:
+            self._at_end = dict(self._judged)
         elif kind == "end" and not host:
             self._end = record
         elif kind in {"active", "reached"} and not host:
@@ -382,6 +390,12 @@ class LastVerdicts:
         elif kind == "host" and record["message"]:
             self._messages[host] = str(record["message"])
         self._output(host, record)
+
+    @staticmethod
+    def _last(last: Verdict | None, before: Verdict | None) -> Verdict | None:
+        if last is None or before is None or last.run is None or last.run.exit_code:
+            return last
+        return dataclasses.replace(before, run=last.run)
 
     def combined(self) -> Verdict:
         """Return the verdict of all: what any found, and who found it where not all did."""
@@ -440,7 +454,8 @@ def _verdict_in(record: Record) -> Verdict | None:
         found = from_json(json.dumps({"blocking": False, **record}), Verdict)
     except ValueError:
         return None
-    return dataclasses.replace(found, blocking=found.verdict is Outcome.VIOLATED)
+    blocking = found.blocking or found.verdict is Outcome.VIOLATED
+    return dataclasses.replace(found, blocking=blocking)
 
 
 class HostsOutput(Protocol):

@@ -265,6 +265,24 @@ def test_one_report_has_what_any_supervisor_found_and_each_machines_own_verdict(
     assert len(silent) == 5
 
 
+def test_that_machines_ended_before_is_no_finding_of_one_that_ended_well() -> None:
+    own = {name: each for name, each in VERDICT.items() if name not in {"host", "run"}}
+    fine = {**own, "verdict": "ok", "findings": []}
+    done = {"reason": "terminated", "reached": "active", "exit_code": 0}
+    last = LastVerdicts("ab", lambda *_: None)
+    for host in "ab":
+        last(host, {"host": host, "event": "verdict", "stage": "active", "verdict": fine})
+    last("", {"host": "", "event": "ending", "reason": "terminated"})
+    last("a", {"host": "a", **fine, "run": done})
+    last("b", {"host": "b", "event": "verdict", "stage": "active", "verdict": own})
+    last("b", {"host": "b", **own, "run": done})
+    last("", {"host": "", "event": "end", "reason": "terminated", "exit_code": 0})
+    assert (last.combined().verdict, last.combined().findings) == (Outcome.OK, ())
+    # What ended badly has its own last word.
+    last("b", VERDICT)
+    assert last.combined().verdict is Outcome.VIOLATED
+
+
 def test_a_report_of_all_hosts_says_what_kept_them_from_being_started(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
