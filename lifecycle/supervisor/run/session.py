@@ -568,7 +568,7 @@ class Session:
         """Keep the system for as long as was asked; return the result of the run."""
         self._held = True
         hold_s = self._options.stop_after_s
-        if hold_s is None and self._options.until is not Until.ACTIVE:
+        if hold_s is None and self._options.until is not Until.ACTIVE and not self._options.holds:
             hold_s = 0.0
         return self._outcome(await self._holding.hold(stage, hold_s))
 
