@@ -246,7 +246,7 @@ class RunDirectory:
             except FileNotFoundError:
                 continue
             try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                _take_lock(lock)
                 if path.exists() and os.path.samestat(os.fstat(lock), path.lstat()):
                     self._lock = lock
                     return
@@ -368,7 +368,7 @@ def is_held(path: Path) -> bool:
     except OSError:
         return False
     try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:
         return True
     finally:
@@ -376,13 +376,37 @@ def is_held(path: Path) -> bool:
     return False
 
 
+def _take_lock(descriptor: int) -> None:
+    """Take a lock that only a supervisor holds for longer than it takes to see whether one does.
+
+    Raises:
+        BlockingIOError: a supervisor has it.
+    """
+    deadline = time.monotonic() + _LOOK_S
+    while time.monotonic() < deadline:
+        with contextlib.suppress(BlockingIOError):
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return
+        time.sleep(_LOOK_S / 10)
+    raise BlockingIOError(errno.EWOULDBLOCK, os.strerror(errno.EWOULDBLOCK))
+
+
+_LOOK_S = 0.1
+"""Within which `is_held` has given a lock back, also where it was interrupted."""
+
 FORK_SERVER = "zygote"
 """The fork server's name in a record; every other process there runs nodes, or serves them."""
 
 
 def lost(path: Path) -> UsageError:
-    """Return that the supervisor of a run was killed, with what still runs of it."""
+    """Return why a run has no answer: its supervisor was killed, with what still runs of it."""
     record = read_record(path)
+    if is_held(path):
+        pid = f" (pid {record.supervisor.pid})" if record is not None else ""
+        return UsageError(
+            f"cannot ask {path.name!r}: its supervisor{pid} is just starting or ending",
+            hint="try again",
+        )
     pid, left = "", list[str]()
     if record is not None:
         pid = f" (pid {record.supervisor.pid})"

@@ -11,6 +11,7 @@ apps/v1; the Compose Specification.
 
 from __future__ import annotations
 
+import hashlib
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping
@@ -18,15 +19,20 @@ from collections.abc import Callable, Iterator, Mapping
 import yaml
 
 from lifecycle import dataclasses
-from lifecycle.errors import ExitCode
+from lifecycle.errors import ExitCode, UsageError
+from lifecycle.manifest import THIS_HOST, Restart, Timeouts
 from lifecycle.plan import Plan
+from lifecycle.printable import one_line
 from lifecycle.run_directory import run_name
 
 START_MARGIN_S = 60.0
 """For imports, and for discovery; the deadlines of bring-up end it before."""
 
 STOP_S = 30
-"""What is left after so long is killed; an orderly shutdown takes its deadlines at most."""
+"""What is left after so long is killed, unless the deadlines of an orderly shutdown are longer."""
+
+BRING_UP_S = 30
+"""`lifecycle up` without `--timeout`: for everything, and 1 s more for each process."""
 
 WATCHDOG_S = 10
 PROBE_S = 5
@@ -53,34 +59,53 @@ class Deployment:
         plan: all machines of it.
         manifest: path of the manifest where it is started: on the machine, or in the image.
         words: further words of `lifecycle up`: arguments and options.
+        timeout_s: of the whole bring-up, where `words` set one; 0 for none.
         image: of containers; has the programs of all nodes.
         program: path of `lifecycle`; in containers it is found by name.
-        restarts: the supervisor restarts its nodes itself, and says when it gives up.
         programs_networks: it is told to program networks, which takes CAP_NET_ADMIN.
     """
 
     plan: Plan
     manifest: str
     words: tuple[str, ...] = ()
+    timeout_s: float = 0.0
     image: str = ""
     program: str = "/opt/lifecycle/bin/lifecycle"
-    restarts: bool = False
     programs_networks: bool = False
 
     @property
     def machines(self) -> tuple[str, ...]:
         """Names of the machines that have a part of it; one empty name where none is declared."""
-        return tuple(dict.fromkeys(each.machine for each in self.plan.processes)) or ("",)
+        named = tuple(dict.fromkeys(each.machine for each in self.plan.processes))
+        return ("",) if set(named) <= {THIS_HOST} else named
 
     def name(self, machine: str) -> str:
-        """Return what the part of one machine is called: a DNS label, RFC 1123."""
-        name = self.plan.system + (f"-{machine}" if machine else "")
-        return re.sub(r"[^a-z0-9-]+", "-", name.lower())[:_LONGEST_NAME].strip("-")
+        """Return what the part of one machine is called: a DNS label, RFC 1123, its alone."""
+        name = self._label(machine)
+        alike = [each for each in self.machines if self._label(each) == name]
+        if len(alike) <= 1 and len(name) <= _LONGEST_NAME:
+            return name
+        # Too long, or spelled differently only in what a label does not have.
+        digest = hashlib.sha256(f"{self.plan.system} {machine}".encode()).hexdigest()[:6]
+        where = f"-{_dns_label(machine)}"[: _LONGEST_NAME // 2]
+        system = _dns_label(self.plan.system)[: _LONGEST_NAME - len(where) - len(digest) - 1]
+        return "-".join(each.strip("-") for each in (system, where, digest) if each.strip("-"))
+
+    def _label(self, machine: str) -> str:
+        return _dns_label(self.plan.system + (f"-{machine}" if machine else ""))
 
     def arguments(self, machine: str) -> tuple[str, ...]:
         """Return the words of `lifecycle` that start a machine's part."""
         where = ("--machine", machine) if machine else ()
         return ("up", self.manifest, *where, *self.words)
+
+    def restarts(self, machine: str) -> bool:
+        """Return whether a machine's supervisor restarts nodes itself, and may give up."""
+        return any(
+            each.supervision.restart is not Restart.NO
+            for each in self.plan.nodes
+            if each.machine == machine or not machine
+        )
 
     def probe(self, what: str) -> tuple[str, ...]:
         """Return the command that says, in a container, whether it is "live" or "ready"."""
@@ -89,14 +114,29 @@ class Deployment:
     @property
     def start_s(self) -> int:
         """Seconds within which a part is ready or has given up, by its own deadlines."""
-        steps = 0.0
-        for level in self.plan.levels:
-            limits = [self.plan.node(key).timeouts for key in level]
-            steps += max(
-                (each.start_s + each.configure_s + each.connect_s + each.activate_s)
-                for each in limits
+        steps = self._longest(
+            lambda limits: (
+                limits.start_s + limits.configure_s + limits.connect_s + limits.activate_s
             )
-        return math.ceil(steps + START_MARGIN_S)
+        )
+        whole = self.timeout_s or BRING_UP_S + len(self.plan.processes)
+        return math.ceil(max(steps, whole) + START_MARGIN_S)
+
+    @property
+    def stop_s(self) -> int:
+        """Seconds within which a part has ended in order, by its own deadlines."""
+        steps = self._longest(
+            # Both disconnect and cleanup have `cleanup_s`.
+            lambda limits: limits.deactivate_s + 2 * limits.cleanup_s + limits.shutdown_s
+        )
+        return max(STOP_S, math.ceil(steps + PROBE_S))
+
+    def _longest(self, seconds: Callable[[Timeouts], float]) -> float:
+        """Return how long it takes at most where one level of nodes waits for another."""
+        return sum(
+            max(seconds(self.plan.node(key).timeouts) for key in level)
+            for level in self.plan.levels
+        )
 
 
 def systemd(deployment: Deployment) -> dict[str, str]:
@@ -114,9 +154,11 @@ def _systemd_unit(deployment: Deployment, machine: str) -> str:
         ("NotifyAccess", "main"),
         ("ExecStart", _command((deployment.program, *deployment.arguments(machine)))),
         ("TimeoutStartSec", deployment.start_s),
-        ("TimeoutStopSec", STOP_S),
+        ("TimeoutStopSec", deployment.stop_s),
+        # SIGTERM to the supervisor alone, which takes its nodes down in order.
+        ("KillMode", "mixed"),
         ("WatchdogSec", WATCHDOG_S),
-        *_systemd_restart(deployment),
+        *_systemd_restart(deployment, machine),
         ("RuntimeDirectory", name),
         ("StateDirectory", name),
         ("Environment", f"XDG_RUNTIME_DIR=%t/{name}"),
@@ -149,12 +191,12 @@ def _systemd_capabilities(deployment: Deployment) -> Iterator[tuple[str, object]
         yield "AmbientCapabilities", allowed
 
 
-def _systemd_restart(deployment: Deployment) -> Iterator[tuple[str, object]]:
+def _systemd_restart(deployment: Deployment, machine: str) -> Iterator[tuple[str, object]]:
     """What is restarted by whom: nodes by the supervisor, or all of it by systemd; never both.
 
     A supervisor that is killed, or hangs, cannot restart anything: that is systemd's in any case.
     """
-    if deployment.restarts:
+    if deployment.restarts(machine):
         yield "Restart", "on-abnormal"
     else:
         yield "Restart", "on-failure"
@@ -183,7 +225,7 @@ def _quadlet_unit(deployment: Deployment, machine: str) -> str:
             ("Image", deployment.image),
             ("Exec", _command(deployment.arguments(machine))),
             ("Network", "host"),
-            ("PodmanArgs", f"--entrypoint=lifecycle --ipc=host --stop-timeout={STOP_S}"),
+            ("PodmanArgs", f"--entrypoint=lifecycle --ipc=host --stop-timeout={deployment.stop_s}"),
             ("Notify", "true"),
             # podman passes readiness on, but no watchdog.
             ("HealthCmd", _command(deployment.probe("live"))),
@@ -201,8 +243,8 @@ def _quadlet_unit(deployment: Deployment, machine: str) -> str:
         ],
         Service=[
             ("TimeoutStartSec", deployment.start_s),
-            ("TimeoutStopSec", STOP_S + PROBE_S),
-            *_systemd_restart(deployment),
+            ("TimeoutStopSec", deployment.stop_s + PROBE_S),
+            *_systemd_restart(deployment, machine),
         ],
         Install=[("WantedBy", "default.target")],
     )
@@ -224,6 +266,7 @@ def compose(deployment: Deployment) -> dict[str, str]:
 def _compose_project(deployment: Deployment, machine: str) -> dict[str, object]:
     service = {
         "image": deployment.image,
+        "container_name": deployment.name(machine),
         "entrypoint": ["lifecycle"],
         "command": [each.replace("$", "$$") for each in deployment.arguments(machine)],
         "network_mode": "host",
@@ -236,9 +279,9 @@ def _compose_project(deployment: Deployment, machine: str) -> dict[str, object]:
         "security_opt": ["no-new-privileges:true"],
         "init": False,
         "stop_signal": "SIGTERM",
-        "stop_grace_period": f"{STOP_S}s",
+        "stop_grace_period": f"{deployment.stop_s}s",
         # Compose knows no exit codes: `on-failure` with a bound starts no hopeless case for ever.
-        "restart": "no" if deployment.restarts else "on-failure:5",
+        "restart": "no" if deployment.restarts(machine) else "on-failure:5",
         "healthcheck": {
             "test": ["CMD", *deployment.probe("ready")],
             "interval": f"{PROBE_S}s",
@@ -247,7 +290,8 @@ def _compose_project(deployment: Deployment, machine: str) -> dict[str, object]:
             "start_period": f"{deployment.start_s}s",
         },
     }
-    return {"name": deployment.name(machine), "services": {deployment.name(machine): service}}
+    # No `name` of the project: docker-compose 1 refuses it. The container has one in any case.
+    return {"services": {deployment.name(machine): service}}
 
 
 def kubernetes(deployment: Deployment) -> dict[str, str]:
@@ -271,7 +315,7 @@ def _kubernetes_object(deployment: Deployment, machine: str) -> dict[str, object
         "metadata": {"labels": labels},
         "spec": _pod(deployment, machine),
     }
-    if deployment.restarts:
+    if deployment.restarts(machine):
         # A supervisor that gives up is not started again by the engine; one that the machine
         # loses is, when the pod is applied again.
         return {
@@ -328,12 +372,21 @@ def _pod(deployment: Deployment, machine: str) -> dict[str, object]:
         "hostNetwork": True,
         "hostIPC": True,
         "dnsPolicy": "ClusterFirstWithHostNet",
-        "terminationGracePeriodSeconds": STOP_S,
+        "terminationGracePeriodSeconds": deployment.stop_s,
         "containers": [container],
         "volumes": [{"name": "tmp", "emptyDir": {}}],
     }
-    if machine:
-        spec["nodeSelector"] = {"kubernetes.io/hostname": machine}
+    if machine and machine != THIS_HOST:
+        # A node's name is a DNS name: capitals and `_` cannot be in it.
+        node = _dns_label(machine)[:_LONGEST_NAME]
+        alike = [each for each in deployment.machines if _dns_label(each) == node]
+        if not node or len(alike) > 1:
+            names = ", ".join(map(repr, alike or [machine]))
+            raise UsageError(
+                f"cannot choose a node of Kubernetes by the name of {names}: a node's name has "
+                "letters, digits and '-', in lower case; name machines so that they differ in these"
+            )
+        spec["nodeSelector"] = {"kubernetes.io/hostname": node}
     return spec
 
 
@@ -352,10 +405,11 @@ def _title(deployment: Deployment, machine: str) -> str:
 
 
 def _head(deployment: Deployment, machine: str) -> str:
-    by = "its supervisor" if deployment.restarts else "the engine"
+    by = "its supervisor" if deployment.restarts(machine) else "the engine"
+    source = one_line(deployment.manifest)
     return (
         f"# {_title(deployment, machine)}.\n"
-        f"# Written by lifecycle export from {deployment.manifest}; {by} restarts what fails.\n"
+        f"# Written by lifecycle export from {source}; {by} restarts what fails.\n"
     )
 
 
@@ -382,6 +436,10 @@ class _Plain(yaml.SafeDumper):
         return True
 
 
+def _dns_label(text: str) -> str:
+    return re.sub(r"[^a-z0-9-]+", "-", text.lower()).strip("-")
+
+
 def _command(words: tuple[str, ...]) -> str:
     """Return a command line as systemd.service(5) reads it; `%` and `$` stand for themselves."""
     return " ".join(map(_word, words))
@@ -389,5 +447,7 @@ def _command(words: tuple[str, ...]) -> str:
 
 def _word(word: str) -> str:
     escaped = word.replace("\\", "\\\\").replace('"', '\\"').replace("%", "%%").replace("$", "$$")
+    # A line break would end the command, and begin a setting of its own.
+    escaped = re.sub(r"[\x01-\x1f\x7f]", lambda sign: f"\\x{ord(sign[0]):02x}", escaped)
     plain = re.fullmatch(r"[A-Za-z0-9_@%+=:,./$-]+", escaped)
     return escaped if plain else f'"{escaped}"'

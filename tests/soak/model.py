@@ -168,6 +168,7 @@ class Expectation:
 
     Attributes:
         exit_codes: the run ends with one of these; empty: it goes on.
+        may_go_on: it may go on all the same; then a limit of starts is reached, and no more.
         failed: processes of which a failure is reported.
         may_fail: processes of which one may be, or that they are silent.
         silent: processes whose nodes are reported as silent.
@@ -179,6 +180,7 @@ class Expectation:
     """
 
     exit_codes: frozenset[int] = frozenset()
+    may_go_on: bool = False
     failed: frozenset[str] = frozenset()
     may_fail: frozenset[str] = frozenset()
     silent: frozenset[str] = frozenset()
@@ -198,6 +200,7 @@ def follows(state: State, done: Round) -> tuple[Expectation, State]:
     silent: set[str] = set()
     codes: set[int] = set()
     starts = state.starts
+    may_go_on = False
     for fault in done.faults:
         own = process(fault.target)
         if fault.kind in HANGS or fault.kind is Kind.STOP_BRIEFLY:
@@ -209,11 +212,22 @@ def follows(state: State, done: Round) -> tuple[Expectation, State]:
             codes.add(ENDED_6)
             continue
         again |= set(own.takes_down)
-        if own.burst is not None:
-            fails = 1 + (fault.kind is Kind.STUMBLE)
+        for limited in (each for each in PROCESSES if each.burst is not None):
+            if own is not limited:
+                # Every start counts, and only an own failure has it given up.
+                if starts is not None and set(limited.nodes) <= set(own.takes_down):
+                    by_hand = not {"", *own.nodes}.isdisjoint(done.orders)
+                    starts = None if by_hand else starts + 1
+                continue
             assert starts is not None
-            if starts + fails > own.burst:
+            assert limited.burst is not None
+            fails = 1 + (fault.kind is Kind.STUMBLE)
+            if starts + fails > limited.burst:
                 codes.add(ENDED_7)
+            # Another's failure may cut off the start that was to fail; it begins anew then.
+            others = [each for each in done.faults if each is not fault]
+            cut_off = any(each.kind in DIES | HANGS for each in others)
+            may_go_on = starts < limited.burst and cut_off
             starts += fails
     # Who goes down with another may be down before it fails itself.
     covered = {
@@ -246,6 +260,7 @@ def follows(state: State, done: Round) -> tuple[Expectation, State]:
             starts = None
     expected = Expectation(
         exit_codes=frozenset(codes),
+        may_go_on=may_go_on and codes == {ENDED_7},
         failed=frozenset(failed) - covered,
         may_fail=frozenset(covered),
         silent=frozenset(silent) - covered,

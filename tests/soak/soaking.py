@@ -27,6 +27,7 @@ from tests.soak.model import (
     DIES,
     HANGS,
     NODES,
+    PROCESSES,
     UNMANAGED,
     Condition,
     Expectation,
@@ -58,6 +59,9 @@ BACK_S = 40.0
 UP_S = 60.0
 DOWN_S = 25.0
 
+REPORTING = tuple(each for each in NODES if each not in ("pool", "part"))
+"""Nodes whose own reports of their states are compared with what was requested."""
+
 _SIGNALS = {"term": signal.SIGTERM, "interrupt": signal.SIGINT}
 _BRIEFLY_S = 0.4
 
@@ -82,7 +86,7 @@ class Soaking:
             subprocess.run(["mount", *options, str(self.runtime)], check=True)
         self.stumble = directory / "stumble"
         self.manifest = manifest(directory, domain_id, self.mark)
-        self.transitions = Transitions(domain_id)
+        self.transitions = Transitions(domain_id, (f"/{each}" for each in REPORTING))
         self.domain_id = domain_id
         self.stalls = Stalls()
         self.state = State()
@@ -107,6 +111,9 @@ class Soaking:
                 shutil.rmtree(each)
             self.run = Watched(self.manifest, runtime=self.runtime)
             self._until_as_it_was(self.run, UP_S)
+            # What is compared with the requests later must not be empty.
+            if not self.transitions.activated(self._began, time.monotonic()):
+                raise NotAsPromisedError("no node published that it became active")
         return self.run
 
     def end(self, how: str) -> None:
@@ -213,7 +220,9 @@ class Soaking:
         if done.condition is Condition.FROZEN:
             times = {each: max(at, healed) for each, at in times.items()}
             self._reports(run, done, expected, since, times, delayed_s)
-        if expected.exit_codes:
+        if expected.may_go_on and self._goes_on(run):
+            after = State(starts=max(each.burst or 0 for each in PROCESSES))
+        elif expected.exit_codes:
             self.run = None
             # While the run ended the intruder may have used a port of the supervisor's.
             self._ended(run, expected.exit_codes, alone=done.condition is not Condition.INTRUDER)
@@ -471,6 +480,15 @@ class Soaking:
             time.sleep(0.05)
         raise NotAsPromisedError(f"not as it was within {within_s:g} s: {why}")
 
+    def _goes_on(self, run: Watched) -> bool:
+        """Whether the system comes to be as it was, and does not end."""
+        deadline = time.monotonic() + BACK_S
+        while run.process.poll() is None and time.monotonic() < deadline:
+            if not self._what_lacks(run):
+                return True
+            time.sleep(0.05)
+        return False
+
     def _what_lacks(self, run: Watched) -> str:
         status = run.status()
         if status is None:
@@ -494,7 +512,7 @@ class Soaking:
 
     def _judge(self, run: Watched) -> None:
         assert_gate_held(tuple(run.events))
-        names = [f"/{each}" for each in NODES if each not in ("pool", "part")]
+        names = [f"/{each}" for each in REPORTING]
         until = time.monotonic()
         assert_activated_on_request(run, self.transitions, self._began, until, names)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
+import fcntl
 import os
 import socket
 import threading
@@ -28,6 +29,7 @@ from lifecycle.run_directory import (
     short_path,
 )
 from lifecycle.supervisor.control import protocol
+from lifecycle.supervisor.control.client import status
 from lifecycle.supervisor.control.protocol import (
     Answer,
     ControlRequest,
@@ -64,6 +66,31 @@ def test_a_second_supervisor_of_one_system_is_refused_with_the_pid_of_the_first(
     RunDirectory.acquire(tmp_path, "robot@31", "def").release()
     first.release()
     RunDirectory.acquire(tmp_path, "robot@30", "def").release()
+
+
+def test_who_looks_whether_a_supervisor_runs_does_not_keep_one_from_starting(
+    tmp_path: Path,
+) -> None:
+    """A probe of a service manager, say, each few seconds, in the moment of a start."""
+    (tmp_path / "robot@0").mkdir(mode=0o700)
+    (tmp_path / "robot@0/lock").touch(mode=0o600)
+    with (tmp_path / "robot@0/lock").open("r+") as looking:
+        fcntl.flock(looking, fcntl.LOCK_SH)
+        assert running(tmp_path) == ()
+        release = threading.Timer(0.03, fcntl.flock, (looking, fcntl.LOCK_UN))
+        release.start()
+        RunDirectory.acquire(tmp_path, "robot@0", "r").release()
+        release.join()
+
+
+def test_a_supervisor_that_is_starting_is_not_said_to_have_died(tmp_path: Path) -> None:
+    directory = RunDirectory.acquire(tmp_path, "robot@0", "r")
+    with pytest.raises(UsageError) as caught:
+        status(directory.path)
+    directory.release()
+    assert caught.value.message == (
+        f"cannot ask 'robot@0': its supervisor (pid {os.getpid()}) is just starting or ending"
+    )
 
 
 def test_what_a_killed_supervisor_wrote_is_found_by_the_next(tmp_path: Path) -> None:

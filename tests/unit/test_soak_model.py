@@ -57,6 +57,29 @@ def test_a_limit_of_starts_is_reached_over_rounds_or_by_failing_again() -> None:
     assert _after(Fault(Kind.STUMBLE, "fragile", "connect exit9"))[0].exit_codes == {7}
 
 
+def test_a_start_counts_that_another_s_failure_made_necessary() -> None:
+    expected, state = _after(Fault(Kind.KILL, "core"))
+    assert (expected.exit_codes, state.starts) == (set(), 2)
+    assert _after(Fault(Kind.KILL, "core"), state=state)[0].exit_codes == set()
+    assert _after(Fault(Kind.KILL, "fragile"), state=state)[0].exit_codes == {7}
+    assert _after(Fault(Kind.KILL, "base"))[1].starts == 1
+    ordered = _after(Fault(Kind.KILL, "core"), condition=Condition.STORM, orders=("core",))
+    assert ordered[1].starts is None
+
+
+def test_a_start_that_is_to_fail_may_be_cut_off_by_another_s_failure() -> None:
+    stumble = Fault(Kind.STUMBLE, "fragile", "construct sleep")
+    pool = Fault(Kind.KILL, "pool")
+    assert not _after(stumble)[0].may_go_on
+    assert not _after(stumble, Fault(Kind.STOP_BRIEFLY, "pool"))[0].may_go_on
+    expected, _ = _after(stumble, pool)
+    assert (expected.exit_codes, expected.may_go_on) == ({7}, True)
+    # Killed once more it is given up, whatever would come of its next start.
+    assert not _after(stumble, pool, state=State(starts=2))[0].may_go_on
+    ends, _ = _after(stumble, Fault(Kind.KILL, "lone"))
+    assert not ends.may_go_on
+
+
 def test_a_hang_is_reported_as_silent_and_then_as_a_failure() -> None:
     expected, _ = _after(Fault(Kind.SPIN, "arm"))
     assert expected.silent == expected.failed == {"arm"}

@@ -52,8 +52,9 @@ def status_text(status: SystemStatus) -> str:
     count = "" if living == len(status.nodes) else f" {living}/{len(status.nodes)}"
     mode = f", mode {status.mode}" if status.mode else ""
     applied = f", revision {status.revision}: {status.manifest}" if status.revision > 1 else ""
+    phase = f"{status.phase} ({status.ends})" if status.ends else status.phase
     head = (
-        f"{status.system}: {status.phase}{count}{mode}, verdict {verdict}, "
+        f"{status.system}: {phase}{count}{mode}, verdict {verdict}, "
         f"domain {status.domain_id}, supervisor {status.supervisor}, "
         f"up for {status.elapsed_s:.1f} s{applied}"
     )
@@ -117,7 +118,7 @@ def _history(node: NodeStatus) -> str:
 @click.option(
     "--probe",
     type=click.Choice(["live", "ready"]),
-    help="For health checks: print nothing, exit with 0 while the supervisor answers (live), or "
+    help="For health checks: print no status, exit with 0 while the supervisor answers (live), or "
     "while the system is active and not violated (ready), else with 6.",
 )
 def status_command(

@@ -15,7 +15,7 @@ import click
 
 from lifecycle.cli.common import load_manifest, manifest_arguments
 from lifecycle.errors import ExitCode, UsageError
-from lifecycle.manifest import EndpointPolicy, Restart
+from lifecycle.manifest import EndpointPolicy
 from lifecycle.printable import lines
 
 if TYPE_CHECKING:
@@ -133,7 +133,8 @@ def _engine_command(engine: str) -> click.Command:
         from lifecycle.export import ENGINES, Deployment
         from lifecycle.plan import build_plan
 
-        words = _up_options(more, container=engine in _CONTAINERS)
+        words, timeout_s = _up_options(more, container=engine in _CONTAINERS)
+        _check_places(engine, at=at, **rest)
         loaded = load_manifest(manifest, assignments, machine=None)
         here = str(Path(manifest).resolve())
         inside = f"/system/{Path(manifest).name}" if engine in _CONTAINERS else here
@@ -144,8 +145,8 @@ def _engine_command(engine: str) -> click.Command:
             words=(*assignments, *words),
             image=rest.get("image", ""),
             program=rest.get("program", ""),
-            restarts=any(each.supervision.restart is not Restart.NO for each in plan.nodes),
-            programs_networks="--program" in " ".join(words),
+            timeout_s=timeout_s,
+            programs_networks=any(each.startswith("--program") for each in words),
         )
         for name, text in ENGINES[engine](deployment).items():
             _write(output / name, text)
@@ -174,23 +175,64 @@ for _engine in _WRITTEN_FOR:
     command.add_command(_engine_command(_engine))
 
 
-def _up_options(more: str, *, container: bool) -> tuple[str, ...]:
-    """Return further words of `lifecycle up`.
+def _up_options(more: str, *, container: bool) -> tuple[tuple[str, ...], float]:
+    """Return further words of `lifecycle up`, and the `--timeout` in them, seconds; 0 for none.
 
     Raises:
-        UsageError: they cannot be read, or what they ask for cannot be had in a container.
+        UsageError: `up` would refuse them, or what they ask for cannot be had from an engine.
     """
+    from lifecycle.cli.verbs.up import command as up
+
     try:
         words = tuple(shlex.split(more))
     except ValueError as error:
         raise UsageError(f"cannot read --up {more!r}: {error}") from error
-    if container and any(each.partition("=")[0] == "--program" for each in words):
+    try:
+        given = up.make_context("up", ["MANIFEST", *words]).params
+    except click.exceptions.Exit as error:
+        raise UsageError(f"cannot start a system with --up {more!r}") from error
+    except click.ClickException as error:
+        raise UsageError(
+            f"cannot use --up {more!r}: {error.format_message()}", hint="lifecycle up --help"
+        ) from error
+    if given["assignments"]:
+        raise UsageError(
+            f"cannot take {given['assignments'][0]!r} from --up; "
+            "write arguments of the manifest after the manifest"
+        )
+    for name, why in _NOT_OF_ENGINES.items():
+        if given[name]:
+            raise UsageError(f"cannot use --{name.replace('_', '-')} in --up: {why}")
+    if given["until"] != "active":
+        raise UsageError(
+            f"cannot use --until {given['until']} in --up: only an active system is ever ready"
+        )
+    if container and given["targets"]:
         raise UsageError(
             "cannot program networks from a container without root: engines give capabilities to "
             "root alone there",
             hint="program them on the machine: lifecycle export systemd … --up '--program …'",
         )
-    return words
+    return words, given["timeout"] or 0.0
+
+
+_NOT_OF_ENGINES = {
+    "hosts": "each machine's engine starts its own part",
+    "machine": "each file names its machine",
+}
+
+
+def _check_places(engine: str, *, at: str, program: str = "", image: str = "") -> None:
+    """Raise UsageError for a path or an image that the engine would refuse, or not find."""
+    if engine == "systemd":
+        for option, path in (("--program", program), ("--at", at)):
+            if path and not path.startswith("/"):
+                raise UsageError(
+                    f"cannot use {option} {path!r} in a unit: a service has no working directory "
+                    "of ours; write an absolute path"
+                )
+    elif not image or re.search(r"\s", image) or image.startswith("-"):
+        raise UsageError(f"cannot use image {image!r}; write it as in 'registry/robot:1'")
 
 
 def _check_paths(enclaves: tuple[Enclave, ...]) -> None:

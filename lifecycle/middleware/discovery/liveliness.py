@@ -21,6 +21,7 @@ lifecycle.plan.comparison.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import functools
 import json
 import logging
@@ -42,6 +43,7 @@ from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, Reliabilit
 from std_msgs.msg import Empty, String
 
 from lifecycle.codec import from_json
+from lifecycle.middleware.rcl import abi
 
 LEASE_S = 0.85
 """A participant whose liveliness was not asserted for so long is lost: within a second with all
@@ -184,8 +186,30 @@ class _Pulse:
             while not self._ended:
                 if self._publisher is not None:
                     with contextlib.suppress(InvalidHandle):  # its node was destroyed first
-                        self._publisher.assert_liveliness()
+                        _assert_liveliness(self._publisher)
                 self._changed.wait(None if self._publisher is None else ASSERTED_EACH_S)
+
+
+def _assert_liveliness(publisher: Publisher) -> None:
+    """Assert it without the GIL, which rclpy's own call keeps.
+
+    Fast DDS takes locks there, and was seen not to give them back while peers left: with the GIL
+    the whole process stood still, deadlines too.
+
+    Raises:
+        InvalidHandle: it was destroyed.
+    """
+    with publisher.handle:
+        if _asserting()(publisher.handle.pointer):
+            _logger.debug("liveliness was not asserted: %s", abi.load().take_error())
+
+
+@functools.cache
+def _asserting() -> Callable[[int], int]:
+    asserts: Callable[[int], int] = abi.bind(
+        "rcl", "rcl_publisher_assert_liveliness", ctypes.c_int, (ctypes.c_void_p,)
+    )
+    return asserts
 
 
 @typing.final

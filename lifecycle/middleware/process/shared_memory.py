@@ -216,8 +216,10 @@ def sweep(only: Collection[str], *, within_s: float = 0.0) -> tuple[str, ...]:
 
     Args:
         only: names that processes which have ended were seen to own.
-        within_s: seconds to try again while others use some: they let go of the port of a
-            participant that left once they have read that, and after a kill none removes it.
+        within_s: seconds to try again while others use some. They let go of the port of a
+            participant that left when they next send over shared memory
+            (SharedMemTransport::cleanup_output_ports in Fast DDS 2.14), of one that was killed only
+            seconds later; and where one was killed that had sent there, none removes it.
 
     Returns:
         The names removed, sorted; empty where there is no /dev/shm.

@@ -275,8 +275,9 @@ class GraphObserver:
 
         A part that is shown as in the last snapshot for the same names is the same object.
 
-        All but its own node. The housekeeping of client libraries is left out. Services are known
-        by their nodes, so those of no known node are looked for by name.
+        All but its own node, of which there is only what it publishes under `names`. The
+        housekeeping of client libraries is left out. Services are known by their nodes, so those
+        of no known node are looked for by name.
 
         Args:
             declared: fully qualified names of nodes that are looked for.
@@ -298,7 +299,10 @@ class GraphObserver:
         for each in self._topic_endpoints(kept, last):
             shown.setdefault(each.node, []).append(each)
         if ourselves is not None:
-            shown.pop(ourselves, None)
+            # Others match what a supervisor offers under names that are looked for.
+            own = shown.pop(ourselves, [])
+            if own := [each for each in own if names.looks_for(each.kind, each.name)]:
+                shown[ourselves] = own
         unreported = {""}
         for name in sorted(name for name in counts if known_node(name) and name != ourselves):
             services, managed = self._services_of(name, kept, last)
@@ -655,8 +659,8 @@ def _topic_endpoint(
 ) -> ObservedEndpoint | None:
     """Return a publisher or subscription; None if it is the housekeeping of a client library."""
     node = known_node(info.node)
-    feeds = node not in declared and names.fed_by(kind, topic)
-    if not feeds and is_noise_endpoint(kind, node, topic, info.type, ours=False):
+    wanted = node not in declared and names.looks_for(kind, topic)
+    if not wanted and is_noise_endpoint(kind, node, topic, info.type, ours=False):
         return None
     return ObservedEndpoint(
         kind=kind,

@@ -269,6 +269,7 @@ class NodeLoop:
         self._stopping = False
         self._done = False
         self._left = False
+        self._leaving = threading.Lock()
         self._code = 0
 
     @property
@@ -314,12 +315,18 @@ class NodeLoop:
         republish_names((*by_context.values(), *hidden_nodes()))
 
     def call_soon(self, task: Callable[..., Coroutine[Any, Any, None]], *arguments: object) -> None:
-        """Run an `async def` where callbacks of nodes run; from any thread. It must not raise."""
-        self._own.create_task(task, *arguments)
+        """Run an `async def` where callbacks of nodes run; from any thread. It must not raise.
+
+        Once the process leaves, nothing runs any more.
+        """
+        with self._leaving:
+            if not self._left:
+                self._own.create_task(task, *arguments)
 
     def call_beside(self, task: Callable[[], Any]) -> object:
         """Run a function, sync or async, in the main thread's executor; false after its end."""
-        return False if self._left else self._executor.create_task(task)
+        with self._leaving:
+            return False if self._left else self._executor.create_task(task)
 
     def stop(self, reason: str, *, code: int) -> None:
         """Shut every node down and leave with `code`; from any thread, the first call counts.
@@ -361,9 +368,10 @@ class NodeLoop:
                 self._turn()
             except (Exception, SystemExit) as error:  # noqa: BLE001, PERF203 - the user's code
                 self._failed(error)
+        with self._leaving:
+            self._left = True
         if self._own is not self._executor:
             self._own.shutdown(_LEAVE_S)
-        self._left = True
         self._executor.shutdown()
         contexts = dict.fromkeys([self._context, *(node.context for node in self._nodes)])
         leave_and_exit(self._code, nodes=self._nodes, contexts=contexts)

@@ -13,7 +13,9 @@ import shlex
 from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
+from lifecycle.errors import MiddlewareError
 from lifecycle.graph import set_within
+from lifecycle.manifest import EndpointKind
 from lifecycle.plan import ParticipantConnections, Plan, PlannedNode
 from lifecycle.supervisor.control.ros_interface import Answer, Offer
 from lifecycle.supervisor.health.peer_supervisors import Listener
@@ -224,12 +226,30 @@ class ObserverParticipant:
         return PlanNotices(self._node, on_notice)
 
     def ros_interface(
-        self, prefix: str, services: Iterable[str], on_call: Callable[[str, Answer], None]
+        self,
+        prefix: str,
+        services: Iterable[str],
+        on_call: Callable[[str, Answer], None],
+        *,
+        diagnoses: bool,
     ) -> Offer:
-        """Make the topics and services by which ROS programs reach the supervisor."""
-        from lifecycle.middleware import RosInterface
+        """Make the topics and services by which ROS programs reach the supervisor.
 
-        return RosInterface(self._node, prefix, services, on_call)
+        Raises:
+            MiddlewareError: a package cannot be loaded, or rcl refuses.
+        """
+        try:
+            from lifecycle.middleware import RosInterface
+
+            return RosInterface(self._node, prefix, services, on_call, diagnoses=diagnoses)
+        except Exception as error:  # rclpy has no root of its own errors
+            raise MiddlewareError(" ".join(str(error).split())) from error
+
+    def is_subscribed(self, topic: str) -> bool:
+        """Return whether discovery shows a subscription of a topic."""
+        from lifecycle.middleware import endpoints_of
+
+        return bool(endpoints_of(self._node, EndpointKind.SUBSCRIPTION, topic))
 
     def call_out(self, addresses: Iterable[str]) -> None:
         """Make all participants announce themselves, as far as the system's discovery allows."""

@@ -1,7 +1,8 @@
 """Notify systemd of a run's readiness, status and watchdog: the sd_notify protocol.
 
 Owns: `ServiceManager`, a listener of events. READY is sent when the system is verified and active,
-never before; WATCHDOG from the supervisor's event loop, so that a supervisor that hangs is ended.
+never before. Until then EXTEND_TIMEOUT_USEC, and always WATCHDOG, come from the supervisor's event
+loop, so that a supervisor that hangs is ended.
 Source: sd_notify(3), sd_watchdog_enabled(3), systemd.service(5) "Type=notify".
 """
 
@@ -27,6 +28,10 @@ from lifecycle.supervisor.run.events import (
 _TIMES_PER_LIMIT = 2
 """sd_watchdog_enabled(3): send in half of the time that is given."""
 
+_EXTENSION_S = 20.0
+"""For how much longer it may be starting. Bring-up has its own deadlines, which count anew for what
+is restarted; the service manager's is for a supervisor that hangs."""
+
 
 class ServiceManager:
     """Reports one run to the service manager that has started this process.
@@ -40,6 +45,7 @@ class ServiceManager:
         self._address = f"\0{address[1:]}" if address.startswith("@") else address
         self._watchdog_s = watchdog_s
         self._timer: asyncio.TimerHandle | None = None
+        self._starting = True
         self._active = False
         self._system = ""
 
@@ -65,7 +71,7 @@ class ServiceManager:
             trusted = f"; taken on trust: {event.trusted}" if event.trusted else ""
             self._send(STATUS=f"{self._system}: verified, activating{trusted}")
         elif isinstance(event, SystemReached) and event.reached == "active":
-            self._active = True
+            self._starting, self._active = False, True
             self._send(READY="1", STATUS=f"{self._system}: active and verified")
         elif isinstance(event, VerdictChanged):
             found = f", {len(event.verdict.findings)} findings" if event.verdict.findings else ""
@@ -74,13 +80,14 @@ class ServiceManager:
         elif isinstance(event, Failure):
             self._send(STATUS=f"{self._system}: {event.message}")
         elif isinstance(event, Stopping):
-            self._active = False
+            self._starting = self._active = False
             self._send(STOPPING="1", STATUS=f"{self._system}: stopping, {event.reason}")
 
     def watch(self) -> Callable[[], None]:
         """Send signs of life from the running event loop; return what ends that."""
-        if self._watchdog_s is not None:
-            self._alive(asyncio.get_running_loop(), self._watchdog_s / _TIMES_PER_LIMIT)
+        if self._address:
+            limit_s = min(self._watchdog_s or _EXTENSION_S, _EXTENSION_S)
+            self._alive(asyncio.get_running_loop(), limit_s / _TIMES_PER_LIMIT)
 
         def end() -> None:
             if self._timer is not None:
@@ -89,7 +96,10 @@ class ServiceManager:
         return end
 
     def _alive(self, loop: asyncio.AbstractEventLoop, period_s: float) -> None:
-        self._send(WATCHDOG="1")
+        if self._starting:
+            self._send(EXTEND_TIMEOUT_USEC=f"{_EXTENSION_S * 1e6:.0f}")
+        if self._watchdog_s is not None:
+            self._send(WATCHDOG="1")
         self._timer = loop.call_later(period_s, self._alive, loop, period_s)
 
     def _send(self, **state: str) -> None:

@@ -216,6 +216,7 @@ class Session:
         self._held = False
         self._keeps = False
         self._ends = ""
+        self._reason = ""
         self._hurry = asyncio.Event()
         self._stop: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._changes = ChangeCounter(system, observer_participant)
@@ -295,7 +296,7 @@ class Session:
         )
 
         self._ros_interface = RosInterface(
-            system.plan.policy.ros_interface,
+            system.plan,
             min(system.machines or ("",)),
             observer_participant,
             modes=() if system.remote else (each.name for each in system.plan.modes),
@@ -303,6 +304,7 @@ class Session:
             verdict=lambda: self._judge.latest,
             order=self._holding.ordered,
             down=lambda: self._down("the down service"),
+            notify=lambda text: emit(Notice(message=text)),
         )
 
     def status(self) -> SystemStatus:
@@ -314,6 +316,7 @@ class Session:
             supervisor=os.getpid(),
             elapsed_s=self._emit.elapsed_s,
             schedule=self._schedule,
+            ends=self._reason,
         )
 
     def look(self) -> SupervisorSnapshot:
@@ -356,6 +359,7 @@ class Session:
         self._agreement.open()
         self._emit.listen(lambda event: None if isinstance(event, LogLine) else server.changed())
         self._emit.listen(self._ros_interface.on_event)
+        self._ros_interface.begin()
         self._emit.listen(self._keep)
         result = UpResult(exit_code=ExitCode.INTERNAL, verdict=NOT_JUDGED)
         offering = asyncio.ensure_future(self._interfaces.follow())
@@ -406,14 +410,14 @@ class Session:
             elif self._gate_sequence.phase == "activating":
                 stopping = "what became active is not what was verified"
             reason = f"{stopping}; {not_ok(error.verdict) or error.verdict.verdict.value}"
-        self._gate.close()
-        self._gate_sequence.phase = _STOPPING
-        self._emit(Stopping(reason=stopping))
-        self._ends = stopping
         if end.why:
             reason = f"{reason}, but {end.why}" if reason == "done" else f"{reason}; {end.why}"
         if restarted := self._schedule.summary():
             reason = f"{reason}; {restarted}"
+        self._gate.close()
+        self._gate_sequence.phase = _STOPPING
+        self._ends, self._reason = stopping, reason
+        self._emit(Stopping(reason=stopping))
         run = RunEnd(
             reason=reason,
             reached=self._furthest,

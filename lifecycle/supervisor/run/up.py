@@ -37,6 +37,7 @@ from lifecycle.run_directory import (
 from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.connections.networks import open_networks, token_variables
 from lifecycle.supervisor.control.protocol import SystemStatus
+from lifecycle.supervisor.control.ros_interface import check_installed
 from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.forerunner import Forerunner
@@ -177,6 +178,7 @@ def _up(
         with ending.raised() if options.program else contextlib.nullcontext():
             networks = open_networks(plan, options, directory, emit, environment=os.environ)
         check_log_root(os.environ)
+        check_installed(plan.policy)
         _enter_graph(plan, options, directory)
 
         async def run(leaving: contextlib.AsyncExitStack) -> UpResult:
@@ -306,7 +308,9 @@ def _preloading(
 
 
 _LET_GO_S = 0.5
-"""Others let go of what a participant used within milliseconds of its leaving."""
+"""Others let go of the port of a participant that left when they next send over shared memory: most
+within milliseconds, one that sends nothing perhaps never. Then the port stays for who uses it next.
+"""
 
 
 def _sweep(records: Records | None, emit: Emitter | None = None, *, within_s: float = 0.0) -> None:

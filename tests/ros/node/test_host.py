@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
 import signal
@@ -174,6 +175,18 @@ def test_a_signal_ends_the_process_well(start: Start, number: signal.Signals) ->
     os.kill(host.process.pid, number)
     assert host.states(2) == ["shuttingdown", "finalized"]
     assert host.wait() == 0
+
+
+def test_a_command_that_arrives_while_the_process_leaves_is_passed_over(start: Start) -> None:
+    """As systemd's SIGTERM to all of a unit at once has it happen."""
+    host = start(hosted("one", "Good"))
+    host.until("ready")
+    os.kill(host.process.pid, signal.SIGTERM)
+    with contextlib.suppress(OSError):
+        while host.process.poll() is None:
+            host.ask("/one", CONFIGURE)
+    assert host.wait() == 0
+    assert "Traceback" not in host.log.read_text()
 
 
 def test_an_async_callback_that_waits_does_not_keep_the_process(start: Start) -> None:

@@ -584,7 +584,7 @@ def test_what_a_running_supervisor_cannot_take_is_refused_with_the_reason(
     assert refused.stderr == (
         "cannot reload the manifest of 'pair' while it runs: a running supervisor cannot "
         'change this:\ndiscovery.range: was "localhost", is "subnet"\n'
-        'policy.ros_interface: was "off", is "full"' + end
+        'policy.ros_interface: was "read_only", is "full"' + end
     )
     refused = verb("restart", "pair", "--reload", runtime=directory)
     assert refused.returncode == ExitCode.USAGE

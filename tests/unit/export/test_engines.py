@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import configparser
+import os
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -16,6 +18,7 @@ from click.testing import CliRunner
 from lifecycle.cli import cli
 from lifecycle.errors import UsageError
 from lifecycle.export import ENGINES, Deployment
+from lifecycle.manifest import Restart, Supervision
 from lifecycle.plan import Plan
 from tests.builders import plan_of, planned_node
 
@@ -26,9 +29,21 @@ PLAN = plan_of(planned_node("camera"), planned_node("viewer", after={"camera": "
 
 def written(engine: str, **fields: Any) -> str:
     (text,) = ENGINES[engine](
-        Deployment(plan=PLAN, manifest="/system/robot.lifecycle.yaml", image="robot:1", **fields)
+        Deployment(
+            **{
+                "plan": PLAN,
+                "manifest": "/system/robot.lifecycle.yaml",
+                "image": "robot:1",
+                **fields,
+            }
+        )
     ).values()
     return text
+
+
+def restarting(*, restarts: bool) -> Plan:
+    restart = Restart.ON_FAILURE if restarts else Restart.NO
+    return plan_of(planned_node("camera", supervision=Supervision(restart=restart)))
 
 
 def exported(tmp_path: Path, *words: str) -> dict[str, str]:
@@ -64,19 +79,6 @@ def test_each_machine_has_a_unit_that_starts_its_part(tmp_path: Path) -> None:
     assert "AmbientCapabilities" not in service
 
 
-@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd is not installed")
-@pytest.mark.parametrize("more", [(), ("--up", "--program 'nft'")])
-def test_systemd_finds_nothing_wrong_with_its_units(tmp_path: Path, more: tuple[str, ...]) -> None:
-    exported(tmp_path, "systemd", TELEOP, "--program", "/bin/true", *more)
-    done = subprocess.run(
-        ["systemd-analyze", "verify", "--man=no", *map(str, tmp_path.iterdir())],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert (done.returncode, done.stderr) == (0, "")
-
-
 def test_who_programs_networks_may_do_that_and_no_more(tmp_path: Path) -> None:
     text = exported(tmp_path, "systemd", TELEOP, "--up", "--program nft")["teleop-robot.service"]
     service = sections(text)["Service"]
@@ -95,7 +97,8 @@ def test_words_with_signs_of_systemd_stand_for_themselves() -> None:
 
 @pytest.mark.parametrize("restarts", [False, True])
 def test_kubernetes_takes_its_objects(*, restarts: bool) -> None:
-    made = yaml.safe_load(written("kubernetes", restarts=restarts, words=("a:=$(b)",)))
+    plan = restarting(restarts=restarts)
+    made = yaml.safe_load(written("kubernetes", plan=plan, words=("a:=$(b)",)))
     kubernetes_validate.validate(made, "1.30", strict=True)
     assert made["kind"] == ("Pod" if restarts else "Deployment")
     pod = made["spec"] if restarts else made["spec"]["template"]["spec"]
@@ -132,28 +135,17 @@ def test_compose_has_a_service_that_is_healthy_once_verified() -> None:
     )
 
 
-@pytest.mark.skipif(
-    shutil.which("docker") is None
-    or subprocess.run(["docker", "compose", "version"], capture_output=True, check=False).returncode
-    != 0,
-    reason="docker compose is not installed",
-)
-def test_compose_finds_nothing_wrong_with_its_file(tmp_path: Path) -> None:
-    exported(tmp_path, "compose", TELEOP, "--image", "teleop:1")
-    for each in tmp_path.iterdir():
-        subprocess.run(["docker", "compose", "-f", str(each), "config", "--quiet"], check=True)
-
-
 @pytest.mark.parametrize(
     ("restarts", "unit", "composed"),
     [(False, "on-failure", "on-failure:5"), (True, "on-abnormal", "no")],
 )
 def test_what_fails_is_restarted_by_one_of_both(restarts: bool, unit: str, composed: str) -> None:
-    assert sections(written("systemd", restarts=restarts))["Service"]["Restart"] == unit
-    assert sections(written("quadlet", restarts=restarts))["Service"]["Restart"] == unit
-    (service,) = yaml.safe_load(written("compose", restarts=restarts))["services"].values()
+    plan = restarting(restarts=restarts)
+    assert sections(written("systemd", plan=plan))["Service"]["Restart"] == unit
+    assert sections(written("quadlet", plan=plan))["Service"]["Restart"] == unit
+    (service,) = yaml.safe_load(written("compose", plan=plan))["services"].values()
     assert service["restart"] == composed
-    pod = yaml.safe_load(written("kubernetes", restarts=restarts))["spec"]
+    pod = yaml.safe_load(written("kubernetes", plan=plan))["spec"]
     assert pod.get("restartPolicy") == ("Never" if restarts else None)
 
 
@@ -173,3 +165,225 @@ def test_a_manifest_that_restarts_a_node_leaves_the_engine_its_supervisor(tmp_pa
     )
     (text,) = exported(tmp_path / "out", "systemd", str(manifest)).values()
     assert sections(text)["Service"]["Restart"] == "on-abnormal"
+
+
+AWKWARD = """
+manifest_version: 1
+system: The_Longest-System_Name_That_Anybody_Would_Write_In_A_Manifest_Of_Theirs
+arguments: {what: {default: a}}
+machines:
+  Left_Arm: {address: 10.0.0.1}
+  right_arm: {address: 10.0.0.2}
+  _base: {address: 10.0.0.3}
+modes: {normal: {}, safe: {inactive: [hand]}}
+nodes:
+  arm:
+    run: {command: [arm], environment: {ARM_TOKEN: topsecret}, limits: {nofile: 512}}
+    machine: Left_Arm
+    timeouts: {configure_s: 400, deactivate_s: 90}
+  hand: {run: {command: [hand]}, machine: right_arm, restart: always, after: {arm: active}}
+  eye: {run: {command: [eye]}, machine: _base, health: {diagnostics: "eye: *"}}
+  cart: {run: {command: [cart]}, parameters: {what: $(arg what)}}
+"""
+SIGNS = 'x y\nTimeoutStartSec=1\n %h $HOME ${A} "q" \' \\ ; é \t'
+"""What a shell, systemd, Compose and Kubernetes each would read as something else."""
+
+
+@pytest.fixture(scope="module")
+def awkward(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """What each engine is given for manifests of all kinds: folders, by engine."""
+    base = tmp_path_factory.mktemp("engines")
+    manifest = base / "awkward manifest.lifecycle.yaml"
+    manifest.write_text(AWKWARD)
+    shipped = ROOT / "manifests"
+    for engine, option in (
+        ("systemd", ("--program", "/bin/true", "--up", "--strict --timeout 600")),
+        *((each, ("--image", "reg:5000/robot:1")) for each in ("quadlet", "compose", "kubernetes")),
+    ):
+        for words in (
+            (str(manifest), f"what:={SIGNS}"),
+            (str(shipped / "first_node.lifecycle.yaml"),),
+            (str(shipped / "client_server_master.lifecycle.yaml"),),
+            (TELEOP,),
+        ):
+            command = ["export", engine, *words, "-o", str(base / engine), *option]
+            CliRunner().invoke(cli, command, standalone_mode=False, catch_exceptions=False)
+    return {engine: base / engine for engine in ENGINES}
+
+
+def checked(*command: str | Path, **environment: str) -> str:
+    """Run an engine's tool, which must find nothing wrong."""
+    done = subprocess.run(
+        list(map(str, command)),
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+        env={**os.environ, **environment},
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout + done.stderr
+
+
+def test_no_two_parts_have_one_file(awkward: dict[str, Path]) -> None:
+    for folder in awkward.values():
+        names = [each.name for each in folder.iterdir()]
+        assert len(names) == 4 + 1 + 2 + 2
+        assert max(map(len, names)) < 63 + len("compose..container")
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd is not installed")
+def test_systemd_finds_nothing_wrong_with_its_units(
+    awkward: dict[str, Path], tmp_path: Path
+) -> None:
+    exported(tmp_path, "systemd", TELEOP, "--program", "/bin/true", "--up", "--program 'nft'")
+    for folder in (awkward["systemd"], tmp_path):
+        assert checked("systemd-analyze", "verify", "--man=no", *folder.iterdir()) == ""
+
+
+GENERATOR = next(
+    filter(
+        Path.exists,
+        (
+            Path(each, "podman/quadlet")
+            for each in ("/usr/libexec", "/usr/lib", "/usr/local/libexec")
+        ),
+    ),
+    Path(os.environ.get("QUADLET", "quadlet")),
+)
+
+
+@pytest.mark.skipif(not GENERATOR.exists(), reason="podman's quadlet (4.4) is not installed")
+def test_podman_makes_units_of_quadlets(awkward: dict[str, Path], tmp_path: Path) -> None:
+    """`--dryrun` names what it cannot use, but ends with 0 for some of it."""
+    said = checked(GENERATOR, "-dryrun", QUADLET_UNIT_DIRS=str(awkward["quadlet"]))
+    assert said.count("ExecStart=/usr/bin/podman run") == 9
+    assert not re.search("unsupported|converting|error", said, re.IGNORECASE)
+    assert r'"what:=x y\nTimeoutStartSec=1\n %%h $$HOME $${A} \"q\" ' in said
+
+
+COMPOSE = [
+    each
+    for each in (["docker", "compose"], ["docker-compose"])
+    if shutil.which(each[0])
+    and subprocess.run([*each, "version"], capture_output=True, check=False).returncode == 0
+]
+
+
+@pytest.mark.skipif(not COMPOSE, reason="neither docker compose nor docker-compose is installed")
+def test_compose_finds_nothing_wrong_with_its_files(awkward: dict[str, Path]) -> None:
+    # One of each kind: docker-compose 1 takes half a second to start.
+    chosen = [
+        each for each in awkward["compose"].iterdir() if not re.search("left|right|ope", each.name)
+    ]
+    assert len(chosen) == 4
+    for command in COMPOSE:
+        for each in chosen:
+            made = yaml.safe_load(checked(*command, "-f", each, "config"))
+            (service,) = made["services"].values()
+            if "what:" in each.read_text():
+                # `config` writes `$` doubled, as it reads it.
+                assert service["command"][-1].replace("$$", "$") == f"what:={SIGNS}"
+
+
+@pytest.mark.skipif(shutil.which("kubectl") is None, reason="kubectl is not installed")
+def test_kubectl_loses_nothing_of_its_objects(awkward: dict[str, Path]) -> None:
+    """Without a server: read into the API's own types, in which an unknown field is lost."""
+    for each in awkward["kubernetes"].iterdir():
+        made = yaml.safe_load(each.read_text())
+        kubernetes_validate.validate(made, "1.30", strict=True)
+        command = ("kubectl", "label", "--local", "-f", each, "app.kubernetes.io/part-of=x")
+        read = yaml.safe_load(checked(*command, "-o", "yaml"))
+        assert contained(made, read)
+
+
+def contained(less: object, more: object) -> bool:
+    """Return whether all of `less` is in `more`, at its place."""
+    if isinstance(less, dict) and isinstance(more, dict):
+        return all(key in more and contained(value, more[key]) for key, value in less.items())
+    if isinstance(less, list) and isinstance(more, list):
+        return len(less) == len(more) and all(map(contained, less, more))
+    return less == more
+
+
+def test_a_system_of_one_host_may_run_on_any_node(tmp_path: Path) -> None:
+    """`local` is what its machine is called inside; no host has that name."""
+    manifest = str(ROOT / "manifests/first_node.lifecycle.yaml")
+    (text,) = exported(tmp_path, "kubernetes", manifest, "--image", "robot:1").values()
+    assert "nodeSelector" not in text
+    assert "--machine" not in text
+    assert yaml.safe_load(text)["metadata"]["name"] == "first-node"
+
+
+def test_machines_that_kubernetes_cannot_tell_apart_are_refused(tmp_path: Path) -> None:
+    manifest = tmp_path / "robot.lifecycle.yaml"
+    manifest.write_text(
+        "manifest_version: 1\nsystem: robot\n"
+        "machines: {arm_1: {address: 10.0.0.1}, Arm_1: {address: 10.0.0.2}}\n"
+        "nodes:\n  a: {run: {command: [a]}, machine: arm_1}\n"
+        "  b: {run: {command: [b]}, machine: Arm_1}\n"
+    )
+    files = exported(tmp_path / "units", "systemd", str(manifest))
+    assert len(files) == 2
+    assert all(each.startswith("robot-arm-1-") for each in files)
+    with pytest.raises(UsageError, match="cannot choose a node of Kubernetes by the name"):
+        exported(tmp_path / "k", "kubernetes", str(manifest), "--image", "robot:1")
+
+
+def test_the_engine_restarts_the_part_of_a_machine_on_which_nothing_restarts_itself(
+    awkward: dict[str, Path],
+) -> None:
+    units = {each.name: sections(each.read_text()) for each in awkward["systemd"].iterdir()}
+    restart = {
+        machine: next(
+            unit["Service"]["Restart"] for name, unit in units.items() if f"{machine}-" in name
+        )
+        for machine in ("left-arm", "right-arm")
+    }
+    assert restart == {"left-arm": "on-failure", "right-arm": "on-abnormal"}
+
+
+def test_an_engine_waits_as_long_as_nodes_may_take(awkward: dict[str, Path]) -> None:
+    """A node that takes 90 s to park is not killed in the middle of it."""
+    for each in awkward["systemd"].iterdir():
+        service = sections(each.read_text())["Service"]
+        assert service["KillMode"] == "mixed"
+        if "left-arm" in each.name:
+            assert int(service["TimeoutStopSec"]) > 90
+            assert int(service["TimeoutStartSec"]) >= 600
+    many = plan_of(*(planned_node(f"n{number}") for number in range(120)))
+    service = sections(written("systemd", plan=many))["Service"]
+    assert int(service["TimeoutStartSec"]) >= 30 + 120
+    (text,) = (each.read_text() for each in awkward["compose"].iterdir() if "left-arm" in each.name)
+    (part,) = yaml.safe_load(text)["services"].values()
+    assert int(part["stop_grace_period"].rstrip("s")) > 90
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (
+            "--until verified",
+            "cannot use --until verified in --up: only an active system is ever ready",
+        ),
+        ("--hosts", "cannot use --hosts in --up: each machine's engine starts its own part"),
+        ("--machine x", "cannot use --machine in --up: each file names its machine"),
+        (
+            "a:=b",
+            "cannot take 'a:=b' from --up; write arguments of the manifest after the manifest",
+        ),
+        ("--nonsense", "cannot use --up '--nonsense': No such option '--nonsense'."),
+        ("'", 'cannot read --up "\'": No closing quotation'),
+    ],
+)
+def test_what_up_would_refuse_is_refused(tmp_path: Path, more: str, message: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        exported(tmp_path, "systemd", TELEOP, "--up", more)
+    assert caught.value.message == message
+
+
+def test_places_that_an_engine_would_not_find_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"cannot use --program '\./lifecycle' in a unit"):
+        exported(tmp_path, "systemd", TELEOP, "--program", "./lifecycle")
+    with pytest.raises(UsageError, match="cannot use image 'a b'"):
+        exported(tmp_path, "compose", TELEOP, "--image", "a b")

@@ -77,6 +77,9 @@ def test_the_watchdog_is_served_in_half_of_its_time_from_the_loop(
     environment = {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "40000"}
     service = ServiceManager.of({**environment, "WATCHDOG_PID": str(os.getpid())})
 
+    service.on_event(SystemReached(reached="active", elapsed_s=2.0))
+    _received(manager)
+
     async def main() -> None:
         loop = asyncio.get_running_loop()
         end = service.watch()
@@ -87,12 +90,25 @@ def test_the_watchdog_is_served_in_half_of_its_time_from_the_loop(
 
     asyncio.run(main())
     other = ServiceManager.of({**environment, "WATCHDOG_PID": "1"})
+    asyncio.run(_watched(other))
+    assert ["WATCHDOG=1"] not in _received(manager)
 
-    async def nothing() -> None:
-        other.watch()
 
-    asyncio.run(nothing())
+def test_a_bring_up_that_goes_on_has_more_time_until_it_is_active(
+    manager: socket.socket, tmp_path: Path
+) -> None:
+    """What is restarted during bring-up has its time anew; a fixed limit would cut that off."""
+    service = ServiceManager.of({"NOTIFY_SOCKET": str(tmp_path / "notify")})
+    asyncio.run(_watched(service))
+    assert _received(manager) == [["EXTEND_TIMEOUT_USEC=20000000"]]
+    service.on_event(SystemReached(reached="active", elapsed_s=2.0))
+    assert _received(manager) == [["READY=1", "STATUS=: active and verified"]]
+    asyncio.run(_watched(service))
     assert _received(manager) == []
+
+
+async def _watched(service: ServiceManager) -> None:
+    service.watch()()
 
 
 def test_without_a_service_manager_nothing_is_sent_and_a_deaf_one_stops_nothing(
