@@ -107,11 +107,12 @@ def _named(system: str) -> re.Pattern[str]:
 def runs_of(root: Path, system: str = "") -> list[Path]:
     """Return the log directories of runs of a system, or of all, the newest first."""
     named = _named(system)
-    entries: list[Path] = []
+    names: list[str] = []
     with contextlib.suppress(OSError):
-        entries = list(root.iterdir())
-    found = (each for each in entries if named.fullmatch(each.name) and not each.is_symlink())
-    return sorted((each for each in found if each.is_dir()), reverse=True)
+        names = os.listdir(root)  # noqa: PTH208 - every ROS process leaves a file there
+    found = (root / name for name in names if name[0].isdigit() and named.fullmatch(name))
+    found = (each for each in found if not each.is_symlink() and each.is_dir())
+    return sorted(found, reverse=True)
 
 
 def is_running(run: Path) -> bool:
