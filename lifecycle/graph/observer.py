@@ -304,7 +304,9 @@ class Observer:
             settling_s = self._discovery.settling_s()
             if settling_s <= 0:
                 break
-            await set_within(self._changed, settling_s)
+            # To look costs more than the moment in which the rest of a burst comes.
+            if await set_within(self._changed, settling_s):
+                await asyncio.sleep(min(self._quiet_s, settling_s))
         self._show(nodes, endpoints)
         given = self.state.given
         judged = {

@@ -30,7 +30,7 @@ from lifecycle.middleware.discovery.dead_peers import (
     is_used,
     remove_participants,
 )
-from lifecycle.middleware.discovery.probe import probes_for
+from lifecycle.middleware.discovery.probe import answered_at, probes_for
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.fastdds.settings import stop_listening
 from lifecycle.middleware.process.process_table import programs_of
@@ -345,6 +345,12 @@ class GraphObserver:
             for probe in self._probes:
                 probe.ask_again(to_count=False)
         return max(0.0, PATIENCE_S - age_s)
+
+    def announce_ourselves(self) -> None:
+        """Have our participant announce itself to all others of this host, as far as that goes."""
+        everybody = answered_at(self.domain_id, self.urls, os.environ)
+        for probe in self._probes if everybody else ():
+            probe.announce_ourselves(everybody)
 
     def offers(self, node: str, service: str) -> bool:
         """Return whether discovery shows `service` (a fully qualified name) on `node`."""

@@ -17,7 +17,7 @@ from collections.abc import Iterable
 from typing import NoReturn
 
 from lifecycle import codec, dataclasses, middleware
-from lifecycle.manifest import DiscoveryRange
+from lifecycle.manifest import DiscoveryRange, Health, Run
 from lifecycle.node.host.control import Command, Event, HostChannel, HostSpec, Operation, give_up
 from lifecycle.plan import PlannedNode
 
@@ -155,6 +155,8 @@ def _rehearse() -> None:
             machine.resolve(0, request.value)
             machine.request(request)
             machine.finish(CallbackOutcome.SUCCESS)
+    getattr(Health, "__init__")  # noqa: B009 - looking them up makes them, see dataclasses
+    getattr(Run, "__eq__")  # noqa: B009
     dataclasses.make_constructors(
         "lifecycle.node",
         "lifecycle.middleware",

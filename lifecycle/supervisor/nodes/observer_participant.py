@@ -257,6 +257,10 @@ class ObserverParticipant:
 
         call_out(self._graph.discovery.domain_id, self._graph.discovery.urls, addresses, os.environ)
 
+    def announce_ourselves(self) -> None:
+        """Have our participant announce itself to those that it knows, as far as that goes."""
+        self._graph.discovery.announce_ourselves()
+
     def introduce(self, newcomers: Iterable[int], pids: Iterable[int]) -> None:
         """Have new participants discovered by, and discover, those that were there before."""
         from lifecycle.middleware import introduce

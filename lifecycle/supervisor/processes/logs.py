@@ -111,13 +111,13 @@ def runs_of(root: Path, system: str = "") -> list[Path]:
     been set back since the others.
     """
     named = _named(system)
-    entries: list[Path] = []
+    names: list[str] = []
     last = ""
     with contextlib.suppress(OSError):
-        entries = list(root.iterdir())
+        names = os.listdir(root)  # noqa: PTH208 - every ROS process leaves a file there
         last = (root / LATEST).readlink().name
-    found = (each for each in entries if named.fullmatch(each.name) and not each.is_symlink())
-    there = (each for each in found if each.is_dir())
+    found = (root / name for name in names if name[0].isdigit() and named.fullmatch(name))
+    there = (each for each in found if not each.is_symlink() and each.is_dir())
     return sorted(there, key=lambda each: (each.name == last, each), reverse=True)
 
 

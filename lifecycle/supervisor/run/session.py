@@ -153,6 +153,9 @@ class SessionParticipant(
     def drop_configuration(self, node: str) -> None:
         """Forget what a node reported whose process ended."""
 
+    def announce_ourselves(self) -> None:
+        """Have our participant announce itself to those that it knows."""
+
     def prepare_to_leave(self) -> None:
         """Close connections that are not answered, so that leaving does not wait for them."""
 
@@ -249,6 +252,7 @@ class Session:
             gives=observer_participant.give,
             loads=observer_participant.load,
             alone=self._alone,
+            announce=observer_participant.announce_ourselves,
         )
         self._remote_nodes = RemoteNodes(
             system.plan, system.awaited(), observer_participant, self._changes

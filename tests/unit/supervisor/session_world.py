@@ -298,6 +298,9 @@ class FakeParticipant:
     def introduce(self, newcomers: Iterable[int], pids: Iterable[int]) -> None:
         """Everybody is discovered at once."""
 
+    def announce_ourselves(self) -> None:
+        """Likewise."""
+
     def announce_machine(self, system: str, machine: str) -> _Connection:
         raise AssertionError(f"{system} has no other machine than {machine}")
 
