@@ -199,6 +199,9 @@ class ObserverParticipant:
 
     def remove_participants(self, prefixes: Iterable[str], pids: Iterable[int]) -> None:
         """Have all participants forget those whose process is dead."""
+        from lifecycle.middleware import disown_ports
+
+        disown_ports()
         self._graph.discovery.remove_participants(prefixes, pids)
 
     def announce_machine(self, system: str, machine: str) -> AlivePublisher:
