@@ -199,10 +199,13 @@ class ObserverParticipant:
 
     def remove_participants(self, prefixes: Iterable[str], pids: Iterable[int]) -> None:
         """Have all participants forget those whose process is dead."""
+        self._graph.discovery.remove_participants(prefixes, pids)
+
+    def disown_ports(self) -> None:
+        """Have all participants of this host send no more to ports whose process is dead."""
         from lifecycle.middleware import disown_ports
 
         disown_ports()
-        self._graph.discovery.remove_participants(prefixes, pids)
 
     def announce_machine(self, system: str, machine: str) -> AlivePublisher:
         """Announce ourselves as the supervisor of a machine, by DDS liveliness."""
