@@ -43,6 +43,7 @@ from .process.control import rename_process as rename_process
 from .process.process_table import note_ended as note_ended
 from .process.shared_memory import Creations as Creations
 from .process.shared_memory import check_room as check_room
+from .process.shared_memory import disown_ports as disown_ports
 from .process.shared_memory import holds_shared_memory as holds_shared_memory
 from .process.shared_memory import leftovers as leftovers
 from .process.shared_memory import segments_by_holder as segments_by_holder

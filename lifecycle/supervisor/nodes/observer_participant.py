@@ -201,6 +201,12 @@ class ObserverParticipant:
         """Have all participants forget those whose process is dead."""
         self._graph.discovery.remove_participants(prefixes, pids)
 
+    def disown_ports(self) -> None:
+        """Have all participants of this host send no more to ports whose process is dead."""
+        from lifecycle.middleware import disown_ports
+
+        disown_ports()
+
     def announce_machine(self, system: str, machine: str) -> AlivePublisher:
         """Announce ourselves as the supervisor of a machine, by DDS liveliness."""
         from lifecycle.middleware import AlivePublisher, machine_topic

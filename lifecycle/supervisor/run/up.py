@@ -23,6 +23,7 @@ from lifecycle.middleware import (
     check_threads,
     discovery_environment,
     discovery_peers,
+    disown_ports,
     exit_after,
     peers_environment,
     sweep,
@@ -441,6 +442,7 @@ def _graph_variables(environment: Mapping[str, str]) -> tuple[tuple[str, str], .
 def _clean_up_after(record: RunRecord, emit: Emitter) -> None:
     """Sweep what a supervisor left that had no chance to do it itself."""
     ended, segments = end_run(record)
+    disown_ports()
     swept = sweep(segments)
     if ended or swept:
         emit(

@@ -295,6 +295,9 @@ class FakeParticipant:
     def remove_participants(self, prefixes: Iterable[str], pids: Iterable[int]) -> None:
         raise AssertionError(f"nothing is left in this graph: {prefixes} {pids}")
 
+    def disown_ports(self) -> None:
+        """There is no shared memory."""
+
     def introduce(self, newcomers: Iterable[int], pids: Iterable[int]) -> None:
         """Everybody is discovered at once."""
 
