@@ -18,10 +18,9 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping
 
 from lifecycle import dataclasses
-from lifecycle.manifest import EndpointKind, RunKind
+from lifecycle.manifest import DIAGNOSTICS_TOPIC, EndpointKind, RunKind
 from lifecycle.plan import Plan, PlannedNode, PlannedProcess
 from lifecycle.verify import (
-    DIAGNOSTICS_TOPIC,
     GRAPH_TOPIC,
     NODE_SERVICES,
     OUR_SERVICES,
@@ -257,12 +256,7 @@ def _supervisor_profile(plan: Plan, machine: str) -> Profile:
     if any(node.health is not None and node.health.diagnostics for node in plan.nodes):
         allowed.add((EndpointKind.SUBSCRIPTION, DIAGNOSTICS_TOPIC))
     several = len({each.machine for each in plan.nodes}) > 1
-    allowed |= supervisor_endpoints(
-        plan.system,
-        machine if several else "",
-        plan.policy.ros_interface,
-        () if several else [each.name for each in plan.modes],
-    )
+    allowed |= supervisor_endpoints(plan, machine if several else "")
     return Profile(namespace="/", name="_lifecycle_observer", allowed=frozenset(allowed))
 
 

@@ -70,6 +70,10 @@ from .model import SystemDeclaration as SystemDeclaration
 from .model import TargetState as TargetState
 from .model import Timeouts as Timeouts
 from .model import UniqueHow as UniqueHow
+from .names import DIAGNOSTICS_TOPIC as DIAGNOSTICS_TOPIC
+from .names import MODE_SERVICE as MODE_SERVICE
+from .names import SUPERVISOR_STATUS as SUPERVISOR_STATUS
+from .names import SUPERVISORS as SUPERVISORS
 from .names import action_of as action_of
 from .names import expand as expand
 from .names import full_name_problem as full_name_problem
@@ -78,6 +82,9 @@ from .names import name_problem as name_problem
 from .names import namespace_problem as namespace_problem
 from .names import node_name_problem as node_name_problem
 from .names import resolve as resolve
+from .names import supervisor_prefix as supervisor_prefix
+from .names import supervisor_services as supervisor_services
+from .names import supervisor_status_topic as supervisor_status_topic
 from .qos import BEST_AVAILABLE_NS as BEST_AVAILABLE_NS
 from .qos import INFINITE_NS as INFINITE_NS
 from .qos import POLICIES as POLICIES

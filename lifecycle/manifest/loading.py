@@ -196,6 +196,7 @@ def _policy(root: Cursor) -> Policy:
         unverifiable_blocks=cursor.text("unverifiable") == "block",
         unpublished=_SEVERITIES[cursor.text("unpublished", "error")],
         unheard=_SEVERITIES[cursor.text("unheard", "warning")],
+        ros_interface_required=cursor.get("ros_interface") is not None,
     )
 
 

@@ -747,6 +747,8 @@ class Policy:
         unpublished: severity of a subscription without publisher; None ignores it.
         unheard: severity of a publisher without subscription; None ignores it.
         ros_interface: what the supervisor publishes, and may be asked, in ROS.
+        ros_interface_required: the manifest asks for it; else the system runs without it where
+            the packages that it takes are not installed.
     """
 
     undeclared_nodes: EndpointPolicy = EndpointPolicy.DECLARED
@@ -754,7 +756,8 @@ class Policy:
     unverifiable_blocks: bool = False
     unpublished: Severity | None = Severity.ERROR
     unheard: Severity | None = Severity.WARNING
-    ros_interface: RosInterfaceAccess = RosInterfaceAccess.OFF
+    ros_interface: RosInterfaceAccess = RosInterfaceAccess.READ_ONLY
+    ros_interface_required: bool = False
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

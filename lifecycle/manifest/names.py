@@ -4,7 +4,8 @@ Owns: the rules of rmw_validate_node_name, rmw_validate_namespace, rmw_validate_
 rcl_validate_topic_name, rcl_expand_topic_name and the order in which rcl applies them; the grammar
 of a remap rule of `ros2 run … --ros-args -r RULE`, as rcl's argument parser has it
 (rcl/arguments.c, rcl/lexer.c): `[node:][rostopic://|rosservice://]from:=to`, `[node:]__node:=name`,
-`[node:]__ns:=/namespace`. plan/ resolves every endpoint through `resolve`. Pure.
+`[node:]__ns:=/namespace`. plan/ resolves every endpoint through `resolve`. Also the
+names that a supervisor has in ROS. Pure.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from lifecycle import dataclasses
 from lifecycle.errors import ExitCode, LifecycleError
-from lifecycle.manifest.model import EndpointKind
+from lifecycle.manifest.model import EndpointKind, RosInterfaceAccess
 from lifecycle.manifest.yaml.yaml_parser import quote
 
 # rcl's lexer: a token has no two underscores in a row and does not start with a digit.
@@ -354,3 +355,45 @@ def _odd(text: str, allowed: str) -> str:
     """Name the first character outside `[A-Za-z0-9_]` and `allowed`; empty if none is."""
     found = _NOT_IN[allowed].search(text)
     return f", not {found[0]!r}" if found else ""
+
+
+DIAGNOSTICS_TOPIC = "/diagnostics"
+SUPERVISORS = "/lifecycle/"
+"""What the names of all status topics and services of supervisors begin with."""
+SUPERVISOR_STATUS = "status"
+MODE_SERVICE = "mode/"
+"""What the names of services begin with, below a supervisor's prefix, that enter a mode."""
+_READING = ("get_status",)
+_ORDERING = ("pause", "resume", "restart", "down")
+
+
+def supervisor_prefix(system: str, machine: str = "") -> str:
+    """Return what the names of a supervisor's status topic and services begin with.
+
+    Args:
+        system: its name.
+        machine: of the supervisor, where nodes of the system run on several; else empty.
+    """
+    names = (system, machine) if machine else (system,)
+    return SUPERVISORS + "/".join(each.replace("-", "_") for each in names)
+
+
+def supervisor_status_topic(prefix: str) -> str:
+    """Return the name of the status topic of the supervisor with a prefix."""
+    return f"{prefix}/{SUPERVISOR_STATUS}"
+
+
+def supervisor_services(access: RosInterfaceAccess, modes: Iterable[str] = ()) -> tuple[str, ...]:
+    """Return the names, below its prefix, of the services that a supervisor offers.
+
+    Args:
+        access: what the manifest allows.
+        modes: names of those that it may be asked to enter.
+    """
+    if access is RosInterfaceAccess.OFF:
+        return ()
+    if access is RosInterfaceAccess.READ_ONLY:
+        return _READING
+    # Names of ROS hold no "__" and do not end with "_".
+    legal = (each for each in modes if "__" not in f"{each}_")
+    return (*_READING, *_ORDERING, *(f"{MODE_SERVICE}{each}" for each in legal))

@@ -28,6 +28,7 @@ from .fastdds.settings import stop_listening as stop_listening
 from .fastdds.settings import unknown_versions as unknown_versions
 from .process.busy_timer import BusySign as BusySign
 from .process.busy_timer import Overdue as Overdue
+from .process.clock import ClockWatch as ClockWatch
 from .process.control import adopt_orphans as adopt_orphans
 from .process.control import check_threads as check_threads
 from .process.control import drop_network_administration as drop_network_administration
@@ -38,9 +39,11 @@ from .process.control import limit_resources as limit_resources
 from .process.control import machine_id as machine_id
 from .process.control import no_room_for_threads as no_room_for_threads
 from .process.control import refuse_new_privileges as refuse_new_privileges
+from .process.control import rename_process as rename_process
 from .process.process_table import note_ended as note_ended
 from .process.shared_memory import Creations as Creations
 from .process.shared_memory import check_room as check_room
+from .process.shared_memory import disown_ports as disown_ports
 from .process.shared_memory import holds_shared_memory as holds_shared_memory
 from .process.shared_memory import leftovers as leftovers
 from .process.shared_memory import segments_by_holder as segments_by_holder
@@ -61,6 +64,7 @@ from .rcl.matched_peers import matched_with as matched_with
 from .rcl.qos import UnknownInterfaceError as UnknownInterfaceError
 from .rcl.qos import from_rclpy as from_rclpy
 from .rcl.qos import import_interface as import_interface
+from .rcl.qos import load_type_support as load_type_support
 from .rcl.qos import to_rclpy as to_rclpy
 from .rcl.rclpy_nodes import RCLError as RCLError
 from .rcl.rclpy_nodes import RclpyStateMachine as RclpyStateMachine
@@ -69,6 +73,7 @@ from .rcl.rclpy_nodes import follow_nodes as follow_nodes
 from .rcl.rclpy_nodes import interface_of as interface_of
 from .rcl.rclpy_nodes import is_rclpy_managed as is_rclpy_managed
 from .rcl.rmw_choice import check_rmw as check_rmw
+from .rcl.timers import NodeTimers as NodeTimers
 from .services.actions import GoalClient as GoalClient
 from .services.actions import GoalServer as GoalServer
 from .services.clients import NodeClients as NodeClients

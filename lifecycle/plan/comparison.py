@@ -131,7 +131,7 @@ def _document(plan: Plan) -> _Tree:
         "discovery": _fields(plan.discovery, "at"),
         "network": _fields(plan.network, "at"),
         "data_layer": _fields(plan.data_layer, "at"),
-        "policy": _fields(plan.policy),
+        "policy": _fields(plan.policy, "ros_interface_required"),
         "on_violation": _consequences(plan.on_violation),
         "modes": {
             each.name: {
@@ -340,12 +340,16 @@ class PlanNotice:
     reason: str = ""
 
     def replaces(self, other: PlanNotice) -> bool:
-        """Whether it replaces `other`: from the same supervisor, or its successor."""
+        """Whether it replaces `other`: from the same supervisor, or its successor.
+
+        Supervisors of two machines of one system run beside each other, on one host too, and have
+        the same nodes in their plans.
+        """
         if self.run == other.run:
             return True
         same = not {*self.machines}.isdisjoint(other.machines)
-        if self.system == other.system and same:
-            return True
+        if self.system == other.system and self.machines and other.machines:
+            return same
         gone = other.left or self.host == other.host
         return gone and (same or not {*self.nodes}.isdisjoint(other.nodes))
 

@@ -29,6 +29,7 @@ from .rules import rule as rule
 from .rules.catalogue import About as About
 from .rules.catalogue import Heals as Heals
 from .rules.endpoints import DEFINITION_DIFFERS as DEFINITION_DIFFERS
+from .rules.health import UNHEALTHY as UNHEALTHY
 from .rules.health import health_of as health_of
 from .rules.matching import SERVER_OF as SERVER_OF
 from .rules.matching import MatchEnd as MatchEnd
@@ -50,9 +51,7 @@ from .rules.run import TRANSITION_FAILED as TRANSITION_FAILED
 from .rules.run import node_of as node_of
 from .rules.state import ACTIVATED_AT_CLOSED_GATE as ACTIVATED_AT_CLOSED_GATE
 from .rules.state import MISSING_REPORT as MISSING_REPORT
-from .tool_filter import DIAGNOSTICS_TOPIC as DIAGNOSTICS_TOPIC
 from .tool_filter import GRAPH_TOPIC as GRAPH_TOPIC
-from .tool_filter import MODE_SERVICE as MODE_SERVICE
 from .tool_filter import NO_NAMES as NO_NAMES
 from .tool_filter import NODE_SERVICES as NODE_SERVICES
 from .tool_filter import OUR_SERVICES as OUR_SERVICES
@@ -61,10 +60,12 @@ from .tool_filter import fold_actions as fold_actions
 from .tool_filter import is_hidden_node as is_hidden_node
 from .tool_filter import is_noise_endpoint as is_noise_endpoint
 from .tool_filter import is_noise_node as is_noise_node
+from .tool_filter import is_of_supervisor as is_of_supervisor
 from .tool_filter import known_node as known_node
+from .tool_filter import matches as matches
 from .tool_filter import supervisor_endpoints as supervisor_endpoints
-from .tool_filter import supervisor_prefix as supervisor_prefix
-from .tool_filter import supervisor_services as supervisor_services
+from .tool_filter import supervisor_label as supervisor_label
+from .tool_filter import takes_diagnostics as takes_diagnostics
 from .tool_filter import tolerating_pattern as tolerating_pattern
 from .tool_filter import without_noise as without_noise
 from .transport import NONE as NONE

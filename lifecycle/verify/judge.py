@@ -18,7 +18,7 @@ from lifecycle.verify.matcher import lay_out
 from lifecycle.verify.observation import Observation
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import CHECKS, rule
-from lifecycle.verify.tool_filter import OUR_NODES
+from lifecycle.verify.tool_filter import OUR_NODES, of_supervisors
 from lifecycle.verify.transport import effective_transport
 from lifecycle.verify.uniqueness import Uniqueness
 from lifecycle.verify.verdict import (
@@ -246,7 +246,8 @@ def _verdict(view: View) -> Verdict:
 def _tolerated(view: View) -> tuple[ToleratedNode, ...]:
     """List the undeclared nodes that the policy lets be there, sorted by name."""
     because = {name: f"tolerated_nodes: {pattern}" for name, pattern in view.tools.items()}
-    endpoints = list(view.of_tools)
+    supervisors = of_supervisors(view.plan, view.of_tools)
+    endpoints = [each for each in view.of_tools if each not in supervisors]
     if view.plan.policy.undeclared_nodes is EndpointPolicy.OPEN:
         others = (*view.foreign, *view.unattributed)
         undeclared = {name for name in view.observed if name not in view.planned}

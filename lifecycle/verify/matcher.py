@@ -269,7 +269,7 @@ def _counts(endpoint: ObservedEndpoint, node: str, frame: Frame, *, ours: bool) 
     """Return whether an endpoint of a node is declared, feeds what is, or was made on purpose."""
     return (
         (node, endpoint.kind, endpoint.name) in frame.declared
-        or (node not in frame.planned and frame.names.fed_by(endpoint.kind, endpoint.name))
+        or (node not in frame.planned and frame.names.looks_for(endpoint.kind, endpoint.name))
         or not is_noise_endpoint(
             endpoint.kind, known_node(endpoint.node), endpoint.name, endpoint.type, ours=ours
         )

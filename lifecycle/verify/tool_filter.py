@@ -16,7 +16,27 @@ import re
 from collections.abc import Collection, Iterable, Mapping
 
 from lifecycle import dataclasses
-from lifecycle.manifest import TOLERATED_NODES, EndpointKind, RosInterfaceAccess, join
+from lifecycle.manifest import (
+    DIAGNOSTICS_TOPIC,
+    MODE_SERVICE,
+    SUPERVISOR_STATUS,
+    SUPERVISORS,
+    TOLERATED_NODES,
+    Certainty,
+    Durability,
+    EndpointKind,
+    History,
+    Liveliness,
+    QosProfile,
+    Reliability,
+    RosInterfaceAccess,
+    incompatibilities,
+    join,
+    supervisor_prefix,
+    supervisor_services,
+    supervisor_status_topic,
+)
+from lifecycle.network import UniqueRequirement
 from lifecycle.plan import Plan, PlannedNode, owner_of
 from lifecycle.verify.observation import NodeConfiguration, ObservedEndpoint
 
@@ -27,14 +47,16 @@ whatever the policy: a name proves nothing, so they may do no more than those.""
 _OUR_TOPICS = "/_lifecycle/"
 """Where the supervisors of several machines notice each other."""
 
-DIAGNOSTICS_TOPIC = "/diagnostics"
 _DIAGNOSTICS = DIAGNOSTICS_TOPIC, "diagnostic_msgs/msg/DiagnosticArray"
-_SUPERVISORS = "/lifecycle/"
-_SUPERVISOR_TOPIC = "status", "std_msgs/msg/String"
-_READING = ("get_status",)
-MODE_SERVICE = "mode/"
-"""What the names of services begin with, below a supervisor's prefix, that enter a mode."""
-_ORDERING = ("pause", "resume", "restart", "down")
+_DIAGNOSTICS_QOS = QosProfile(
+    history=History.KEEP_LAST,
+    depth=10,
+    reliability=Reliability.RELIABLE,
+    durability=Durability.VOLATILE,
+    liveliness=Liveliness.AUTOMATIC,
+)
+"""What a supervisor's publisher offers."""
+_SUPERVISOR_TOPIC = SUPERVISOR_STATUS, "std_msgs/msg/String"
 _SUPERVISOR_SERVICE_TYPE = "std_srvs/srv/Trigger"
 
 PLACEHOLDER_NAMES = frozenset({"_NODE_NAME_UNKNOWN_", "_CREATED_BY_BARE_DDS_APP_"})
@@ -102,6 +124,9 @@ OURS_BY = frozenset({"get_configuration", "map_to"})
 NODE_TOPICS = frozenset({"_alive", "_alive_pulse", "transition_event"})
 """Topics that a node publishes under its own name."""
 
+_PREFIX_DIGITS = 24
+"""A GUID begins with its participant's prefix of 12 bytes (DDSI-RTPS §9.3.1)."""
+
 _ACTION_PART = "/_action/"
 _ACTION_SERVER_PARTS = frozenset(
     {
@@ -138,7 +163,7 @@ def tolerating_pattern(full_name: str, patterns: Collection[str] = TOLERATED_NOD
     """
     base = full_name.rpartition("/")[2]
     for pattern in (OUR_NODES, *patterns):
-        if _matches(full_name if "/" in pattern else base, pattern):
+        if matches(full_name if "/" in pattern else base, pattern):
             return pattern
     return ""
 
@@ -149,7 +174,8 @@ def is_noise_node(full_name: str) -> bool:
     return bool(tolerating_pattern(full_name))
 
 
-def _matches(name: str, pattern: str) -> bool:
+def matches(name: str, pattern: str) -> bool:
+    """Return whether a name is as a pattern of a manifest has it: `*`, `?`, all else as it is."""
     return _compiled(pattern).fullmatch(name) is not None
 
 
@@ -180,10 +206,16 @@ class DeclaredNames:
         names: by the kind that offers, fully qualified, those that endpoints declare.
         own: likewise, those that every declared node has under its own name: its lifecycle and
             parameter services, `~/transition_event` and the like.
+        of_supervisors: likewise, those that only supervisors of the plan may have, whatever
+            `policy.ros_interface` says.
+        diagnosed: the plan declares who reads /diagnostics, so that it must be known who are
+            supervisors, those of other systems too.
     """
 
     names: frozenset[tuple[EndpointKind, str]] = frozenset()
     own: frozenset[tuple[EndpointKind, str]] = frozenset()
+    of_supervisors: frozenset[tuple[EndpointKind, str]] = frozenset()
+    diagnosed: bool = False
 
     @classmethod
     def of(cls, plan: Plan) -> DeclaredNames:
@@ -198,21 +230,31 @@ class DeclaredNames:
     @classmethod
     def _of(cls, plan: Plan) -> DeclaredNames:
         services = (*NODE_SERVICES, *OUR_SERVICES)
+        names = frozenset(
+            (_NAMESPACES[each.kind], each.resolved)
+            for node in plan.nodes
+            for each in node.endpoints
+        )
+        own = frozenset(
+            (kind, f"{node.full_name}/{name}")
+            for node in plan.nodes
+            for kind, found in (
+                (EndpointKind.SERVICE_SERVER, services),
+                (EndpointKind.PUBLISHER, NODE_TOPICS),
+            )
+            for name in found
+        )
+        of_supervisors = frozenset(
+            (kind, name)
+            for prefix in supervisor_prefixes(plan)
+            for kind, name in _below(prefix, plan, RosInterfaceAccess.FULL)
+        )
         return cls(
-            names=frozenset(
-                (_NAMESPACES[each.kind], each.resolved)
-                for node in plan.nodes
-                for each in node.endpoints
-            ),
-            own=frozenset(
-                (kind, f"{node.full_name}/{name}")
-                for node in plan.nodes
-                for kind, names in (
-                    (EndpointKind.SERVICE_SERVER, services),
-                    (EndpointKind.PUBLISHER, NODE_TOPICS),
-                )
-                for name in names
-            ),
+            names=names,
+            own=own,
+            # A manifest may declare a node of its own that has them.
+            of_supervisors=of_supervisors - names,
+            diagnosed=(EndpointKind.PUBLISHER, DIAGNOSTICS_TOPIC) in names,
         )
 
     def of_kind(self, kind: EndpointKind) -> tuple[str, ...]:
@@ -228,7 +270,17 @@ class DeclaredNames:
         """Return whether an endpoint of an undeclared node would feed or serve the system."""
         if kind not in OFFERS or (kind, name) in NOISE_TOPICS:
             return False
-        return self.has(kind, name) or (kind, name) in self.own
+        return (
+            self.has(kind, name) or (kind, name) in self.own or self.is_of_supervisors(kind, name)
+        )
+
+    def is_of_supervisors(self, kind: EndpointKind, name: str) -> bool:
+        """Return whether only a supervisor of the plan may offer an endpoint."""
+        return (kind, name) in self.of_supervisors
+
+    def looks_for(self, kind: EndpointKind, name: str) -> bool:
+        """Return whether an undeclared node's endpoint is looked at, whatever it looks like."""
+        return self.fed_by(kind, name) or (self.diagnosed and _is_status(kind, name))
 
 
 _DECLARED: dict[int, tuple[tuple[PlannedNode, ...], DeclaredNames]] = {}
@@ -250,61 +302,142 @@ def _is_service_event(kind: EndpointKind, name: str, type_: str) -> bool:
     return publishes and "/srv/" in type_ and type_.endswith("_Event")
 
 
-def supervisor_prefix(system: str, machine: str = "") -> str:
-    """Return what the names of a supervisor's status topic and services begin with.
+def is_of_supervisor(hardware_id: str) -> bool:
+    """Return whether an entry on /diagnostics with a hardware id is a supervisor's."""
+    return hardware_id.startswith(SUPERVISORS)
 
-    Args:
-        system: its name.
-        machine: of the supervisor, where nodes of the system run on several; else empty.
+
+def supervisor_label(system: str, machine: str = "") -> str:
+    """Return what the names of a supervisor's entries on /diagnostics begin with."""
+    return f"{system}/{machine}" if machine else system
+
+
+def supervisor_prefixes(plan: Plan) -> frozenset[str]:
+    """Return the prefixes that supervisors of a plan may have.
+
+    One that brings up all nodes has that of the system, also where it declares several machines.
     """
-    names = (system, machine) if machine else (system,)
-    return _SUPERVISORS + "/".join(each.replace("-", "_") for each in names)
+    machines = {each.machine for each in plan.nodes}
+    names = ("", *(machines if len(machines) > 1 else ()))
+    return frozenset(supervisor_prefix(plan.system, each) for each in names)
 
 
-def supervisor_services(access: RosInterfaceAccess, modes: Iterable[str] = ()) -> tuple[str, ...]:
-    """Return the names, below its prefix, of the services that a supervisor offers.
-
-    Args:
-        access: what the manifest allows.
-        modes: names of those that it may be asked to enter.
-    """
-    if access is RosInterfaceAccess.OFF:
-        return ()
-    if access is RosInterfaceAccess.READ_ONLY:
-        return _READING
-    # Names of ROS hold no "__" and do not end with "_".
-    legal = (each for each in modes if "__" not in f"{each}_")
-    return (*_READING, *_ORDERING, *(f"{MODE_SERVICE}{each}" for each in legal))
-
-
-def supervisor_endpoints(
-    system: str, machine: str, access: RosInterfaceAccess, modes: Iterable[str] = ()
-) -> frozenset[tuple[EndpointKind, str]]:
+def supervisor_endpoints(plan: Plan, machine: str = "") -> frozenset[tuple[EndpointKind, str]]:
     """Return what a supervisor makes by `policy.ros_interface`; see `supervisor_prefix`."""
+    access = plan.policy.ros_interface
     if access is RosInterfaceAccess.OFF:
         return frozenset()
-    prefix = supervisor_prefix(system, machine)
+    found = _below(supervisor_prefix(plan.system, machine), plan, access)
+    if machine:
+        # Which mode a system is in that has several supervisors is not for one of them to say.
+        found = frozenset(each for each in found if f"/{MODE_SERVICE}" not in each[1])
+    diagnostics = {(EndpointKind.PUBLISHER, DIAGNOSTICS_TOPIC)} if takes_diagnostics(plan) else ()
+    return found.union(diagnostics)
+
+
+def _below(
+    prefix: str, plan: Plan, access: RosInterfaceAccess
+) -> frozenset[tuple[EndpointKind, str]]:
+    """Return what the supervisor with a prefix offers below it."""
+    services = supervisor_services(access, (each.name for each in plan.modes))
     return frozenset(
         (
-            (EndpointKind.PUBLISHER, DIAGNOSTICS_TOPIC),
-            (EndpointKind.PUBLISHER, f"{prefix}/{_SUPERVISOR_TOPIC[0]}"),
-            *(
-                (EndpointKind.SERVICE_SERVER, f"{prefix}/{name}")
-                for name in supervisor_services(access, modes)
-            ),
+            (EndpointKind.PUBLISHER, supervisor_status_topic(prefix)),
+            *((EndpointKind.SERVICE_SERVER, f"{prefix}/{name}") for name in services),
+        )
+    )
+
+
+def takes_diagnostics(plan: Plan) -> bool:
+    """Return whether a supervisor may publish on /diagnostics and disturb nothing of the plan.
+
+    It may not where the manifest has the name for something else, where its publisher would be of
+    no use to a declared subscription, and where the manifest says what flow the topic must have:
+    what the supervisor sent to the same port would be part of what was verified and programmed.
+    """
+    ends = [
+        each for node in plan.nodes for each in node.endpoints if each.resolved == DIAGNOSTICS_TOPIC
+    ]
+    free = (UniqueRequirement.NOT_REQUIRED, UniqueRequirement.SYSTEM_DEFAULT)
+    return not any(flow.topic == DIAGNOSTICS_TOPIC and flow.linked for flow in plan.flows) and all(
+        each.type == _DIAGNOSTICS[1]
+        and each.unique in free
+        and each.dscp is None
+        and each.five_qi is None
+        and (
+            each.kind is not EndpointKind.SUBSCRIPTION
+            or each.qos is None
+            or all(
+                found.severity is not Certainty.CERTAIN
+                for found in incompatibilities(_DIAGNOSTICS_QOS, each.qos)
+            )
+        )
+        for each in ends
+    )
+
+
+def _is_status(kind: EndpointKind, name: str) -> bool:
+    """Return whether a name is that of a supervisor's status topic, of whatever system."""
+    below = name.startswith(SUPERVISORS) and name.rpartition("/")[2] == _SUPERVISOR_TOPIC[0]
+    return below and kind is EndpointKind.PUBLISHER
+
+
+def of_supervisors(
+    plan: Plan, endpoints: Iterable[ObservedEndpoint]
+) -> frozenset[ObservedEndpoint]:
+    """Return those endpoints that supervisors offer as policies allow, of this or another system.
+
+    A name proves nothing: who publishes a status topic is that supervisor, if nobody else does; its
+    services are of the same node, and what it publishes on /diagnostics is of the same participant.
+
+    Args:
+        plan: of the system that is judged.
+        endpoints: of tools.
+    """
+    found = [
+        each
+        for each in endpoints
+        if is_supervisor_endpoint(each.kind, each.node, each.name, each.type)
+    ]
+    claims: dict[str, list[ObservedEndpoint]] = {}
+    for each in found:
+        if _is_status(each.kind, each.name):
+            claims.setdefault(each.name, []).append(each)
+    ours = {supervisor_status_topic(each): each for each in supervisor_prefixes(plan)}
+    access = plan.policy.ros_interface
+    allowed: set[ObservedEndpoint] = set()
+    services: set[tuple[str, EndpointKind, str]] = set()
+    participants: set[tuple[str, str]] = set()
+    for topic, (claim, *others) in claims.items():
+        if others or (topic in ours and access is RosInterfaceAccess.OFF):
+            continue
+        allowed.add(claim)
+        participants.add((claim.node, claim.gid[:_PREFIX_DIGITS]))
+        if topic in ours:
+            services |= {(claim.node, *each) for each in _below(ours[topic], plan, access)}
+    diagnoses = takes_diagnostics(plan)
+    return frozenset(
+        each
+        for each in found
+        if each in allowed
+        or (not each.kind.is_topic and (each.node, each.kind, each.name) in services)
+        or (
+            each.name == DIAGNOSTICS_TOPIC
+            and diagnoses
+            and (each.node, each.gid[:_PREFIX_DIGITS]) in participants
         )
     )
 
 
 def is_supervisor_endpoint(kind: EndpointKind, node: str, name: str, type_: str) -> bool:
     """Return whether an endpoint is one that `policy.ros_interface` has a supervisor make."""
-    if not _matches(node.rpartition("/")[2], OUR_NODES):
+    if not matches(node.rpartition("/")[2], OUR_NODES):
         return False
-    base = name.rpartition("/")[2] if name.startswith(_SUPERVISORS) else ""
+    base = name.rpartition("/")[2] if name.startswith(SUPERVISORS) else ""
     if kind is EndpointKind.PUBLISHER:
         return (name, type_) == _DIAGNOSTICS or (base, type_) == _SUPERVISOR_TOPIC
-    enters = name.startswith(_SUPERVISORS) and name.split("/")[-2] == MODE_SERVICE[:-1]
-    known = enters or base in (*_READING, *_ORDERING)
+    enters = name.startswith(SUPERVISORS) and name.split("/")[-2] == MODE_SERVICE[:-1]
+    known = enters or base in supervisor_services(RosInterfaceAccess.FULL)
     serves = kind is EndpointKind.SERVICE_SERVER and known
     return serves and type_ == _SUPERVISOR_SERVICE_TYPE
 
@@ -378,7 +511,7 @@ def without_noise(
     return tuple(
         each
         for each in found
-        if but.fed_by(each.kind, each.name)
+        if but.looks_for(each.kind, each.name)
         or not is_noise_endpoint(each.kind, each.node, each.name, each.type, ours=each.node in ours)
     )
 

@@ -2,8 +2,8 @@
 
 N1 and N2 are the example of *Unique Network Flows*: N1 publishes video and battery state, N2 takes
 both. `LateListener` stands in for one of the nine systems'. The environment of a process may ask
-for more: HOLD_CONFIGURE_FILE holds configure until that file is there, and FAIL_CONFIGURE makes it
-fail.
+for more: HOLD_CONFIGURE_FILE holds configure until that file is there, HOLD_START_FILE and its like
+another stage, and FAIL_CONFIGURE makes configure fail.
 """
 
 from __future__ import annotations
@@ -21,11 +21,15 @@ _PERIOD_S = 0.02
 _HOLD_S = 20.0
 
 
-def configure() -> None:
-    hold = os.environ.get("HOLD_CONFIGURE_FILE", "")
+def hold(stage: str) -> None:
+    file = os.environ.get(f"HOLD_{stage}_FILE", "")
     end = time.monotonic() + _HOLD_S
-    while hold and not Path(hold).exists() and time.monotonic() < end:
+    while file and not Path(file).exists() and time.monotonic() < end:
         time.sleep(0.01)
+
+
+def configure() -> None:
+    hold("CONFIGURE")
     if os.environ.get("FAIL_CONFIGURE"):
         raise RuntimeError("no screen")
 
@@ -47,8 +51,21 @@ class Sink(LifecycleNode):
 
     _heard: frozenset[str] = frozenset()
 
+    def __init__(self, *arguments, **options) -> None:
+        hold("START")
+        super().__init__(*arguments, **options)
+
     def on_configure(self, state):
         configure()
+
+    def on_connect(self, state):
+        hold("CONNECT")
+
+    def on_activate(self, state):
+        hold("ACTIVATE")
+
+    def on_deactivate(self, state):
+        hold("DEACTIVATE")
 
     @on_message("video")
     def see(self, message: String) -> None:

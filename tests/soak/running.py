@@ -1,20 +1,26 @@
 """One run of the soak's system, looked at from outside: events, control socket, graph, /proc.
 
 Owns: `Watched`, a `lifecycle up` whose events have times; `Transitions`, what the nodes themselves
-tell the graph of their states; and `assert_gate_held`, the promise of the gate read from both.
+publish of their states; and `assert_gate_held`, the promise of the gate read from both.
 """
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
+import os
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lifecycle.graph import EventKind, Graph, GraphEvent, StateChanged
+from lifecycle_msgs.msg import TransitionEvent
+from rclpy.executors import SingleThreadedExecutor
+
+from lifecycle.middleware import GraphObserver, segments_of
+from lifecycle.plan import ParticipantConnections
 from lifecycle.supervisor.control.protocol import (
     Answer,
     ControlRequest,
@@ -35,11 +41,11 @@ class NotAsPromisedError(AssertionError):
 class Watched(Up):
     """A `lifecycle up` whose events can be waited for together with their times."""
 
-    def __init__(self, manifest: Path, *, runtime: Path) -> None:
+    def __init__(self, manifest: Path, *, runtime: Path, variables: Mapping[str, str]) -> None:
         self.times: list[float] = []
         self._came = threading.Condition()
-        variables = {"PYTHONPATH": str(COMPOSITION)}
-        super().__init__(manifest, runtime=runtime, variables=variables)
+        more = {"PYTHONPATH": str(COMPOSITION), **variables}
+        super().__init__(manifest, runtime=runtime, variables=more)
 
     def _read(self) -> None:
         assert self.process.stdout is not None
@@ -95,20 +101,43 @@ class Watched(Up):
 
 
 class Transitions:
-    """What nodes tell of their states, received by a participant of our own.
+    """What nodes publish of their states (`~/transition_event`), received by our own participant.
+
+    It has no shared memory: Fast DDS lets go of another's port only when it next sends over shared
+    memory, and what we hold open, a system that ends cannot remove.
 
     Attributes:
         seen: time, node and state of each change, in the order in which they came.
     """
 
-    def __init__(self, domain_id: int) -> None:
+    def __init__(self, domain_id: int, nodes: Iterable[str]) -> None:
         self.seen: list[tuple[float, str, str]] = []
-        self._graph = Graph.open(domain_id)
-        self._graph.events.on((EventKind.STATE_CHANGED, EventKind.JOINED), self._take)
+        connections = ParticipantConnections(urls=("udpv4://127.0.0.1",))
+        self._observer = GraphObserver(domain_id, connections)
+        if segments_of((os.getpid(),)):
+            raise AssertionError("the observer shares memory with what it judges")
+        node = self._observer.node
+        self._subscriptions = {
+            name: node.create_subscription(
+                TransitionEvent,
+                f"{name}/transition_event",
+                functools.partial(self._take, name),
+                10,
+            )
+            for name in nodes
+        }
+        self._executor = SingleThreadedExecutor(context=node.context)
+        self._executor.add_node(node)
+        self._thread = threading.Thread(target=self._executor.spin, name="transitions")
+        self._thread.start()
 
-    def _take(self, event: GraphEvent) -> None:
-        if isinstance(event.message, StateChanged):
-            self.seen.append((time.monotonic(), event.node, event.message.state))
+    def _take(self, name: str, event: TransitionEvent) -> None:
+        self.seen.append((time.monotonic(), name, event.goal_state.label))
+
+    def not_received(self) -> list[str]:
+        """Return the nodes of which nothing is received: they are not discovered, or not there."""
+        subscriptions = self._subscriptions.items()
+        return [name for name, each in subscriptions if not each.get_publisher_count()]
 
     def activated(self, since: float, until: float) -> list[tuple[float, str]]:
         """Return when which nodes became active between two times."""
@@ -120,7 +149,9 @@ class Transitions:
 
     def close(self) -> None:
         """Leave the graph."""
-        self._graph.close()
+        self._executor.shutdown()
+        self._thread.join()
+        self._observer.destroy()
 
 
 def assert_gate_held(events: Sequence[Event]) -> None:

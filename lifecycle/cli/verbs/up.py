@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import sys
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -22,6 +23,7 @@ from lifecycle.cli.common import (
     treatment_options,
 )
 from lifecycle.cli.report import ReportFile, report_option, written_or_said
+from lifecycle.cli.standard_streams import are_own
 from lifecycle.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
@@ -49,6 +51,7 @@ if TYPE_CHECKING:
     metavar="SECONDS",
     help="Hold it so long, then shut down; no success if it ended before, or was violated.",
 )
+@click.option("--hold", is_flag=True, hidden=True)  # what `--hosts` has each supervisor do
 @timeout_option(
     None,
     "For everything from the first start to the system being active.",
@@ -101,6 +104,7 @@ def command(
     format_: str,
     until: str,
     stop_after: float | None,
+    hold: bool,
     timeout: float | None,
     report: Path | None,
     strict: bool,
@@ -158,11 +162,14 @@ def command(
         ):
             from lifecycle.supervisor import Forerunner
 
-            # Its imports and ours, and reading the manifest, take as long as each other: side by
-            # side.
+            # What it alone imports, and what we alone do and reading the manifest, take as long as
+            # each other: side by side.
             program = _networks(targets, **rest)
-            forerunner = Forerunner(without=_tokens(program), programs=bool(program))
+            forerunner = Forerunner(
+                without=_tokens(program), programs=bool(program), forks=are_own()
+            )
             try:
+                _import_asyncio()
                 from lifecycle.cli.up_output import output
                 from lifecycle.plan import build_plan, started_by_others
                 from lifecycle.supervisor import Until, UpOptions, ended_early, up
@@ -175,6 +182,7 @@ def command(
                 options = UpOptions(
                     until=Until(until),
                     stop_after_s=stop_after,
+                    holds=hold,
                     timeout_s=timeout,
                     strict=strict,
                     machine=machine,
@@ -210,6 +218,19 @@ def command(
     except Ended as ended:
         click.echo(f"ended before anything was started: {ended.reason}", err=True)
         return ended.exit_code
+
+
+def _import_asyncio() -> None:
+    """Import it without ssl, which takes 6 ms, and which it does without where there is none.
+
+    A supervisor's loop has no connections with TLS. Who needs ssl imports it by itself.
+    """
+    if not {"asyncio", "ssl"} & sys.modules.keys():
+        sys.modules["ssl"] = None  # type: ignore[assignment]
+        try:
+            import asyncio  # noqa: F401
+        finally:
+            del sys.modules["ssl"]
 
 
 @contextlib.contextmanager

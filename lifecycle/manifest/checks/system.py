@@ -10,13 +10,29 @@ services, rcl_lifecycle's services and event. Pure.
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.diagnostics import Position
-from lifecycle.manifest.model import Endpoint, EndpointKind, EndpointPolicy, Manifest, Node
-from lifecycle.manifest.names import RemapRule, full_node_name, parse_rule, resolve
+from lifecycle.manifest.model import (
+    Endpoint,
+    EndpointKind,
+    EndpointPolicy,
+    Manifest,
+    Node,
+    RosInterfaceAccess,
+)
+from lifecycle.manifest.names import (
+    DIAGNOSTICS_TOPIC,
+    RemapRule,
+    full_node_name,
+    parse_rule,
+    resolve,
+    supervisor_prefix,
+    supervisor_services,
+    supervisor_status_topic,
+)
 from lifecycle.network import DEFAULT_RMW
 
 _RMW_VARIABLE = "RMW_IMPLEMENTATION"
@@ -208,10 +224,24 @@ _OF_THE_GRAPH = (
 def implicit_names(system: DeclaredSystem) -> frozenset[tuple[EndpointKind, str]]:
     """Return kind and fully qualified name of every endpoint that exists undeclared."""
     names = set(_OF_THE_GRAPH)
+    names.update(_of_supervisors(system.manifest))
     for node in system.manifest.nodes:
         own = (*_EVERY_NODE, *(_MANAGED_NODE if node.managed else ()), *_OWN_NODE)
         names.update((kind, f"{full_name(node)}/{name}") for kind, name in own)
     return frozenset(names)
+
+
+def _of_supervisors(manifest: Manifest) -> Iterator[tuple[EndpointKind, str]]:
+    """Yield what the supervisors of a system offer by its policy."""
+    access = manifest.policy.ros_interface
+    if access is RosInterfaceAccess.OFF:
+        return
+    yield EndpointKind.PUBLISHER, DIAGNOSTICS_TOPIC
+    for machine in ("", *(each.name for each in manifest.machines)):
+        prefix = supervisor_prefix(manifest.system, machine)
+        yield EndpointKind.PUBLISHER, supervisor_status_topic(prefix)
+        for name in supervisor_services(access, (each.name for each in manifest.modes)):
+            yield EndpointKind.SERVICE_SERVER, f"{prefix}/{name}"
 
 
 SEPARABLE = frozenset(

@@ -127,6 +127,21 @@ class Probe:
         if self._socket is not None:
             self._send((self._socket.getsockname()[1],) if to_count else self._receivers)
 
+    def announce_ourselves(self, everybody: Iterable[tuple[str, int]]) -> None:
+        """Have our own participant announce itself at once.
+
+        One that is new announces itself before it listens, so that we know it at once, and it knows
+        us with our next announcement, up to 0.2 s later (profiles.py). Our participant answers one
+        that does not exist, and that nobody else is told of.
+
+        Args:
+            everybody: IP addresses and UDP ports at which it is heard.
+        """
+        if self._socket is not None:
+            own = "::1" if self._ipv6 else "127.0.0.1"
+            targets = (ProbeTarget(address=own, port=port) for port in self._receivers)
+            send(self._socket, announcement(everybody), targets)
+
     def _send(self, ports: Iterable[int]) -> None:
         if self._socket is None:
             return
@@ -268,7 +283,7 @@ def probes_for(
 
 def probe_targets(
     domain_id: int, urls: Sequence[ConnectionUrl], environment: Mapping[str, str]
-) -> tuple[tuple[str, tuple[ProbeTarget, ...]], ...]:
+) -> tuple[tuple[Medium, tuple[ProbeTarget, ...]], ...]:
     """Return the UDP destinations of all participants that an observer with these URLs could find.
 
     Args:
@@ -292,6 +307,28 @@ def probe_targets(
         for kind in (tuple(family.kind for family in found) or (() if urls else (RMW_DISCOVERY,)))
         if range_ != "OFF"
     )
+
+
+def answered_at(
+    domain_id: int, urls: Sequence[ConnectionUrl], environment: Mapping[str, str]
+) -> tuple[tuple[str, int], ...]:
+    """Return where one answer reaches all participants of this host that an observer could find.
+
+    Args:
+        domain_id: 0–232.
+        urls: the observer's; none for what the RMW does by itself.
+        environment: as for `probes_for`.
+
+    Returns:
+        IPv4 addresses and UDP ports; none where participants are told whom to look for.
+    """
+    kind = RMW_DISCOVERY
+    if urls or chosen_otherwise(environment) or _range(environment) == "OFF":
+        return ()
+    if _range(environment) == "SUBNET":
+        return ((DISCOVERY_GROUP[kind], participant_ports(domain_id, 0).discovery_multicast),)
+    found = well_known_targets(domain_id, kind.loopback, LOCALHOST_PEERS_RANGE)
+    return tuple((each.address, each.port) for each in found)
 
 
 def _range(environment: Mapping[str, str]) -> str:

@@ -22,6 +22,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import fcntl
+import mmap
 import os
 import re
 import signal
@@ -216,8 +217,10 @@ def sweep(only: Collection[str], *, within_s: float = 0.0) -> tuple[str, ...]:
 
     Args:
         only: names that processes which have ended were seen to own.
-        within_s: seconds to try again while others use some: they let go of the port of a
-            participant that left once they have read that, and after a kill none removes it.
+        within_s: seconds to try again while others use some. They let go of the port of a
+            participant that left when they next send over shared memory
+            (SharedMemTransport::cleanup_output_ports in Fast DDS 2.14), of one that was killed only
+            seconds later; and where one was killed that had sent there, none removes it.
 
     Returns:
         The names removed, sorted; empty where there is no /dev/shm.
@@ -229,6 +232,66 @@ def sweep(only: Collection[str], *, within_s: float = 0.0) -> tuple[str, ...]:
         time.sleep(_AGAIN_S)
         removed += _unused(only, remove=True)
     return tuple(sorted(removed))
+
+
+def disown_ports() -> tuple[str, ...]:
+    """Have every sender let go of the ports of this user's processes that have been killed.
+
+    Who has sent to a port keeps it mapped, and goes on sending there when another process has made
+    it anew: what it sends is lost. Fast DDS 2.14 has each sender look after its ports, by the
+    machine's clock, which takes two seconds, or an hour where that is set back by one
+    (SharedMemGlobal::Port::Watchdog). Here what it would note then is noted at once; where the
+    memory is not as in that version nothing is.
+
+    Returns:
+        Their names, sorted.
+    """
+    groups: dict[str, list[_SharedFile]] = {}
+    for file in _files():
+        if file.is_port and file.uid == os.getuid():
+            groups.setdefault(file.group, []).append(file)
+    return tuple(sorted(group for group, files in groups.items() if _disowned(group, files)))
+
+
+def _disowned(group: str, files: Collection[_SharedFile]) -> bool:
+    """Mark a port as not ok whose owner has ended; whether it was and is now not."""
+    if not any(file.is_lock for file in files):
+        return False
+    with contextlib.suppress(OSError, ValueError), contextlib.ExitStack() as stack:
+        file = os.open(_DIRECTORY / group, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW)
+        stack.callback(os.close, file)
+        memory = stack.enter_context(mmap.mmap(file, 0))
+        flags = _port_flags(memory, int(group.removeprefix(_PORT)))
+        if flags is None or memory[flags] & _READ_AND_OK != _READ_AND_OK:
+            return False
+        # The semaphore first: opening the port after this waits until we are done.
+        for each in sorted(files, key=lambda each: not each.is_mutex):
+            if each.is_lock or each.is_mutex:
+                stack.enter_context(_claim(each))
+        memory[flags] &= ~_OK
+        return True
+    return False
+
+
+_PORT = "fastrtps_port"
+_PORT_NODE = struct.Struct("=7I")
+"""From port_id to the flags of SharedMemGlobal::PortNode in Fast DDS 2.14."""
+_OK, _READ_AND_OK = 1, 5
+
+
+def _port_flags(memory: mmap.mmap, number: int) -> int | None:
+    """Return where the flags of a port are in its memory; None if that is not as it is known."""
+    found = None
+    start = memory.find(wanted := struct.pack("=I", number))
+    while start >= 0:
+        if start % 4 == 0 and start + _PORT_NODE.size <= len(memory):
+            _, _, check_ms, wait_ms, descriptors, _, flags = _PORT_NODE.unpack_from(memory, start)
+            if check_ms and wait_ms == check_ms // 3 and descriptors and 0 < flags < 8:
+                if found is not None:
+                    return None
+                found = start + _PORT_NODE.size - 4
+        start = memory.find(wanted, start + 1)
+    return found
 
 
 def leftovers(*, only: Collection[str] | None = None) -> tuple[str, ...]:

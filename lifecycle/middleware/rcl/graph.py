@@ -30,7 +30,7 @@ from lifecycle.middleware.discovery.dead_peers import (
     is_used,
     remove_participants,
 )
-from lifecycle.middleware.discovery.probe import probes_for
+from lifecycle.middleware.discovery.probe import answered_at, probes_for
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.fastdds.settings import stop_listening
 from lifecycle.middleware.process.process_table import programs_of
@@ -275,8 +275,9 @@ class GraphObserver:
 
         A part that is shown as in the last snapshot for the same names is the same object.
 
-        All but its own node. The housekeeping of client libraries is left out. Services are known
-        by their nodes, so those of no known node are looked for by name.
+        All but its own node, of which there is only what it publishes under `names`. The
+        housekeeping of client libraries is left out. Services are known by their nodes, so those
+        of no known node are looked for by name.
 
         Args:
             declared: fully qualified names of nodes that are looked for.
@@ -298,7 +299,10 @@ class GraphObserver:
         for each in self._topic_endpoints(kept, last):
             shown.setdefault(each.node, []).append(each)
         if ourselves is not None:
-            shown.pop(ourselves, None)
+            # Others match what a supervisor offers under names that are looked for.
+            own = shown.pop(ourselves, [])
+            if own := [each for each in own if names.looks_for(each.kind, each.name)]:
+                shown[ourselves] = own
         unreported = {""}
         for name in sorted(name for name in counts if known_node(name) and name != ourselves):
             services, managed = self._services_of(name, kept, last)
@@ -341,6 +345,12 @@ class GraphObserver:
             for probe in self._probes:
                 probe.ask_again(to_count=False)
         return max(0.0, PATIENCE_S - age_s)
+
+    def announce_ourselves(self) -> None:
+        """Have our participant announce itself to all others of this host, as far as that goes."""
+        everybody = answered_at(self.domain_id, self.urls, os.environ)
+        for probe in self._probes if everybody else ():
+            probe.announce_ourselves(everybody)
 
     def offers(self, node: str, service: str) -> bool:
         """Return whether discovery shows `service` (a fully qualified name) on `node`."""
@@ -649,8 +659,8 @@ def _topic_endpoint(
 ) -> ObservedEndpoint | None:
     """Return a publisher or subscription; None if it is the housekeeping of a client library."""
     node = known_node(info.node)
-    feeds = node not in declared and names.fed_by(kind, topic)
-    if not feeds and is_noise_endpoint(kind, node, topic, info.type, ours=False):
+    wanted = node not in declared and names.looks_for(kind, topic)
+    if not wanted and is_noise_endpoint(kind, node, topic, info.type, ours=False):
         return None
     return ObservedEndpoint(
         kind=kind,

@@ -1,7 +1,7 @@
 """QoS profiles and message, service and action types: the manifest's names as rclpy's objects.
 
-Owns: the conversion of QoS both ways; from `package/msg/Type` to the Python class, and the message
-that says what is wrong with a name.
+Owns: the conversion of QoS both ways; from `package/msg/Type` to the Python class and its type
+support, and the message that says what is wrong with a name.
 
 Policies go by name: both sides use rmw's. Infinite durations are None on our side; rmw spells them
 RMW_DURATION_UNSPECIFIED (0, what a default profile holds) or RMW_DURATION_INFINITE (what discovery
@@ -10,9 +10,10 @@ shows), which mean the same on Fast DDS.
 
 from __future__ import annotations
 
-import difflib
+import contextlib
 import importlib
 import re
+import sys
 from typing import Any
 
 from rclpy.duration import Duration
@@ -23,6 +24,7 @@ from rclpy.qos import (
     QoSProfile,
     ReliabilityPolicy,
 )
+from rclpy.type_support import check_is_valid_msg_type, check_is_valid_srv_type
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest import Durability, History, Liveliness, QosProfile, Reliability
@@ -105,9 +107,37 @@ def import_interface(name: str) -> type[Any]:
         ) from error
     found = getattr(module, type_, None)
     if not isinstance(found, type):
+        import difflib
+
         near = difflib.get_close_matches(type_, dir(module), n=1)
         raise UnknownInterfaceError(
             f"cannot find interface type {name!r}: package {package!r} has no {kind} {type_!r}",
             hint=f"did you mean {package}/{kind}/{near[0]}?" if near else "",
         )
     return found
+
+
+_GENERATOR = "rosidl_generator_py.generate_py_impl"
+
+
+def load_type_support(name: str) -> None:
+    """Import an interface, and of a message or service what rcl needs of it: a shared library.
+
+    The package that loads these libraries also has what generates Python from IDL, with a parser
+    and a grammar, and does without where that cannot be imported: 15 ms of CPU that nobody uses.
+
+    Raises:
+        UnknownInterfaceError: see import_interface.
+    """
+    found = import_interface(name)
+    if _GENERATOR not in sys.modules:
+        sys.modules[_GENERATOR] = None  # type: ignore[assignment]
+        try:
+            with contextlib.suppress(ImportError):
+                importlib.import_module("rosidl_generator_py")
+        finally:
+            del sys.modules[_GENERATOR]
+    if "/msg/" in name:
+        check_is_valid_msg_type(found)
+    elif "/srv/" in name:
+        check_is_valid_srv_type(found)

@@ -33,6 +33,7 @@ from lifecycle.verify import (
     NodeConfiguration,
     ParameterReport,
     decode_configuration,
+    is_of_supervisor,
 )
 
 if TYPE_CHECKING:
@@ -390,7 +391,9 @@ class NodeClients:
         from diagnostic_msgs.msg import DiagnosticArray  # few systems have use for it
 
         def arrived(message: Any) -> None:
-            callback([(each.name, each.level[0], each.message) for each in message.status])
+            # What supervisors say of nodes is made of what nodes say.
+            said = (each for each in message.status if not is_of_supervisor(each.hardware_id))
+            callback([(each.name, each.level[0], each.message) for each in said])
 
         node, group = self._observer.node, self._calls.group
         self._diagnostics = node.create_subscription(

@@ -13,6 +13,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
@@ -21,7 +22,7 @@ from rclpy.task import Future
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from lifecycle.verify import DIAGNOSTICS_TOPIC
+from lifecycle.manifest import DIAGNOSTICS_TOPIC, supervisor_status_topic
 
 _LATCHED = QoSProfile(
     depth=1,
@@ -33,6 +34,9 @@ _DIAGNOSTICS = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.VOLATILE,
 )
+_LAST = Duration(nanoseconds=200_000_000)
+"""Within so long who is there has acknowledged what was published last: a round trip or two."""
+
 Entry = tuple[int, str, str, str, Sequence[tuple[str, str]]]
 """Level, name, message, hardware id and values of a diagnostic_msgs/DiagnosticStatus."""
 
@@ -47,6 +51,7 @@ class RosInterface:
         services: names of the services.
         on_call: called in the executor's thread with the name of a service that is called and with
             what answers the call (success, message), which may be called once from any thread.
+        diagnoses: publish on /diagnostics, too.
     """
 
     def __init__(
@@ -55,6 +60,8 @@ class RosInterface:
         prefix: str,
         services: Iterable[str],
         on_call: Callable[[str, Callable[[bool, str], None]], None],
+        *,
+        diagnoses: bool = True,
     ) -> None:
         self._node = node
         self._on_call = on_call
@@ -63,10 +70,14 @@ class RosInterface:
         quiet = PublisherEventCallbacks(use_default_callbacks=False)
         # rclpy's own methods, as everywhere on an observer's node.
         self._status = Node.create_publisher(
-            node, String, f"{prefix}/status", _LATCHED, event_callbacks=quiet
+            node, String, supervisor_status_topic(prefix), _LATCHED, event_callbacks=quiet
         )
-        self._diagnostics = Node.create_publisher(
-            node, DiagnosticArray, DIAGNOSTICS_TOPIC, _DIAGNOSTICS, event_callbacks=quiet
+        self._diagnostics = (
+            Node.create_publisher(
+                node, DiagnosticArray, DIAGNOSTICS_TOPIC, _DIAGNOSTICS, event_callbacks=quiet
+            )
+            if diagnoses
+            else None
         )
         self._services = tuple(
             Node.create_service(
@@ -83,7 +94,7 @@ class RosInterface:
 
     def publish_diagnostics(self, entries: Iterable[Entry]) -> None:
         """Publish diagnostics, if anything subscribes to them."""
-        if not self._diagnostics.get_subscription_count():
+        if self._diagnostics is None or not self._diagnostics.get_subscription_count():
             return
         message = DiagnosticArray()
         message.header.stamp = self._node.get_clock().now().to_msg()
@@ -100,10 +111,14 @@ class RosInterface:
         self._diagnostics.publish(message)
 
     def destroy(self) -> None:
-        """Offer and publish nothing any more."""
+        """Offer and publish nothing any more; what was published last has arrived, if it can."""
         for service in self._services:
             Node.destroy_service(self._node, service)
         for publisher in (self._status, self._diagnostics):
+            if publisher is None:
+                continue
+            if publisher.get_subscription_count():
+                publisher.wait_for_all_acked(_LAST)
             Node.destroy_publisher(self._node, publisher)
 
     def _served(self, name: str) -> Callable[[Any, Any], Any]:

@@ -16,15 +16,14 @@ import socket
 from collections.abc import Iterable
 from typing import NoReturn
 
-from lifecycle import codec, dataclasses
-from lifecycle.manifest import DiscoveryRange
+from lifecycle import codec, dataclasses, middleware
+from lifecycle.manifest import DiscoveryRange, Health, Run
 from lifecycle.node.host.control import Command, Event, HostChannel, HostSpec, Operation, give_up
 from lifecycle.plan import PlannedNode
 
-_PRELOADED = (
+_SHARED = (
     "rclpy.executors",
     "rclpy.node",
-    "rclpy.lifecycle",
     "rclpy.logging_service",
     "lifecycle_msgs.msg",
     "lifecycle_msgs.srv",
@@ -32,13 +31,31 @@ _PRELOADED = (
     "rcl_interfaces.srv",
     "std_msgs.msg",
     "std_srvs.srv",
+)
+"""What a supervisor has, too: its participant is a node."""
+
+_PRELOADED = (
+    *_SHARED,
+    "rclpy.lifecycle",
     "lifecycle.node.host.hosting",
 )
-_MESSAGES = (
-    "rcl_interfaces/msg/ParameterEvent",
-    "lifecycle_msgs/msg/TransitionEvent",
-    "std_msgs/msg/String",
+_SHARED_NAMES = (
+    "BusySign",
+    "ParticipantSettings",
+    "discovery_environment",
+    "discovery_peers",
+    "endpoints_of",
+    "give_up_dead_connections",
+    "hidden_nodes",
+    "import_interface",
+    "is_server_matched",
+    "parameter_value",
+    "participant_settings",
+    "segments_of",
+    "widen_discovery_buffers",
 )
+_SHARED_MESSAGES = ("rcl_interfaces/msg/ParameterEvent", "std_msgs/msg/String")
+_MESSAGES = (*_SHARED_MESSAGES, "lifecycle_msgs/msg/TransitionEvent")
 _SERVICES = (
     "rcl_interfaces/srv/DescribeParameters",
     "rcl_interfaces/srv/GetParameterTypes",
@@ -79,6 +96,19 @@ def preload(names: Iterable[str] = ()) -> None:
             _load(name)
     load_libraries()
     _rehearse()
+
+
+def preload_shared() -> None:
+    """Import what a host and a supervisor both need, for a supervisor that will fork.
+
+    What `preload` says of threads, participants and sockets holds here, too.
+    """
+    for name in _SHARED:
+        importlib.import_module(name)
+    for name in _SHARED_NAMES:
+        getattr(middleware, name)
+    for message in _SHARED_MESSAGES:
+        _load(message)
 
 
 _OFTEN = 8
@@ -125,6 +155,8 @@ def _rehearse() -> None:
             machine.resolve(0, request.value)
             machine.request(request)
             machine.finish(CallbackOutcome.SUCCESS)
+    getattr(Health, "__init__")  # noqa: B009 - looking them up makes them, see dataclasses
+    getattr(Run, "__eq__")  # noqa: B009
     dataclasses.make_constructors(
         "lifecycle.node",
         "lifecycle.middleware",
@@ -139,15 +171,7 @@ def _load(name: str) -> None:
     if "/" not in name:
         importlib.import_module(name)
         return
-    from rclpy.type_support import check_is_valid_msg_type, check_is_valid_srv_type
-
-    from lifecycle.middleware import import_interface
-
-    found = import_interface(name)
-    if "/msg/" in name:
-        check_is_valid_msg_type(found)
-    elif "/srv/" in name:
-        check_is_valid_srv_type(found)
+    middleware.load_type_support(name)
 
 
 def needed_by(nodes: Iterable[PlannedNode]) -> tuple[str, ...]:

@@ -141,6 +141,7 @@ class SystemStatus(msgspec.Struct, frozen=True, kw_only=True):
         mode: name of the one that it is in; empty for a system without modes.
         manifest: path of the manifest in force, as it was given; empty where it is not known.
         revision: number of it in this run; 1 for the one that it began with.
+        ends: why it is being taken down; empty while it is not.
     """
 
     system: str
@@ -154,6 +155,7 @@ class SystemStatus(msgspec.Struct, frozen=True, kw_only=True):
     mode: str = ""
     manifest: str = ""
     revision: int = 1
+    ends: str = ""
 
 
 class ControlRequest(enum.Enum):

@@ -1,7 +1,9 @@
 """Diagnostics, status and orders over ROS topics and services, for those without a shell.
 
 Owns: when a supervisor publishes on /diagnostics and on its status topic, what it says there, and
-how a service call becomes the order that the control socket would give. Must not import rclpy.
+how a service call becomes the order that the control socket would give. None of it is there while
+a bring-up goes on: it is made a moment after the system is active, or once nothing goes on. Must
+not import rclpy.
 """
 
 from __future__ import annotations
@@ -9,23 +11,36 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections.abc import Awaitable, Callable, Iterable, Sequence
+from importlib.util import find_spec
 from typing import Protocol
 
 from msgspec.structs import replace
 
 from lifecycle.codec import to_json
-from lifecycle.errors import LifecycleError
-from lifecycle.manifest import RosInterfaceAccess
-from lifecycle.supervisor.control.orders import Done, Order, OrderKind
-from lifecycle.supervisor.control.protocol import NodeStatus, SystemStatus
-from lifecycle.supervisor.run.events import Event, LogLine, SystemReached
-from lifecycle.verify import (
+from lifecycle.errors import LifecycleError, MiddlewareError
+from lifecycle.manifest import (
     MODE_SERVICE,
-    Outcome,
-    Verdict,
+    Policy,
+    RosInterfaceAccess,
     supervisor_prefix,
     supervisor_services,
+    supervisor_status_topic,
 )
+from lifecycle.plan import Plan
+from lifecycle.supervisor.control.orders import ACTIVE, Done, Order, OrderKind
+from lifecycle.supervisor.control.protocol import NodeStatus, SystemStatus
+from lifecycle.supervisor.run.events import (
+    Event,
+    GateOpened,
+    NodeChanged,
+    NodeJoined,
+    ProcessChanged,
+    RequestSent,
+    Stopping,
+    SystemReached,
+    WiringChanged,
+)
+from lifecycle.verify import Outcome, Verdict, supervisor_label, takes_diagnostics
 
 Entry = tuple[int, str, str, str, Sequence[tuple[str, str]]]
 """Level, name, message, hardware id and values of a diagnostic_msgs/DiagnosticStatus."""
@@ -35,8 +50,45 @@ OK, WARN, ERROR, STALE = range(4)
 
 EACH_S = 1.0
 """How often diagnostics are published at least, as their aggregator expects it."""
+HELD_UP_S = 3.5
+"""A bring-up in which nothing happened for so long is held up, and says why. What discovery lost it
+sends again after 3 s (middleware/rcl/graph.py)."""
+AFTER_ACTIVE_S = 0.25
+"""What was to do for `active` is done first; who ends the system then pays nothing for this."""
 _BURST_S = 0.05
 _DOWN = "down"
+_PACKAGES = ("diagnostic_msgs", "std_msgs", "std_srvs")
+_ON_ITS_WAY = (
+    GateOpened,
+    NodeChanged,
+    NodeJoined,
+    ProcessChanged,
+    RequestSent,
+    SystemReached,
+    WiringChanged,
+)
+"""Events of a bring-up that goes on; another verdict may come for ever."""
+
+
+def check_installed(policy: Policy) -> None:
+    """Make sure that what a manifest asks for can be offered.
+
+    Raises:
+        MiddlewareError: a package is not installed.
+    """
+    asked = policy.ros_interface_required and policy.ros_interface is not RosInterfaceAccess.OFF
+    if asked and (reason := _not_installed()):
+        value = policy.ros_interface.value
+        raise MiddlewareError(
+            f"cannot offer 'policy: {{ros_interface: {value}}}': {reason}",
+            hint="install it, or write 'policy: {ros_interface: off}'",
+        )
+
+
+def _not_installed() -> str:
+    """Say which package is not installed that is needed; empty if all are."""
+    lacking = [name for name in _PACKAGES if find_spec(name) is None]
+    return f"no Python package {' or '.join(lacking)} is installed" if lacking else ""
 
 
 class Offer(Protocol):
@@ -59,28 +111,41 @@ class Offering(Protocol):
     """What makes topics and services, see ObserverParticipant."""
 
     def ros_interface(
-        self, prefix: str, services: Iterable[str], on_call: Callable[[str, Answer], None]
+        self,
+        prefix: str,
+        services: Iterable[str],
+        on_call: Callable[[str, Answer], None],
+        *,
+        diagnoses: bool,
     ) -> Offer:
-        """Make them; calls come from any thread."""
+        """Make them; calls come from any thread.
+
+        Raises:
+            MiddlewareError: they cannot be made.
+        """
+
+    def is_subscribed(self, topic: str) -> bool:
+        """Return whether discovery shows a subscription of a topic."""
 
 
 class RosInterface:
-    """What one run offers in ROS, from the moment that its system is active.
+    """What one run offers in ROS, from the moment that its system is active or held up.
 
     Args:
-        access: what the manifest allows.
+        plan: whose policy says what is allowed.
         machine: of this supervisor, where the system has several; else empty.
-        modes: names of those that it may be asked to enter.
         participant: makes topics and services.
+        modes: names of those that it may be asked to enter.
         status: returns what is known now.
         verdict: returns the last one; None before the first.
         order: carries out an order.
         down: begins to take the system down.
+        notify: told, once, why nothing can be offered.
     """
 
     def __init__(
         self,
-        access: RosInterfaceAccess,
+        plan: Plan,
         machine: str,
         participant: Offering,
         *,
@@ -89,8 +154,10 @@ class RosInterface:
         verdict: Callable[[], Verdict | None],
         order: Callable[[Order], Awaitable[Done]],
         down: Callable[[], None],
+        notify: Callable[[str], None],
     ) -> None:
-        self._access = access
+        self._plan = plan
+        self._access = plan.policy.ros_interface
         self._machine = machine
         self._modes = tuple(modes)
         self._participant = participant
@@ -98,49 +165,84 @@ class RosInterface:
         self._verdict = verdict
         self._order = order
         self._down = down
+        self._notify = notify
         self._offer: Offer | None = None
+        self._opens = self._access is not RosInterfaceAccess.OFF
+        self._was_active = False
         self._due: asyncio.TimerHandle | None = None
         self._orders: set[asyncio.Task[None]] = set()
         self._rules: set[str] = set()
         self._published: SystemStatus | None = None
         self._hurries = False
 
+    def begin(self) -> None:
+        """Wait from now on for the system to be active, or to be held up."""
+        if self._opens:
+            self._open_in(HELD_UP_S)
+
     def on_event(self, event: Event) -> None:
         """Publish what changed; a listener of the run."""
-        if isinstance(event, LogLine) or self._access is RosInterfaceAccess.OFF:
-            return
-        if self._offer is None:
-            if isinstance(event, SystemReached) and event.reached == "active":
+        if self._offer is not None:
+            if not self._hurries:
+                self._hurries = True  # changes come in bursts
+                self._publish_in(_BURST_S)
+        elif not self._opens:
+            pass
+        elif isinstance(event, Stopping):
+            # It will not be there for long: for those only who wait for it already.
+            self._wait(None)
+            if self._participant.is_subscribed(self._status_topic):
                 self._open()
-        elif not self._hurries:
-            self._hurries = True  # changes come in bursts
-            self._publish_in(_BURST_S)
+            self._opens = False
+        elif not self._was_active and isinstance(event, _ON_ITS_WAY):
+            self._was_active = isinstance(event, SystemReached) and event.reached == ACTIVE
+            self._open_in(AFTER_ACTIVE_S if self._was_active else HELD_UP_S)
 
     def close(self) -> None:
         """Publish a last time, and offer nothing any more; again is harmless."""
-        if self._due is not None:
-            self._due.cancel()
+        self._wait(None)
+        self._opens = False
         offer, self._offer = self._offer, None
         if offer is not None:
             self._say(offer)
             offer.destroy()
 
+    @property
+    def _status_topic(self) -> str:
+        return supervisor_status_topic(supervisor_prefix(self._plan.system, self._machine))
+
+    def _open_in(self, wait_s: float) -> None:
+        self._wait(asyncio.get_running_loop().call_later(wait_s, self._open))
+
+    def _wait(self, due: asyncio.TimerHandle | None) -> None:
+        if self._due is not None:
+            self._due.cancel()
+        self._due = due
+
     def _open(self) -> None:
+        self._opens = False
         loop = asyncio.get_running_loop()
 
         def called(name: str, answer: Answer) -> None:
             with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
                 loop.call_soon_threadsafe(self._called, name, answer)
 
-        prefix = supervisor_prefix(self._status().system, self._machine)
+        prefix = supervisor_prefix(self._plan.system, self._machine)
         services = supervisor_services(self._access, self._modes)
-        self._offer = self._participant.ros_interface(prefix, services, called)
-        self._publish()
+        try:
+            self._offer = self._participant.ros_interface(
+                prefix, services, called, diagnoses=takes_diagnostics(self._plan)
+            )
+        except MiddlewareError as error:
+            self._notify(
+                f"cannot offer diagnostics and status in ROS: {error}; the system runs without; "
+                "'policy: {ros_interface: off}' does not try"
+            )
+        else:
+            self._publish()
 
     def _publish_in(self, wait_s: float) -> None:
-        if self._due is not None:
-            self._due.cancel()
-        self._due = asyncio.get_running_loop().call_later(wait_s, self._publish)
+        self._wait(asyncio.get_running_loop().call_later(wait_s, self._publish))
 
     def _publish(self) -> None:
         if self._offer is not None:
@@ -153,7 +255,11 @@ class RosInterface:
         if (timeless := _timeless(status)) != self._published:
             self._published = timeless
             offer.publish_status(to_json(status).decode())
-        offer.publish_diagnostics(diagnostics(status, self._verdict(), self._rules))
+        label = supervisor_label(status.system, self._machine)
+        source = supervisor_prefix(status.system, self._machine)
+        offer.publish_diagnostics(
+            diagnostics(status, self._verdict(), self._rules, label=label, source=source)
+        )
 
     def _called(self, name: str, answer: Answer) -> None:
         if name == _DOWN:
@@ -196,7 +302,7 @@ def _timeless(status: SystemStatus) -> SystemStatus:
 
 
 def diagnostics(
-    status: SystemStatus, verdict: Verdict | None, reported: set[str]
+    status: SystemStatus, verdict: Verdict | None, reported: set[str], *, label: str, source: str
 ) -> tuple[Entry, ...]:
     """Return one entry for each node, and one for each rule that is violated or unverifiable.
 
@@ -206,12 +312,15 @@ def diagnostics(
         reported: rules that had an entry before. They go on having one, which says that all is
             well: an aggregator would take an entry that does not come any more for a failure.
             Those of `verdict` are added.
+        label: what the names of entries begin with, which an aggregator knows them by.
+        source: their hardware id, by which those who read the health of nodes leave them out.
     """
     findings = () if verdict is None else verdict.findings
     entries = [
         _of_node(
             each,
             status,
+            (label, source),
             Outcome.worst(
                 finding.outcome
                 for finding in findings
@@ -227,9 +336,9 @@ def diagnostics(
         entries.append(
             (
                 _LEVELS[Outcome.worst(each.outcome for each in found)],
-                f"{status.system}: {rule}",
+                f"{label}: {rule}",
                 f"{found[0].message}{more}" if found else "ok",
-                status.system,
+                source,
                 tuple((each.subject, each.observed) for each in found),
             )
         )
@@ -239,8 +348,11 @@ def diagnostics(
 _LEVELS = {Outcome.OK: OK, Outcome.UNVERIFIABLE: WARN, Outcome.VIOLATED: ERROR}
 
 
-def _of_node(node: NodeStatus, status: SystemStatus, outcome: Outcome) -> Entry:
+def _of_node(
+    node: NodeStatus, status: SystemStatus, label: tuple[str, str], outcome: Outcome
+) -> Entry:
     level, message = _LEVELS[outcome], node.state or node.reach.value
+    message += f", {node.doing}" if node.doing else ""
     if node.next_try_s is not None:
         level, message = ERROR, f"starts again in {node.next_try_s:.1f} s"
     elif node.died:
@@ -264,4 +376,4 @@ def _of_node(node: NodeStatus, status: SystemStatus, outcome: Outcome) -> Entry:
         values += [("cpu_s", f"{node.cpu_s:.2f}"), ("rss_bytes", str(node.rss_bytes))]
     if node.last_failure is not None:
         values.append(("last_failure", f"{node.last_failure.at}: {node.last_failure.message}"))
-    return level, f"{status.system}: {node.node}", message, status.system, tuple(values)
+    return level, f"{label[0]}: {node.node}", message, label[1], tuple(values)

@@ -101,6 +101,7 @@ def system_status(
     supervisor: int,
     elapsed_s: float,
     schedule: RestartSchedule | None = None,
+    ends: str = "",
 ) -> SystemStatus:
     """Return what is known of the whole system, with what its processes use now."""
     silent = system.liveliness.silent
@@ -128,4 +129,5 @@ def system_status(
         mode=system.mode,
         manifest=system.first.manifest_path,
         revision=system.revision,
+        ends=ends,
     )

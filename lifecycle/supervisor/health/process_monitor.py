@@ -140,6 +140,9 @@ class ParticipantRegistry(Protocol):
     def remove_participants(self, prefixes: Iterable[str], pids: Iterable[int]) -> None:
         """Have all others forget participants whose process is dead."""
 
+    def disown_ports(self) -> None:
+        """Have all others send no more to ports in shared memory whose process is dead."""
+
     def introduce(self, newcomers: Iterable[int], pids: Iterable[int]) -> None:
         """Have new participants discovered by, and discover, those that were there before."""
 
@@ -230,6 +233,7 @@ class StaleNodes:
         """
         if self._closed:
             return
+        self._graph.disown_ports()
         names = [node.name for node in nodes]
         reported = frozenset(prefix for node in nodes for prefix in _reported(node))
         prefixes = self._graph.participants_of(pid, nodes=names, reported=reported)

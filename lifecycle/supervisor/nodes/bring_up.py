@@ -87,10 +87,12 @@ class Gathering:
 
     Args:
         limit_s: seconds, > 0, that any of them waits for the others at most.
+        announce: has our participant announce itself to those that it knows.
     """
 
-    def __init__(self, limit_s: float) -> None:
+    def __init__(self, limit_s: float, announce: Callable[[], None]) -> None:
         self._limit_s = limit_s
+        self._announce = announce
         self._missing: set[ControlChannel] = set()
         self._waiting: list[ControlChannel] = []
         self._tasks: set[asyncio.Task[None]] = set()
@@ -124,6 +126,8 @@ class Gathering:
             if timer is not None:
                 timer.cancel()
         self._limit = self._quiet = None
+        if self._waiting:
+            self._announce()
         for channel in self._waiting:
             channel.proceed()
         self._waiting = []
@@ -148,6 +152,7 @@ class BringUp:
         gives: sets the parameters of a running node that its command line does not give it.
         loads: has the container of this full name load a node, and returns what unloads it.
         wirer: wires each node between its configure and its connect; None leaves it to the nodes.
+        announce: see Gathering.
     """
 
     def __init__(
@@ -162,7 +167,9 @@ class BringUp:
         gives: Callable[[PlannedNode], Awaitable[None]] | None = None,
         alone: Callable[[NodeRun], None] | None = None,
         loads: Callable[[PlannedNode, str], Awaitable[Callable[[], Awaitable[None]]]] | None = None,
+        announce: Callable[[], None] = lambda: None,
     ) -> None:
+        self._announce = announce
         self._gives = gives
         self._alone = alone
         self._loads = loads
@@ -266,7 +273,7 @@ class BringUp:
         nodes = tuple(nodes)
         hosts = {node.planned.process for node in nodes if node.planned.run.kind is RunKind.PYTHON}
         limit_s = min((node.planned.timeouts.start_s for node in nodes), default=0.0) / 2
-        self._gathering = Gathering(limit_s) if len(hosts) > 1 else None
+        self._gathering = Gathering(limit_s, self._announce) if hosts else None
         try:
             await self._side_by_side(self._walk(node) for node in nodes)
         finally:

@@ -13,7 +13,9 @@ import shlex
 from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
+from lifecycle.errors import MiddlewareError
 from lifecycle.graph import set_within
+from lifecycle.manifest import EndpointKind
 from lifecycle.plan import ParticipantConnections, Plan, PlannedNode
 from lifecycle.supervisor.control.ros_interface import Answer, Offer
 from lifecycle.supervisor.health.peer_supervisors import Listener
@@ -187,7 +189,7 @@ class ObserverParticipant:
 
     def drop_configuration(self, node: str) -> None:
         """Forget what a node reported whose process ended."""
-        self._graph.state.drop_configuration(node)
+        self._graph.drop_configuration(node)
 
     def participants_of(
         self, pid: int, *, nodes: Iterable[str], reported: Iterable[str]
@@ -198,6 +200,12 @@ class ObserverParticipant:
     def remove_participants(self, prefixes: Iterable[str], pids: Iterable[int]) -> None:
         """Have all participants forget those whose process is dead."""
         self._graph.discovery.remove_participants(prefixes, pids)
+
+    def disown_ports(self) -> None:
+        """Have all participants of this host send no more to ports whose process is dead."""
+        from lifecycle.middleware import disown_ports
+
+        disown_ports()
 
     def announce_machine(self, system: str, machine: str) -> AlivePublisher:
         """Announce ourselves as the supervisor of a machine, by DDS liveliness."""
@@ -224,18 +232,40 @@ class ObserverParticipant:
         return PlanNotices(self._node, on_notice)
 
     def ros_interface(
-        self, prefix: str, services: Iterable[str], on_call: Callable[[str, Answer], None]
+        self,
+        prefix: str,
+        services: Iterable[str],
+        on_call: Callable[[str, Answer], None],
+        *,
+        diagnoses: bool,
     ) -> Offer:
-        """Make the topics and services by which ROS programs reach the supervisor."""
-        from lifecycle.middleware import RosInterface
+        """Make the topics and services by which ROS programs reach the supervisor.
 
-        return RosInterface(self._node, prefix, services, on_call)
+        Raises:
+            MiddlewareError: a package cannot be loaded, or rcl refuses.
+        """
+        try:
+            from lifecycle.middleware import RosInterface
+
+            return RosInterface(self._node, prefix, services, on_call, diagnoses=diagnoses)
+        except Exception as error:  # rclpy has no root of its own errors
+            raise MiddlewareError(" ".join(str(error).split())) from error
+
+    def is_subscribed(self, topic: str) -> bool:
+        """Return whether discovery shows a subscription of a topic."""
+        from lifecycle.middleware import endpoints_of
+
+        return bool(endpoints_of(self._node, EndpointKind.SUBSCRIPTION, topic))
 
     def call_out(self, addresses: Iterable[str]) -> None:
         """Make all participants announce themselves, as far as the system's discovery allows."""
         from lifecycle.middleware import call_out
 
         call_out(self._graph.discovery.domain_id, self._graph.discovery.urls, addresses, os.environ)
+
+    def announce_ourselves(self) -> None:
+        """Have our participant announce itself to those that it knows, as far as that goes."""
+        self._graph.discovery.announce_ourselves()
 
     def introduce(self, newcomers: Iterable[int], pids: Iterable[int]) -> None:
         """Have new participants discovered by, and discover, those that were there before."""

@@ -22,7 +22,7 @@ class RestartPolicy:
         started_s: when it was started for the first time, by any clock that only goes forward.
 
     Attributes:
-        restarts: how often it has been started again.
+        restarts: how often it has been started again after a failure.
     """
 
     def __init__(self, how: Supervision, started_s: float) -> None:
@@ -54,9 +54,12 @@ class RestartPolicy:
                 return None
         return again_s
 
-    def started(self, now_s: float) -> None:
-        """Note that it was started again after a failure."""
-        self.restarts += 1
+    def started(self, now_s: float, *, after_failure: bool = True) -> None:
+        """Note that it was started again, also where another's failure took it down or cut it off.
+
+        systemd.unit(5): StartLimitBurst= applies to all kinds of starts.
+        """
+        self.restarts += after_failure
         # Without a limit they are not counted, and must not pile up.
         kept = self._starts if self.how.start_limit_interval_sec else []
         self._starts = [*kept, now_s]

@@ -212,14 +212,19 @@ class RestartSchedule:
         now_s = self._emit.elapsed_s
         keys = self._ready()
         left: list[_Entry] = []
+        failed = set[str]()
         for entry in self._entries:
             own = {key for key in keys if self._system.nodes[key].planned.process == entry.process}
             begins = bool(own & entry.keys) and entry.due_s <= now_s
             if begins:
-                self._records[entry.process].policy.started(now_s)
+                failed.add(entry.process)
             if entry.keys - keys:
                 process = "" if begins else entry.process
                 left.append(dataclasses.replace(entry, process=process, keys=entry.keys - keys))
+        begun = {self._system.nodes[key].process for key in keys}
+        for again in (each for each in begun if each is not None):
+            policy = self._record(again).policy
+            policy.started(now_s, after_failure=again.name in failed)
         self._entries = left
         self._returning |= keys
         return tuple(key for key in self._system.nodes if key in keys)

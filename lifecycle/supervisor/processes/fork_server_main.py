@@ -1,9 +1,10 @@
 """The fork server's own process: forks the processes of a system, and guards them.
 
 Owns: what runs in `python -m lifecycle.supervisor.processes.fork_server_main SOCKET_FD [--preload]
-[--programs] [--again]`. It stays single-threaded and never calls rclpy.init, so that forking is
-safe and every child is a participant of its own; with `--preload` a forked host skips ~130 ms of
-imports. Each child leads a session of its own. It adopts what its children leave behind
+[--programs] [--again]`, or in a fork of the supervisor that is made to be the same (`become`), so
+that what both need is imported once. It stays single-threaded and never calls rclpy.init, so that
+forking is safe and every child is a participant of its own; with `--preload` a forked host skips
+~130 ms of imports. Each child leads a session of its own. It adopts what its children leave behind
 (PR_SET_CHILD_SUBREAPER), so as long as it lives, what descends from it is what the run started. If
 the supervisor vanishes it ends what is left of its children, bounded, and of those of a fork server
 before it that was killed; those that are to be kept it reads, so that none of them writes to a pipe
@@ -23,7 +24,7 @@ import sys
 import time
 import traceback
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -36,6 +37,7 @@ from lifecycle.middleware import (
     fill_heap,
     limit_resources,
     refuse_new_privileges,
+    rename_process,
 )
 from lifecycle.supervisor.processes.forerunner import PRELOAD
 
@@ -106,6 +108,7 @@ _CHILD_SIGNAL = -1
 _ENDED = os.WEXITED | os.WNOWAIT | os.WNOHANG
 _STOPS = os.WSTOPPED | os.WCONTINUED | os.WNOHANG
 _PIPE_BYTES = 65536
+_STDOUT, _STDERR = 1, 2
 
 
 class _Kept:
@@ -451,8 +454,70 @@ def _preload(names: Iterable[str]) -> None:
     gc.enable()
 
 
-def main() -> int:
-    """Run the fork server."""
+def import_shared() -> None:
+    """Import what a supervisor needs as well as a fork server, before one becomes the other."""
+    from lifecycle.node import preload_shared
+
+    with _idle_blas():
+        preload_shared()
+
+
+def become(
+    argv: Sequence[str], environment: Mapping[str, str], control: int, mask: Iterable[int]
+) -> NoReturn:
+    """Turn a fork of a supervisor into what `argv` would start; never returns.
+
+    Like a program it has an environment, a command line and a session of its own, the descriptors
+    and handlers of signals that a program would inherit, and none of its parent's threads. Where
+    the kernel does not let it have that environment for all to see, by which others recognise what
+    belongs to a run, it executes the program.
+
+    Args:
+        argv: a command line of this module, by `python -m`.
+        environment: complete.
+        control: descriptor of its socket.
+        mask: of signals; while this is called all are blocked.
+    """
+    os.setsid()
+    for number in map(int, signal.valid_signals()):
+        if callable(signal.getsignal(number)):
+            signal.signal(number, signal.SIG_DFL)
+    for each in os.listdir("/proc/self/fd"):  # noqa: PTH208 - names are numbers
+        if int(each) > _STDERR and int(each) != control:
+            with contextlib.suppress(OSError):  # that by which they are listed
+                os.close(int(each))
+    null = os.open(os.devnull, os.O_RDONLY)
+    os.dup2(null, 0)
+    os.close(null)
+    try:
+        rename_process(argv, environment)
+    except MiddlewareError:
+        os.set_inheritable(control, True)
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        os.execve(argv[0], [*argv], environment)  # noqa: S606 - as the supervisor would
+    for name in os.environ.keys() - environment.keys():
+        del os.environ[name]
+    os.environ.update(environment)
+    # The supervisor has streams of its own, and a thread that writes one of them.
+    sys.stdin, sys.stdout, sys.stderr = sys.__stdin__, sys.__stdout__, sys.__stderr__
+    for name, number in (("stdout", _STDOUT), ("stderr", _STDERR)):
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(number, "w", closefd=False))
+    module = sys.modules[__name__]
+    sys.modules["__main__"] = module
+    sys.orig_argv = [*argv]
+    sys.argv = [str(module.__file__), *argv[3:]]
+    if not getattr(sys.flags, "safe_path", False):
+        sys.path[0] = os.getcwd()  # noqa: PTH109 - it is a text
+    main(mask)
+
+
+def main(mask: Iterable[int] | None = None) -> NoReturn:
+    """Run the fork server.
+
+    Args:
+        mask: of signals, once they are handled; None leaves it.
+    """
     parser = argparse.ArgumentParser(prog=f"python -m {__spec__.name}")
     parser.add_argument("socket_fd", type=int)
     parser.add_argument("--preload", action="store_true")
@@ -462,15 +527,16 @@ def main() -> int:
     # Ctrl-C is the supervisor's to handle, and its end is what ends us.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    if mask is not None:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
     adopt_orphans()
     if options.programs and os.geteuid() != 0:
         drop_network_administration()
     if options.preload:
         _preload(())
     _ForkServer(socket.socket(fileno=options.socket_fd), again=options.again).serve()
-    return 0
+    os._exit(0)
 
 
 if __name__ == "__main__":
     main()
-    os._exit(0)

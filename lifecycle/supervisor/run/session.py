@@ -153,6 +153,9 @@ class SessionParticipant(
     def drop_configuration(self, node: str) -> None:
         """Forget what a node reported whose process ended."""
 
+    def announce_ourselves(self) -> None:
+        """Have our participant announce itself to those that it knows."""
+
     def prepare_to_leave(self) -> None:
         """Close connections that are not answered, so that leaving does not wait for them."""
 
@@ -213,6 +216,7 @@ class Session:
         self._held = False
         self._keeps = False
         self._ends = ""
+        self._reason = ""
         self._hurry = asyncio.Event()
         self._stop: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._changes = ChangeCounter(system, observer_participant)
@@ -248,6 +252,7 @@ class Session:
             gives=observer_participant.give,
             loads=observer_participant.load,
             alone=self._alone,
+            announce=observer_participant.announce_ourselves,
         )
         self._remote_nodes = RemoteNodes(
             system.plan, system.awaited(), observer_participant, self._changes
@@ -291,7 +296,7 @@ class Session:
         )
 
         self._ros_interface = RosInterface(
-            system.plan.policy.ros_interface,
+            system.plan,
             min(system.machines or ("",)),
             observer_participant,
             modes=() if system.remote else (each.name for each in system.plan.modes),
@@ -299,6 +304,7 @@ class Session:
             verdict=lambda: self._judge.latest,
             order=self._holding.ordered,
             down=lambda: self._down("the down service"),
+            notify=lambda text: emit(Notice(message=text)),
         )
 
     def status(self) -> SystemStatus:
@@ -310,6 +316,7 @@ class Session:
             supervisor=os.getpid(),
             elapsed_s=self._emit.elapsed_s,
             schedule=self._schedule,
+            ends=self._reason,
         )
 
     def look(self) -> SupervisorSnapshot:
@@ -352,6 +359,7 @@ class Session:
         self._agreement.open()
         self._emit.listen(lambda event: None if isinstance(event, LogLine) else server.changed())
         self._emit.listen(self._ros_interface.on_event)
+        self._ros_interface.begin()
         self._emit.listen(self._keep)
         result = UpResult(exit_code=ExitCode.INTERNAL, verdict=NOT_JUDGED)
         offering = asyncio.ensure_future(self._interfaces.follow())
@@ -383,6 +391,7 @@ class Session:
     async def _until_over(self) -> UpResult:
         """Run the phases; whatever ends them becomes an exit code and a verdict."""
         reason = stopping = "done"
+        failed = ""
         end = _RunEnd()
         try:
             end = await self._unless_stopped(self._phases())
@@ -393,6 +402,7 @@ class Session:
             for each in failure.every:
                 self._emit(each.event())
             reason, stopping = failure.reason, "rolling back"
+            failed = "; ".join(each.message for each in failure.every)
             verdict = with_failure(self._judge.latest or NOT_JUDGED, failure)
             end = _RunEnd(exit_code=failure.exit_code, verdict=verdict)
         except VerificationError as error:
@@ -402,14 +412,14 @@ class Session:
             elif self._gate_sequence.phase == "activating":
                 stopping = "what became active is not what was verified"
             reason = f"{stopping}; {not_ok(error.verdict) or error.verdict.verdict.value}"
-        self._gate.close()
-        self._gate_sequence.phase = _STOPPING
-        self._emit(Stopping(reason=stopping))
-        self._ends = stopping
         if end.why:
             reason = f"{reason}, but {end.why}" if reason == "done" else f"{reason}; {end.why}"
         if restarted := self._schedule.summary():
             reason = f"{reason}; {restarted}"
+        self._gate.close()
+        self._gate_sequence.phase = _STOPPING
+        self._ends, self._reason = stopping, failed or reason
+        self._emit(Stopping(reason=stopping))
         run = RunEnd(
             reason=reason,
             reached=self._furthest,
@@ -562,7 +572,7 @@ class Session:
         """Keep the system for as long as was asked; return the result of the run."""
         self._held = True
         hold_s = self._options.stop_after_s
-        if hold_s is None and self._options.until is not Until.ACTIVE:
+        if hold_s is None and self._options.until is not Until.ACTIVE and not self._options.holds:
             hold_s = 0.0
         return self._outcome(await self._holding.hold(stage, hold_s))
 

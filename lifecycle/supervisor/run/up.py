@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import gc
 import os
+import time
 import traceback
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
 
@@ -22,6 +23,7 @@ from lifecycle.middleware import (
     check_threads,
     discovery_environment,
     discovery_peers,
+    disown_ports,
     exit_after,
     peers_environment,
     sweep,
@@ -37,6 +39,7 @@ from lifecycle.run_directory import (
 from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.connections.networks import open_networks, token_variables
 from lifecycle.supervisor.control.protocol import SystemStatus
+from lifecycle.supervisor.control.ros_interface import check_installed
 from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.forerunner import Forerunner
@@ -49,6 +52,7 @@ from lifecycle.supervisor.run.journal import Journal
 from lifecycle.supervisor.run.options import (
     UpOptions,
     UpResult,
+    address_that_is_down,
     local_processes,
     observer_connections,
     own_machines,
@@ -177,6 +181,7 @@ def _up(
         with ending.raised() if options.program else contextlib.nullcontext():
             networks = open_networks(plan, options, directory, emit, environment=os.environ)
         check_log_root(os.environ)
+        check_installed(plan.policy)
         _enter_graph(plan, options, directory)
 
         async def run(leaving: contextlib.AsyncExitStack) -> UpResult:
@@ -199,7 +204,7 @@ def _up(
                 # Before any participant: who asks a server that is not there waits to ask again.
                 with ending.raised():
                     await discovery_server.begin(system, fork_server, ours=_serves(plan, options))
-                observer_participant = _observer_participant(plan, options, emit)
+                observer_participant = await _observer_participant(plan, options, emit, ending)
                 leaving.callback(observer_participant.destroy)
                 await records.note_segments()
                 emit(_started(system, observer_participant, str(logs)))
@@ -306,7 +311,9 @@ def _preloading(
 
 
 _LET_GO_S = 0.5
-"""Others let go of what a participant used within milliseconds of its leaving."""
+"""Others let go of the port of a participant that left when they next send over shared memory: most
+within milliseconds, one that sends nothing perhaps never. Then the port stays for who uses it next.
+"""
 
 
 def _sweep(records: Records | None, emit: Emitter | None = None, *, within_s: float = 0.0) -> None:
@@ -326,16 +333,37 @@ def _ends_within(seconds: float, code: int) -> Iterator[None]:
         live_on()
 
 
+_INTERFACE_S = 0.05
+
+
+async def _until_interface_is_up(plan: Plan, options: UpOptions, emit: Emitter) -> None:
+    """Wait, bounded, before any participant is made that would never use this host's address."""
+    deadline_s = time.monotonic() + options.bring_up_s(0)
+    said = ""
+    while (address := address_that_is_down(plan, options.machine)) and (
+        time.monotonic() < deadline_s
+    ):
+        if address != said:
+            said = address
+            message = f"waits until the network interface with {address} is up: what is made before"
+            emit(Notice(message=f"{message} would not be found from other machines"))
+        await asyncio.sleep(_INTERFACE_S)
+
+
 def _serves(plan: Plan, options: UpOptions) -> bool:
     server = plan.server
     return server is not None and server.machine in own_machines(plan, options.machine)
 
 
-def _observer_participant(plan: Plan, options: UpOptions, emit: Emitter) -> ObserverParticipant:
+async def _observer_participant(
+    plan: Plan, options: UpOptions, emit: Emitter, ending: Ending
+) -> ObserverParticipant:
     """Make the supervisor's participant; on another port if a discovery server is not reached.
 
     Fast DDS may never use the first connection to it (middleware/discovery/dead_peers.py).
     """
+    with ending.raised():
+        await _until_interface_is_up(plan, options, emit)
     layer = plan.data_layer
     dynamic = layer.source is DataLayerSource.DYNAMIC
     wires = layer.authority is Authority.SUPERVISOR
@@ -414,6 +442,7 @@ def _graph_variables(environment: Mapping[str, str]) -> tuple[tuple[str, str], .
 def _clean_up_after(record: RunRecord, emit: Emitter) -> None:
     """Sweep what a supervisor left that had no chance to do it itself."""
     ended, segments = end_run(record)
+    disown_ports()
     swept = sweep(segments)
     if ended or swept:
         emit(

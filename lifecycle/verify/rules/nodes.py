@@ -8,15 +8,14 @@ policy names it.
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 
-from lifecycle.manifest import EndpointPolicy, RosInterfaceAccess, RunKind
+from lifecycle.manifest import EndpointPolicy, RunKind
 from lifecycle.verify.observation import ObservedEndpoint
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.rules.endpoints import UNDECLARED
-from lifecycle.verify.tool_filter import is_supervisor_endpoint
+from lifecycle.verify.tool_filter import of_supervisors
 from lifecycle.verify.verdict import Finding, Stage
 from lifecycle.verify.view import View
 
@@ -183,41 +182,29 @@ def check_outsiders(view: View) -> Iterator[Finding]:
 
 
 def _offered_by_tools(view: View) -> Iterator[Finding]:
-    supervisors = _of_supervisors(view)
+    supervisors = of_supervisors(view.plan, view.of_tools)
     for endpoint in view.of_tools:
-        if not view.names.fed_by(endpoint.kind, endpoint.name) or endpoint in supervisors:
+        if endpoint in supervisors or not view.names.fed_by(endpoint.kind, endpoint.name):
             continue
         word = endpoint.kind.noun
+        of_supervisor = view.names.is_of_supervisors(endpoint.kind, endpoint.name)
         verb = "feeds" if endpoint.kind.is_topic else "serves"
+        whom = "whoever asks for the supervisor" if of_supervisor else "the system"
         yield UNDECLARED[endpoint.kind].finding(
             Outcome.VIOLATED,
             subject=endpoint.name,
             expected=f"no such {word} of {endpoint.node}",
             observed=f"{word} of type {endpoint.type}" if endpoint.type else word,
             message=f"cannot allow the {word} of {endpoint.name} in {endpoint.node}: the manifest"
-            f" does not declare it, and it {verb} the system",
+            f" does not declare it, and it {verb} {whom}",
             node=endpoint.node,
             endpoint=endpoint.kind,
-            hint=f"policy.tolerated_nodes ({view.tools[endpoint.node]}) lets it listen only: stop"
+            hint="only the supervisor of this system offers it; if several nodes do, none is taken"
+            " for the supervisor: stop those that are not"
+            if of_supervisor
+            else f"policy.tolerated_nodes ({view.tools[endpoint.node]}) lets it listen only: stop"
             " it, or declare its node",
         )
-
-
-def _of_supervisors(view: View) -> Collection[ObservedEndpoint]:
-    """Return what supervisors offer under declared names, as the policy has them.
-
-    A name proves nothing: where there are more of one than machines, none is taken for theirs.
-    """
-    if view.plan.policy.ros_interface is RosInterfaceAccess.OFF:
-        return ()
-    found = [
-        each
-        for each in view.of_tools
-        if is_supervisor_endpoint(each.kind, each.node, each.name, each.type)
-    ]
-    count = Counter((each.kind, each.name) for each in found)
-    most = max(1, len(view.plan.machines))
-    return [each for each in found if count[each.kind, each.name] <= most]
 
 
 def _unattributed(view: View) -> Iterator[Finding]:
@@ -228,6 +215,8 @@ def _unattributed(view: View) -> Iterator[Finding]:
     for endpoint in view.unattributed:
         word = endpoint.kind.noun
         feeds = view.names.fed_by(endpoint.kind, endpoint.name)
+        # The supervisor of another machine begins to offer them after its gate.
+        feeds = feeds and not view.names.is_of_supervisors(endpoint.kind, endpoint.name)
         violated = feeds or view.stage is Stage.CONNECTED
         yield UNATTRIBUTED_ENDPOINT.finding(
             Outcome.VIOLATED if violated else Outcome.UNVERIFIABLE,

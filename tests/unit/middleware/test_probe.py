@@ -9,7 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.middleware.discovery.probe import chosen_otherwise, probes_for
+from lifecycle.middleware.discovery.probe import (
+    Probe,
+    answered_at,
+    chosen_otherwise,
+    probes_for,
+)
 from lifecycle.network.connection_url import parse
 
 _WAIT_S = 5.0
@@ -60,6 +65,42 @@ def test_a_listed_peer_is_asked_to_answer_the_observer_and_is_counted(peer: sock
         assert probe.answered() == {_PREFIX.hex()}
     finally:
         probe.close()
+
+
+@pytest.mark.parametrize(
+    ("range_", "everybody"),
+    [
+        ("", (("239.255.0.1", 13650),)),
+        ("LOCALHOST", tuple(("127.0.0.1", 13660 + 2 * each) for each in range(32))),
+        ("OFF", ()),
+    ],
+)
+def test_our_own_participant_is_to_answer_where_all_of_this_host_hear_it(
+    range_: str, everybody: tuple[tuple[str, int], ...]
+) -> None:
+    found = answered_at(25, (), {"ROS_AUTOMATIC_DISCOVERY_RANGE": range_})
+    assert found == everybody
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ours:
+        ours.settimeout(_WAIT_S)
+        ours.bind(("127.0.0.1", 0))
+        probe = Probe((), ("127.0.0.1",), (ours.getsockname()[1],))
+        try:
+            probe.announce_ourselves(found)
+        finally:
+            probe.close()
+        message = ours.recv(65536)
+    for address, port in everybody:
+        assert port in locators(message, address)
+
+
+@pytest.mark.parametrize(
+    ("url", "environment"),
+    [("udpv4://127.0.0.1:7911?metatraffic_port=7910", {}), ("", {"ROS_DISCOVERY_SERVER": "x"})],
+)
+def test_where_participants_are_told_whom_to_look_for_ours_announces_itself_by_itself(
+    url: str, environment: dict[str, str]
+) -> None:
+    assert answered_at(25, (parse(url),) if url else (), environment) == ()
 
 
 def test_who_is_not_listed_is_not_asked(peer: socket.socket) -> None:

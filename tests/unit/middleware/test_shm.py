@@ -8,13 +8,21 @@ import fcntl
 import mmap
 import os
 import select
+import struct
 import threading
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from lifecycle.middleware import leftovers, segments_by_holder, segments_of, still_there, sweep
+from lifecycle.middleware import (
+    disown_ports,
+    leftovers,
+    segments_by_holder,
+    segments_of,
+    still_there,
+    sweep,
+)
 from lifecycle.middleware.process import shared_memory
 from lifecycle.middleware.process.shared_memory import Creations
 
@@ -231,6 +239,44 @@ def test_the_kernels_list_of_locks_names_the_owner_of_a_group(directory: Path) -
 
 def test_a_process_that_has_ended_owns_nothing() -> None:
     assert segments_of([2**22 + 1]) == frozenset()
+
+
+def port_node(*, number: int = 7411, wait_ms: int = 333, flags: int = 7) -> bytes:
+    """A port's memory, as far as it is looked at, as Fast DDS 2.14.5 was seen to write it."""
+    node = struct.pack("=7I", number, 1, 1000, wait_ms, 512, 1, flags)
+    return struct.pack("=I", 7411) + bytes(272) + node + bytes(1024)
+
+
+@pytest.mark.parametrize(
+    ("memory", "disowned"),
+    [
+        (port_node(), True),
+        (port_node(flags=6), False),  # it is known already
+        (port_node(flags=1), False),  # nobody reads there yet
+        (port_node(wait_ms=100), False),  # another version's, perhaps
+        (port_node(number=7413), False),
+        (port_node() + port_node(), False),
+        (b"", False),
+    ],
+)
+def test_senders_let_go_of_the_port_of_a_dead_process_where_its_memory_is_as_known(
+    directory: Path, memory: bytes, disowned: bool
+) -> None:
+    make(directory, *GROUP, SEGMENT)
+    (directory / PORT).write_bytes(memory)
+    assert disown_ports() == ((PORT,) if disowned else ())
+    after = (directory / PORT).read_bytes()
+    assert after == (port_node(flags=6) if disowned else memory)
+    assert disown_ports() == ()
+
+
+def test_the_port_of_a_living_process_stays_as_it_is(directory: Path) -> None:
+    make(directory, *GROUP)
+    (directory / PORT).write_bytes(port_node())
+    with (directory / f"{PORT}_el").open("rb") as owner:
+        fcntl.flock(owner, fcntl.LOCK_EX)
+        assert disown_ports() == ()
+    assert disown_ports() == (PORT,)
 
 
 def test_a_machine_without_shared_memory_has_nothing_to_sweep(

@@ -70,6 +70,14 @@ def test_a_notice_is_replaced_by_what_comes_in_its_place() -> None:
     assert said(plan("other"), run="2", host="h3").replaces(gone)
 
 
+@pytest.mark.parametrize("host", ["h2", "h3"])
+def test_a_notice_replaces_none_of_another_machine_of_its_system(host: str) -> None:
+    beside = said(plan(), "left", run="2", host=host)
+    first = said(plan())
+    assert not beside.replaces(first)
+    assert not beside.replaces(dataclasses.replace(first, left=True))
+
+
 def test_what_is_no_notice_is_refused() -> None:
     shown_badly = encode(dataclasses.replace(said(plan()), reason="\x1b[2J"))
     for text in ("", "{}", '{"run": 1}', shown_badly, "x" * (notices.MAX_TEXT + 1)):

@@ -144,6 +144,7 @@ class FakeRosInterface:
         self.statuses: list[str] = []
         self.diagnostics: list[tuple[Entry, ...]] = []
         self.destroyed = False
+        self.diagnoses = True
         self._on_call = on_call
 
     async def call(self, name: str) -> tuple[bool, str]:
@@ -179,6 +180,8 @@ class FakeParticipant:
         asked_for: services that have a client.
         while_looking: done once, when the next look has seen everything and is not over yet.
         ros: what ROS programs see of the supervisor; None before it is made.
+        no_ros: why it cannot be made; empty if it can.
+        subscribed: topics that others subscribe to.
         refuses: value of a parameter that no node takes, `rate=5`.
         refuses_live: why nodes do not take parameters while they run.
     """
@@ -195,6 +198,8 @@ class FakeParticipant:
         self.asked_for: set[str] = set()
         self.while_looking: Callable[[], None] | None = None
         self.ros: FakeRosInterface | None = None
+        self.no_ros = ""
+        self.subscribed: set[str] = set()
         self.refuses = ""
         self.refuses_live: dict[str, str] = {}
         self._hosts = hosts
@@ -290,8 +295,14 @@ class FakeParticipant:
     def remove_participants(self, prefixes: Iterable[str], pids: Iterable[int]) -> None:
         raise AssertionError(f"nothing is left in this graph: {prefixes} {pids}")
 
+    def disown_ports(self) -> None:
+        """There is no shared memory."""
+
     def introduce(self, newcomers: Iterable[int], pids: Iterable[int]) -> None:
         """Everybody is discovered at once."""
+
+    def announce_ourselves(self) -> None:
+        """Likewise."""
 
     def announce_machine(self, system: str, machine: str) -> _Connection:
         raise AssertionError(f"{system} has no other machine than {machine}")
@@ -312,10 +323,18 @@ class FakeParticipant:
         prefix: str,
         services: Iterable[str],
         on_call: Callable[[str, Callable[[bool, str], None]], None],
+        *,
+        diagnoses: bool,
     ) -> FakeRosInterface:
         assert self.ros is None
+        if self.no_ros:
+            raise MiddlewareError(self.no_ros)
         self.ros = FakeRosInterface(prefix, tuple(services), on_call)
+        self.ros.diagnoses = diagnoses
         return self.ros
+
+    def is_subscribed(self, topic: str) -> bool:
+        return topic in self.subscribed
 
     def call_out(self, addresses: Iterable[str]) -> None:
         """Nobody is far away."""

@@ -619,7 +619,7 @@ class _Host:
 
 def _proceeding(*hosts: _Host, limit_s: float = 5.0) -> list[float | None]:
     async def main() -> list[float | None]:
-        gathering = Gathering(limit_s)
+        gathering = Gathering(limit_s, lambda: None)
         began = asyncio.get_running_loop().time()
         for host in hosts:
             gathering.expect(host)  # type: ignore[arg-type]
@@ -635,6 +635,21 @@ def _proceeding(*hosts: _Host, limit_s: float = 5.0) -> list[float | None]:
 
 def test_hosts_make_their_endpoints_once_the_last_participant_is_there() -> None:
     assert _proceeding(_Host(0.1), _Host(0.4), _Host(0.3)) == [0.4, 0.4, 0.4]
+
+
+def test_hosts_are_told_of_us_once_they_listen_and_before_they_have_endpoints() -> None:
+    async def main() -> None:
+        met: list[list[float | None]] = []
+        hosts = (_Host(0.1, fails=True), _Host(0.2), _Host(0.3))
+        gathering = Gathering(5.0, lambda: met.append([each.proceeded_at for each in hosts]))
+        for host in hosts:
+            gathering.expect(host)  # type: ignore[arg-type]
+        await asyncio.sleep(1.0)
+        await gathering.close()
+        assert met == [[None, None, None]]
+        assert [each.proceeded_at is None for each in hosts] == [True, False, False]
+
+    run(main())
 
 
 def test_a_host_that_cannot_be_made_holds_no_other() -> None:

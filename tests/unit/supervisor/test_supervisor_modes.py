@@ -188,7 +188,7 @@ def test_parameters_are_set_before_what_comes_in_is_activated_and_set_back_if_on
 
         async def switch() -> None:
             await world.story.until("[system] active")
-            await asyncio.sleep(0.1)
+            await asyncio.sleep(0.3)
             ros = world.graph.ros
             assert ros is not None
             assert ros.services[-2:] == ("mode/normal", "mode/slow")

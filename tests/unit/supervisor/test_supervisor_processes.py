@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import os
 import pwd
 import signal
@@ -230,6 +231,77 @@ def test_a_fork_server_that_was_killed_is_replaced_and_what_it_started_runs_on(
         await bench.close()
 
     _run(test())
+
+
+_FORKS = """
+import json, os, signal, sys
+from pathlib import Path
+
+from lifecycle.codec import to_json
+from lifecycle.errors import MiddlewareError
+from lifecycle.supervisor.processes import fork_server_main
+from lifecycle.supervisor.processes.forerunner import ForkServerProcess
+
+
+def refuse(*_):
+    raise MiddlewareError("refused")
+
+
+if sys.argv[1] == "refused":
+    fork_server_main.rename_process = refuse
+fork_server_main.import_shared = lambda: None  # which needs ROS
+signal.signal(signal.SIGHUP, lambda *_: None)
+signal.signal(signal.SIGUSR1, signal.SIG_IGN)
+held = open("/proc/self/status")
+environment = {**os.environ, "OF_THE_RUN": "1"}
+del environment["OURS"]
+process = ForkServerProcess(preload=False, environment=environment, forks=True)
+process.socket.send(to_json(fork_server_main.SERVES))
+process.socket.recv(1000)
+proc = Path(f"/proc/{process.popen.pid}")
+status = dict(line.split(":", 1) for line in (proc / "status").read_text().splitlines())
+shown = (proc / "environ").read_bytes().split(b"\\0")[:-1]
+print(json.dumps({
+    "argv": (proc / "cmdline").read_bytes().decode().split("\\0"),
+    "as given": sorted(shown) == sorted(f"{n}={v}".encode() for n, v in environment.items()),
+    "files": sorted(os.readlink(each) for each in (proc / "fd").iterdir() if int(each.name) > 2),
+    "input": os.readlink(proc / "fd" / "0"),
+    "caught": int(status["SigCgt"], 16) & 0x7fff,
+    "blocked": int(status["SigBlk"], 16),
+    "ignores": [n for n in (1, 2, 10, 15) if int(status["SigIgn"], 16) >> (n - 1) & 1],
+    "leads": os.getsid(process.popen.pid) == process.popen.pid,
+    "mask": len(signal.pthread_sigmask(signal.SIG_BLOCK, ())),
+}))
+process.close()
+print(process.popen.wait())
+"""
+
+
+@pytest.mark.parametrize("rename", ["allowed", "refused"])
+def test_a_fork_of_the_supervisor_is_a_fork_server_as_a_program_of_its_own_is(rename: str) -> None:
+    result = subprocess.run(
+        (PYTHON, "-c", _FORKS, rename),
+        env={**os.environ, "OURS": "1"},
+        stdin=subprocess.PIPE,
+        capture_output=True,
+        text=True,
+        timeout=BOUND_S,
+        check=False,
+    )
+    assert result.stderr == ""
+    found, exit_code = result.stdout.splitlines()
+    seen = json.loads(found)
+    assert seen["argv"][:3] == [PYTHON, "-m", "lifecycle.supervisor.processes.fork_server_main"]
+    assert seen["as given"]
+    # Its socket, what it waits with, and what signals wake it by; nothing of ours.
+    assert [each.partition(":")[0] for each in seen["files"]] == [
+        *("anon_inode", "pipe", "pipe", "socket")
+    ]
+    assert seen["input"] == os.devnull
+    assert seen["ignores"] == [signal.SIGINT, signal.SIGUSR1, signal.SIGTERM]
+    assert (seen["caught"], seen["blocked"], seen["mask"]) == (0, 0, 0)
+    assert seen["leads"]
+    assert exit_code == "0"
 
 
 def test_without_any_fork_server_nothing_can_be_started(

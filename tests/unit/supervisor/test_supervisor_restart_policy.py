@@ -266,6 +266,55 @@ def test_a_node_that_dies_during_bring_up_comes_again_while_the_others_wait(
     run(main())
 
 
+def test_a_start_counts_towards_the_limit_also_where_another_s_failure_took_it_down(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        twice = dataclasses.replace(ON_FAILURE, start_limit_burst=2, start_limit_interval_sec=3600)
+        world = SessionWorld(_chain(DEPENDENTS, twice), tmp_path, stop_after_s=60.0)
+
+        async def die() -> None:
+            await world.story.until("[system] active")
+            for times in (1, 2):  # more starts than the limit, and no failure of its own
+                world.kill("camera")
+                await world.story.until("[restarted] camera", times)
+            world.kill("viewer")
+
+        await world.run(die())
+        assert "[gave_up] viewer (1 failures)" in world.outline
+        assert world.outline[-1] == "[stopped] 7"
+
+    run(main())
+
+
+def test_a_start_that_was_cut_off_by_another_s_failure_counts_and_is_no_failure(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        thrice = dataclasses.replace(ON_FAILURE, start_limit_burst=3, start_limit_interval_sec=3600)
+        plan = plan_of(
+            planned_node("camera", supervision=ON_FAILURE),
+            planned_node("viewer", supervision=thrice),
+        )
+        world = SessionWorld(plan, tmp_path, stop_after_s=60.0)
+
+        async def die() -> None:
+            await world.story.until("[system] active")
+            world.hosts.takes_s["/viewer configure"] = 3.0
+            world.kill("viewer")
+            await world.story.until("/viewer configure", 2)
+            world.kill("camera")
+            await world.story.until("[restarted] viewer")
+            assert sum(each == "viewer start" for each in world.outline) == 3
+            world.kill("viewer")
+
+        await world.run(die())
+        assert "[gave_up] viewer (2 failures)" in world.outline
+        assert world.outline[-1] == "[stopped] 7"
+
+    run(main())
+
+
 def test_a_node_that_fails_to_activate_is_restarted_and_what_is_active_stays_so(
     tmp_path: Path,
 ) -> None:

@@ -3,31 +3,143 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import dataclasses
 import json
+import sys
 from pathlib import Path
 
+import pytest
+
+from lifecycle.errors import ExitCode, MiddlewareError
 from lifecycle.manifest import Policy, RosInterfaceAccess
 from lifecycle.plan import Plan
-from lifecycle.supervisor.control.ros_interface import ERROR, OK, STALE, WARN
+from lifecycle.supervisor.control.ros_interface import (
+    ERROR,
+    HELD_UP_S,
+    OK,
+    STALE,
+    WARN,
+    check_installed,
+)
 from lifecycle.supervisor.health.liveliness import Cause
 from tests.unit.supervisor.fakes import run
-from tests.unit.supervisor.session_world import CHAIN, INTRUDED, SessionWorld
+from tests.unit.supervisor.session_world import CHAIN, INTRUDED, FakeRosInterface, SessionWorld
 
-FULL = RosInterfaceAccess.FULL
+OFF, FULL = RosInterfaceAccess.OFF, RosInterfaceAccess.FULL
+STATUS = "/lifecycle/robot/status"
 
 
 def offering(access: RosInterfaceAccess, plan: Plan = CHAIN) -> Plan:
     return dataclasses.replace(plan, policy=Policy(ros_interface=access))
 
 
-def test_it_is_off_by_default(tmp_path: Path) -> None:
+def test_it_reads_only_by_default_and_off_leaves_nothing(tmp_path: Path) -> None:
+    async def main(access: RosInterfaceAccess | None, stop_after_s: float) -> FakeRosInterface:
+        plan = CHAIN if access is None else offering(access)
+        directory = tmp_path / f"{access} {stop_after_s}"
+        directory.mkdir()
+        world = SessionWorld(plan, directory, stop_after_s=stop_after_s)
+        world.graph.subscribed.add(STATUS)
+        await world.run()
+        return world.graph.ros
+
+    assert run(main(OFF, 3.0)) is None
+    assert run(main(None, 3.0)).services == ("get_status",)
+
+
+def test_who_only_tries_a_system_pays_nothing_for_it(tmp_path: Path) -> None:
     async def main() -> None:
-        world = SessionWorld(CHAIN, tmp_path, stop_after_s=3.0)
+        world = SessionWorld(CHAIN, tmp_path, stop_after_s=0.1)
         await world.run()
         assert world.graph.ros is None
 
     run(main())
+
+
+def test_a_bring_up_that_is_held_up_says_why_before_it_is_active(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path, stop_after_s=1.0)
+        world.graph.unseen.add("/camera")
+
+        async def wait() -> None:
+            await world.story.until("[joined] /viewer")
+            await asyncio.sleep(HELD_UP_S - 0.2)
+            assert world.graph.ros is None
+            await asyncio.sleep(0.4)
+            ros = world.graph.ros
+            assert ros is not None
+            said = json.loads(ros.statuses[-1])
+            assert (said["phase"], said["verdict"]) == ("verifying", "violated")
+            assert said["not_ok"] == "missing: /camera (node)"
+            assert [each[:3] for each in ros.diagnostics[-1]] == [
+                (ERROR, "robot: /camera", "inactive"),
+                (WARN, "robot: /viewer", "inactive, the system is verifying"),
+                (
+                    ERROR,
+                    "robot: graph.missing-node",
+                    "cannot find node /camera in domain 30",
+                ),
+            ]
+            world.graph.unseen.clear()
+            world.graph.note()
+            await world.story.until("[system] active")
+            await asyncio.sleep(0.1)
+            assert json.loads(ros.statuses[-1])["phase"] == "active"
+
+        await world.run(wait())
+
+    run(main())
+
+
+def test_who_waits_for_the_status_is_told_why_a_bring_up_ends(tmp_path: Path) -> None:
+    async def main(subscribed: set[str]) -> FakeRosInterface | None:
+        directory = tmp_path / str(len(subscribed))
+        directory.mkdir()
+        world = SessionWorld(CHAIN, directory, timeout_s=2.0)
+        world.graph.subscribed = subscribed
+        world.intrude()
+        await world.run()
+        return world.graph.ros
+
+    assert run(main(set())) is None
+    ros = run(main({STATUS}))
+    assert ros.destroyed
+    said = json.loads(ros.statuses[-1])
+    assert said["phase"] == "stopping"
+    assert said["ends"].startswith("the verdict keeps the gate closed; wrong: /intruder")
+
+
+def test_what_cannot_be_offered_is_said_once_and_the_system_runs_without(tmp_path: Path) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path, stop_after_s=5.0)
+        world.graph.no_ros = "No module named 'diagnostic_msgs'"
+        await world.run()
+        said = [each for each in world.outline if each.startswith("[notice]")]
+        why = "cannot offer diagnostics and status in ROS: No module named 'diagnostic_msgs'"
+        off = "the system runs without; 'policy: {ros_interface: off}' does not try"
+        assert said == [f"[notice] {why}; {off}"]
+        assert world.result is not None
+        assert world.result.exit_code is ExitCode.OK
+
+    run(main())
+
+
+@pytest.mark.parametrize("required", [True, False], ids=str)
+def test_what_a_manifest_asks_for_must_be_installed(
+    required: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "diagnostic_msgs", None)
+    policy = Policy(ros_interface=FULL, ros_interface_required=required)
+    refused = pytest.raises(MiddlewareError) if required else contextlib.nullcontext()
+    with refused as error:
+        check_installed(policy)
+    check_installed(dataclasses.replace(policy, ros_interface=OFF))
+    if error is not None:
+        assert str(error.value) == (
+            "cannot offer 'policy: {ros_interface: full}': no Python package diagnostic_msgs is "
+            "installed; install it, or write 'policy: {ros_interface: off}'"
+        )
 
 
 def test_diagnostics_come_from_active_on_each_second_and_at_once_when_something_changed(
@@ -77,7 +189,7 @@ def test_services_give_the_orders_of_the_control_socket(tmp_path: Path) -> None:
 
         async def order() -> None:
             await world.story.until("[system] active")
-            await asyncio.sleep(0.1)
+            await asyncio.sleep(0.3)
             ros = world.graph.ros
             assert ros is not None
             assert ros.services == ("get_status", "pause", "resume", "restart", "down")

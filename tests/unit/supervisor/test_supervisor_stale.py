@@ -34,6 +34,9 @@ class Graph:
     def remove_participants(self, prefixes: Iterable[str], pids: Iterable[int]) -> None:
         self.removed.append((frozenset(prefixes), tuple(pids)))
 
+    def disown_ports(self) -> None:
+        """There is no shared memory."""
+
 
 def system() -> System:
     """A system of one node whose process has ended, and one process that lives."""

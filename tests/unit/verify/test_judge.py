@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import pytest
 
-from lifecycle.manifest.model import EndpointKind, EndpointPolicy, Policy, RosInterfaceAccess
-from lifecycle.manifest.qos import QosProfile
+from lifecycle.manifest.model import (
+    Endpoint,
+    EndpointKind,
+    EndpointPolicy,
+    Policy,
+    RosInterfaceAccess,
+)
+from lifecycle.manifest.qos import Durability, Liveliness, QosProfile
+from lifecycle.network import UniqueRequirement
 from lifecycle.plan import Plan
 from lifecycle.verify import Outcome, Stage, Verdict, verify
+from lifecycle.verify.tool_filter import takes_diagnostics
 from lifecycle.verify.verdict import OpenEndpoint, ToleratedNode
 from tests.builders import need, node, planned, publisher, subscription
 from tests.unit.verify.edits import Edit, add_endpoint, add_node, both, change_report
@@ -17,7 +23,6 @@ from tests.unit.verify.perfect import perfect
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
 CLIENT, SERVER = EndpointKind.SERVICE_CLIENT, EndpointKind.SERVICE_SERVER
-READ_ONLY = RosInterfaceAccess.READ_ONLY
 STRING = "std_msgs/msg/String"
 
 
@@ -91,32 +96,104 @@ def test_observers_are_listed_only_where_they_do_more_than_observe() -> None:
     )
 
 
-def test_what_supervisors_offer_in_ros_is_theirs_but_of_no_more_than_there_are_machines() -> None:
-    ours, other = "/_lifecycle_observer_1", "/_lifecycle_observer_2"
-    array, trigger = "diagnostic_msgs/msg/DiagnosticArray", "std_srvs/srv/Trigger"
+ARRAY, TRIGGER = "diagnostic_msgs/msg/DiagnosticArray", "std_srvs/srv/Trigger"
+SYSTEM_DEFAULT = Liveliness.SYSTEM_DEFAULT
+ONE_PARTICIPANT = "10000000000000000000000a"
 
-    def offers(name: str, gid: str) -> Edit:
+
+def supervisor(number: int, system: str = "robot", *, participant: str = ONE_PARTICIPANT) -> Edit:
+    """What a supervisor has in ROS, at `participant` and a number."""
+    name, prefix = f"/_lifecycle_observer_{number}", f"{participant[:-1]}{number}"
+    return both(
+        add_node(name),
+        add_endpoint(PUB, name, "/diagnostics", gid=f"{prefix}1", type=ARRAY, qos=QosProfile()),
+        add_endpoint(PUB, name, f"/lifecycle/{system}/status", gid=f"{prefix}2", qos=QosProfile()),
+        add_endpoint(SERVER, name, f"/lifecycle/{system}/get_status", type=TRIGGER),
+    )
+
+
+def rules(plan: Plan, *edits: Edit) -> list[tuple[str, str, str]]:
+    return [(each.rule, each.node, each.subject) for each in judged(plan, *edits).findings]
+
+
+def test_what_a_supervisor_offers_in_ros_is_its_own_and_no_one_elses() -> None:
+    ours, other = "/_lifecycle_observer_1", "/_lifecycle_observer_2"
+    publisher_rule, server_rule = "graph.undeclared-publisher", "graph.undeclared-service-server"
+    plan = plan_of()
+    verdict = judged(plan, supervisor(1), supervisor(2, "others"))
+    assert (verdict.verdict, verdict.tolerated) == (Outcome.OK, ())
+    # Of two that say they are the same, neither is believed; tools and services are not either.
+    both_claim = rules(plan, supervisor(1), supervisor(2))
+    assert {each[1] for each in both_claim} == {ours, other}
+    assert (publisher_rule, other, "/lifecycle/robot/status") in both_claim
+    assert (server_rule, other, "/lifecycle/robot/get_status") in both_claim
+    tool = add_endpoint(SERVER, "/rqt_1", "/lifecycle/robot/pause", type=TRIGGER)
+    assert rules(plan, supervisor(1), tool) == [(server_rule, "/rqt_1", "/lifecycle/robot/pause")]
+    pauses = add_endpoint(SERVER, ours, "/lifecycle/robot/pause", type=TRIGGER)
+    assert rules(plan, supervisor(1), pauses) == [(server_rule, ours, "/lifecycle/robot/pause")]
+    full = plan_of(ros_interface=RosInterfaceAccess.FULL)
+    assert rules(full, supervisor(1), pauses) == []
+    off = plan_of(ros_interface=RosInterfaceAccess.OFF)
+    assert {each[2] for each in rules(off, supervisor(1))} == {
+        "/lifecycle/robot/status",
+        "/lifecycle/robot/get_status",
+    }
+
+
+def test_who_reads_diagnostics_has_those_of_supervisors_and_of_nobody_else() -> None:
+    reads = node("one", publisher("a"), subscription("/diagnostics", ARRAY))
+    plan = planned(reads, node("two", subscription("a")), policy=Policy())
+    of_diagnostics = "graph.undeclared-publisher", "/diagnostics"
+
+    def found(*edits: Edit) -> list[tuple[str, str]]:
+        return [(rule, subject) for rule, _, subject in rules(plan, *edits)]
+
+    assert found(supervisor(1)) == []
+    assert found(supervisor(1), supervisor(2, "another")) == []
+
+    def publishes(name: str, gid: str) -> Edit:
         return both(
             add_node(name),
-            add_endpoint(PUB, name, "/diagnostics", gid=gid, type=array, qos=QosProfile()),
-            add_endpoint(PUB, name, "/lifecycle/robot/status", gid=gid * 2, qos=QosProfile()),
-            add_endpoint(SERVER, name, "/lifecycle/robot/pause", type=trigger),
+            add_endpoint(PUB, name, "/diagnostics", gid=gid, type=ARRAY, qos=QosProfile()),
         )
 
-    assert judged(plan_of(), offers(ours, "1"), offers(other, "2")).tolerated == ()
-    # The manifest declares what reads it.
-    reads = node("one", publisher("a"), subscription("/diagnostics", array))
-    on = planned(reads, node("two", subscription("a")), policy=Policy(ros_interface=READ_ONLY))
-    assert judged(on, offers(ours, "1")).verdict is Outcome.OK
-    strangers = judged(on, offers(ours, "1"), offers(other, "2")).findings
-    assert [(each.rule, each.node) for each in strangers] == [
-        ("graph.undeclared-publisher", ours),
-        ("graph.undeclared-publisher", other),
-    ]
-    as_rviz = judged(on, offers("/rviz2", "1")).findings
-    assert [each.rule for each in as_rviz] == ["graph.undeclared-publisher"]
-    off = dataclasses.replace(on, policy=Policy())
-    assert judged(off, offers(ours, "1")).verdict is Outcome.VIOLATED
+    assert found(supervisor(1), publishes("/rqt_robot_monitor", "7" * 25)) == [of_diagnostics]
+    # It is called as a supervisor is; another participant has that one's status.
+    same_name = publishes("/_lifecycle_observer_1", "7" * 25)
+    assert found(supervisor(1), same_name) == [of_diagnostics]
+    assert found(publishes("/_lifecycle_observer_9", "7" * 25)) == [of_diagnostics]
+
+
+@pytest.mark.parametrize(
+    ("end", "publishes"),
+    [
+        (subscription("/diagnostics", ARRAY), True),
+        (subscription("/diagnostics", ARRAY, qos=QosProfile(liveliness=SYSTEM_DEFAULT)), True),
+        (publisher("/diagnostics", ARRAY), True),
+        (subscription("/diagnostics", "my_msgs/msg/Diagnostics"), False),
+        (
+            subscription(
+                "/diagnostics", ARRAY, qos=QosProfile(durability=Durability.TRANSIENT_LOCAL)
+            ),
+            False,
+        ),
+    ],
+)
+def test_a_supervisor_does_not_publish_diagnostics_where_it_would_disturb(
+    end: Endpoint, publishes: bool
+) -> None:
+    assert takes_diagnostics(planned(node("one", end))) is publishes
+
+
+def test_a_supervisor_adds_nothing_to_a_flow_that_the_manifest_wants_for_itself() -> None:
+    unique = need(SUB, "/diagnostics", UniqueRequirement.OPTIONALLY_REQUIRED)
+    alone = node("one", subscription("/diagnostics", ARRAY), needs=(unique,))
+    plan = planned(alone)
+    assert not takes_diagnostics(plan)
+    assert rules(plan, supervisor(1))[0][:2] == (
+        "graph.undeclared-publisher",
+        "/_lifecycle_observer_1",
+    )
 
 
 def test_who_else_is_there_is_listed_in_an_open_system_and_nobody_else() -> None:
