@@ -1,7 +1,8 @@
-"""`--hosts` of `lifecycle up` and `down`: every machine of a manifest from one place.
+"""`--hosts` of `lifecycle up`, `status` and `down`: every machine of a manifest from one place.
 
 Owns: options as transports and parts, the run of a coordinator in this process, and its output:
-JSON lines, or plain lines with the host in front; live_view.py has the table.
+JSON lines, or plain lines with the host in front; live_view.py has the table. Owns also the status
+of all hosts as one.
 """
 
 from __future__ import annotations
@@ -12,18 +13,22 @@ import json
 import os
 import signal
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Protocol
 
 import click
 
+from lifecycle import dataclasses
 from lifecycle.cli.common import load_manifest
+from lifecycle.cli.report import ReportFile, written_or_said
 from lifecycle.cli.up_output import PlainLines, Sink, stdout_writer, verdict_line
-from lifecycle.codec import from_json
+from lifecycle.codec import from_json, to_plain
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.fleet import (
+    NOTABLE_S,
     Coordinator,
+    HostStatus,
     LocalTransport,
     Place,
     Record,
@@ -35,19 +40,19 @@ from lifecycle.fleet import (
     parts_of,
     ranks,
     ssh_command,
+    statuses,
     worst,
 )
 from lifecycle.manifest import noting_files
 from lifecycle.plan import build_plan
 from lifecycle.printable import json_text, one_line
-from lifecycle.run_directory import run_name
 from lifecycle.supervisor import TIMEOUT_S, UpOptions, from_record, own_machines
-from lifecycle.verify import Outcome, Verdict, render_text
+from lifecycle.verify import Finding, FlowReport, Outcome, RunEnd, Verdict, render_text
 
 if TYPE_CHECKING:
     from lifecycle.fleet import Part
     from lifecycle.plan import Plan
-    from lifecycle.supervisor import Event
+    from lifecycle.supervisor import Event, SystemStatus
 
 _MORE_S = TIMEOUT_S
 """For supervisors to start, and to end by themselves at the deadline that they have, too."""
@@ -76,6 +81,19 @@ def up_on_hosts(
         UsageError: an option cannot be used so, or a machine is not declared.
         ManifestError: the manifest has errors.
     """
+    with ReportFile(options["report"], strict=options["strict"]) as written:
+        return _up(manifest, assignments, chosen, remote_command, format_, options, written)
+
+
+def _up(  # noqa: PLR0917 - as of up_on_hosts
+    manifest: str,
+    assignments: tuple[str, ...],
+    chosen: tuple[str, ...],
+    remote_command: str,
+    format_: str,
+    options: Mapping[str, Any],
+    written: ReportFile,
+) -> int:
     _refuse(options)
     domain_id = options["domain"]
     with noting_files() as files:
@@ -97,21 +115,29 @@ def up_on_hosts(
         )
     transports = _transports(plan, chosen, remote_command)
     order = ranks(plan)
-    with _output(format_, plan.system, tuple(each.machine for each in parts)) as output:
+    machines = tuple(each.machine for each in parts)
+    written.begin(plan)
+    with _output(format_, plan.system, machines) as output:
+        last = LastVerdicts(machines, output)
         coordinator = Coordinator(
             plan.system,
             [
                 _place(part, transports[part.machine], order.get(part.machine, 0), manifest)
                 for part in parts
             ],
-            output,
+            last,
             version=version("ros-lifecycle-manifests"),
             bring_up_s=_bring_up_s(plan, parts, options["timeout"]) + _MORE_S,
             again=tuple(f"lifecycle {verb} {manifest} --hosts" for verb in ("up", "down")),  # type: ignore[arg-type]
+            until=options["until"],
             stop_after_s=options["stop_after"],
             keep_going=options["keep_going"],
         )
-        return asyncio.run(_run(coordinator))
+        code = asyncio.run(_run(coordinator))
+        unwritten = written_or_said(
+            lambda: written.end(last.combined(), plan, machines=last.verdicts)
+        )
+        return code or unwritten
 
 
 def _place(part: Part, transport: Transport, rank: int, manifest: str) -> Place:
@@ -147,29 +173,133 @@ def down_on_hosts(
     """
     plan = build_plan(load_manifest(target, assignments, quiet=True).manifest)
     transports = _transports(plan, chosen, remote_command)
-    used = sorted({each.machine for each in plan.processes})
-    names = {machine: run_name(plan, machine) for machine in used}
-    outcomes = asyncio.run(down(names, transports, timeout_s))
+    parts, _ = parts_of(plan, {})
+    outcomes = asyncio.run(down(parts, transports, timeout_s))
     for machine, (code, message) in outcomes.items():
         said = message or ("ended" if code is ExitCode.OK else f"exit code {int(code)}")
         click.echo(f"{one_line(machine)} | {one_line(said)}", err=True)
     return worst(code for code, _ in outcomes.values())
 
 
+def status_of_hosts(
+    target: str,
+    assignments: tuple[str, ...],
+    *,
+    chosen: tuple[str, ...],
+    remote_command: str,
+    format_: str,
+    probe: str | None,
+) -> int:
+    """Show how a system is on all machines of a manifest, or exit as a probe does.
+
+    Raises:
+        UsageError: a machine is not declared, or the system runs on none of them.
+        ManifestError: the manifest has errors.
+    """
+    plan = build_plan(load_manifest(target, assignments, quiet=True).manifest)
+    transports = _transports(plan, chosen, remote_command)
+    parts, _ = parts_of(plan, {})
+    asked = statuses(parts, transports, version=version("ros-lifecycle-manifests"))
+    found = tuple(map(_readable, asyncio.run(asked)))
+    if all(each.is_absent for each in found):
+        raise UsageError(
+            f"cannot find a running system {plan.system!r} on {', '.join(e.host for e in found)}",
+            hint=f"start it: lifecycle up {target} --hosts",
+        )
+    verdict = _verdict_of(found)
+    if probe is not None:
+        phases = [_system(each) for each in found]
+        answers = all(each is not None for each in phases)
+        is_active = all(each is not None and each.phase == "active" for each in phases)
+        is_ready = is_active and verdict is not Outcome.VIOLATED
+        return ExitCode.OK if answers and (is_ready or probe == "live") else _NOT_READY
+    if format_ == "json":
+        hosts = [_host_record(each) for each in found]
+        record = {"system": plan.system, "domain_id": plan.domain_id}
+        record |= {"verdict": verdict and verdict.value, "hosts": hosts}
+        click.echo(json_text(json.dumps(record, ensure_ascii=False, separators=(",", ":"))))
+    else:
+        click.echo("\n".join(_status_lines(plan.system, verdict, found)))
+    if verdict is Outcome.VIOLATED:
+        return ExitCode.VIOLATED
+    is_known = all(each.status is not None for each in found)
+    return ExitCode.OK if is_known else ExitCode.UNVERIFIABLE
+
+
+_NOT_READY = ExitCode.BRING_UP_FAILED
+
+
+def _readable(host: HostStatus) -> HostStatus:
+    if host.status is None or _system(host) is not None:
+        return host
+    return dataclasses.replace(host, status=None, message="its status cannot be read")
+
+
+def _system(host: HostStatus) -> SystemStatus | None:
+    from lifecycle.supervisor import SystemStatus
+
+    try:
+        return None if host.status is None else from_json(json.dumps(host.status), SystemStatus)
+    except ValueError:
+        return None
+
+
+def _verdict_of(hosts: Iterable[HostStatus]) -> Outcome | None:
+    """Return the worst of all; who does not answer is unverifiable. None: not judged yet."""
+    systems = [_system(each) for each in hosts]
+    found = [Outcome.UNVERIFIABLE if each is None else each.verdict for each in systems]
+    for each in (Outcome.VIOLATED, Outcome.UNVERIFIABLE, None):
+        if each in found:
+            return each
+    return Outcome.OK
+
+
+def _host_record(host: HostStatus) -> Record:
+    plain = to_plain(host)
+    assert isinstance(plain, dict)
+    if host.clock is not None:
+        plain["clock"]["differs"] = host.clock.differs(NOTABLE_S)
+    return plain
+
+
+def _status_lines(
+    system: str, verdict: Outcome | None, hosts: tuple[HostStatus, ...]
+) -> Iterator[str]:
+    """Yield a line for all, and each host's own status with its name in front."""
+    from lifecycle.cli.verbs.control import status_text
+
+    judged = "not judged yet" if verdict is None else verdict.value
+    silent = [f"{each.host} ({each.message})" for each in hosts if each.status is None]
+    unverifiable = f"; unverifiable: {', '.join(silent)}" if silent else ""
+    yield one_line(
+        f"{system} on {', '.join(e.host for e in hosts)}: verdict {judged}{unverifiable}"
+    )
+    for host in hosts:
+        prefix = f"{one_line(host.host)} | "
+        seen = _system(host)
+        if seen is not None:
+            yield from (prefix + each for each in status_text(seen).splitlines())
+        else:
+            hint = f"; {host.hint}" if host.hint else ""
+            yield prefix + one_line(
+                f"cannot be verified at {host.destination}: {host.message}{hint}"
+            )
+        if host.clock is not None and host.clock.differs(NOTABLE_S):
+            yield prefix + clock_text(host.clock.offset_s, host.clock.uncertainty_s)
+
+
 _REFUSED = {
-    "until": "what is not to become active is verified by hand, machine by machine",
-    "report": "each host's verdict is in the output of --format json",
     "machine": "all machines are started; leave it out",
     "targets": "start that machine by itself: lifecycle up MANIFEST --machine NAME --program …",
     "mapping": "start that machine by itself: lifecycle up MANIFEST --machine NAME --program …",
     "flow_labels": "start that machine by itself: lifecycle up MANIFEST --machine NAME --program …",
 }
-_FLAGS = {"until": "--until", "mapping": "--dscp-from-5qi", "targets": "--program"}
+_FLAGS = {"mapping": "--dscp-from-5qi", "targets": "--program"}
 
 
 def _refuse(options: Mapping[str, Any]) -> None:
     for name, hint in _REFUSED.items():
-        if options[name] and (name, options[name]) != ("until", "active"):
+        if options[name]:
             flag = _FLAGS.get(name, f"--{name.replace('_', '-')}")
             raise UsageError(f"cannot use {flag} with --hosts", hint=hint)
 
@@ -181,6 +311,8 @@ def _passed_on(options: Mapping[str, Any]) -> Iterator[str]:
             yield f"--{name.replace('_', '-')}"
     for node in options["without"]:
         yield f"--except={node}"
+    if options["until"] != "active":
+        yield from (f"--until={options['until']}", "--hold")
     for name in ("timeout", "domain"):
         if options[name] is not None:
             yield f"--{name}={options[name]}"
@@ -218,6 +350,112 @@ def _transports(plan: Plan, chosen: tuple[str, ...], remote_command: str) -> dic
         else LocalTransport()
         for machine, place in destinations(plan, by_hand, local.__contains__).items()
     }
+
+
+class LastVerdicts:
+    """Keeps the last verdict of each host on its way to the output, and makes one of all.
+
+    Args:
+        machines: of all.
+        output: what all events are passed on to.
+
+    Attributes:
+        verdicts: by machine; None of one whose supervisor gave none. Of one that ended well it is
+            what it found when all were asked to end: it may be the last to go, and the absence of
+            those before it is no finding on the system.
+    """
+
+    def __init__(self, machines: Iterable[str], output: HostsOutput) -> None:
+        self.verdicts: dict[str, Verdict | None] = dict.fromkeys(machines)
+        self._output = output
+        self._messages: dict[str, str] = {}
+        self._judged: dict[str, Verdict | None] = {}
+        self._at_end: dict[str, Verdict | None] = {}
+        self._reached: str | None = None
+        self._end: Record = {"reason": "", "exit_code": int(ExitCode.INTERNAL)}
+
+    def __call__(self, host: str, record: Record) -> None:
+        """Take one event, see fleet.coordinator.Listener."""
+        kind = record.get("event")
+        if kind is None:
+            self.verdicts[host] = self._last(_verdict_in(record), self._at_end.get(host))
+        elif kind == "verdict" and isinstance(record.get("verdict"), dict):
+            self._judged[host] = _verdict_in(record["verdict"])
+        elif kind == "ending" and not host:
+            self._at_end = dict(self._judged)
+        elif kind == "end" and not host:
+            self._end = record
+        elif kind in {"active", "reached"} and not host:
+            self._reached = str(record.get("reached", "active"))
+        elif kind == "host" and record["message"]:
+            self._messages[host] = str(record["message"])
+        self._output(host, record)
+
+    @staticmethod
+    def _last(last: Verdict | None, before: Verdict | None) -> Verdict | None:
+        if last is None or before is None or last.run is None or last.run.exit_code:
+            return last
+        return dataclasses.replace(before, run=last.run)
+
+    def combined(self) -> Verdict:
+        """Return the verdict of all: what any found, and who found it where not all did."""
+        found = {name: each for name, each in self.verdicts.items() if each is not None}
+        lacking = [name for name in self.verdicts if name not in found]
+        reason = str(self._end["reason"])
+        if lacking:
+            why = (f"{name} ({self._messages.get(name, 'it did not run')})" for name in lacking)
+            reason += f"; no verdict of {', '.join(why)}"
+        run = RunEnd(reason=reason, reached=self._reached, exit_code=self._end["exit_code"])
+        outcomes = {each.verdict for each in found.values()}
+        outcomes |= {Outcome.UNVERIFIABLE} if lacking else set[Outcome]()
+        worst_first = (Outcome.VIOLATED, Outcome.UNVERIFIABLE, Outcome.OK)
+        return Verdict(
+            verdict=next(each for each in worst_first if each in outcomes),
+            blocking=bool(lacking) or any(each.blocking for each in found.values()),
+            findings=tuple(self._findings(found)),
+            flows=_flows(found.values()),
+            open_endpoints=tuple(
+                dict.fromkeys(e for v in found.values() for e in v.open_endpoints)
+            ),
+            tolerated=tuple(dict.fromkeys(e for v in found.values() for e in v.tolerated)),
+            judged=not lacking and all(each.judged for each in found.values()),
+            run=run,
+        )
+
+    def _findings(self, found: Mapping[str, Verdict]) -> Iterator[Finding]:
+        seen: dict[tuple[object, ...], tuple[Finding, list[str]]] = {}
+        for name, verdict in found.items():
+            for each in verdict.findings:
+                key = (each.rule, each.outcome, each.subject, each.node, each.endpoint)
+                seen.setdefault(key, (each, []))[1].append(name)
+        for finding, by in seen.values():
+            if len(by) == len(self.verdicts):
+                yield finding
+            else:
+                message = f"{finding.message} (found by the supervisor of {', '.join(by)})"
+                yield dataclasses.replace(finding, message=message)
+
+
+def _flows(verdicts: Iterable[Verdict]) -> tuple[FlowReport, ...]:
+    """Return each flow once, as the worst of its reports has it."""
+    order = (Outcome.OK, Outcome.UNVERIFIABLE, Outcome.VIOLATED)
+    found: dict[tuple[str, str, str], FlowReport] = {}
+    for verdict in verdicts:
+        for each in verdict.flows:
+            known = found.setdefault((each.topic, each.publisher, each.subscription), each)
+            if order.index(each.outcome) > order.index(known.outcome):
+                found[each.topic, each.publisher, each.subscription] = each
+    return tuple(found.values())
+
+
+def _verdict_in(record: Record) -> Verdict | None:
+    """Return the last verdict of a host's supervisor; None for what is none of ours."""
+    try:
+        found = from_json(json.dumps({"blocking": False, **record}), Verdict)
+    except ValueError:
+        return None
+    blocking = found.blocking or found.verdict is Outcome.VIOLATED
+    return dataclasses.replace(found, blocking=blocking)
 
 
 class HostsOutput(Protocol):
@@ -284,9 +522,8 @@ class PlainHosts:
 
     def _finish(self, host: str, record: Record) -> None:
         """Write the last verdict of a host, in full where it is not ok; its flows are many."""
-        try:
-            verdict = from_json(json.dumps({"blocking": False, **record}), Verdict)
-        except ValueError:  # not ours
+        verdict = _verdict_in(record)
+        if verdict is None:
             _Prefixed(self._sink, f"{one_line(host)} | ").put("its last verdict cannot be read")
             return
         is_ok = verdict.verdict is Outcome.OK
@@ -344,19 +581,26 @@ def _host_changed(record: Record) -> str:
 
 
 def _clock(record: Record) -> str | None:
-    if not record["differs"]:
-        return None
-    where = "ahead of" if record["offset_s"] > 0 else "behind"
+    return clock_text(record["offset_s"], record["uncertainty_s"]) if record["differs"] else None
+
+
+def clock_text(offset_s: float, uncertainty_s: float) -> str:
+    """Say in one line that the clock of a host differs from ours."""
+    where = "ahead of" if offset_s > 0 else "behind"
     return (
-        f"its clock is {abs(record['offset_s']):.3f} s {where} this host's "
-        f"(± {record['uncertainty_s']:.3f} s): times in messages and logs differ by that; "
-        "synchronise them, with chrony or PTP"
+        f"its clock is {abs(offset_s):.3f} s {where} this host's (± {uncertainty_s:.3f} s): times "
+        "in messages and logs differ by that; synchronise them, with chrony or PTP"
     )
 
 
 def _active(record: Record) -> str:
     hosts = ", ".join(record["hosts"])
     return f"system active on all hosts ({hosts}) after {record['elapsed_s']:.2f} s"
+
+
+def _reached(record: Record) -> str:
+    hosts = ", ".join(record["hosts"])
+    return f"system {record['reached']} on all hosts ({hosts}) after {record['elapsed_s']:.2f} s"
 
 
 def _end(record: Record) -> str:
@@ -372,6 +616,7 @@ _TELLERS = {
     "clock": _clock,
     "stderr": lambda record: str(record["line"]),
     "active": _active,
+    "reached": _reached,
     "ending": lambda record: f"ending all: {record['reason']}",
     "end": _end,
 }

@@ -39,6 +39,7 @@ from lifecycle.fleet.protocol import (
 from lifecycle.run_directory import (
     SENT_PREFIX,
     is_held,
+    lost,
     private_directory,
     read_record,
     runtime_root,
@@ -263,6 +264,8 @@ class _Agent:
             try:
                 if order.do is Do.DOWN:
                     self._down(order)
+                elif order.do is Do.STATUS:
+                    self._say(_status_of(self._run_of(order)))
                 elif order.part is not None:
                     self._say(self._begin(order.part, starts=order.do is Do.START))
             except LifecycleError as error:
@@ -285,11 +288,14 @@ class _Agent:
             for directory, process in _sent(path):
                 if process is not None and process.lives:
                     return self._attach(part, directory, process)
-            if is_held(path):
+            by_hand = next(
+                (each for each in self._paths(part.name, part.whole) if is_held(each)), None
+            )
+            if by_hand is not None:
                 raise UsageError(
-                    f"cannot follow {part.name!r}: its supervisor runs already, and was not "
+                    f"cannot follow {by_hand.name!r}: its supervisor runs already, and was not "
                     "started by lifecycle up --hosts",
-                    hint=f"end it first: lifecycle down {part.name}",
+                    hint=f"end it first: lifecycle down {by_hand.name}",
                 )
             if not starts:
                 return Said(agent=Word.ABSENT)
@@ -304,6 +310,15 @@ class _Agent:
         if not _NAME.fullmatch(name):
             raise UsageError(f"cannot use {name!r} as the name of a run")
         return runtime_root(os.environ) / name
+
+    def _paths(self, name: str, whole: str) -> tuple[Path, ...]:
+        """Return where the run of a machine may be: its own, and that of all of this host's."""
+        return tuple(map(self._path, (name, whole) if whole else (name,)))
+
+    def _run_of(self, order: Order) -> Path:
+        """Return where the run is that an order is about; where it would be if there is none."""
+        found = self._paths(order.name, order.whole)
+        return next((each for each in found if is_held(each) or read_record(each)), found[0])
 
     def _start(self, part: Part, path: Path) -> Said:
         directory = path / f"{SENT_PREFIX}{os.urandom(8).hex()}"
@@ -421,7 +436,7 @@ class _Agent:
 
     def _down(self, order: Order) -> None:
         """End a run, whoever started it."""
-        path = self._path(order.name)
+        path = self._run_of(order)
         deadline = time.monotonic() + _BEGIN_S
         while not is_held(path) and time.monotonic() < deadline:
             if not any(process is not None and process.lives for _, process in _sent(path)):
@@ -434,7 +449,7 @@ class _Agent:
 
         errors = tempfile.TemporaryFile()  # noqa: SIM115 - until that has ended
         child = subprocess.Popen(
-            [*self._command, "down", order.name, "--timeout", str(order.timeout_s)],
+            [*self._command, "down", path.name, "--timeout", str(order.timeout_s)],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=errors,
@@ -503,6 +518,24 @@ def _status(path: Path) -> object:
         return to_plain(status(path))
     except (LifecycleError, OSError):
         return None
+
+
+def _status_of(path: Path) -> Said:
+    """Return the status of a run, or why there is none.
+
+    Raises:
+        UsageError: its supervisor was killed, or does not answer.
+    """
+    if not is_held(path):
+        if read_record(path) is not None:
+            raise lost(path)
+        return Said(agent=Word.ABSENT)
+    from lifecycle.supervisor import status
+
+    try:
+        return Said(agent=Word.STATUS, status=to_plain(status(path)))
+    except TimeoutError as error:
+        raise UsageError(f"cannot ask {path.name!r}: its supervisor does not answer") from error
 
 
 def _relative(path: str) -> tuple[str, ...]:

@@ -1,6 +1,6 @@
 """Starts, watches and ends the supervisors of all hosts of one system: `lifecycle up --hosts`.
 
-Owns: `Coordinator`, its events, and `down`. It owns no supervisor: what runs on a host goes on if
+Owns: `Coordinator` and its events. It owns no supervisor: what runs on a host goes on if
 this process dies or a link is cut, and is followed again. Every wait has a deadline. Must not
 import rclpy.
 """
@@ -19,9 +19,19 @@ from typing import Any, ClassVar, NamedTuple, Union, get_args
 from lifecycle import dataclasses
 from lifecycle.codec import from_json, to_plain
 from lifecycle.errors import ExitCode
+from lifecycle.fleet.asking import (
+    ANSWER_S,
+    HEARTBEAT_S,
+    HELLO_S,
+    READINGS,
+    down_one,
+    hello,
+    worst,
+)
 from lifecycle.fleet.protocol import (
     AGENT_MARK,
     LONGEST_LINE,
+    NOTABLE_S,
     PROTOCOL,
     ClockOffset,
     Do,
@@ -35,16 +45,9 @@ from lifecycle.fleet.protocol import (
 )
 from lifecycle.fleet.transport import Channel, Transport
 
-HELLO_S = 30.0
-"""For a connection, the login shell there, and the start of the agent."""
-
 AGAIN_HELLO_S = 15.0
 """The same, of a host that answered before."""
 
-ANSWER_S = 20.0
-"""For an agent to start a supervisor, or follow one."""
-
-HEARTBEAT_S = 1.0
 CUT_S = 4.0
 """A link on which nothing came for so long is cut."""
 
@@ -60,11 +63,7 @@ CLEAN_S = 30.0
 CUT_END_S = 10.0
 """How long a host that cannot be reached is waited for when it is to end."""
 
-READINGS = 8
-"""Round trips that a clock's offset is the best of."""
-
-NOTABLE_S = 0.01
-"""Clocks that differ by less are not worth a line."""
+_ACTIVE = "active"
 
 Record = dict[str, Any]
 Listener = Callable[[str, Record], None]
@@ -155,6 +154,20 @@ class HostsActive:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class HostsReached:
+    """The system has come as far as it is to come, short of active, on all hosts.
+
+    Attributes:
+        reached: "connected" or "verified".
+    """
+
+    kind: ClassVar[str] = "reached"
+    reached: str
+    hosts: tuple[str, ...]
+    elapsed_s: float
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class HostsEnding:
     """All are being taken down; with a reason, `interrupted`, `done`, or what failed."""
 
@@ -179,7 +192,14 @@ class HostsEnded:
 
 
 HostEvent = Union[  # noqa: UP007 - a run-time alias on Python 3.10
-    HostsFound, HostChanged, ClockMeasured, HostStderr, HostsActive, HostsEnding, HostsEnded
+    HostsFound,
+    HostChanged,
+    ClockMeasured,
+    HostStderr,
+    HostsActive,
+    HostsReached,
+    HostsEnding,
+    HostsEnded,
 ]
 
 
@@ -213,6 +233,8 @@ class _Host:
         is_begun: it has a supervisor, ours or found.
         is_ours: which we started.
         is_taken: which another coordinator follows now.
+        until: how far it is to come.
+        is_up: it has come so far, at least once.
         is_cut: its link is.
         starts: how often we asked for a supervisor.
         asked_s: since when an answer is due to START or ATTACH.
@@ -221,12 +243,13 @@ class _Host:
         has_failed: there will be no supervisor.
     """
 
-    def __init__(self, place: Place) -> None:
+    def __init__(self, place: Place, until: str) -> None:
+        self.until = until
         self.part, self.transport, self.rank = place
         self.name = place.part.machine
         self.channel: Channel | None = None
         self.is_ready = self.is_begun = self.is_ours = self.is_taken = False
-        self.is_active = self.is_cut = self.is_ending = self.has_failed = False
+        self.is_up = self.is_cut = self.is_ending = self.has_failed = False
         self.was_killed = False
         self.exit_code: int | None = None
         self.reached = ""
@@ -234,7 +257,7 @@ class _Host:
         self.cut_s = 0.0
         self.starts = 0
         self.asked_s: float | None = None
-        self.pings: dict[int, float] = {}
+        self.pings: dict[int, tuple[float, float]] = {}
         self.readings: collections.deque[RoundTrip] = collections.deque(maxlen=READINGS)
         self.clock: ClockOffset | None = None
         self._said_code: int | None = None
@@ -254,7 +277,7 @@ class _Host:
         kind = record.get("event")
         if kind == "system":
             self.reached = str(record.get("reached"))
-            self.is_active = self.reached == "active" or self.is_active
+            self.is_up = self.reached == self.until or self.is_up
         elif kind == "stopped":
             self._said_code = _code(record.get("exit_code"))
         elif kind is None and isinstance(run := record.get("run"), dict):
@@ -278,7 +301,9 @@ class Coordinator:
         listener: takes every event, in this loop, and does not block.
         version: of this package: agents have the same.
         bring_up_s: from the start of the supervisors to all of them being active.
-        stop_after_s: hold it so long; None for until it is asked to end.
+        until: how far to bring it: "connected", "verified" or "active".
+        stop_after_s: hold it so long; None for until it is asked to end, and not at all where it is
+            only connected or verified.
         keep_going: a supervisor that fails does not end the others.
         again: what a person types to follow it again, and to end it.
         clock: seconds since the epoch.
@@ -293,16 +318,19 @@ class Coordinator:
         version: str,
         bring_up_s: float,
         again: tuple[str, str],
+        until: str = _ACTIVE,
         stop_after_s: float | None = None,
         keep_going: bool = False,
         clock: Callable[[], float] = time.time,
     ) -> None:
         self._system = system
-        self._hosts = tuple(_Host(each) for each in places)
+        self._hosts = tuple(_Host(each, until) for each in places)
+        self._until_reached = until
         self._listener = listener
         self._version = version
         self._bring_up_s = bring_up_s
-        self._stop_after_s = stop_after_s
+        is_brief = stop_after_s is None and until != _ACTIVE
+        self._stop_after_s = 0.0 if is_brief else stop_after_s
         self._keep_going = keep_going
         self._again = again
         self._clock = clock
@@ -310,7 +338,7 @@ class Coordinator:
         self._goes = False
         self._reason = ""
         self._wanted: ExitCode | None = None
-        self._leaves = self._was_active = False
+        self._leaves = self._was_up = False
         self._numbers = 0
         self._began_s = 0.0
 
@@ -376,7 +404,7 @@ class Coordinator:
         for each in self._hosts:
             if each.channel is not None:
                 self._ask(each)
-        failure = await self._become_active()
+        failure = await self._come_up()
         if self._leaves:
             return ""
         if failure:
@@ -402,15 +430,15 @@ class Coordinator:
     def _elapsed_s(self) -> float:
         return self._now_s - self._began_s
 
-    async def _become_active(self) -> str:
-        """Wait until all are active; return what failed, if anything."""
-        hosts = self._hosts
+    async def _come_up(self) -> str:
+        """Wait until all are as far as they are to come; return what failed, if anything."""
+        hosts, until = self._hosts, self._until_reached
 
         def is_over() -> bool:
             return self._is_asked or any(each.is_over for each in hosts)
 
         in_time = await self._until(
-            lambda: is_over() or all(each.is_active for each in hosts), self._bring_up_s
+            lambda: is_over() or all(each.is_up for each in hosts), self._bring_up_s
         )
         if self._is_asked:
             return ""
@@ -418,13 +446,17 @@ class Coordinator:
             lacking = ", ".join(
                 f"{each.name} ({'its link is cut' if each.is_cut else each.reached or 'started'})"
                 for each in hosts
-                if not each.is_active
+                if not each.is_up
             )
-            return f"not active on all hosts within {self._bring_up_s:g} s: {lacking}"
+            return f"not {until} on all hosts within {self._bring_up_s:g} s: {lacking}"
         if over := [each.name for each in hosts if each.is_over]:
-            return f"not active, and over on {', '.join(over)}"
-        self._was_active = True
-        self._emit(HostsActive(hosts=tuple(each.name for each in hosts), elapsed_s=self._elapsed_s))
+            return f"not {until}, and over on {', '.join(over)}"
+        self._was_up = True
+        names = tuple(each.name for each in hosts)
+        if until == _ACTIVE:
+            self._emit(HostsActive(hosts=names, elapsed_s=self._elapsed_s))
+        else:
+            self._emit(HostsReached(reached=until, hosts=names, elapsed_s=self._elapsed_s))
         return ""
 
     async def _hold(self) -> str:
@@ -458,7 +490,7 @@ class Coordinator:
             await asyncio.gather(*(self._clean_up(each) for each in hosts if each.was_killed))
 
     async def _clean_up(self, host: _Host) -> None:
-        code, message = await _down(host.part.name, host.transport, CLEAN_S)
+        code, message = await down_one(host.part, host.transport, CLEAN_S)
         if code is not ExitCode.OK:
             self._emit(
                 HostChanged(
@@ -508,7 +540,7 @@ class Coordinator:
             code = worst(each for each in codes.values() if each is not None)
             wanted = self._wanted
             if wanted is not None and code in _CUT_SHORT:
-                is_done = self._was_active and code is ExitCode.OK
+                is_done = self._was_up and code is ExitCode.OK
                 code = code if is_done and wanted is not ExitCode.INTERRUPTED else wanted
             if failure:
                 code = ExitCode.BRING_UP_FAILED if code in _CUT_SHORT else code
@@ -585,7 +617,7 @@ class Coordinator:
         """Follow a host over one channel; return why that is over, empty if its end says."""
         try:
             limit_s = AGAIN_HELLO_S if host.is_ready else HELLO_S
-            said = await asyncio.wait_for(_hello(channel, noise), limit_s)
+            said = await asyncio.wait_for(hello(channel, noise), limit_s)
         except (asyncio.TimeoutError, EOFError):
             return ""
         if (said.version, said.protocol) != (self._version, PROTOCOL):
@@ -645,10 +677,10 @@ class Coordinator:
         if not isinstance(record, dict) or str(record.get("event")) in _OURS:
             self._emit(HostStderr(line=data.decode(errors="replace")), host)
             return
-        was_active, was_reached = host.is_active, host.reached
+        was_up, was_reached = host.is_up, host.reached
         host.note(record)
         self._listener(host.name, {"host": host.name, **record} | {"host": host.name})
-        if (host.is_active, host.reached) != (was_active, was_reached):
+        if (host.is_up, host.reached) != (was_up, was_reached):
             self._notify()
 
     def _take(self, host: _Host, said: Said) -> None:
@@ -683,6 +715,14 @@ class Coordinator:
 
     def _follows(self, host: _Host, said: Said) -> None:
         host.asked_s = None
+        was_there = said.agent is Word.ATTACHED and not host.is_begun and host.starts <= 1
+        if was_there and host.until != _ACTIVE:
+            self._fail(
+                host,
+                "its supervisor runs already, and is left as it is",
+                f"verify what runs, on that host: lifecycle verify {self._system}",
+            )
+            return
         state = LinkState.ATTACHED if said.agent is Word.ATTACHED else LinkState.STARTED
         message = ""
         lost_s = self._now_s - host.cut_s if host.is_cut else 0.0
@@ -694,8 +734,8 @@ class Coordinator:
         if not host.is_begun:  # the answer to an earlier START may have been lost
             host.is_ours = said.agent is Word.STARTED or host.starts > 1
         host.is_begun, host.is_cut = True, False
-        if isinstance(said.status, dict) and said.status.get("phase") == "active":
-            host.is_active = True
+        if isinstance(said.status, dict) and _is_up(said.status, host.until):
+            host.is_up = True
         self._emit(
             HostChanged(
                 state=state, pid=said.pid, message=message, lost_s=lost_s, status=said.status
@@ -735,21 +775,24 @@ class Coordinator:
 
     def _ping(self, host: _Host) -> None:
         self._numbers += 1
-        host.pings[self._numbers] = self._clock()
+        host.pings[self._numbers] = (self._clock(), self._now_s)
         self._send(host, Order(do=Do.PING, number=self._numbers))
 
     def _pong(self, host: _Host, said: Said) -> None:
-        sent_s = host.pings.pop(said.number, None)
-        if sent_s is None:
+        sent = host.pings.pop(said.number, None)
+        if sent is None:
             return
-        host.readings.append(
-            RoundTrip(
-                sent_s=sent_s,
-                there_s=said.received_s,
-                answered_s=said.sent_s,
-                back_s=self._clock(),
-            )
+        sent_s, asked_s = sent
+        back_s = self._clock()
+        if abs((back_s - sent_s) - (self._now_s - asked_s)) > NOTABLE_S:
+            host.readings.clear()  # our own clock was set: they tell how far it was off before
+            return
+        reading = RoundTrip(
+            sent_s=sent_s, there_s=said.received_s, answered_s=said.sent_s, back_s=back_s
         )
+        if reading.delay_s < -NOTABLE_S:
+            return  # theirs was set while they answered
+        host.readings.append(reading)
         if len(host.readings) < READINGS:
             return
         found, known = clock_offset(host.readings), host.clock
@@ -777,108 +820,17 @@ class Coordinator:
         self._changed.set()
 
 
-_SEVERITY = (
-    ExitCode.OK,
-    ExitCode.HUNG_UP,
-    ExitCode.INTERRUPTED,
-    ExitCode.TERMINATED,
-    ExitCode.UNVERIFIABLE,
-    ExitCode.VIOLATED,
-    ExitCode.SUPERVISION_GAVE_UP,
-    ExitCode.BRING_UP_FAILED,
-    ExitCode.MANIFEST_INVALID,
-    ExitCode.USAGE,
-    ExitCode.INTERNAL,
-)
-_CUT_SHORT = frozenset(_SEVERITY[:4])
+_CUT_SHORT = frozenset((ExitCode.OK, ExitCode.HUNG_UP, ExitCode.INTERRUPTED, ExitCode.TERMINATED))
 
 
-def worst(codes: Iterable[int]) -> ExitCode:
-    """Return the exit code that says most of several; one that is none of ours is our bug."""
-    known = {int(each): each for each in _SEVERITY}
-    found = (known.get(each, ExitCode.INTERNAL) for each in codes)
-    return max(found, key=_SEVERITY.index, default=ExitCode.OK)
+def _is_up(status: Mapping[str, Any], until: str) -> bool:
+    """Whether a status shows what an event said that may be lost: how far the system came."""
+    if status.get("phase") == _ACTIVE or until == _ACTIVE:
+        return status.get("phase") == _ACTIVE
+    nodes = status.get("nodes", ())
+    connected = all(each["reach"] in {"connected", _ACTIVE} for each in nodes)
+    return connected and (until == "connected" or status.get("verdict") == "ok")
 
 
 def _code(value: object) -> int | None:
     return value if isinstance(value, int) else None
-
-
-async def _hello(channel: Channel, noise: list[str]) -> Said:
-    """Return the first word of an agent, after what login shells print.
-
-    Raises:
-        EOFError: there is none.
-    """
-    while True:
-        data = await channel.receive()
-        if data.startswith(AGENT_MARK):
-            with contextlib.suppress(ValueError):
-                return from_json(data, Said, longest=LONGEST_LINE)
-        noise.append(data.decode(errors="replace"))
-        del noise[:-READINGS]
-
-
-async def down(
-    names: Mapping[str, str], transports: Mapping[str, Transport], timeout_s: float
-) -> dict[str, tuple[ExitCode, str]]:
-    """End the runs of all hosts at once, whoever started them.
-
-    Args:
-        names: of the runs, by machine.
-        transports: by machine.
-        timeout_s: for each.
-
-    Returns:
-        The exit code of each, and what there is to say.
-    """
-    outcomes = await asyncio.gather(
-        *(_down(name, transports[machine], timeout_s) for machine, name in names.items())
-    )
-    return dict(zip(names, outcomes, strict=True))
-
-
-async def _down(name: str, transport: Transport, timeout_s: float) -> tuple[ExitCode, str]:
-    try:
-        channel = await transport.open()
-    except OSError as error:
-        return ExitCode.BRING_UP_FAILED, f"cannot start {error.filename}: {error.strerror}"
-    noise: list[str] = []
-    said: Said | None = None
-    try:
-        await asyncio.wait_for(_hello(channel, noise), HELLO_S)
-        channel.send(line(Order(do=Do.DOWN, name=name, timeout_s=timeout_s)))
-        said = await asyncio.wait_for(_outcome(channel), timeout_s + ANSWER_S)
-    except (asyncio.TimeoutError, EOFError):
-        pass
-    finally:
-        closed = await asyncio.shield(asyncio.ensure_future(channel.close()))
-    if said is None:
-        why, hint = transport.explained(closed, "\n".join(noise))
-        return ExitCode.BRING_UP_FAILED, f"{why}; {hint}" if hint else why
-    if said.agent is Word.ABSENT:
-        return ExitCode.OK, "did not run"
-    if said.agent is Word.DONE and said.exit_code is not None:
-        return worst([said.exit_code]), said.message
-    return ExitCode.BRING_UP_FAILED, said.message
-
-
-async def _outcome(channel: Channel) -> Said:
-    """Return what came of a DOWN; asks meanwhile, because a silent coordinator is left."""
-    reading = asyncio.ensure_future(_answered(channel))
-    try:
-        while not reading.done():
-            channel.send(line(Order(do=Do.PING)))
-            await asyncio.wait({reading}, timeout=HEARTBEAT_S)
-        return reading.result()
-    finally:
-        reading.cancel()
-
-
-async def _answered(channel: Channel) -> Said:
-    while True:
-        data = await channel.receive()
-        if data.startswith(AGENT_MARK):
-            said = from_json(data, Said, longest=LONGEST_LINE)
-            if said.agent in (Word.DONE, Word.ABSENT, Word.REFUSED):
-                return said

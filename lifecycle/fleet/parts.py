@@ -76,6 +76,7 @@ def parts_of(
             arguments=arguments,
             options=options,
             digest=digest,
+            whole=run_name(plan),
         )
         for machine in machines
     ), tuple(unsent)

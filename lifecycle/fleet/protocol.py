@@ -13,8 +13,11 @@ from collections.abc import Iterable
 from lifecycle import dataclasses
 from lifecycle.codec import to_json
 
-PROTOCOL = 1
+PROTOCOL = 2
 """Changes with what an agent of another version could not understand."""
+
+NOTABLE_S = 0.01
+"""Clocks that differ by less are not worth a line."""
 
 LONGEST_LINE = 64 * 2**20
 """Bytes; a verdict on a large system has megabytes."""
@@ -28,6 +31,7 @@ class Do(enum.Enum):
     ATTACH = "attach"
     END = "end"
     DOWN = "down"
+    STATUS = "status"
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,6 +52,7 @@ class Part:
 
     Attributes:
         name: of the run directory, see run_directory.run_name.
+        whole: of the one that `lifecycle up` has there without --machine.
         manifest: which of the files it is; an absolute path for one that is there already.
         arguments: `name:=value` of the manifest.
         options: further options of `lifecycle up`.
@@ -61,6 +66,7 @@ class Part:
     arguments: tuple[str, ...] = ()
     options: tuple[str, ...] = ()
     digest: str = ""
+    whole: str = ""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,7 +76,8 @@ class Order:
     Attributes:
         number: of a PING, returned with its answer.
         part: for START and ATTACH. The latter starts nothing.
-        name: for DOWN, of the run; END is for the supervisor that the agent follows.
+        name: for DOWN and STATUS, of the run; END is for the supervisor that the agent follows.
+        whole: likewise of the run to take where there is none of that name, see Part.
         timeout_s: for DOWN.
     """
 
@@ -78,6 +85,7 @@ class Order:
     number: int = 0
     part: Part | None = None
     name: str = ""
+    whole: str = ""
     timeout_s: float = 60.0
 
 
@@ -93,6 +101,7 @@ class Word(enum.Enum):
     STDERR = "stderr"
     ENDED = "ended"
     DONE = "done"
+    STATUS = "status"
     TAKEN = "taken"
 
 
@@ -102,13 +111,14 @@ class Said:
 
     Attributes:
         agent: STARTED and ATTACHED: it follows a supervisor now, whose pid it is. ABSENT: there is
-            none to attach to. ENDED: that supervisor has. DONE: of a DOWN. TAKEN: another
-            coordinator follows the supervisor from now on.
+            none, to attach to or to ask. ENDED: that supervisor has. DONE: of a DOWN. TAKEN:
+            another coordinator follows the supervisor from now on.
         version: of HELLO, of the package; `protocol` too.
         number: of a PONG.
         received_s: of a PONG, when its PING came, in seconds since the epoch.
         sent_s: when the PONG was sent.
-        status: of ATTACHED, as `lifecycle status --format json` has it; None if none was given.
+        status: of ATTACHED and STATUS, as `lifecycle status --format json` has it; None if none
+            was given.
         message: of REFUSED, and of a DONE that failed, a whole sentence; of STDERR a line.
         hint: the next thing to do.
         exit_code: of ENDED and DONE; None where it is not known: the supervisor is no child of this

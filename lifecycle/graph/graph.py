@@ -178,6 +178,10 @@ class Graph:
         """
         return await self._observer.observe(plan)
 
+    def drop_configuration(self, node: str) -> None:
+        """Forget what a node said of itself whose process ended, on /diagnostics too."""
+        self._observer.drop_configuration(node)
+
     @property
     def changes(self) -> int:
         """Changes so far, each counted at once: before its burst has passed (`wait_change`)."""

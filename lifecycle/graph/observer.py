@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import fnmatch
 import functools
 import logging
 import threading
@@ -39,6 +38,7 @@ from lifecycle.verify import (
     ObservedNode,
     is_noise_node,
     known_node,
+    matches,
     tolerating_pattern,
 )
 
@@ -121,7 +121,7 @@ class _Shown:
     beside: tuple[tuple[str, tuple[ObservedEndpoint, ...]], ...]
 
 
-_OF_ERROR, _OF_STALE = 2, 3
+_OF_WARN, _OF_ERROR, _OF_STALE = 1, 2, 3
 """Levels of that."""
 
 STALE_S = 5.0
@@ -167,6 +167,13 @@ class DiagnosticReadings:
         if patterns:
             self._clients.on_diagnostics(self._arrived)
 
+    def forget(self, node: str) -> None:
+        """Forget what was said of a node: what comes in its place has said nothing yet."""
+        with self._lock:
+            patterns = self._patterns.get(node, ())
+            for name in [one for one in self._entries if any(matches(one, p) for p in patterns)]:
+                del self._entries[name]
+
     def reports(self) -> dict[str, HealthReport]:
         """Return what is known now, by full node name."""
         with self._lock:
@@ -178,7 +185,7 @@ class DiagnosticReadings:
             wanted = {each for patterns in self._patterns.values() for each in patterns}
             for name, level, message in entries:
                 known = name in self._entries or len(self._entries) < _MOST_ENTRIES
-                if known and any(fnmatch.fnmatchcase(name, each) for each in wanted):
+                if known and any(matches(name, each) for each in wanted):
                     self._entries[name] = level, message[:_LONGEST_MESSAGE], self._clock()
             changed = self._reports() != self._said
         if changed:
@@ -191,13 +198,17 @@ class DiagnosticReadings:
     def _report(self, patterns: tuple[str, ...]) -> HealthReport | None:
         wrong, unknown, ok = [], [], False
         for name, (level, message, at_s) in sorted(self._entries.items()):
-            if not any(fnmatch.fnmatchcase(name, each) for each in patterns):
+            if not any(matches(name, each) for each in patterns):
                 continue
-            if level == _OF_STALE or self._clock() - at_s > STALE_S:
-                old = f": {message}" if level == _OF_STALE else f" for {STALE_S:g} s"
-                unknown.append(f"{name!r} is stale{old}")
+            said = f": {message}" if message else ""
+            if self._clock() - at_s > STALE_S:
+                unknown.append(f"{name!r} was not published for {STALE_S:g} s")
+            elif level == _OF_STALE:
+                unknown.append(f"{name!r} is stale{said}")
             elif level == _OF_ERROR:
-                wrong.append(f"{name!r}: {message}")
+                wrong.append(f"{name!r}{said or ' has level ERROR'}")
+            elif level > _OF_WARN:
+                unknown.append(f"{name!r} has level {level}, which has no meaning{said}")
             else:
                 ok = True
         if wrong or unknown:
@@ -265,6 +276,11 @@ class Observer:
             events.scheduler.post(self._follow)
 
     # -- one observation
+
+    def drop_configuration(self, node: str) -> None:
+        """Forget what a node said of itself whose process ended."""
+        self.state.drop_configuration(node)
+        self._diagnostics.forget(node)
 
     async def observe(self, plan: Plan) -> Observation:
         """Return what is there now, as the state has it then.

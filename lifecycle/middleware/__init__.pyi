@@ -28,6 +28,7 @@ from .fastdds.settings import stop_listening as stop_listening
 from .fastdds.settings import unknown_versions as unknown_versions
 from .process.busy_timer import BusySign as BusySign
 from .process.busy_timer import Overdue as Overdue
+from .process.clock import ClockWatch as ClockWatch
 from .process.control import adopt_orphans as adopt_orphans
 from .process.control import check_threads as check_threads
 from .process.control import drop_network_administration as drop_network_administration
@@ -71,6 +72,7 @@ from .rcl.rclpy_nodes import follow_nodes as follow_nodes
 from .rcl.rclpy_nodes import interface_of as interface_of
 from .rcl.rclpy_nodes import is_rclpy_managed as is_rclpy_managed
 from .rcl.rmw_choice import check_rmw as check_rmw
+from .rcl.timers import NodeTimers as NodeTimers
 from .services.actions import GoalClient as GoalClient
 from .services.actions import GoalServer as GoalServer
 from .services.clients import NodeClients as NodeClients

@@ -79,4 +79,5 @@ from .restart import moved_observer as moved_observer
 from .restart import moving_nodes as moving_nodes
 from .restart import restarted as restarted
 from .secrets import is_secret as is_secret
+from .secrets import shown as shown
 from .secrets import without_secrets as without_secrets

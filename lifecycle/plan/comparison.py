@@ -24,7 +24,7 @@ from lifecycle import dataclasses
 from lifecycle.codec import from_json, to_json, to_plain
 from lifecycle.manifest import OnViolation, Position, RunKind
 from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedNode
-from lifecycle.plan.secrets import REDACTED, is_secret, without_secrets
+from lifecycle.plan.secrets import shown, without_secrets
 
 _VALUE_CHARACTERS = 80
 _MOST = 20
@@ -263,8 +263,10 @@ def _compared(path: _Path, old: object, new: object) -> Iterator[tuple[_Path, st
         for key in {**old, **new}:
             yield from _compared((*path, key), old.get(key), new.get(key))
     else:
-        if path[-2:-1] == ("environment",) and is_secret(path[-1]):
-            old, new = (REDACTED if each else each for each in (old, new))
+        if path[-2:-1] == ("environment",):
+            old, new = (
+                shown(path[-1], each) if isinstance(each, str) else each for each in (old, new)
+            )
         absent = "not declared" if isinstance(old or new, Mapping) else "not set"
         yield path, _shown(old, absent), _shown(new, absent)
 

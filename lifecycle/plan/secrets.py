@@ -15,13 +15,23 @@ from lifecycle.plan.model import Plan
 REDACTED = "(redacted)"
 
 _SECRET = re.compile(
-    "TOKEN|SECRET|PASSW|CREDENTIAL|PRIVATE|(API|ACCESS)_?KEY|AUTH(?!OR)", re.IGNORECASE
+    "TOKEN|SECRET|PASSW|PASSPHRASE|(^|_)PASS(_|$)|_PWD$|CREDENTIAL|PRIVATE|COOKIE"
+    "|(API|ACCESS)_?KEY|(^|_)KEYS?$|AUTH(?!OR)",
+    re.IGNORECASE,
 )
+
+_PASSWORD_IN_URL = re.compile(r"(?<=://)([^/?#@\s:]*):[^/@\s]+(?=@)")
+"""RFC 3986 section 3.2.1, `user:password@`."""
 
 
 def is_secret(variable: str) -> bool:
     """Return whether the name of an environment variable says that its value is secret."""
     return _SECRET.search(variable) is not None
+
+
+def shown(variable: str, value: str) -> str:
+    """Return the value of an environment variable as it may be shown."""
+    return REDACTED if is_secret(variable) else _PASSWORD_IN_URL.sub(rf"\1:{REDACTED}", value)
 
 
 def without_secrets(plan: Plan) -> Plan:
@@ -31,7 +41,7 @@ def without_secrets(plan: Plan) -> Plan:
             node,
             run=dataclasses.replace(node.run, environment=_redacted(node.run.environment)),
         )
-        if any(is_secret(name) for name, _ in node.run.environment)
+        if _has_secrets(node.run.environment)
         else node
         for node in plan.nodes
     )
@@ -41,7 +51,7 @@ def without_secrets(plan: Plan) -> Plan:
             environment=_redacted(process.environment),
             run=dataclasses.replace(process.run, environment=_redacted(process.run.environment)),
         )
-        if any(is_secret(name) for name, _ in (*process.environment, *process.run.environment))
+        if _has_secrets((*process.environment, *process.run.environment))
         else process
         for process in plan.processes
     )
@@ -50,5 +60,9 @@ def without_secrets(plan: Plan) -> Plan:
     return dataclasses.replace(plan, nodes=nodes, processes=processes)
 
 
+def _has_secrets(variables: Iterable[tuple[str, str]]) -> bool:
+    return any(shown(name, value) != value for name, value in variables)
+
+
 def _redacted(variables: Iterable[tuple[str, str]]) -> tuple[tuple[str, str], ...]:
-    return tuple((name, REDACTED if is_secret(name) else value) for name, value in variables)
+    return tuple((name, shown(name, value)) for name, value in variables)

@@ -56,6 +56,7 @@ from .run.history import moment_of as moment_of
 from .run.history import named_findings as named_findings
 from .run.history import read_run as read_run
 from .run.history import replayed as replayed
+from .run.history import was_set_s as was_set_s
 from .run.looking import attached_picture as attached_picture
 from .run.looking import attached_pictures as attached_pictures
 from .run.looking import capture_running as capture_running

@@ -29,6 +29,7 @@ from .rules import rule as rule
 from .rules.catalogue import About as About
 from .rules.catalogue import Heals as Heals
 from .rules.endpoints import DEFINITION_DIFFERS as DEFINITION_DIFFERS
+from .rules.health import UNHEALTHY as UNHEALTHY
 from .rules.health import health_of as health_of
 from .rules.matching import SERVER_OF as SERVER_OF
 from .rules.matching import MatchEnd as MatchEnd
@@ -61,6 +62,7 @@ from .tool_filter import is_noise_endpoint as is_noise_endpoint
 from .tool_filter import is_noise_node as is_noise_node
 from .tool_filter import is_of_supervisor as is_of_supervisor
 from .tool_filter import known_node as known_node
+from .tool_filter import matches as matches
 from .tool_filter import supervisor_endpoints as supervisor_endpoints
 from .tool_filter import supervisor_label as supervisor_label
 from .tool_filter import takes_diagnostics as takes_diagnostics

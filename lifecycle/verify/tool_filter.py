@@ -22,9 +22,11 @@ from lifecycle.manifest import (
     SUPERVISOR_STATUS,
     SUPERVISORS,
     TOLERATED_NODES,
+    Certainty,
     Durability,
     EndpointKind,
     History,
+    Liveliness,
     QosProfile,
     Reliability,
     RosInterfaceAccess,
@@ -51,6 +53,7 @@ _DIAGNOSTICS_QOS = QosProfile(
     depth=10,
     reliability=Reliability.RELIABLE,
     durability=Durability.VOLATILE,
+    liveliness=Liveliness.AUTOMATIC,
 )
 """What a supervisor's publisher offers."""
 _SUPERVISOR_TOPIC = SUPERVISOR_STATUS, "std_msgs/msg/String"
@@ -160,7 +163,7 @@ def tolerating_pattern(full_name: str, patterns: Collection[str] = TOLERATED_NOD
     """
     base = full_name.rpartition("/")[2]
     for pattern in (OUR_NODES, *patterns):
-        if _matches(full_name if "/" in pattern else base, pattern):
+        if matches(full_name if "/" in pattern else base, pattern):
             return pattern
     return ""
 
@@ -171,7 +174,8 @@ def is_noise_node(full_name: str) -> bool:
     return bool(tolerating_pattern(full_name))
 
 
-def _matches(name: str, pattern: str) -> bool:
+def matches(name: str, pattern: str) -> bool:
+    """Return whether a name is as a pattern of a manifest has it: `*`, `?`, all else as it is."""
     return _compiled(pattern).fullmatch(name) is not None
 
 
@@ -363,7 +367,10 @@ def takes_diagnostics(plan: Plan) -> bool:
         and (
             each.kind is not EndpointKind.SUBSCRIPTION
             or each.qos is None
-            or not incompatibilities(_DIAGNOSTICS_QOS, each.qos)
+            or all(
+                found.severity is not Certainty.CERTAIN
+                for found in incompatibilities(_DIAGNOSTICS_QOS, each.qos)
+            )
         )
         for each in ends
     )
@@ -424,7 +431,7 @@ def of_supervisors(
 
 def is_supervisor_endpoint(kind: EndpointKind, node: str, name: str, type_: str) -> bool:
     """Return whether an endpoint is one that `policy.ros_interface` has a supervisor make."""
-    if not _matches(node.rpartition("/")[2], OUR_NODES):
+    if not matches(node.rpartition("/")[2], OUR_NODES):
         return False
     base = name.rpartition("/")[2] if name.startswith(SUPERVISORS) else ""
     if kind is EndpointKind.PUBLISHER:

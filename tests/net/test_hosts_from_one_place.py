@@ -7,12 +7,14 @@ nor a cut link ends one.
 from __future__ import annotations
 
 import contextlib
+import json
+import os
 import shlex
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import pytest
@@ -28,7 +30,13 @@ from tests.ros.supervisor.running import BOUND_S, ROOT, Event, Up, left_of
 
 pytestmark = pytest.mark.skipif(bool(lacking()), reason=lacking() or "-")
 
-REMOTE = f"cd {shlex.quote(str(ROOT))} && {shlex.quote(sys.executable)} -m lifecycle.cli"
+_ROOTED = f"cd {shlex.quote(str(ROOT))} && {shlex.quote(sys.executable)} -m lifecycle.cli"
+REMOTE = (
+    'touch "$XDG_RUNTIME_DIR/asked"; while test -e "$XDG_RUNTIME_DIR/hold"; do sleep 0.02; done; '
+    f"{_ROOTED}"
+)
+"""A login shell that takes its time while a file is there."""
+
 _STRING = "std_msgs/msg/String"
 
 
@@ -48,11 +56,17 @@ class Fleet:
     def runtime(self, name: str) -> Path:
         return self.directory / name
 
-    def manifest(self, **environment: str) -> Path:
-        """Write the manifest of the article; further hosts have a subscriber, too."""
+    def manifest(self, more: Mapping[str, object] | None = None, **environment: str) -> Path:
+        """Write the manifest of the article; further hosts have a subscriber, too.
+
+        Args:
+            more: values by path, see `article`.
+            environment: of node n2.
+        """
         folder = self.directory / "manifest"
         folder.mkdir(exist_ok=True)
-        edit = {f"nodes/n2/run/environment/{key}": value for key, value in environment.items()}
+        edit: dict[str, object] = {**(more or {})}
+        edit |= {f"nodes/n2/run/environment/{key}": value for key, value in environment.items()}
         addresses = [each.ipv4 for each in self.hosts.values()]
         for name, address in list(zip(self.hosts, addresses, strict=True))[2:]:
             edit[f"machines/{name}"] = {"address": address}
@@ -80,11 +94,11 @@ class Fleet:
         self._stack.callback(up.close)
         return up
 
-    def down(self, manifest: Path) -> subprocess.CompletedProcess[str]:
+    def verb(self, name: str, manifest: Path, *options: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
             self.hosts["a"].command(
-                *(sys.executable, "-m", "lifecycle.cli", "down", str(manifest)),
-                *("--hosts", "--remote-command", REMOTE),
+                *(sys.executable, "-m", "lifecycle.cli", name, str(manifest)),
+                *("--hosts", "--remote-command", REMOTE, *options),
             ),
             env={
                 **self.hosts["a"].environment(self.runtime("a")),
@@ -140,6 +154,17 @@ def test_three_hosts_come_up_and_are_ended_from_one_place(three: Fleet) -> None:
     assert all(not each["differs"] for each in clocks.values())
     assert all(abs(each["offset_s"]) <= each["uncertainty_s"] + 0.005 for each in clocks.values())
     assert {each["host"] for each in up.of_kind("gate")} == {"a", "b", "c"}
+    for name in "abc":
+        _until_ok(three, name)
+    shown = three.verb("status", up.manifest, "--format", "json")
+    assert shown.returncode == ExitCode.OK, shown.stderr
+    found = json.loads(shown.stdout)
+    assert (found["system"], found["verdict"]) == ("article", "ok")
+    hosts = {each["host"]: each for each in found["hosts"]}
+    assert [*hosts] == ["a", "b", "c"]
+    assert {each["node"] for each in hosts["c"]["status"]["nodes"]} == {"/n_c"}
+    assert {each["status"]["phase"] for each in hosts.values()} == {"active"}
+    assert not any(each["clock"]["differs"] for each in hosts.values())
     up.signal(signal.SIGTERM)
     assert up.finish() == ExitCode.OK, up.said()
     end = up.events[-1]
@@ -150,62 +175,171 @@ def test_three_hosts_come_up_and_are_ended_from_one_place(three: Fleet) -> None:
         assert [*(three.runtime(name) / "lifecycle").iterdir()] == []
 
 
-@pytest.mark.parametrize("stage", ["configuring", "active"])
-def test_a_host_that_is_cut_off_runs_on_and_is_followed_once_it_is_back(
-    two: Fleet, stage: str
-) -> None:
-    go = two.directory / "go"
-    up = two.up(two.manifest(HOLD_CONFIGURE_FILE=str(go)))
-    if stage == "configuring":
-        up.until("request", host="b", operation="configure")
-    else:
-        go.touch()
-        _active(up)
-    pid = up.met("host", host="b", state="started")["pid"]
-    two.hosts["b"].ip("link", "set", "e0", "down")
-    up.until("host", host="b", state="cut")
-    assert two.runs("b")
-    two.hosts["b"].ip("link", "set", "e0", "up")
-    assert up.until("host", host="b", state="healed")["pid"] == pid
-    if stage == "configuring":
-        go.touch()
-        _active(up)
-    else:
-        for name in "ab":
-            _until_ok(two, name)
-    up.signal(signal.SIGTERM)
+def test_what_is_only_to_be_verified_waits_for_all_hosts_and_is_in_one_report(two: Fleet) -> None:
+    report = two.directory / "report.json"
+    up = two.up(two.manifest(), "--until", "verified", "--report", str(report))
     assert up.finish() == ExitCode.OK, (up.events[-1], up.said())
+    (reached,) = up.of_kind("reached")
+    assert (reached["reached"], sorted(reached["hosts"])) == ("verified", ["a", "b"])
+    assert up.of_kind("gate") == []
+    found = json.loads(report.read_text())
+    assert found["verdict"] == "ok"
+    assert found["run"] == {"reason": "done", "reached": "verified", "exit_code": 0}
+    assert {name: each["verdict"] for name, each in found["machines"].items()} == {
+        "a": "ok",
+        "b": "ok",
+    }
+    assert len(found["flows"]) == 2
     assert left_of(up.mark) == []
 
 
-@pytest.mark.parametrize("stage", ["configuring", "active"])
-def test_a_coordinator_that_is_killed_leaves_all_running_to_be_followed_and_ended(
-    two: Fleet, stage: str
+HOLDS = {
+    "starting": "START",
+    "configuring": "CONFIGURE",
+    "connecting": "CONNECT",
+    "activating": "ACTIVATE",
+    "restarting": "CONFIGURE",
+    "ending": "DEACTIVATE",
+}
+"""What node /n2 of host B waits in for the file `go`, by stage."""
+
+
+class Stage:
+    """A bring-up that is held in one stage of host B, until `release`."""
+
+    def __init__(self, fleet: Fleet, name: str) -> None:
+        self.fleet, self.name = fleet, name
+        self.go = fleet.directory / "go"
+        self.shell = fleet.runtime("b") / "hold"
+        held = {f"HOLD_{HOLDS[name]}_FILE": str(self.go)} if name in HOLDS else {}
+        edit: dict[str, object] = {}
+        if name == "restarting":
+            self.go.touch()
+            edit = {"nodes/n2/restart": "on-failure", "nodes/n2/restart_sec": 0.1}
+        elif name == "verifying":
+            edit = {"nodes/n1/run/environment/HOLD_CONFIGURE_FILE": str(self.go)}
+        elif name == "asking":
+            self.shell = fleet.runtime("c") / "hold"  # until it answers, no host is asked
+        if name in {"ssh", "asking"}:
+            self.shell.touch()
+        self.manifest = fleet.manifest(edit, **held)
+
+    def reach(self, up: Up) -> None:
+        """Wait until host B is there."""
+        if self.name == "ssh":
+            deadline = time.monotonic() + BOUND_S
+            while not self.shell.with_name("asked").exists():
+                assert time.monotonic() < deadline
+                time.sleep(0.02)
+        elif self.name == "asking":
+            up.until("host", host="b", state="connected")
+        elif self.name == "beginning":
+            up.until("host", host="b", state="started")
+        elif self.name == "starting":
+            up.until("process", host="b", state="starting")
+        elif self.name == "verifying":
+            up.until("system", host="b", reached="connected")
+        elif self.name in {"configuring", "connecting", "activating"}:
+            operation = HOLDS[self.name].lower()
+            up.until("request", host="b", operation=operation)
+        else:
+            _active(up)
+            since = up.catch_up()
+            if self.name == "restarting":
+                self.go.unlink()
+                os.kill(up.pid_of("n2"), signal.SIGKILL)
+                up.met("request", host="b", operation="configure", since=since)
+            elif self.name == "ending":
+                up.signal(signal.SIGTERM)
+                up.until("request", host="b", operation="deactivate")
+
+    def release(self) -> None:
+        self.shell.unlink(missing_ok=True)
+        self.go.touch()
+
+
+def _nothing_left(fleet: Fleet, *ups: Up) -> None:
+    for each in ups:
+        assert left_of(each.mark, BOUND_S / 2) == []
+    for name in fleet.hosts:
+        assert [*(fleet.runtime(name) / "lifecycle").glob("*")] == []
+
+
+@pytest.mark.parametrize("name", ["ssh", "asking", "beginning", *HOLDS, "verifying", "active"])
+def test_a_host_that_is_cut_off_runs_on_and_is_followed_once_it_is_back(
+    three: Fleet, name: str
 ) -> None:
-    go = two.directory / "go"
-    manifest = two.manifest(HOLD_CONFIGURE_FILE=str(go))
-    first = two.up(manifest)
-    if stage == "configuring":
-        first.until("request", host="b", operation="configure")
+    stage = Stage(three, name)
+    up = three.up(stage.manifest)
+    stage.reach(up)
+    three.hosts["b"].ip("link", "set", "e0", "down")
+    if name == "ssh":
+        time.sleep(1)  # a connection that is being made is not said to be cut
     else:
-        go.touch()
-        _active(first)
-    pids = {name: first.met("host", host=name, state="started")["pid"] for name in "ab"}
+        up.until("host", host="b", state="cut")
+        assert three.runs("b") is (name != "asking")
+    if name == "active":
+        shown = three.verb("status", stage.manifest)
+        assert shown.returncode == ExitCode.VIOLATED
+        assert "unverifiable: b (" in shown.stdout
+        assert "a | article: active" in shown.stdout
+    three.hosts["b"].ip("link", "set", "e0", "up")
+    stage.release()
+    if name == "ending":
+        assert up.finish() == ExitCode.OK, (up.events[-1], up.said())
+        assert up.events[-1]["exit_codes"] == {"a": 0, "b": 0, "c": 0}
+    else:
+        state = "started" if name in {"ssh", "asking"} else "healed"
+        healed = up.until("host", host="b", state=state)
+        if state == "healed":
+            assert healed["pid"] == up.met("host", host="b", state="started")["pid"]
+        if name not in {"active", "restarting"}:
+            up.met("active", host="")
+        for each in "abc":
+            _until_ok(three, each)
+        up.signal(signal.SIGTERM)
+        assert up.finish() == ExitCode.OK, (up.events[-1], up.said())
+    assert len([each for each in up.of_kind("run") if each["host"] == "b"]) <= 1
+    _nothing_left(three, up)
+
+
+@pytest.mark.parametrize("name", ["ssh", "beginning", *HOLDS, "verifying", "active"])
+def test_a_coordinator_that_is_killed_leaves_all_running_to_be_followed_and_ended(
+    two: Fleet, name: str
+) -> None:
+    stage = Stage(two, name)
+    first = two.up(stage.manifest)
+    stage.reach(first)
     first.process.kill()  # nsenter and env became the coordinator by exec
     first.process.wait(BOUND_S)
-    go.touch()
-    second = two.up(manifest)
-    attached = {name: second.until("host", state="attached") for name in "ab"}.values()
-    assert {each["host"]: each["pid"] for each in attached} == pids
-    _active(second)
-    second.signal(signal.SIGHUP)
-    assert second.finish() == ExitCode.HUNG_UP
-    assert two.runs("a")
-    assert two.runs("b")
-    done = two.down(manifest)
+    first.catch_up()
+    if name == "ssh":
+        assert not two.runs("a")
+        stage.release()
+        _nothing_left(two, first)
+        return
+    assert two.runs("b") or name == "beginning"
+    stage.release()
+    if name != "ending":
+        pids = {each: first.met("host", host=each, state="started")["pid"] for each in "ab"}
+        second = two.up(stage.manifest)
+        attached = {each: second.until("host", state="attached") for each in "ab"}.values()
+        assert {each["host"]: each["pid"] for each in attached} == pids
+        _active(second)
+        if name == "active":
+            second.signal(signal.SIGHUP)
+            assert second.finish() == ExitCode.HUNG_UP
+            assert two.runs("a")
+            assert two.runs("b")
+        else:
+            for each in "ab":
+                _until_ok(two, each)
+            second.signal(signal.SIGTERM)
+            assert second.finish() == ExitCode.OK, (second.events[-1], second.said())
+        first = second
+    done = two.verb("down", stage.manifest)
     assert done.returncode == ExitCode.OK, done.stderr
-    assert left_of(first.mark) == []
-    assert left_of(second.mark) == []
+    _nothing_left(two, first)
 
 
 def test_what_is_wrong_with_a_host_is_one_error_with_the_next_step(two: Fleet) -> None:

@@ -63,6 +63,30 @@ def test_both_supervisors_activate_their_own_on_the_same_verified_flows(
     assert {each["effective_transport"] for each in flows} == {"udpv4"}
 
 
+def test_each_supervisor_says_how_its_own_nodes_are_to_a_node_of_either(
+    pair: tuple[Host, Host], tmp_path: Path
+) -> None:
+    reads = {"name": "/diagnostics", "type": "diagnostic_msgs/msg/DiagnosticArray"}
+    monitor = {
+        "machine": "a",
+        "run": {"python": "tests.ros.supervisor.systems:Monitor"},
+        "interface": {"subscriptions": [reads]},
+    }
+    edit = {**UNIQUE, "nodes/monitor": monitor}
+    manifest = article(tmp_path, pair[0].ipv4, pair[1].ipv4, edit=edit)
+    with up_on_both(*pair, manifest, runtime=tmp_path) as ups:
+        begun = []
+        for up in ups:
+            up.until("system", reached="active")
+            begun.append(len(up.events))
+        for said in ("a: /n1", "a: /monitor", "b: /n2"):
+            ups[0].met("log", line=f"diagnosed article/{said} as active")
+        for up, since in zip(ups, begun, strict=True):
+            up.catch_up()
+            later = [each for each in up.events[since:] if each.get("event") == "verdict"]
+            assert [each["verdict"]["findings"] for each in later] == [[]] * len(later)
+
+
 def test_the_gate_on_one_host_waits_for_the_nodes_of_the_other(
     pair: tuple[Host, Host], tmp_path: Path
 ) -> None:

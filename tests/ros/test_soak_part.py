@@ -1,4 +1,4 @@
-"""Three rounds of `make soak`: an intruder, a consequence, a supervisor that is killed."""
+"""Three rounds of `make soak`: a manifest applied, a supervisor killed, the clock set."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def test_three_rounds_of_a_seed_come_out_as_expected() -> None:
-    words = ("--seed", "2349", "--rounds", "3")
+    words = ("--seed", "10968", "--rounds", "3")
     soak = subprocess.Popen(
         [sys.executable, "-m", "tests.soak", *words],
         cwd=ROOT,

@@ -1,6 +1,6 @@
 """`make soak`: rounds of faults against a supervised system of ten nodes, judged from outside.
 
-    python -m tests.soak [--seed N] [--rounds N] [--first N] [--list] [--keep]
+    python -m tests.soak [--seed N] [--rounds N] [--first N] [--only CONDITION] [--list] [--keep]
 
 A seed stands for a list of rounds, which `--list` prints. With root they run in network and mount
 namespaces of their own, so that links can be cut and disks filled; without, those rounds are
@@ -23,7 +23,8 @@ import traceback
 import warnings
 from pathlib import Path
 
-from tests.soak.model import NEEDS_ROOT, plan
+from tests.soak.model import NEEDS_ROOT, Condition, plan
+from tests.wall_clock import LACKS
 
 _INSIDE = "SOAK_INSIDE"
 _SET_UP = (
@@ -37,11 +38,19 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--rounds", type=int, default=100)
     parser.add_argument("--first", type=int, default=1, metavar="N", help="begin with this round")
+    parser.add_argument(
+        "--only",
+        action="append",
+        choices=[each.value for each in Condition],
+        help="only rounds in this condition; may be given again",
+    )
     parser.add_argument("--list", action="store_true", help="print the rounds, and do nothing")
     parser.add_argument("--go-on", action="store_true", help="also after a round that failed")
     parser.add_argument("--keep", action="store_true", help="keep the logs in any case")
     options = parser.parse_args()
     rounds = plan(options.seed, options.rounds)[options.first - 1 :]
+    if options.only:
+        rounds = tuple(each for each in rounds if each.condition.value in options.only)
     if options.list:
         print(*rounds, sep="\n")
         return 0
@@ -50,9 +59,11 @@ def main() -> int:
         again = [sys.executable, "-m", "tests.soak", *sys.argv[1:]]
         os.environ[_INSIDE] = "1"
         os.execvp("unshare", ["unshare", "-n", "-m", "sh", "-c", _SET_UP, "soak", *again])
-    skipped = [each for each in rounds if each.condition in NEEDS_ROOT and not private]
+    lacks = {} if private else dict.fromkeys(NEEDS_ROOT, "needs root and nft")
+    lacks |= {Condition.CLOCK: LACKS} if LACKS else {}
+    skipped = [each for each in rounds if each.condition in lacks]
     for each in skipped:
-        print(f"skipped, needs root and nft: {each}")
+        print(f"skipped, {lacks[each.condition]}: {each}")
     return _soak(options, [each for each in rounds if each not in skipped], private=private)
 
 
@@ -74,7 +85,6 @@ def _soak(options: argparse.Namespace, rounds: list, *, private: bool) -> int:
             if done is None and soaking.run is None:
                 break
             print(done or "down", flush=True)
-            since = time.strftime("%Y-%m-%dT%H:%M:%S")
             started_s = time.monotonic()
             try:
                 if done is None:
@@ -87,7 +97,7 @@ def _soak(options: argparse.Namespace, rounds: list, *, private: bool) -> int:
                 traceback.print_exc(limit=-2, file=sys.stdout)
                 kept = Path(tempfile.mkdtemp(prefix=f"soak-failed-{options.seed}-")) / "kept"
                 shutil.copytree(directory, kept, ignore=_sockets)
-                _history(soaking, since, kept / "history.txt")
+                _history(soaking, kept / "history.txt")
                 upto = done.number if done else options.rounds
                 again = f"python -m tests.soak --seed {options.seed} --rounds {upto}"
                 print(f"  history of it: {kept}/history.txt; again: {again}", flush=True)
@@ -121,11 +131,11 @@ def _sockets(directory: str, names: list[str]) -> list[str]:
     ]
 
 
-def _history(soaking, since: str, file: Path) -> None:
+def _history(soaking, file: Path) -> None:
     from tests.ros.supervisor.running import command, environment
 
     done = subprocess.run(
-        [*command("history"), "--since", since],
+        command("history"),
         env=environment(soaking.runtime, ""),
         capture_output=True,
         text=True,

@@ -102,9 +102,38 @@ class Condition(enum.Enum):
     SAFE = "safe"  # mode
     STORM = "storm"  # several `lifecycle restart` at once
     SUPERVISOR_KILLED = "supervisor_killed"  # and started again
+    CLOCK = "clock"  # the wall clock is set, and set back when it is over
+    APPLY = "apply"  # another manifest is applied; the faults come while that is done
 
 
 NEEDS_ROOT = frozenset({Condition.CUT, Condition.LINK_DOWN, Condition.DISK_FULL})
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Manifest:
+    """How the system's manifest differs from the one that a run begins with.
+
+    Attributes:
+        tint: value of a parameter of `TINTED`, which take it while they run; 0 is its default.
+        issue: value of a variable in the environment of `ISSUED`, which are restarted for it.
+        extra: there is one node more, `EXTRA`.
+        bad: the step that a node more, `BAD`, fails in, and how; empty: it is not there.
+    """
+
+    tint: int = 0
+    issue: int = 0
+    extra: bool = False
+    bad: str = ""
+
+    def __str__(self) -> str:
+        """How the list of a seed shows it."""
+        more = f"{', extra' if self.extra else ''}{', bad ' if self.bad else ''}{self.bad}"
+        return f"tint {self.tint}, issue {self.issue}{more}"
+
+
+TINTED = ("base", "camera")
+ISSUED = ("filter", "detector")
+EXTRA, BAD = "extra", "bad"
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -130,6 +159,9 @@ class Round:
         lasts_s: how long the condition lasts after the first fault.
         orders: what `lifecycle restart` is asked for in a storm; empty text: the whole system.
         ends: how the run is ended after it; empty: it goes on.
+        sets_s: by how many seconds the wall clock is set.
+        manifest: what is applied.
+        later_s: seconds from the beginning of that to the first fault.
     """
 
     number: int
@@ -139,12 +171,18 @@ class Round:
     lasts_s: float = 0.0
     orders: tuple[str, ...] = ()
     ends: str = ""
+    sets_s: float = 0.0
+    manifest: Manifest | None = None
+    later_s: float = 0.0
 
     def __str__(self) -> str:
         """How the list of a seed shows it."""
         done = ", ".join(str(each) for each in self.faults) or "nothing"
         storm = f" restart {', '.join(each or 'all' for each in self.orders)}"
         what = f"{self.condition.value}{storm if self.orders else ''}"
+        what += f" set by {self.sets_s:+g} s" if self.sets_s else ""
+        what += f" {self.manifest}" if self.manifest else ""
+        what += f", {self.later_s:.2f} s before" if self.manifest and self.faults else ""
         lasts = f" for {self.lasts_s:.1f} s" if self.lasts_s else ""
         apart = f", {self.spread_s:.2f} s apart" if self.spread_s and len(self.faults) > 1 else ""
         then = f"; then {self.ends}" if self.ends else ""
@@ -157,9 +195,16 @@ class State:
 
     Attributes:
         starts: how often `fragile` was started as its limit counts; None: not known.
+        manifest: that is in force.
     """
 
     starts: int | None = 1
+    manifest: Manifest = Manifest()
+
+    @property
+    def nodes(self) -> tuple[str, ...]:
+        """Keys of the nodes that there are."""
+        return (*NODES, EXTRA) if self.manifest.extra else NODES
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -168,7 +213,7 @@ class Expectation:
 
     Attributes:
         exit_codes: the run ends with one of these; empty: it goes on.
-        may_go_on: it may go on all the same; then a limit of starts is reached, and no more.
+        goes_on: what is left where it goes on all the same; None: it ends for sure.
         failed: processes of which a failure is reported.
         may_fail: processes of which one may be, or that they are silent.
         silent: processes whose nodes are reported as silent.
@@ -177,10 +222,11 @@ class Expectation:
         may_again: nodes of which that is not known.
         heal: orders that bring the system back; each is given until it is carried out.
         consequence: the action that is reported; empty: none.
+        outcomes: what may become of the manifest that is applied; empty: none is.
     """
 
     exit_codes: frozenset[int] = frozenset()
-    may_go_on: bool = False
+    goes_on: State | None = None
     failed: frozenset[str] = frozenset()
     may_fail: frozenset[str] = frozenset()
     silent: frozenset[str] = frozenset()
@@ -189,18 +235,28 @@ class Expectation:
     may_again: frozenset[str] = frozenset()
     heal: tuple[tuple[str, ...], ...] = ()
     consequence: str = ""
+    outcomes: frozenset[str] = frozenset()
 
 
 def follows(state: State, done: Round) -> tuple[Expectation, State]:
     """Return what must come of a round, and what it leaves for those after it."""
     if done.condition is Condition.SUPERVISOR_KILLED:
-        return Expectation(may_again=frozenset(NODES)), State()
+        return Expectation(may_again=frozenset(state.nodes)), State()
     failed: set[str] = set()
     again: set[str] = set()
     silent: set[str] = set()
     codes: set[int] = set()
+    may_end: set[int] = set()
     starts = state.starts
-    may_go_on = False
+    # Who goes down with another may be down before it fails itself.
+    covered = {
+        each.target
+        for each in done.faults
+        for other in done.faults
+        if other.target != each.target
+        and other.kind in DIES | HANGS
+        and set(process(each.target).nodes) <= set(process(other.target).takes_down)
+    }
     for fault in done.faults:
         own = process(fault.target)
         if fault.kind in HANGS or fault.kind is Kind.STOP_BRIEFLY:
@@ -209,9 +265,9 @@ def follows(state: State, done: Round) -> tuple[Expectation, State]:
             continue
         failed.add(own.name)
         if own.restart == "no" or (own.restart == "on-failure" and fault.kind is Kind.EXIT_0):
-            codes.add(ENDED_6)
+            (may_end if own.name in covered else codes).add(ENDED_6)
             continue
-        again |= set(own.takes_down)
+        again |= set(state.nodes if own.takes_down is _ALL else own.takes_down)
         for limited in (each for each in PROCESSES if each.burst is not None):
             if own is not limited:
                 # Every start counts, and only an own failure has it given up.
@@ -222,22 +278,12 @@ def follows(state: State, done: Round) -> tuple[Expectation, State]:
             assert starts is not None
             assert limited.burst is not None
             fails = 1 + (fault.kind is Kind.STUMBLE)
-            if starts + fails > limited.burst:
-                codes.add(ENDED_7)
             # Another's failure may cut off the start that was to fail; it begins anew then.
-            others = [each for each in done.faults if each is not fault]
-            cut_off = any(each.kind in DIES | HANGS for each in others)
-            may_go_on = starts < limited.burst and cut_off
+            others = (each.kind for each in done.faults if each is not fault)
+            cut_off = starts < limited.burst and not (DIES | HANGS).isdisjoint(others)
+            if starts + fails > limited.burst:
+                (may_end if cut_off else codes).add(ENDED_7)
             starts += fails
-    # Who goes down with another may be down before it fails itself.
-    covered = {
-        each.target
-        for each in done.faults
-        for other in done.faults
-        if other.target != each.target
-        and other.kind in DIES | HANGS
-        and set(process(each.target).nodes) <= set(process(other.target).takes_down)
-    }
     found = [each for each in done.faults if each.kind in VIOLATES]
     violated = {
         (
@@ -254,13 +300,16 @@ def follows(state: State, done: Round) -> tuple[Expectation, State]:
     if done.condition is Condition.SAFE:
         heal = (("mode", "normal"),)
     may = frozenset[str]()
+    outcomes = frozenset[str]()
+    if done.manifest is not None:
+        outcomes, may = _applied(state.manifest, done)
     if done.condition is Condition.STORM:
-        may = frozenset(_restarted(done.orders))
+        may = frozenset(_restarted(done.orders, state))
         if "fragile" in may:
             starts = None
     expected = Expectation(
-        exit_codes=frozenset(codes),
-        may_go_on=may_go_on and codes == {ENDED_7},
+        exit_codes=frozenset(codes | may_end),
+        goes_on=State(starts=starts, manifest=state.manifest) if may_end and not codes else None,
         failed=frozenset(failed) - covered,
         may_fail=frozenset(covered),
         silent=frozenset(silent) - covered,
@@ -269,10 +318,29 @@ def follows(state: State, done: Round) -> tuple[Expectation, State]:
         may_again=may,
         heal=heal,
         consequence=consequence,
+        outcomes=outcomes,
     )
-    if codes:
+    if expected.exit_codes:
         return expected, State()
-    return expected, State(starts=starts)
+    # What is in force where more than one outcome is allowed the system itself says.
+    taken = done.manifest is not None and outcomes == {"applied"}
+    manifest = done.manifest if taken and done.manifest is not None else state.manifest
+    return expected, State(starts=starts, manifest=manifest)
+
+
+def _applied(before: Manifest, done: Round) -> tuple[frozenset[str], frozenset[str]]:
+    """Return what may become of a manifest, and the nodes that it may restart."""
+    assert done.manifest is not None
+    touched = set(ISSUED) if done.manifest.issue != before.issue else set()
+    touched |= {EXTRA} if done.manifest.extra != before.extra else set()
+    touched |= {BAD} if done.manifest.bad else set()
+    if done.manifest.bad:
+        outcomes = {"rolled_back"}
+    elif done.manifest == before:
+        outcomes = {"unchanged"}
+    else:
+        outcomes = {"applied", "rolled_back"} if done.faults else {"applied"}
+    return frozenset(outcomes), frozenset(touched)
 
 
 def _consequence(done: Round, found: list[Fault]) -> tuple[tuple[tuple[str, ...], ...], str]:
@@ -284,12 +352,12 @@ def _consequence(done: Round, found: list[Fault]) -> tuple[tuple[tuple[str, ...]
     return (), ""
 
 
-def _restarted(orders: Iterable[str]) -> set[str]:
+def _restarted(orders: Iterable[str], state: State) -> set[str]:
     found: set[str] = set()
     for order in orders:
         own = next((each for each in PROCESSES if order in each.nodes), None)
         with_it = () if own is None else own.nodes
-        found |= {*(with_it or NODES), *(("part",) if order == "pool" else ())}
+        found |= {*(with_it or state.nodes), *(("part",) if order == "pool" else ())}
     return found
 
 
@@ -306,6 +374,7 @@ def plan(seed: int, rounds: int) -> tuple[Round, ...]:
 
 def _round(dice: random.Random, number: int, state: State) -> Round:
     conditions = [Condition.NONE] * 8 + [each for each in Condition if each is not Condition.NONE]
+    conditions += [Condition.CLOCK, Condition.APPLY, Condition.APPLY]
     condition = dice.choice(conditions)
     targets = [each.name for each in PROCESSES]
     ends = dice.random() < 0.08
@@ -313,6 +382,8 @@ def _round(dice: random.Random, number: int, state: State) -> Round:
         targets.remove("fragile")
     if condition in (Condition.STORM, Condition.PAUSED, Condition.SAFE, Condition.FROZEN):
         targets = [each for each in targets if each not in ("fragile", "lone")]
+    if condition is Condition.APPLY:
+        return _apply(dice, number, state, ends=ends)
     if condition is Condition.NONE and dice.random() < 0.25:
         kind = dice.choice(sorted(VIOLATES, key=str))
         able = [each for each in targets if process(each).violation != "report"]
@@ -337,7 +408,34 @@ def _round(dice: random.Random, number: int, state: State) -> Round:
         spread_s=dice.choice((0.0, 0.0, 0.02, 0.15, 0.4, 1.0)),
         lasts_s=round(dice.uniform(0.5, 3.0), 1) if condition is not Condition.NONE else 0.0,
         orders=_orders(dice) if condition is Condition.STORM else (),
-        ends=dice.choice(("down", "term", "interrupt")) if ends else "",
+        ends=dice.choice(_ENDS) if ends else "",
+        sets_s=dice.choice(_SETS_S) if condition is Condition.CLOCK else 0.0,
+    )
+
+
+_ENDS = ("down", "term", "interrupt")
+_SETS_S = (2.0, -2.0, 70.0, -70.0, 3600.0, -3600.0, -3600.0, 86_400.0, -86_400.0)
+_FAILS = tuple(f"{step} {way}" for step in _STEPS for way in ("raise", "exit9", "stray"))
+
+
+def _apply(dice: random.Random, number: int, state: State, *, ends: bool) -> Round:
+    """Return a round in which one or two things of the manifest change, or what is added fails."""
+    new = dataclasses.asdict(state.manifest)
+    for each in dice.sample(("tint", "issue", "extra"), dice.choice((1, 1, 2, 3))):
+        new[each] = not new[each] if each == "extra" else new[each] + dice.choice((1, -1))
+    if dice.random() < 0.4:
+        new["bad"] = dice.choice(_FAILS)
+    faults: tuple[Fault, ...] = ()
+    if dice.random() < 0.5:
+        able = [each.name for each in PROCESSES if each.restart != "no" and each.burst is None]
+        faults = (Fault(dice.choice((Kind.KILL, Kind.KILL, Kind.STOP)), dice.choice(able)),)
+    return Round(
+        number=number,
+        condition=Condition.APPLY,
+        faults=faults,
+        later_s=dice.choice((0.0, 0.02, 0.1, 0.3, 0.6, 1.0)),
+        manifest=Manifest(**new),
+        ends=dice.choice(_ENDS) if ends else "",
     )
 
 

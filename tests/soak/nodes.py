@@ -1,7 +1,8 @@
 """The node of the soak: it does on order, in its executor, what real nodes do by mistake.
 
-Orders are words in datagrams to an abstract socket, `address`; what it is to fail in when it comes
-again is a file, `STUMBLE_DIRECTORY/NODE` with `step way` in it, which it takes away.
+Orders are words in datagrams to an abstract socket, `address`; `SEEN` is answered with what it has
+published and heard. What it is to fail in when it comes again is a file, `STUMBLE_DIRECTORY/NODE`
+with `step way` in it, which it takes away.
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from std_msgs.msg import String
@@ -23,6 +26,9 @@ from tests.soak.model import DECLARED_RATE
 
 MARK_VARIABLE = "SOAK_MARK"
 STUMBLE_VARIABLE = "SOAK_STUMBLE"
+FAILS_VARIABLE = "SOAK_FAILS"
+"""`step way` of a node that fails each time."""
+SEEN = "seen"
 
 
 def address(mark: str, node: str) -> str:
@@ -33,13 +39,15 @@ def address(mark: str, node: str) -> str:
 class Soaked(LifecycleNode):
     def __init__(self) -> None:
         super().__init__()
-        self._orders: list[str] = []
+        self._orders: list[tuple[str, bytes | str]] = []
+        self._published = self._heard = 0
         self._stray: Any = None
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.bind(address(os.environ[MARK_VARIABLE], self.get_name()))
         threading.Thread(target=self._listen, daemon=True).start()
         # rclpy's own: those of the node are gated, and an inactive node takes orders, too.
-        Node.create_timer(self, 0.05, self._obey)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        Node.create_timer(self, 0.05, self._obey, clock=steady)
         self._stumble("construct")
 
     def on_configure(self, state: Any) -> None:
@@ -56,6 +64,7 @@ class Soaked(LifecycleNode):
         self._stumble("deactivate")
 
     def _publish(self) -> None:
+        self._published += 1
         for name in self.declared_publishers():
             self.publisher(name).publish(String(data=f"{os.getpid()}"))
 
@@ -65,13 +74,27 @@ class Soaked(LifecycleNode):
 
     def _listen(self) -> None:
         while True:
-            self._orders.append(self._socket.recv(64).decode())
+            data, sender = self._socket.recvfrom(64)
+            self._orders.append((data.decode(), sender))
 
     def _obey(self) -> None:
         while self._orders:
-            self._misbehave(self._orders.pop(0))
+            word, sender = self._orders.pop(0)
+            if word == SEEN:
+                tint = self.get_parameter("tint").value if self.has_parameter("tint") else 0
+                found = (self._published, self._heard, tint, os.environ.get("SOAK_ISSUE", "0"))
+                self._socket.sendto(" ".join(map(str, found)).encode(), sender)
+                continue
+            self._misbehave(word)
+
+    def heard(self) -> None:
+        self._heard += 1
 
     def _stumble(self, step: str) -> None:
+        fails, _, how = os.environ.get(FAILS_VARIABLE, "").partition(" ")
+        if fails == step:
+            print(f"fails in {step}: {how}", flush=True)
+            self._misbehave(how)
         file = Path(os.environ[STUMBLE_VARIABLE], self.get_name())
         try:
             wanted, way = file.read_text().split()
@@ -110,22 +133,22 @@ class Soaked(LifecycleNode):
 class Arm(Soaked):
     @on_message("odom")
     def hear(self, message: String) -> None:
-        pass
+        self.heard()
 
 
 class Filter(Soaked):
     @on_message("video")
     def hear(self, message: String) -> None:
-        pass
+        self.heard()
 
 
 class Detector(Soaked):
     @on_message("points")
     def hear(self, message: String) -> None:
-        pass
+        self.heard()
 
 
 class Listener(Soaked):
     @on_message("beat")
     def hear(self, message: String) -> None:
-        pass
+        self.heard()

@@ -12,7 +12,7 @@ import json
 import os
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -41,11 +41,11 @@ class NotAsPromisedError(AssertionError):
 class Watched(Up):
     """A `lifecycle up` whose events can be waited for together with their times."""
 
-    def __init__(self, manifest: Path, *, runtime: Path) -> None:
+    def __init__(self, manifest: Path, *, runtime: Path, variables: Mapping[str, str]) -> None:
         self.times: list[float] = []
         self._came = threading.Condition()
-        variables = {"PYTHONPATH": str(COMPOSITION)}
-        super().__init__(manifest, runtime=runtime, variables=variables)
+        more = {"PYTHONPATH": str(COMPOSITION), **variables}
+        super().__init__(manifest, runtime=runtime, variables=more)
 
     def _read(self) -> None:
         assert self.process.stdout is not None
@@ -117,9 +117,15 @@ class Transitions:
         if segments_of((os.getpid(),)):
             raise AssertionError("the observer shares memory with what it judges")
         node = self._observer.node
-        for name in nodes:
-            take = functools.partial(self._take, name)
-            node.create_subscription(TransitionEvent, f"{name}/transition_event", take, 10)
+        self._subscriptions = {
+            name: node.create_subscription(
+                TransitionEvent,
+                f"{name}/transition_event",
+                functools.partial(self._take, name),
+                10,
+            )
+            for name in nodes
+        }
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
         self._thread = threading.Thread(target=self._executor.spin, name="transitions")
@@ -127,6 +133,11 @@ class Transitions:
 
     def _take(self, name: str, event: TransitionEvent) -> None:
         self.seen.append((time.monotonic(), name, event.goal_state.label))
+
+    def not_received(self) -> list[str]:
+        """Return the nodes of which nothing is received: they are not discovered, or not there."""
+        subscriptions = self._subscriptions.items()
+        return [name for name, each in subscriptions if not each.get_publisher_count()]
 
     def activated(self, since: float, until: float) -> list[tuple[float, str]]:
         """Return when which nodes became active between two times."""

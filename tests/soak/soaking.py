@@ -7,6 +7,8 @@ Owns: `Soaking`: brings the system up, does what a round says, asserts what must
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import json
 import os
 import shutil
 import signal
@@ -27,18 +29,18 @@ from tests.soak.model import (
     DIES,
     HANGS,
     NODES,
-    PROCESSES,
     UNMANAGED,
     Condition,
     Expectation,
     Fault,
     Kind,
+    Manifest,
     Round,
     State,
     follows,
     process,
 )
-from tests.soak.nodes import address
+from tests.soak.nodes import SEEN, address
 from tests.soak.running import (
     NotAsPromisedError,
     Transitions,
@@ -46,18 +48,23 @@ from tests.soak.running import (
     assert_activated_on_request,
     assert_gate_held,
 )
-from tests.soak.system import NAME, manifest
+from tests.soak.system import ISSUED, NAME, PUBLISHES, SUBSCRIBES, TINTED, manifest
 from tests.stalls import Stalls
+from tests.wall_clock import LACKS, WallClock
 
 REPORTED_S = 1.0
-"""From a fault to the event that names its subject; the time that the machine's scheduler took from
-us meanwhile is not counted (tests.stalls)."""
+"""From a fault to the event that names its subject; the time that the machine's scheduler took
+meanwhile from us or from the supervisor is not counted (tests.stalls)."""
 HANG_TAKEN_S = 0.1
 """A node looks for orders each 0.05 s: so much later it hangs."""
 BACK_S = 40.0
 """From the last fault to a system that is as it was; on two busy cores."""
 UP_S = 60.0
 DOWN_S = 25.0
+FLOWS_S = 5.0
+"""From a system that is as it was to data that flow to every node; on two busy cores."""
+APPLY_S = 15.0
+"""`lifecycle apply --timeout`."""
 
 REPORTING = tuple(each for each in NODES if each not in ("pool", "part"))
 """Nodes whose own reports of their states are compared with what was requested."""
@@ -85,7 +92,9 @@ class Soaking:
             options = ("-t", "tmpfs", "-o", "size=24m", "tmpfs")
             subprocess.run(["mount", *options, str(self.runtime)], check=True)
         self.stumble = directory / "stumble"
-        self.manifest = manifest(directory, domain_id, self.mark)
+        self.clock = None if LACKS else WallClock(directory)
+        self.manifest = manifest(directory, domain_id, self.mark, Manifest())
+        self.in_force = self.manifest
         self.transitions = Transitions(domain_id, (f"/{each}" for each in REPORTING))
         self.domain_id = domain_id
         self.stalls = Stalls()
@@ -96,6 +105,8 @@ class Soaking:
         self.reported_s: list[float] = []
         self.stalled = 0
         self._began = 0.0
+        self._reporters: tuple[int, ...] = ()
+        self._late_s = 0.0
         self._spare = leftovers()
 
     # A run
@@ -105,15 +116,20 @@ class Soaking:
         if self.run is None:
             self._began = time.monotonic()
             self.state = State()
+            self.in_force = self.manifest
             for each in self.stumble.iterdir():
                 each.unlink()
             for each in sorted((self.runtime / "log").glob("20*"))[:-1]:
                 shutil.rmtree(each)
-            self.run = Watched(self.manifest, runtime=self.runtime)
+            variables = {} if self.clock is None else self.clock.variables
+            self.run = Watched(self.manifest, runtime=self.runtime, variables=variables)
             self._until_as_it_was(self.run, UP_S)
-            # What is compared with the requests later must not be empty.
-            if not self.transitions.activated(self._began, time.monotonic()):
-                raise NotAsPromisedError("no node published that it became active")
+            # What is compared with the requests must not be empty because nothing is received.
+            deadline = time.monotonic() + DOWN_S
+            while missing := self.transitions.not_received():
+                if time.monotonic() > deadline:
+                    raise NotAsPromisedError(f"transition events are not received of: {missing}")
+                time.sleep(0.02)
         return self.run
 
     def end(self, how: str) -> None:
@@ -206,6 +222,8 @@ class Soaking:
         expected, after = follows(self.state, done)
         with self._condition(run, done) as told:
             delayed_s = {each: _run_delay_s(before[_node_of(each)]) for each in done.faults}
+            self._reporters = _reporters(run.process.pid)
+            self._late_s = sum(map(_run_delay_s, self._reporters))
             times = self._inject(done, before)
             if done.condition is Condition.SUPERVISOR_KILLED:
                 self._supervisor_killed(run, done)
@@ -220,21 +238,25 @@ class Soaking:
         if done.condition is Condition.FROZEN:
             times = {each: max(at, healed) for each, at in times.items()}
             self._reports(run, done, expected, since, times, delayed_s)
-        if expected.may_go_on and self._goes_on(run):
-            after = State(starts=max(each.burst or 0 for each in PROCESSES))
+        if done.manifest is not None and self._end_of_apply(run, expected) == "applied":
+            after = dataclasses.replace(after, manifest=done.manifest)
+        if expected.goes_on is not None and self._goes_on(run, expected):
+            after = expected.goes_on
         elif expected.exit_codes:
             self.run = None
             # While the run ended the intruder may have used a port of the supervisor's.
             self._ended(run, expected.exit_codes, alone=done.condition is not Condition.INTRUDER)
             return
-        for words in expected.heal:
-            self._insist(run, words)
+        else:
+            for words in expected.heal:
+                self._insist(run, words)
+        self.state = after
         self._until_as_it_was(run, BACK_S)
         self.back_s.append(time.monotonic() - healed)
+        self._until_data_flow()
         self._judge(run)
         self._assert_only_who_must_came_again(expected, before)
         self._assert_nobody_else_was_blamed(run, expected, since)
-        self.state = after
         if done.ends:
             self.end(done.ends)
 
@@ -271,7 +293,9 @@ class Soaking:
         delayed_s: dict[Fault, float],
     ) -> None:
         """Assert that each fault is reported with its subject, in time."""
-        for fault, at in times.items():
+        # Who is stopped briefly must go on before its watchdog ends it.
+        briefly = {each for each in times if each.kind is Kind.STOP_BRIEFLY}
+        for fault, at in sorted(times.items(), key=lambda each: each[0] not in briefly):
             own = process(fault.target)
             if own.name in expected.may_fail:
                 continue
@@ -293,7 +317,9 @@ class Soaking:
             what = f"report of {fault}"
             _, seen = run.wait(is_it, since=since, within_s=15.0, what=what)
             bound_s = REPORTED_S + (HANG_TAKEN_S if fault.kind in _ORDERS else 0.0)
-            took_s = self.stalls.taken(at, seen)
+            # Who reports may have got no processor, and not we.
+            late_s = sum(map(_run_delay_s, self._reporters)) - self._late_s
+            took_s = min(self.stalls.taken(at, seen), seen - at - late_s)
             if fault.kind in HANGS:
                 # A callback that gets no processor does not hang: docs/liveliness.md.
                 took_s -= max(0.0, _run_delay_s(self.pids[own.nodes[0]]) - delayed_s[fault])
@@ -369,6 +395,12 @@ class Soaking:
                 self._insist(run, ("mode", "safe"))
             elif done.condition is Condition.STORM:
                 stack.enter_context(self._storm(done))
+            elif done.condition is Condition.CLOCK:
+                assert self.clock is not None
+                stack.callback(self.clock.set, 0.0)
+                self.clock.set(done.sets_s)
+            elif done.condition is Condition.APPLY:
+                began = self._begin_apply(run, done)
             yield began
 
     @contextlib.contextmanager
@@ -411,6 +443,60 @@ class Soaking:
                 if each.poll() is None:
                     each.kill()
                     each.communicate()
+
+    def _begin_apply(self, run: Watched, done: Round) -> float:
+        """Have another manifest applied; return when that began, and `later_s` later."""
+        assert done.manifest is not None
+        name = f"{NAME}-{done.number}"
+        path = manifest(self.directory, self.domain_id, self.mark, done.manifest, name)
+        words = ["apply", str(path), "--format", "json", "--timeout", f"{APPLY_S:g}"]
+        since, asked_s = len(run.events), time.monotonic()
+        self._applied = (
+            path,
+            subprocess.Popen(
+                [*command(words[0]), *words[1:]],
+                cwd=ROOT,
+                env=environment(self.runtime, self.mark),
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+            ),
+        )
+        if done.manifest != self.state.manifest:
+            begun = lambda each: each.get("event") == "apply" and each["stage"] == "begun"  # noqa: E731
+            _, asked_s = run.wait(begun, since=since, within_s=15.0, what="beginning of apply")
+        time.sleep(max(0.0, asked_s + done.later_s - time.monotonic()))
+        return asked_s
+
+    def _end_of_apply(self, run: Watched, expected: Expectation) -> str:
+        """Wait for the end of `lifecycle apply`; return what became of it."""
+        path, asked = self._applied
+        try:
+            out, error = asked.communicate(timeout=3 * APPLY_S)
+        except subprocess.TimeoutExpired:
+            raise NotAsPromisedError("lifecycle apply did not end") from None
+        finally:
+            if asked.poll() is None:
+                asked.kill()
+                asked.communicate()
+        try:
+            report = json.loads(out)
+        except ValueError:
+            raise NotAsPromisedError(f"lifecycle apply: {asked.returncode}: {out}{error}") from None
+        outcome = report["outcome"]
+        good = {"applied": {0}, "unchanged": {0}, "rolled_back": {4, 5, 6}}
+        if outcome not in expected.outcomes or asked.returncode not in good[outcome]:
+            raise NotAsPromisedError(
+                f"became {outcome}, not {sorted(expected.outcomes)}, exit code {asked.returncode}: "
+                f"{report['error']}"
+            )
+        if outcome == "applied":
+            self.in_force = path
+        if outcome == "rolled_back" and not expected.failed | expected.silent:
+            back = "is in force again, revision "
+            if back not in report["error"] or "active and verified" not in report["error"]:
+                raise NotAsPromisedError(f"not as before: {report['error']}")
+        return str(outcome)
 
     def _supervisor_killed(self, run: Watched, done: Round) -> None:
         """Kill the supervisor, and start it again after a while that does not wait for anything."""
@@ -480,8 +566,11 @@ class Soaking:
             time.sleep(0.05)
         raise NotAsPromisedError(f"not as it was within {within_s:g} s: {why}")
 
-    def _goes_on(self, run: Watched) -> bool:
+    def _goes_on(self, run: Watched, expected: Expectation) -> bool:
         """Whether the system comes to be as it was, and does not end."""
+        for words in expected.heal:
+            with contextlib.suppress(NotAsPromisedError):  # it ended
+                self._insist(run, words)
         deadline = time.monotonic() + BACK_S
         while run.process.poll() is None and time.monotonic() < deadline:
             if not self._what_lacks(run):
@@ -502,13 +591,45 @@ class Soaking:
             wanted = "" if node.node[1:] in UNMANAGED else "active"
             if node.state != wanted or node.silent or node.died or node.next_try_s is not None:
                 lacks.append(f"{node.node}: {node.state} {node.silent} {node.died} {node.doing}")
-        if len(status.nodes) != len(NODES):
-            lacks.append(f"{len(status.nodes)} nodes")
+        if {each.node[1:] for each in status.nodes} != set(self.state.nodes):
+            lacks.append(f"nodes {[each.node for each in status.nodes]}")
+        if status.manifest != str(self.in_force):
+            lacks.append(f"by {status.manifest}")
         if not lacks:
             self.pids = {each.node[1:]: each.pid for each in status.nodes}
             self.pids["part"] = self.pids["pool"]
             lacks += [f"{key} is not there" for key, pid in self.pids.items() if not _runs(pid)]
         return "; ".join(lacks)
+
+    def _until_data_flow(self) -> None:
+        """Assert that every node publishes and hears what it is to, by the manifest in force."""
+        deadline = time.monotonic() + FLOWS_S
+        seen: dict[str, tuple[int, int]] = {}
+        wanted = [key for key in self.state.nodes if key in (*PUBLISHES, *SUBSCRIBES)]
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as asking:
+            asking.bind(address(self.mark, "asking"))
+            asking.settimeout(FLOWS_S)
+            while wanted:
+                key = wanted[0]
+                asking.sendto(SEEN.encode(), address(self.mark, key))
+                published, heard, tint, issue = map(int, asking.recv(256).split())
+                declared = self.state.manifest
+                if tint != (declared.tint if key in TINTED else 0):
+                    raise NotAsPromisedError(f"{key} has tint {tint} by {declared}")
+                if issue != (declared.issue if key in ISSUED else 0):
+                    raise NotAsPromisedError(f"{key} has issue {issue} by {declared}")
+                first = seen.setdefault(key, (published, heard))
+                publishes = published > first[0] or key not in PUBLISHES
+                if publishes and (heard > first[1] or key not in SUBSCRIBES):
+                    wanted.remove(key)
+                elif time.monotonic() > deadline:
+                    raise NotAsPromisedError(
+                        f"no data flow: {key} has published {published}, heard {heard}, "
+                        f"{FLOWS_S:g} s after {first}"
+                    )
+                else:
+                    wanted.append(wanted.pop(0))
+                    time.sleep(0.02)
 
     def _judge(self, run: Watched) -> None:
         assert_gate_held(tuple(run.events))
@@ -519,8 +640,9 @@ class Soaking:
     def _assert_only_who_must_came_again(
         self, expected: Expectation, before: dict[str, int]
     ) -> None:
-        again = {key for key in NODES if self.pids[key] != before[key]}
-        if missing := expected.again - again:
+        stayed = self.pids.keys() & before.keys()
+        again = {key for key in stayed if self.pids[key] != before[key]}
+        if missing := (expected.again & stayed) - again:
             raise NotAsPromisedError(f"did not come again in a new process: {sorted(missing)}")
         if more := again - expected.again - expected.may_again:
             raise NotAsPromisedError(f"came again, and nothing was done to them: {sorted(more)}")
@@ -572,6 +694,13 @@ def _run_delay_s(pid: int) -> float:
         return int(Path(f"/proc/{pid}/schedstat").read_text().split()[1]) / 1e9
     except OSError:
         return 0.0
+
+
+def _reporters(supervisor: int) -> tuple[int, ...]:
+    """Return the pids of a supervisor and of its fork server, which sees its nodes die first."""
+    family = psutil.Process(supervisor).children()
+    servers = (each.pid for each in family if any("fork_server" in word for word in each.cmdline()))
+    return (supervisor, *servers)
 
 
 def _runs(pid: int) -> bool:

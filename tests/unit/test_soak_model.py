@@ -10,6 +10,7 @@ from tests.soak.model import (
     Expectation,
     Fault,
     Kind,
+    Manifest,
     Round,
     State,
     follows,
@@ -70,14 +71,21 @@ def test_a_start_counts_that_another_s_failure_made_necessary() -> None:
 def test_a_start_that_is_to_fail_may_be_cut_off_by_another_s_failure() -> None:
     stumble = Fault(Kind.STUMBLE, "fragile", "construct sleep")
     pool = Fault(Kind.KILL, "pool")
-    assert not _after(stumble)[0].may_go_on
-    assert not _after(stumble, Fault(Kind.STOP_BRIEFLY, "pool"))[0].may_go_on
-    expected, _ = _after(stumble, pool)
-    assert (expected.exit_codes, expected.may_go_on) == ({7}, True)
+    assert _after(stumble)[0].goes_on is None
+    assert _after(stumble, Fault(Kind.STOP_BRIEFLY, "pool"))[0].goes_on is None
+    expected, state = _after(stumble, pool)
+    assert (expected.exit_codes, expected.goes_on, state) == ({7}, State(starts=3), State())
     # Killed once more it is given up, whatever would come of its next start.
-    assert not _after(stumble, pool, state=State(starts=2))[0].may_go_on
+    assert _after(stumble, pool, state=State(starts=2))[0].goes_on is None
     ends, _ = _after(stumble, Fault(Kind.KILL, "lone"))
-    assert not ends.may_go_on
+    assert (ends.exit_codes, ends.goes_on) == ({6, 7}, None)
+
+
+def test_who_goes_down_with_another_may_be_down_before_it_would_end_the_run() -> None:
+    exits = Fault(Kind.EXIT_0, "base")
+    expected, _ = _after(Fault(Kind.KILL, "core"), exits)
+    assert (expected.exit_codes, expected.goes_on) == ({6}, State(starts=2))
+    assert _after(Fault(Kind.KILL, "camera"), exits)[0].goes_on is None
 
 
 def test_a_hang_is_reported_as_silent_and_then_as_a_failure() -> None:
@@ -137,3 +145,34 @@ def test_a_seed_stands_for_the_same_rounds_whatever_their_number_and_tries_every
         state = State() if each.ends else state
         codes |= expected.exit_codes
     assert codes == {4, 6, 7}
+
+
+def _applied(manifest: Manifest, *faults: Fault, before: Manifest | None = None) -> Expectation:
+    done = Round(number=1, condition=Condition.APPLY, faults=faults, manifest=manifest)
+    return follows(State(manifest=before or Manifest()), done)[0]
+
+
+def test_a_manifest_that_is_applied_restarts_only_what_differs() -> None:
+    given = _applied(Manifest(tint=1))
+    assert (given.outcomes, given.may_again) == ({"applied"}, set())
+    restarted = _applied(Manifest(issue=1))
+    assert (restarted.outcomes, restarted.may_again) == ({"applied"}, {"filter", "detector"})
+    assert _applied(Manifest(tint=1), before=Manifest(tint=1)).outcomes == {"unchanged"}
+
+
+def test_a_manifest_is_rolled_back_where_a_node_of_it_fails_and_maybe_where_another_does() -> None:
+    assert _applied(Manifest(bad="configure raise")).outcomes == {"rolled_back"}
+    met = _applied(Manifest(extra=True), Fault(Kind.KILL, "base"))
+    assert (met.outcomes, met.again) == ({"applied", "rolled_back"}, {"base", "arm"})
+
+
+def test_a_node_that_was_added_goes_down_with_all_and_is_in_force_until_the_run_ends() -> None:
+    state = State(manifest=Manifest(extra=True))
+    everybody, after = _after(Fault(Kind.KILL, "core"), state=state)
+    assert everybody.again == {*NODES, "extra"}
+    assert after.manifest == Manifest(extra=True)
+    assert _after(Fault(Kind.KILL, "lone"), state=state)[1] == State()
+
+
+def test_setting_the_clock_alone_changes_nothing() -> None:
+    assert _after(condition=Condition.CLOCK)[0] == Expectation()

@@ -103,9 +103,7 @@ def command(
     from lifecycle.supervisor import moment_of
 
     recorded = _recorded(run, system)
-    began = moment_of(since, recorded) if since else float("-inf")
-    if since.count(":") and "." not in since and "T" not in since:
-        began -= 1.0 if since.count(":") == 2 else 60.0
+    began = moment_of(since, recorded, first=True) if since else float("-inf")
     ended = moment_of(until, recorded) if until else float("inf")
     for each in _timeline(recorded, began, ended, node, json=format_ == "json"):
         echo_while_read(each)
@@ -116,13 +114,24 @@ def _timeline(
     recorded: RecordedRun, began: float, ended: float, node: str, *, json: bool
 ) -> Iterator[str]:
     from lifecycle.cli.up_output import describe
-    from lifecycle.supervisor import NodeChanged, Stopped
+    from lifecycle.supervisor import NodeChanged, Stopped, was_set_s
 
     over, said = False, dict[str, str]()
+    before = None
     for each in recorded.moments:
         over = isinstance(each.event, Stopped) or (over and each.line.run is None)
         text = each.text if json else (each.event and describe(each.event))
-        if not text or not began <= each.line.at <= ended:
+        set_s = 0.0 if json or before is None else was_set_s(before, each.line)
+        before = each.line
+        if not began <= each.line.elapsed_s <= ended:
+            continue
+        if set_s:
+            way = "forward" if set_s > 0 else "back"
+            yield (
+                f"{_clock(each.line.at)} {each.line.elapsed_s:+10.3f}  the clock of this host was "
+                f"set {way} by {abs(set_s):.1f} s"
+            )
+        if not text:
             continue
         if node and not _names(text, node):
             continue
@@ -136,7 +145,7 @@ def _timeline(
             if json
             else f"{_clock(each.line.at)} {each.line.elapsed_s:+10.3f}  {text}"
         )
-    if not over and not json and recorded.moments and recorded.moments[-1].line.at <= ended:
+    if not over and not json and recorded.moments and recorded.moments[-1].line.elapsed_s <= ended:
         pid = recorded.run.supervisor if recorded.run else 0
         if not Path(f"/proc/{pid}").exists():
             yield f"the journal ends here: supervisor {pid} ended without saying so"
@@ -188,7 +197,7 @@ def explain_command(*, finding: str, at: str, run: str | None, system: str, form
                 f"cannot find {finding!r} among what any verdict of that run found: {there}"
             )
         what = finding or "finding"
-        when = f" at {_clock(moment)}" if at else " in the last verdict"
+        when = f" at {at}" if at else " in the last verdict"
         click.echo(lines(f"no {what}{when}; lifecycle history shows when there was"))
         return ExitCode.OK
     for number, each in enumerate(found):

@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     metavar="SECONDS",
     help="Hold it so long, then shut down; no success if it ended before, or was violated.",
 )
+@click.option("--hold", is_flag=True, hidden=True)  # what `--hosts` has each supervisor do
 @timeout_option(
     None,
     "For everything from the first start to the system being active.",
@@ -103,6 +104,7 @@ def command(
     format_: str,
     until: str,
     stop_after: float | None,
+    hold: bool,
     timeout: float | None,
     report: Path | None,
     strict: bool,
@@ -180,6 +182,7 @@ def command(
                 options = UpOptions(
                     until=Until(until),
                     stop_after_s=stop_after,
+                    holds=hold,
                     timeout_s=timeout,
                     strict=strict,
                     machine=machine,

@@ -15,7 +15,7 @@ from pathlib import Path
 from lifecycle import dataclasses
 from lifecycle.export import CapturedProgram
 from lifecycle.middleware.discovery.dead_peers import is_of_process
-from lifecycle.plan import is_secret
+from lifecycle.plan import shown
 
 _LONGEST_VALUE = 8192
 
@@ -81,7 +81,9 @@ def read_program(pid: int, environment: Mapping[str, str]) -> CapturedProgram | 
     }
     withheld = tuple(
         sorted(
-            each for each in differing if is_secret(each) or len(differing[each]) > _LONGEST_VALUE
+            each
+            for each, value in differing.items()
+            if shown(each, value) != value or len(value) > _LONGEST_VALUE
         )
     )
     program = _program(argv[0], directory, variables.get("PATH", os.defpath), executable)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import threading
 from collections.abc import Awaitable, Callable
 from typing import Any
@@ -22,6 +23,8 @@ from rclpy.node import Node
 from rclpy.task import Future
 
 from lifecycle.errors import MiddlewareError
+from lifecycle.middleware.discovery.rediscovery import republish_names
+from lifecycle.middleware.process.clock import ClockWatch
 from lifecycle.middleware.rcl.graph import GraphObserver
 
 InvalidHandle = rclpy_implementation.InvalidHandle
@@ -212,10 +215,12 @@ class _Spinner:
         self._stopped = False
         self._thread = threading.Thread(target=self._spin, name=thread, daemon=True)
         self._thread.start()
+        self._clock = ClockWatch(functools.partial(republish_names, (node,)))
 
     def stop(self) -> None:
         """End the thread; again is harmless."""
         self._stopped = True
+        self._clock.close()
         self._executor.shutdown()
         self._thread.join()
 

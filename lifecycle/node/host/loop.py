@@ -37,6 +37,7 @@ from rclpy.node import Node
 from lifecycle.manifest import Executor
 from lifecycle.middleware import (
     BusySign,
+    ClockWatch,
     NodeExecutor,
     Watching,
     hidden_nodes,
@@ -363,6 +364,7 @@ class NodeLoop:
             threading.Thread(target=self._spin_own, name="executor", daemon=True).start()
         if self._prober is not None:
             self._prober.start()
+        ClockWatch(self._clock_set)
         while not self._done:
             try:
                 self._turn()
@@ -375,6 +377,12 @@ class NodeLoop:
         self._executor.shutdown()
         contexts = dict.fromkeys([self._context, *(node.context for node in self._nodes)])
         leave_and_exit(self._code, nodes=self._nodes, contexts=contexts)
+
+    def _clock_set(self) -> None:
+        """Have executors look anew how long to wait, and participants send what is due."""
+        self.call_beside(self.republish_names)
+        if self._own is not self._executor:
+            self._own.wake()
 
     def _turn(self) -> None:
         """Run the next callback under the watchdog."""

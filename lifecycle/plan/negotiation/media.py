@@ -107,6 +107,23 @@ def carried(writer: Collection[str], reader: Collection[str], *, same_host: bool
     return sorted(found)
 
 
+def discover(one: Collection[str], other: Collection[str]) -> bool:
+    """Return whether two participants of one host discover each other without a server.
+
+    Fast DDS 2.14 announces participants by shared memory only where they have nothing else
+    (`fastdds.shm.enforce_metatraffic`, by default `none`).
+
+    Args:
+        one: transports of a participant, as of `carried`.
+        other: of the other one.
+    """
+    networks = [
+        {each for each in _unicast(transports, same_host=True) if each.is_network}
+        for transports in (one, other)
+    ]
+    return bool(networks[0] & networks[1]) or not any(networks)
+
+
 def _unicast(transports: Collection[str], *, same_host: bool) -> set[Medium]:
     """Return by what a participant receives what is sent to it alone.
 

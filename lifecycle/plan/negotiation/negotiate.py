@@ -15,7 +15,15 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from lifecycle import dataclasses
 from lifecycle.manifest import EndpointKind, FlowTransport
-from lifecycle.network import LOOPBACK, UDP_UNICAST, ConnectionUrl, Medium, medium_of, parse
+from lifecycle.network import (
+    CONNECTABLE,
+    LOOPBACK,
+    UDP_UNICAST,
+    ConnectionUrl,
+    Medium,
+    medium_of,
+    parse,
+)
 from lifecycle.plan.connections.hosts import (
     Contact,
     PortPool,
@@ -39,6 +47,7 @@ from lifecycle.plan.negotiation.media import (
     Pair,
     carried,
     choose,
+    discover,
     wish_of,
 )
 
@@ -354,7 +363,7 @@ def negotiate(
     """
     pairs = tuple(_pairs(sorted(parties, key=lambda each: each.key), wishes))
     chosen, problems = _choose(pairs, terms)
-    made = _PairCarriers(chosen, fixed=terms.fixed)
+    made = _PairCarriers(chosen, fixed=terms.fixed, served=terms.server is not None)
     problems += made.problems
     flows = {
         NegotiatedFlow(
@@ -467,6 +476,10 @@ def _token(pair: Pair, choice: Choice) -> str:
     return f"{choice.medium}@{pair.writer.resolved}" if choice.by_group else choice.medium
 
 
+_INTRODUCING = tuple(each for each in CONNECTABLE if each.is_network and not each.is_group)
+"""By what a connection beside shared memory can be discovered."""
+
+
 class _PairCarriers:
     """Which endpoints leave their own participant, and for what.
 
@@ -474,8 +487,9 @@ class _PairCarriers:
     first, then the subscription. What moves takes all its media along.
     """
 
-    def __init__(self, chosen: Sequence[tuple[Pair, Choice]], *, fixed: bool) -> None:
+    def __init__(self, chosen: Sequence[tuple[Pair, Choice]], *, fixed: bool, served: bool) -> None:
         self._fixed = fixed
+        self._served = served
         self.problems: list[NegotiationProblem] = []
         self._chosen = [(pair, choice) for pair, choice in chosen if choice.medium]
         self._unknown = [(pair, choice) for pair, choice in chosen if not choice.medium]
@@ -554,9 +568,18 @@ class _PairCarriers:
     def _holds(self, pair: Pair, choice: Choice) -> bool:
         present = self._present(pair)
         # Inside a process it is enough that the participants find each other.
-        return bool(present) if choice.inside else present == [choice.medium]
+        if choice.inside:
+            return bool(present)
+        return present == [choice.medium] and self._discover(pair)
+
+    def _discover(self, pair: Pair) -> bool:
+        """Whether the ends have by what to discover each other, beside what carries their data."""
+        ends = (self._transports(_writer(pair)), self._transports(_reader(pair)))
+        return self._served or not pair.same_host or discover(*ends)
 
     def _move(self, pair: Pair, choice: Choice) -> bool:
+        if self._present(pair) == [choice.medium] and self._introduce(pair):
+            return True
         for key in (_writer(pair), _reader(pair)):
             if key in self._moved:
                 if choice.inside and MEETING not in self._moved[key]:
@@ -569,6 +592,17 @@ class _PairCarriers:
                 return True
         return False
 
+    def _introduce(self, pair: Pair) -> bool:
+        """Give an end that has moved by what the other one discovers participants."""
+        keys = (_writer(pair), _reader(pair))
+        for key, other in (keys, keys[::-1]):
+            known = self._transports(other)
+            medium = next((each for each in _INTRODUCING if each in known), None)
+            if key in self._moved and medium is not None:
+                self._moved[key].add(medium)
+                return True
+        return False
+
     def _conflict(self, pair: Pair, choice: Choice) -> NegotiationProblem:
         present = self._present(pair)
         one, other = (
@@ -576,7 +610,9 @@ class _PairCarriers:
             for key in (_writer(pair), _reader(pair))
         )
         happens = "it would not arrive"
-        if present:
+        if present == [choice.medium]:
+            happens = "they would not discover each other"
+        elif present:
             happens = f"it would go by {' and '.join(present)}"
             happens += ", twice" if len(present) > 1 else ""
         wish, who = wish_of(pair)

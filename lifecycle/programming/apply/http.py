@@ -59,6 +59,10 @@ class Clock(Protocol):
         """Return seconds since the epoch."""
         ...
 
+    def steady_s(self) -> float:
+        """Return seconds, on a clock that only goes forward."""
+        ...
+
     def sleep(self, seconds: float, woken: threading.Event) -> None:
         """Wait, or until `woken` is set."""
         ...
@@ -70,6 +74,10 @@ class SystemClock:
     def now_s(self) -> float:
         """Return seconds since the epoch."""
         return time.time()
+
+    def steady_s(self) -> float:
+        """Return seconds, on a clock that only goes forward."""
+        return time.monotonic()
 
     def sleep(self, seconds: float, woken: threading.Event) -> None:
         """Wait, or until `woken` is set."""

@@ -351,7 +351,11 @@ class GateSequence:
         was_paused = self.phase == PAUSED
         nodes = tuple(self._system.nodes.values())
         if order.node:
-            nodes = self.with_process_of(node_of(order, self._system))
+            found = {
+                each.planned.key for each in self.with_process_of(node_of(order, self._system))
+            }
+            found |= self._schedule.gone_with(found)
+            nodes = tuple(each for each in nodes if each.planned.key in found)
         try:
             await self._spawner.ready()
         except BringUpError as error:

@@ -33,6 +33,7 @@ from lifecycle.verify import (
     NOT_JUDGED,
     SERVER_OF,
     UNATTRIBUTED_ENDPOINT,
+    UNHEALTHY,
     About,
     Finding,
     Heals,
@@ -164,6 +165,10 @@ SETTLED_S = 0.5
 
 UNWATCHED_S = 0.4
 """What happens to an active node while others are started or ended is reported within a second."""
+
+HEALTH_S = 5.0
+"""Who publishes its health does so within this time, or it counts as stale (graph/observer.py): a
+node that must be healthy, and has not said how it is, is waited for no longer."""
 
 UNVERIFIABLE_S = 3.5
 """What cannot be verified may be unseen yet; Fast DDS announces a late participant every 3 s."""
@@ -307,6 +312,7 @@ class VerificationLoop:
         self.seen = Observation()
         self._presence = NodeArrivals(emit)
         self._grace_period = GracePeriod()
+        self._unsaid: dict[str, float] = {}
         self._asked_of: tuple[Plan, frozenset[str], Plan] | None = None
         self.ahead: frozenset[str] = frozenset()
 
@@ -463,9 +469,14 @@ class VerificationLoop:
         while True:
             count = self._changes.count
             verdict = await self.once(stage)
-            if not closes(verdict, strict=self._strict):
-                return verdict
             now = loop.time()
+            if not closes(verdict, strict=self._strict):
+                unsaid_s = min(self._unsaid_s(verdict, now), deadline - now)
+                if unsaid_s <= 0 or stage is not Stage.CONNECTED:
+                    return verdict
+                if await self._changes.beyond(count, unsaid_s):
+                    await self.quiet()
+                continue
             found = frozenset((each.rule, each.subject) for each in verdict.findings)
             if found != stable:
                 stable, since = found, now
@@ -480,6 +491,19 @@ class VerificationLoop:
                 wait_s, again = min(wait_s, again), min(again * 2, ASK_AGAIN_AT_MOST_S)
             if await self._changes.beyond(count, wait_s):
                 await self.quiet()
+
+    def _unsaid_s(self, verdict: Verdict, now: float) -> float:
+        """Return for how long the health is waited for of nodes that have not said how they are.
+
+        Once for each: who says nothing for so long is taken on trust, if the policy allows it.
+        """
+        unsaid = {
+            each.node
+            for each in verdict.findings
+            if each.rule == UNHEALTHY.id and each.outcome is Outcome.UNVERIFIABLE
+        }
+        self._unsaid = {node: self._unsaid.get(node, now) for node in unsaid}
+        return max((since + HEALTH_S - now for since in self._unsaid.values()), default=0.0)
 
     @property
     def is_reconciling(self) -> bool:

@@ -189,7 +189,7 @@ class ObserverParticipant:
 
     def drop_configuration(self, node: str) -> None:
         """Forget what a node reported whose process ended."""
-        self._graph.state.drop_configuration(node)
+        self._graph.drop_configuration(node)
 
     def participants_of(
         self, pid: int, *, nodes: Iterable[str], reported: Iterable[str]

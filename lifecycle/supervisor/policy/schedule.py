@@ -229,6 +229,13 @@ class RestartSchedule:
         self._returning |= keys
         return tuple(key for key in self._system.nodes if key in keys)
 
+    def gone_with(self, keys: Collection[str]) -> frozenset[str]:
+        """Return the keys of the nodes that went down with these, and wait for nothing else."""
+        names = {self._system.nodes[key].planned.process for key in keys}
+        own = {key for each in self._entries if each.process in names for key in each.keys}
+        others = {key for each in self._entries if each.process not in names for key in each.keys}
+        return frozenset(own - others)
+
     def by_hand(self, keys: Collection[str]) -> None:
         """Note that a person starts nodes again: whose process is among them begins anew."""
         self._entries = [

@@ -105,14 +105,20 @@ def _named(system: str) -> re.Pattern[str]:
 
 
 def runs_of(root: Path, system: str = "") -> list[Path]:
-    """Return the log directories of runs of a system, or of all, the newest first."""
+    """Return the log directories of runs of a system, or of all, the newest first.
+
+    That is by their names, except that the one that began last is the first: the clock may have
+    been set back since the others.
+    """
     named = _named(system)
     names: list[str] = []
+    last = ""
     with contextlib.suppress(OSError):
         names = os.listdir(root)  # noqa: PTH208 - every ROS process leaves a file there
+        last = (root / LATEST).readlink().name
     found = (root / name for name in names if name[0].isdigit() and named.fullmatch(name))
-    found = (each for each in found if not each.is_symlink() and each.is_dir())
-    return sorted(found, reverse=True)
+    there = (each for each in found if not each.is_symlink() and each.is_dir())
+    return sorted(there, key=lambda each: (each.name == last, each), reverse=True)
 
 
 def is_running(run: Path) -> bool:

@@ -8,6 +8,7 @@ today (`replayed`). Needs no ROS.
 from __future__ import annotations
 
 import datetime as dt
+import itertools
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -192,13 +193,17 @@ _CLOCK = re.compile(r"\d{1,2}:\d\d(:\d\d(\.\d{1,6})?)?")
 _AFTER = re.compile(r"\+\d+(\.\d+)?")
 
 
-def moment_of(word: str, recorded: RecordedRun) -> float:
-    """Return the time that a person means, seconds since the epoch.
+def moment_of(word: str, recorded: RecordedRun, *, first: bool = False) -> float:
+    """Return the moment that a person means, in seconds since the supervisor began.
+
+    Where the host's clock was set back, it showed some times twice; one that it was set over, it
+    never showed: then the moment before it was set is meant.
 
     Args:
         word: `12:03:05` or `12:03:05.25`, local time while the run lasted; `+17.5`, seconds since
             the supervisor began; or ISO 8601, `2026-11-23T12:03:05+01:00`.
         recorded: the run it is about.
+        first: the beginning of what is named so, the first time; else its end, the last time.
 
     Raises:
         UsageError: it is none of these.
@@ -206,31 +211,90 @@ def moment_of(word: str, recorded: RecordedRun) -> float:
     lines = [each.line for each in recorded.moments]
     if not lines:
         raise UsageError("cannot find any time in an empty journal")
-    began = lines[0].at - lines[0].elapsed_s
     if _AFTER.fullmatch(word):
-        return began + float(word)
+        return float(word)
     try:
-        if _CLOCK.fullmatch(word):
-            day = dt.datetime.fromtimestamp(began).astimezone()
-            hour, minute, *rest = word.split(":")
-            second, _, fraction = (rest[0] if rest else "0").partition(".")
-            found = day.replace(
-                hour=int(hour),
-                minute=int(minute),
-                second=int(second),
-                microsecond=int(fraction.ljust(6, "0")) if fraction else 0,
-            )
-            named = 1.0 if len(rest) == 1 and not fraction else 60.0 if not rest else 1e-6
-            while found.timestamp() + named <= began:
-                found += dt.timedelta(days=1)
-            # What a person reads as 12:03:05 lasts until 12:03:06.
-            return found.timestamp() + named - 1e-6
-        return dt.datetime.fromisoformat(word.replace("Z", "+00:00")).timestamp()
+        if not _CLOCK.fullmatch(word):
+            at = dt.datetime.fromisoformat(word.replace("Z", "+00:00")).timestamp()
+            return _elapsed_at([(at, at)], lines, first=first)
+        clock, _, fraction = word.partition(".")
+        hour, minute, *rest = map(int, clock.split(":"))
+        microsecond = int(fraction.ljust(6, "0")) if fraction else 0
+        wanted = dt.time(hour, minute, sum(rest), microsecond)
     except ValueError:
         raise UsageError(
             f"cannot read the time {word!r}",
             hint="write 12:03:05, +17.5 for seconds since the supervisor began, or ISO 8601",
         ) from None
+    # What a person reads as 12:03:05 lasts until 12:03:06.
+    lasts_s = 0.0 if fraction else 1.0 - 1e-6 if rest else 60.0 - 1e-6
+    days = dict.fromkeys(dt.datetime.fromtimestamp(each.at).astimezone().date() for each in lines)
+    starts = [dt.datetime.combine(day, wanted).timestamp() for day in days]
+    if starts[-1] + lasts_s < lines[0].at - lines[0].elapsed_s:
+        starts.append(starts[-1] + _DAY_S)
+    return _elapsed_at([(each, each + lasts_s) for each in starts], lines, first=first)
+
+
+_DAY_S = 86_400.0
+_SET_S = 0.5
+"""A clock that is ahead by so much more, or less, than at the line before was set meanwhile."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class _Period:
+    """What the host's clock showed from a line to the next one; nothing is between two of them.
+
+    Attributes:
+        elapsed_s: of the line.
+        at: of the line.
+        until: seconds since the epoch, as the clock had gone on.
+    """
+
+    elapsed_s: float
+    at: float
+    until: float
+
+
+def was_set_s(before: JournalLine, line: JournalLine) -> float:
+    """Return by how many seconds the host's clock was set between two lines; 0 if it was not."""
+    ahead_s = (line.at - before.at) - (line.elapsed_s - before.elapsed_s)
+    return ahead_s if abs(ahead_s) >= _SET_S else 0.0
+
+
+def _periods(lines: Sequence[JournalLine]) -> Iterator[_Period]:
+    first = lines[0]
+    yield _Period(elapsed_s=0.0, at=first.at - first.elapsed_s, until=first.at)
+    for line, following in itertools.pairwise(lines):
+        until = following.at - was_set_s(line, following)
+        yield _Period(elapsed_s=line.elapsed_s, at=line.at, until=until)
+    last = lines[-1]
+    yield _Period(elapsed_s=last.elapsed_s, at=last.at, until=last.at + 1e-6)
+
+
+def _elapsed_at(
+    named: Sequence[tuple[float, float]], lines: Sequence[JournalLine], *, first: bool
+) -> float:
+    """Return how long after the beginning the host's clock showed one of some spans of time."""
+    periods = tuple(_periods(lines))
+    shown = [
+        (
+            each.elapsed_s + max(start - each.at, 0.0),
+            each.elapsed_s + min(end, each.until) - each.at,
+        )
+        for each in periods
+        for start, end in named
+        if each.at <= end and start < each.until
+    ]
+    if shown:
+        return shown[0][0] if first else shown[-1][1]
+    pairs = tuple(itertools.pairwise(periods))
+    for start, end in named:
+        for before, each in pairs:
+            if before.until <= start and end < each.at:  # it was set forward over that time
+                return each.elapsed_s - (0.0 if first else 1e-6)
+    at = named[0][0] if first else named[-1][1]
+    near = periods[0] if at < min(each.at for each in periods) else periods[-1]
+    return near.elapsed_s + at - near.at
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -256,15 +320,15 @@ class Explanation:
     events: tuple[tuple[float, Event], ...]
 
 
-def explained(recorded: RecordedRun, at: float, wanted: str = "") -> tuple[Explanation, ...]:
+def explained(recorded: RecordedRun, elapsed_s: float, wanted: str = "") -> tuple[Explanation, ...]:
     """Return why each finding held at a moment.
 
     Args:
         recorded: the run.
-        at: seconds since the epoch.
+        elapsed_s: the moment, in seconds since the supervisor began.
         wanted: only findings whose rule or subject has this in it.
     """
-    past = [each for each in recorded.moments if each.line.at <= at]
+    past = [each for each in recorded.moments if each.line.elapsed_s <= elapsed_s]
     verdict = past[-1].verdict if past else None
     if verdict is None:
         return ()
@@ -298,8 +362,9 @@ def _explained(moments: Sequence[Moment], until: int, finding: Finding) -> Expla
             first = False
             break
         begins = index
-    facts, others, saw = _turned(past[: begins + 1], finding)
+    facts, others, saw_s = _turned(past[: begins + 1], finding)
     line = past[begins].line
+    now_s = line.elapsed_s
     names = _names(past[begins].plan, finding)
     found = [
         each
@@ -307,11 +372,13 @@ def _explained(moments: Sequence[Moment], until: int, finding: Finding) -> Expla
         if not first
         and each.event is not None
         and not isinstance(each.event, VerdictChanged)
-        and saw - BEFORE_S <= each.line.at <= line.at + AFTER_S
-        and (each.line.at <= line.at or _concerns(each.event, names))
+        and saw_s - BEFORE_S <= each.line.elapsed_s <= now_s + AFTER_S
+        and (each.line.elapsed_s <= now_s or _concerns(each.event, names))
     ]
     # Those that concern it first, then the nearest.
-    found.sort(key=lambda each: (not _concerns(each.event, names), abs(each.line.at - line.at)))
+    found.sort(
+        key=lambda each: (not _concerns(each.event, names), abs(each.line.elapsed_s - now_s))
+    )
     chosen = sorted(found[:_MOST_EVENTS], key=lambda each: each.line.elapsed_s)
     events = tuple((each.line.elapsed_s, each.event) for each in chosen if each.event is not None)
     return Explanation(
@@ -349,7 +416,7 @@ def _turned(past: Sequence[Moment], finding: Finding) -> tuple[tuple[str, ...], 
     """
     looks = [index for index, each in enumerate(past) if each.line.look is not None]
     if not looks:
-        return (), 0, past[-1].line.at
+        return (), 0, past[-1].line.elapsed_s
     chosen = looks[-1]
     for index in reversed(looks):
         look = past[index].line.look
@@ -359,13 +426,13 @@ def _turned(past: Sequence[Moment], finding: Finding) -> tuple[tuple[str, ...], 
         chosen = index
     before = past[chosen - 1].seen if chosen else None
     now = past[chosen].seen
-    at = past[chosen].line.at
+    saw_s = past[chosen].line.elapsed_s
     if before is None or now is None:
-        return (), 0, at
+        return (), 0, saw_s
     words = {finding.subject, *finding.nodes, *re.split(r"[\s:→]+", finding.subject)} - {""}
     facts = tuple(differences(before, now))
     about = tuple(text for names, text in facts if names & words)
-    return about, len(facts) - len(about), at
+    return about, len(facts) - len(about), saw_s
 
 
 def differences(before: Observation, now: Observation) -> Iterator[tuple[frozenset[str], str]]:

@@ -46,7 +46,8 @@ class UpOptions:
 
     Attributes:
         stop_after_s: hold it so long, ≥ 0; None holds an active system until it is asked to end,
-            and does not hold one that is only connected or verified.
+            and one that is only connected or verified where `holds` is set.
+        holds: see above; for hosts that wait for each other.
         timeout_s: for everything from the first start to the system being active, > 0; None for
             one that follows the number of processes, see `bring_up_s` and `gate_s`.
         strict: what cannot be verified keeps the gate closed.
@@ -59,6 +60,7 @@ class UpOptions:
 
     until: Until = Until.ACTIVE
     stop_after_s: float | None = None
+    holds: bool = False
     timeout_s: float | None = None
     strict: bool = False
     machine: str = ""
@@ -115,6 +117,31 @@ def own_machines(plan: Plan | Manifest, machine: str) -> frozenset[str]:
         return frozenset({machine})
     own = _own_addresses() if any(each.address for each in plan.machines) else set[str]()
     return frozenset({"", *(each.name for each in plan.machines if _is_local(each, own))})
+
+
+def address_that_is_down(plan: Plan, machine: str) -> str:
+    """Return the address of this machine where its interface is down; empty if all is well.
+
+    What an interface is needed for is a node of another machine. Fast DDS looks for interfaces when
+    it makes a participant, and never again: one that is made while a cable is out stays alone.
+
+    Args:
+        plan: the whole system.
+        machine: as for `own_machines`.
+    """
+    import psutil
+
+    own = own_machines(plan, machine)
+    if all(each.machine in own for each in plan.nodes):
+        return ""
+    wanted = {each.address for each in plan.machines if each.name in own and each.address}
+    states = psutil.net_if_stats()
+    for name, addresses in psutil.net_if_addrs().items():
+        for each in addresses:
+            address = each.address.partition("%")[0]
+            if address in wanted and name in states and not states[name].isup:
+                return address
+    return ""
 
 
 def local_processes(plan: Plan, machine: str) -> tuple[PlannedProcess, ...]:

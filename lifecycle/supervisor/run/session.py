@@ -391,6 +391,7 @@ class Session:
     async def _until_over(self) -> UpResult:
         """Run the phases; whatever ends them becomes an exit code and a verdict."""
         reason = stopping = "done"
+        failed = ""
         end = _RunEnd()
         try:
             end = await self._unless_stopped(self._phases())
@@ -401,6 +402,7 @@ class Session:
             for each in failure.every:
                 self._emit(each.event())
             reason, stopping = failure.reason, "rolling back"
+            failed = "; ".join(each.message for each in failure.every)
             verdict = with_failure(self._judge.latest or NOT_JUDGED, failure)
             end = _RunEnd(exit_code=failure.exit_code, verdict=verdict)
         except VerificationError as error:
@@ -416,7 +418,7 @@ class Session:
             reason = f"{reason}; {restarted}"
         self._gate.close()
         self._gate_sequence.phase = _STOPPING
-        self._ends, self._reason = stopping, reason
+        self._ends, self._reason = stopping, failed or reason
         self._emit(Stopping(reason=stopping))
         run = RunEnd(
             reason=reason,
@@ -570,7 +572,7 @@ class Session:
         """Keep the system for as long as was asked; return the result of the run."""
         self._held = True
         hold_s = self._options.stop_after_s
-        if hold_s is None and self._options.until is not Until.ACTIVE:
+        if hold_s is None and self._options.until is not Until.ACTIVE and not self._options.holds:
             hold_s = 0.0
         return self._outcome(await self._holding.hold(stage, hold_s))
 

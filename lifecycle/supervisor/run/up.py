@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import gc
 import os
+import time
 import traceback
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
 
@@ -50,6 +51,7 @@ from lifecycle.supervisor.run.journal import Journal
 from lifecycle.supervisor.run.options import (
     UpOptions,
     UpResult,
+    address_that_is_down,
     local_processes,
     observer_connections,
     own_machines,
@@ -201,7 +203,7 @@ def _up(
                 # Before any participant: who asks a server that is not there waits to ask again.
                 with ending.raised():
                     await discovery_server.begin(system, fork_server, ours=_serves(plan, options))
-                observer_participant = _observer_participant(plan, options, emit)
+                observer_participant = await _observer_participant(plan, options, emit, ending)
                 leaving.callback(observer_participant.destroy)
                 await records.note_segments()
                 emit(_started(system, observer_participant, str(logs)))
@@ -330,16 +332,37 @@ def _ends_within(seconds: float, code: int) -> Iterator[None]:
         live_on()
 
 
+_INTERFACE_S = 0.05
+
+
+async def _until_interface_is_up(plan: Plan, options: UpOptions, emit: Emitter) -> None:
+    """Wait, bounded, before any participant is made that would never use this host's address."""
+    deadline_s = time.monotonic() + options.bring_up_s(0)
+    said = ""
+    while (address := address_that_is_down(plan, options.machine)) and (
+        time.monotonic() < deadline_s
+    ):
+        if address != said:
+            said = address
+            message = f"waits until the network interface with {address} is up: what is made before"
+            emit(Notice(message=f"{message} would not be found from other machines"))
+        await asyncio.sleep(_INTERFACE_S)
+
+
 def _serves(plan: Plan, options: UpOptions) -> bool:
     server = plan.server
     return server is not None and server.machine in own_machines(plan, options.machine)
 
 
-def _observer_participant(plan: Plan, options: UpOptions, emit: Emitter) -> ObserverParticipant:
+async def _observer_participant(
+    plan: Plan, options: UpOptions, emit: Emitter, ending: Ending
+) -> ObserverParticipant:
     """Make the supervisor's participant; on another port if a discovery server is not reached.
 
     Fast DDS may never use the first connection to it (middleware/discovery/dead_peers.py).
     """
+    with ending.raised():
+        await _until_interface_is_up(plan, options, emit)
     layer = plan.data_layer
     dynamic = layer.source is DataLayerSource.DYNAMIC
     wires = layer.authority is Authority.SUPERVISOR

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import rclpy
+from builtin_interfaces.msg import Time
 from lifecycle_driver import Driver
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
@@ -16,6 +17,7 @@ from rcl_interfaces.msg import ParameterEvent
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.task import Future
+from rosgraph_msgs.msg import Clock
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
@@ -173,6 +175,20 @@ def test_what_the_author_makes_with_rclpys_factories_is_gated_too(
     node.out.publish(String(data="active"))
     driver.spin_until(lambda: node.heard and node.ticks)
     assert [message.data for message in node.heard] == ["active"]
+
+
+def test_timers_follow_simulated_time_while_it_is(driver: Driver, chatty: Chatty) -> None:
+    simulated = driver.node.create_publisher(Clock, "/clock", 1)
+    up(driver, "configure", "activate")
+    driver.spin_until(lambda: chatty.ticks)
+    chatty.set_parameters([Parameter("use_sim_time", value=True)])
+    driver.spin_until(simulated.get_subscription_count)
+    chatty.ticks = 0
+    for second in (1, 2):
+        simulated.publish(Clock(clock=Time(sec=second)))
+        driver.spin_until(lambda second=second: chatty.ticks == second)
+    chatty.set_parameters([Parameter("use_sim_time", value=False)])
+    driver.spin_until(lambda: chatty.ticks > 4)
 
 
 def test_parameter_events_are_not_gated(driver: Driver, chatty: Chatty) -> None:

@@ -306,9 +306,15 @@ def _found(verdict: Event, rule: str, subject: str = "") -> bool:
 
 
 @contextlib.contextmanager
-def up(manifest: Path, *options: str, runtime: Path, through: Sequence[str] = ()) -> Iterator[Up]:
+def up(
+    manifest: Path,
+    *options: str,
+    runtime: Path,
+    through: Sequence[str] = (),
+    variables: Mapping[str, str] | None = None,
+) -> Iterator[Up]:
     """Start `lifecycle up`, and end it whatever happens."""
-    running = Up(manifest, *options, runtime=runtime, through=through)
+    running = Up(manifest, *options, runtime=runtime, through=through, variables=variables)
     try:
         yield running
     finally:

@@ -80,6 +80,18 @@ class Talker(LifecycleNode):
         self.publisher("chatter").publish(String(data="hello"))
 
 
+class Ticking(LifecycleNode):
+    """Has nothing but a timer: nothing else wakes its executor."""
+
+    def on_configure(self, state):
+        self._ticks = 0
+        self.create_timer(0.3, self._tick)
+
+    def _tick(self) -> None:
+        self._ticks += 1
+        print(f"tick {self._ticks}", flush=True)
+
+
 class Numbered(Talker):
     """Says which process it is."""
 
@@ -154,6 +166,13 @@ class Chatty(Talker):
     def _tick(self) -> None:
         super()._tick()
         print("\n".join(["x" * 5000] * 4), flush=True)
+
+
+class Monitor(LifecycleNode):
+    @on_message("/diagnostics")
+    def _diagnosed(self, message: DiagnosticArray) -> None:
+        for each in message.status:
+            print(f"diagnosed {each.name} as {each.message}", flush=True)
 
 
 class Listener(LifecycleNode):

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 import rclpy
 import yaml
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -124,71 +124,141 @@ def test_a_paused_system_that_is_not_ok_stays_paused(
         assert phases(tmp_path)[0] == "active"
 
 
-def test_a_panel_on_the_network_sees_the_system_and_pauses_it_without_a_shell(
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+class Panel:
+    """A node of someone who has no shell on the robot.
+
+    Attributes:
+        statuses: received so far.
+        diagnostics: likewise.
+    """
+
+    def __init__(self, domain_id: int) -> None:
+        self.statuses: list[Any] = []
+        self.diagnostics: list[Any] = []
+        self._ends = contextlib.ExitStack()
+        context = rclpy.Context()
+        context.init(args=[], domain_id=domain_id)
+        self._ends.callback(gc.collect)
+        self._ends.callback(context.destroy)
+        self._ends.callback(context.try_shutdown)
+        self.node = Node("rqt_panel", context=context, enable_rosout=False)
+        self._ends.callback(self.node.destroy_node)
+        self._executor = SingleThreadedExecutor(context=context)
+        self._executor.add_node(self.node)
+        self.node.create_subscription(DiagnosticArray, "/diagnostics", self.diagnostics.append, 10)
+
+    def __enter__(self) -> Panel:  # noqa: PYI034 - typing.Self is not in Python 3.10
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ends.close()
+
+    def subscribe_status(self) -> None:
+        """Receive what was published last, and what will be."""
+        topic = "/lifecycle/pair/status"
+        self.node.create_subscription(String, topic, self.statuses.append, LATCHED)
+
+    def until(self, holds: Callable[[], object]) -> None:
+        """Spin until something holds."""
+        deadline = time.monotonic() + BOUND_S
+        while not holds():
+            assert time.monotonic() < deadline, (self.statuses[-1:], self.diagnostics[-1:])
+            self._executor.spin_once(timeout_sec=0.1)
+
+    def call(self, name: str) -> tuple[bool, str]:
+        """Call a service of the supervisor."""
+        client = self.node.create_client(Trigger, f"/lifecycle/pair/{name}")
+        self.until(client.service_is_ready)
+        answer = client.call_async(Trigger.Request())
+        self.until(answer.done)
+        return answer.result().success, answer.result().message
+
+
+def test_a_panel_on_the_network_pauses_and_ends_the_system_where_it_may(
     tmp_path: Path, fresh_domain: int
 ) -> None:
-    heard: dict[str, list[Any]] = {"status": [], "diagnostics": []}
-    with contextlib.ExitStack() as whole:
-        context = rclpy.Context()
-        context.init(args=[], domain_id=fresh_domain)
-        whole.callback(gc.collect)
-        whole.callback(context.destroy)
-        whole.callback(context.try_shutdown)
-        panel = Node("rqt_panel", context=context, enable_rosout=False)
-        whole.callback(panel.destroy_node)
-        executor = SingleThreadedExecutor(context=context)
-        executor.add_node(panel)
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        panel.create_subscription(DiagnosticArray, "/diagnostics", heard["diagnostics"].append, 10)
+    edit = {
+        "policy/ros_interface": "full",
+        "modes": {"normal": {}, "quiet": {"inactive": ["talker"]}},
+        "nodes/talker/run/no_new_privileges": True,
+        "nodes/talker/run/limits": {"nofile": 200},
+    }
+    manifest = pair(tmp_path, fresh_domain, edit=edit)
+    with Panel(fresh_domain) as panel, up(manifest, runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        assert panel.call("pause") == (True, "paused")
+        # Who comes later gets what was published last.
+        panel.subscribe_status()
+        panel.until(lambda: panel.statuses and '"phase":"paused"' in panel.statuses[-1].data)
+        panel.until(lambda: panel.diagnostics)
+        assert [each.name for each in panel.diagnostics[-1].status] == [
+            "pair: /listener",
+            "pair: /talker",
+        ]
+        assert panel.call("resume") == (True, "active")
+        success, status = panel.call("get_status")
+        assert (success, json.loads(status)["verdict"]) == (True, "ok")
+        assert all(each["rss_bytes"] > 2**20 for each in json.loads(status)["nodes"])
+        talker, listener = (Path(f"/proc/{run.pid_of(each)}") for each in ("talker", "listener"))
+        assert "NoNewPrivs:\t1" in (talker / "status").read_text()
+        assert "NoNewPrivs:\t0" in (listener / "status").read_text()
+        assert re.search(r"Max open files +200 +200 ", (talker / "limits").read_text())
+        assert panel.call("mode/quiet") == (True, "active")
+        assert json.loads(panel.call("get_status")[1])["mode"] == "quiet"
+        assert panel.call("down")[0]
+        assert run.finish() == ExitCode.OK
+        run.assert_gate_held()
 
-        def until(holds: Callable[[], object]) -> None:
-            deadline = time.monotonic() + BOUND_S
-            while not holds():
-                assert time.monotonic() < deadline, heard
-                executor.spin_once(timeout_sec=0.1)
 
-        def call(name: str) -> tuple[bool, str]:
-            client = panel.create_client(Trigger, f"/lifecycle/pair/{name}")
-            until(client.service_is_ready)
-            answer = client.call_async(Trigger.Request())
-            until(answer.done)
-            return answer.result().success, answer.result().message
-
-        edit = {
-            "policy/ros_interface": "full",
-            "modes": {"normal": {}, "quiet": {"inactive": ["talker"]}},
-            "nodes/talker/run/no_new_privileges": True,
-            "nodes/talker/run/limits": {"nofile": 200},
+def test_without_being_asked_it_only_says_how_it_is_and_nobody_says_it_in_its_place(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    array = "diagnostic_msgs/msg/DiagnosticArray"
+    edit = {
+        "nodes/monitor": {
+            "run": {"python": "tests.ros.supervisor.systems:Monitor"},
+            "interface": {"subscriptions": [{"name": "/diagnostics", "type": array}]},
         }
-        manifest = pair(tmp_path, fresh_domain, edit=edit)
-        with up(manifest, runtime=tmp_path) as run:
-            run.until("system", reached="active")
-            assert call("pause") == (True, "paused")
-            # Who comes later gets what was published last.
-            panel.create_subscription(
-                String, "/lifecycle/pair/status", heard["status"].append, latched
+    }
+    manifest = pair(tmp_path, fresh_domain, edit=edit)
+    with Panel(fresh_domain) as panel, up(manifest, runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        # A node of the system reads what its supervisor says.
+        run.until("log", line="diagnosed pair: /talker as active")
+        assert json.loads(panel.call("get_status")[1])["phase"] == "active"
+        services = {name for name, _ in panel.node.get_service_names_and_types()}
+        assert {each for each in services if each.startswith("/lifecycle/")} == {
+            "/lifecycle/pair/get_status"
+        }
+        judged = verb("verify", str(manifest), *ENOUGH, runtime=tmp_path)
+        assert judged.returncode == ExitCode.OK, judged.stdout
+        assert "_lifecycle_observer" not in judged.stdout
+        assert run.of_kind("verdict")[-1]["verdict"]["verdict"] == "ok"
+        begun = run.catch_up()
+        false = [
+            panel.node.create_publisher(String, "/lifecycle/pair/status", LATCHED),
+            panel.node.create_publisher(DiagnosticArray, "/diagnostics", 10),
+        ]
+        run.until_verdict(
+            lambda verdict: (
+                [(each["rule"], each["node"]) for each in verdict["findings"]]
+                == [("graph.undeclared-publisher", "/rqt_panel")] * len(false)
+            ),
+            since=begun,
+        )
+        panel.until(
+            lambda: (
+                [
+                    each.name
+                    for each in panel.diagnostics[-1].status
+                    if each.level == DiagnosticStatus.ERROR and "rqt_panel" in each.message
+                ]
+                == ["pair: graph.undeclared-publisher"]
             )
-            until(lambda: heard["status"] and '"phase":"paused"' in heard["status"][-1].data)
-            until(lambda: heard["diagnostics"])
-            assert [each.name for each in heard["diagnostics"][-1].status] == [
-                "pair: /listener",
-                "pair: /talker",
-            ]
-            assert call("resume") == (True, "active")
-            success, status = call("get_status")
-            assert (success, json.loads(status)["verdict"]) == (True, "ok")
-            assert all(each["rss_bytes"] > 2**20 for each in json.loads(status)["nodes"])
-            talker, listener = (
-                Path(f"/proc/{run.pid_of(each)}") for each in ("talker", "listener")
-            )
-            assert "NoNewPrivs:\t1" in (talker / "status").read_text()
-            assert "NoNewPrivs:\t0" in (listener / "status").read_text()
-            assert re.search(r"Max open files +200 +200 ", (talker / "limits").read_text())
-            assert call("mode/quiet") == (True, "active")
-            assert json.loads(call("get_status")[1])["mode"] == "quiet"
-            assert call("down")[0]
-            assert run.finish() == ExitCode.OK
-            run.assert_gate_held()
+        )
 
 
 @pytest.fixture

@@ -19,12 +19,14 @@ from xml.etree import ElementTree as ET
 import psutil
 import pytest
 import rclpy
+import yaml
 from rclpy.node import Node
 
 from lifecycle.errors import ExitCode
 from lifecycle.middleware import GraphObserver, NodeClients, segments_of
 from lifecycle.node import INTERFACE_ON_DEMAND
 from lifecycle.supervisor.gate.verification_loop import SETTLED_S
+from tests.ros.middleware.free_ports import free_ports
 from tests.ros.supervisor.running import (
     BOUND_S,
     ROOT,
@@ -798,3 +800,20 @@ def test_systemd_is_notified_once_the_system_is_verified_and_active(
             assert run.finish() == ExitCode.OK
         finally:
             run.close()
+
+
+def test_a_publisher_serves_one_by_tcp_and_another_by_shared_memory(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    """What moves to a connection is still discovered by who stays on its own participant."""
+    (port, *_) = free_ports(20)
+    manifest = pair(tmp_path, fresh_domain, edit={"discovery/first_port": port})
+    document = yaml.safe_load(manifest.read_text())
+    document["nodes"]["beside"] = document["nodes"]["listener"]
+    document["links"][0]["transport"] = "tcpv4"
+    manifest.write_text(yaml.safe_dump(document))
+    with up(manifest, "--until", "verified", runtime=tmp_path) as run:
+        assert run.finish() == ExitCode.OK
+        (*_, last) = run.of_kind("verdict")
+        assert {each["transport"] for each in last["verdict"]["flows"]} == {"tcpv4", "shm"}
+        run.assert_nothing_left()

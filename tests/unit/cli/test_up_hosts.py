@@ -5,14 +5,17 @@ from __future__ import annotations
 import io
 import json
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
 from lifecycle.cli import main
-from lifecycle.cli.hosts import JsonHosts, PlainHosts
+from lifecycle.cli.hosts import JsonHosts, LastVerdicts, PlainHosts
 from lifecycle.cli.live_view import LiveHosts
+from lifecycle.cli.report import format_verdict
 from lifecycle.cli.standard_streams import Writer
 from lifecycle.errors import ExitCode
 from lifecycle.fleet import Record
@@ -186,8 +189,6 @@ def test_nothing_that_a_host_says_ends_the_run_speaks_for_another_or_reaches_the
         (("--hosts", "--host", "a"), "cannot read --host 'a'; write MACHINE=[USER@]HOST"),
         (("--hosts", "--host", "a=-oX"), "cannot read --host 'a=-oX'; write MACHINE=[USER@]HOST"),
         (("--hosts", "--host", "moon=x"), "the manifest declares no such machine"),
-        (("--hosts", "--until", "verified"), "cannot use --until with --hosts"),
-        (("--hosts", "--report", "r.json"), "cannot use --report with --hosts"),
         (("--hosts", "--machine", "a"), "cannot use --machine with --hosts"),
         (("--hosts", "--program", "nft"), "cannot use --program with --hosts"),
     ],
@@ -204,3 +205,98 @@ def test_what_cannot_be_meant_is_refused_before_anything_is_started(
     manifest.write_text(MANIFEST)
     assert main(["up", str(manifest), *arguments]) == ExitCode.USAGE
     assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("verb", "arguments", "message"),
+    [
+        ("status", ("--host", "a=b"), "cannot use --host a=b without --hosts"),
+        ("status", ("--hosts", "--machine", "a"), "cannot use --machine, with --hosts"),
+        ("status", ("--hosts", "--watch"), "cannot use --watch with --hosts"),
+        ("down", ("--hosts", "--machine", "a"), "cannot use --machine, with --hosts"),
+    ],
+)
+def test_a_verb_for_all_machines_takes_a_manifest_and_no_machine(
+    verb: str,
+    arguments: tuple[str, ...],
+    message: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    manifest = tmp_path / "m.lifecycle.yaml"
+    manifest.write_text(MANIFEST)
+    assert main([verb, str(manifest), *arguments]) == ExitCode.USAGE
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("verb", ["status", "down"])
+def test_a_running_systems_name_does_not_say_where_its_machines_are(
+    verb: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([verb, "patrol", "--hosts"]) == ExitCode.USAGE
+    said = capsys.readouterr().err
+    assert "cannot use 'patrol', which is no manifest, with --hosts" in said
+    assert f"lifecycle {verb} MANIFEST --hosts" in said
+
+
+def test_one_report_has_what_any_supervisor_found_and_each_machines_own_verdict() -> None:
+    silent: list[Record] = []
+    last = LastVerdicts("abc", lambda _, record: silent.append(record))
+    last("", {"host": "", "event": "active", "hosts": ["a", "b", "c"], "elapsed_s": 1.0})
+    last("a", {**VERDICT, "host": "a"})
+    last("b", VERDICT)
+    last("c", {"host": "c", "event": "host", "message": "its supervisor still runs"})
+    last("", {"host": "", "event": "end", "reason": "done", "exit_code": 6})
+    found = last.combined()
+    assert (found.verdict, found.judged) == (Outcome.VIOLATED, False)
+    assert [each.message for each in found.findings] == [
+        "the process of /camera was killed by SIGKILL (found by the supervisor of a, b)"
+    ]
+    assert found.run == RunEnd(
+        reason="done; no verdict of c (its supervisor still runs)", reached="active", exit_code=6
+    )
+    written = json.loads(format_verdict(found, None, "json", machines=last.verdicts))
+    assert {name: each and each["verdict"] for name, each in written["machines"].items()} == {
+        "a": "violated",
+        "b": "violated",
+        "c": None,
+    }
+    assert "machine c: no verdict" in format_verdict(found, None, "text", machines=last.verdicts)
+    assert len(silent) == 5
+
+
+def test_that_machines_ended_before_is_no_finding_of_one_that_ended_well() -> None:
+    own = {name: each for name, each in VERDICT.items() if name not in {"host", "run"}}
+    fine = {**own, "verdict": "ok", "findings": []}
+    done = {"reason": "terminated", "reached": "active", "exit_code": 0}
+    last = LastVerdicts("ab", lambda *_: None)
+    for host in "ab":
+        last(host, {"host": host, "event": "verdict", "stage": "active", "verdict": fine})
+    last("", {"host": "", "event": "ending", "reason": "terminated"})
+    last("a", {"host": "a", **fine, "run": done})
+    last("b", {"host": "b", "event": "verdict", "stage": "active", "verdict": own})
+    last("b", {"host": "b", **own, "run": done})
+    last("", {"host": "", "event": "end", "reason": "terminated", "exit_code": 0})
+    assert (last.combined().verdict, last.combined().findings) == (Outcome.OK, ())
+    # What ended badly has its own last word.
+    last("b", VERDICT)
+    assert last.combined().verdict is Outcome.VIOLATED
+
+
+def test_a_report_of_all_hosts_says_what_kept_them_from_being_started(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    manifest = tmp_path / "m.lifecycle.yaml"
+    manifest.write_text(MANIFEST.replace("machine: a", "machine: b"))
+    monkeypatch.setenv("LIFECYCLE_SSH", "sh -c 'echo Connection refused >&2; exit 255'")
+    report = tmp_path / "r.json"
+    up = (sys.executable, "-m", "lifecycle.cli", "up", str(manifest), "--hosts")
+    done = subprocess.run([*up, "--report", str(report)], capture_output=True, check=False)
+    assert done.returncode == ExitCode.BRING_UP_FAILED, done.stderr
+    found = json.loads(report.read_text())
+    assert (found["verdict"], found["judged"]) == ("unverifiable", False)
+    assert found["run"]["exit_code"] == ExitCode.BRING_UP_FAILED
+    assert "no verdict of b (Connection refused)" in found["run"]["reason"]
+    manifest.write_text("nodes: [")
+    assert main(["up", str(manifest), "--hosts", "--report", str(report)]) != ExitCode.OK
+    assert "the manifest is invalid" in json.loads(report.read_text())["run"]["reason"]

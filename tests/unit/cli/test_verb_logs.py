@@ -126,6 +126,15 @@ def test_the_latest_run_is_linked_and_old_ones_of_its_system_go(root: Path) -> N
     assert not old.exists()
 
 
+def test_the_run_that_began_last_is_the_newest_also_after_the_clock_was_set_back(
+    root: Path,
+) -> None:
+    later = run(root, 4, talker="before\n")
+    begun = begin_logs(run(root, 2, talker="after\n"), "pair", {"LIFECYCLE_KEEP_LOGS": "1"})
+    assert runs_of(root, "pair") == [begun]
+    assert not later.exists()
+
+
 def test_a_directory_named_latest_that_is_no_link_stays(root: Path) -> None:
     (root / "latest").mkdir()
     begin_logs(root / f"2026-11-05-10-00-00-000000-h-{GONE}-pair", "pair", {})

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+import json
 from collections.abc import Callable
+from typing import Any
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import ExitCode
@@ -37,7 +39,9 @@ class Supervisor:
     def activate(self) -> None:
         if self.exit_code is None:
             self.is_active = True
-            self._host.say(b'{"event":"system","reached":"active","elapsed_s":1.0}')
+            reached = self._host.reaches
+            record = {"event": "system", "reached": reached, "elapsed_s": 1.0}
+            self._host.say(json.dumps(record).encode())
 
     def end(self, code: int) -> None:
         if self.exit_code is None:
@@ -86,7 +90,7 @@ class FakeTransport:
     """One host.
 
     Attributes:
-        active_s: from start to active; None for never.
+        active_s: from start to active, or what it `reaches`; None for never.
         fails_s: until its supervisor fails.
         ends_s: from the order to the end; None for never.
         way_s: of a line in each direction.
@@ -102,6 +106,7 @@ class FakeTransport:
     rank: int = 0
     version: str = VERSION
     active_s: float | None = 1.0
+    reaches: str = "active"
     fails_s: float | None = None
     ends_s: float | None = 0.5
     way_s: float = 0.001
@@ -173,11 +178,19 @@ class FakeTransport:
     def _answer(self, channel: FakeChannel, order: Order) -> Said | None:
         if order.do is Do.PING:
             now_s = self.world.now_s + self.ahead_s
+            self.world.is_set_s += self.world.sets_s
+            self.world.sets_s = 0.0
             return Said(agent=Word.PONG, number=order.number, received_s=now_s, sent_s=now_s)
         if order.do is Do.END:
             if self.supervisor is not None:
                 self.supervisor.terminate()
             return None
+        if order.do is Do.STATUS:
+            if self.refuses:
+                return Said(agent=Word.REFUSED, message=self.refuses, hint="end it")
+            if self.supervisor is None:
+                return Said(agent=Word.ABSENT)
+            return Said(agent=Word.STATUS, status={"phase": "active"})
         if order.do is Do.DOWN:
             self.downs += 1
             return Said(agent=Word.DONE, exit_code=0)
@@ -185,8 +198,11 @@ class FakeTransport:
             return Said(agent=Word.REFUSED, message=self.refuses, hint="end it")
         channel.follows = True
         if self.supervisor is not None and self.supervisor.exit_code is None:
-            phase = "active" if self.supervisor.is_active else "connecting"
-            return Said(agent=Word.ATTACHED, pid=1, status={"phase": phase})
+            is_there = self.supervisor.is_active
+            phase = "active" if is_there and self.reaches == "active" else "verifying"
+            nodes = [{"reach": "connected" if is_there else "started"}]
+            status = {"phase": phase, "verdict": "ok", "nodes": nodes}
+            return Said(agent=Word.ATTACHED, pid=1, status=status)
         if order.do is Do.ATTACH:
             return Said(agent=Word.ABSENT)
         self.starts += 1
@@ -199,9 +215,11 @@ class World:
 
     Attributes:
         ended: names of hosts in the order in which their supervisors ended.
+        sets_s: by so much the coordinator's clock is set while its next ping is on its way.
     """
 
     def __init__(self) -> None:
+        self.sets_s = self.is_set_s = 0.0
         self.hosts: dict[str, FakeTransport] = {}
         self.said: list[Record] = []
         self.ended: list[str] = []
@@ -214,9 +232,7 @@ class World:
     def now_s(self) -> float:
         return asyncio.get_running_loop().time()
 
-    def coordinator(
-        self, *, stop_after_s: float | None = None, keep_going: bool = False
-    ) -> Coordinator:
+    def coordinator(self, **options: Any) -> Coordinator:
         return Coordinator(
             "patrol",
             [
@@ -231,20 +247,18 @@ class World:
             version=VERSION,
             bring_up_s=30.0,
             again=("lifecycle up m.yaml --hosts", "lifecycle down m.yaml --hosts"),
-            stop_after_s=stop_after_s,
-            keep_going=keep_going,
-            clock=lambda: self.now_s,
+            clock=lambda: self.now_s + self.is_set_s,
+            **options,
         )
 
     async def run(
         self,
         *,
-        stop_after_s: float | None = None,
-        keep_going: bool = False,
         at: tuple[float, Callable[[Coordinator], None]] | None = None,
+        **options: Any,
     ) -> ExitCode:
         """Run a coordinator to its end; `at` is what happens so long after it began."""
-        running = self.coordinator(stop_after_s=stop_after_s, keep_going=keep_going)
+        running = self.coordinator(**options)
         if at is not None:
             asyncio.get_running_loop().call_later(at[0], at[1], running)
         return await asyncio.wait_for(running.run(), 600)

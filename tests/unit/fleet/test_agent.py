@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 
 from lifecycle.codec import from_json, to_json
-from lifecycle.fleet.protocol import AGENT_MARK, Do, Order, Part, Said, SentFile, Word
+from lifecycle.fleet.protocol import AGENT_MARK, PROTOCOL, Do, Order, Part, Said, SentFile, Word
 from lifecycle.run_directory import SENT_PREFIX, RunDirectory, is_held, start_ticks
 from tests.unit.fleet.pretend import COMMAND
 
@@ -42,7 +42,7 @@ class Agent:
             },
         )
         self.records: list[dict[str, object]] = []
-        assert self.until(Word.HELLO).protocol == 1
+        assert self.until(Word.HELLO).protocol == PROTOCOL
 
     def order(self, order: Order) -> None:
         assert self.process.stdin is not None
@@ -117,6 +117,7 @@ class Site:
             arguments=("rate:=-5; rm -rf $HOME",),
             options=("--strict",),
             digest=digest,
+            whole="patrol@7",
         )
 
     def started(self, agent: Agent) -> int:
@@ -231,14 +232,21 @@ def test_another_manifest_is_not_taken_for_the_one_that_runs(site: Site) -> None
     assert said.hint == "end it first: lifecycle down patrol@7.a"
 
 
-def test_a_supervisor_that_a_person_started_is_left_alone(site: Site) -> None:
-    root = site.directory.parent
-    held = RunDirectory.acquire(root, site.directory.name, "1")
+@pytest.mark.parametrize("name", ["patrol@7.a", "patrol@7"])  # with --machine a, and without
+def test_a_supervisor_that_a_person_started_is_left_alone(site: Site, name: str) -> None:
+    held = RunDirectory.acquire(site.directory.parent, name, "1")
     try:
         said = site.agent().begin(site.part())
+        asked = site.agent()
+        for each in (Do.STATUS, Do.DOWN):
+            asked.order(Order(do=each, name="patrol@7.a", whole="patrol@7"))
+        # It holds the run and answers nothing, as one that is just starting: it is there.
+        assert f"cannot ask {name!r}" in asked.until(Word.REFUSED).message
+        assert f"['down', '{name}'" in asked.until(Word.DONE).message
     finally:
         held.release()
     assert said.agent is Word.REFUSED
+    assert f"cannot follow {name!r}" in said.message
     assert "was not started by lifecycle up --hosts" in said.message
 
 
@@ -288,7 +296,8 @@ def test_a_run_has_a_name_that_is_no_path(site: Site, name: str) -> None:
     assert "as the name of a run" in site.agent().begin(part).message
 
 
-def test_what_does_not_run_is_already_down(site: Site) -> None:
+@pytest.mark.parametrize("do", [Do.DOWN, Do.STATUS])
+def test_what_does_not_run_is_already_down(site: Site, do: Do) -> None:
     agent = site.agent()
-    agent.order(Order(do=Do.DOWN, name="patrol@7.a"))
+    agent.order(Order(do=do, name="patrol@7.a", whole="patrol@7"))
     assert agent.until(Word.ABSENT)

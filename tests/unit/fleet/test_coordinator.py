@@ -7,9 +7,10 @@ import asyncio
 import pytest
 
 from lifecycle.errors import ExitCode
-from lifecycle.fleet.coordinator import Coordinator, worst
-from lifecycle.fleet.protocol import Do
-from tests.unit.fleet.fakes import CUT_S, World
+from lifecycle.fleet.asking import statuses, worst
+from lifecycle.fleet.coordinator import Coordinator
+from lifecycle.fleet.protocol import Do, Part
+from tests.unit.fleet.fakes import CUT_S, VERSION, Supervisor, World
 from tests.unit.supervisor.fakes import run
 
 
@@ -160,6 +161,40 @@ def test_an_active_system_is_ended_after_the_time_that_was_asked_for() -> None:
     world.host("a")
     assert run(world.run(stop_after_s=2.0)) is ExitCode.OK
     assert world.of("ending")[0]["reason"] == "done"
+
+
+@pytest.mark.parametrize("until", ["connected", "verified"])
+@pytest.mark.parametrize("is_cut", [False, True])
+def test_what_is_not_to_become_active_waits_on_each_host_for_all_and_then_ends(
+    until: str, is_cut: bool
+) -> None:
+    world = World()
+    world.host("a", reaches=until, active_s=1.0)
+    # What it said while its link was cut is lost; its status shows it.
+    cut = {"cut_at": Do.START, "heals_s": CUT_S + 3} if is_cut else {}
+    world.host("b", reaches=until, active_s=3.0, **cut)
+    assert run(world.run(until=until)) is ExitCode.OK
+    (reached,) = world.of("reached")
+    assert (reached["reached"], [*reached["hosts"]]) == (until, ["a", "b"])
+    assert reached["elapsed_s"] >= 3.0
+    assert world.of("active") == []
+    assert world.of("end")[0]["exit_codes"] == {"a": 0, "b": 0}
+
+
+def test_what_runs_already_is_not_ended_for_having_been_verified() -> None:
+    async def test() -> None:
+        world = World()
+        for name in "ab":
+            world.host(name)
+        running = world.hosts["a"].supervisor = Supervisor(world.hosts["a"])
+        running.activate()
+        assert await world.run(until="verified") is ExitCode.BRING_UP_FAILED
+        assert "a" not in world.ended
+        assert world.of("host", "a")[-1]["message"] == (
+            "its supervisor runs already, and is left as it is"
+        )
+
+    run(test())
 
 
 @pytest.mark.parametrize(
@@ -313,6 +348,20 @@ def test_a_clock_that_jumps_is_said_again() -> None:
     assert world.of("clock", "a")[-1]["offset_s"] == pytest.approx(-1.0, abs=0.01)
 
 
+@pytest.mark.parametrize("set_s", [3600.0, -3600.0])
+def test_a_clock_of_ours_that_is_set_makes_no_difference_that_there_is_not(set_s: float) -> None:
+    world = World()
+    world.host("a")
+
+    async def main() -> None:
+        asyncio.get_running_loop().call_later(5.0, setattr, world, "sets_s", set_s)
+        await world.run(at=(60.0, _stop))
+
+    run(main())
+    offsets_s = [each["offset_s"] for each in world.of("clock", "a")]
+    assert offsets_s == [pytest.approx(0.0, abs=0.01), pytest.approx(-set_s, abs=0.01)]
+
+
 @pytest.mark.parametrize(
     ("codes", "expected"),
     [
@@ -326,3 +375,37 @@ def test_a_clock_that_jumps_is_said_again() -> None:
 )
 def test_the_worst_exit_code_is_the_one_of_all(codes: tuple[int, ...], expected: ExitCode) -> None:
     assert worst(codes) is expected
+
+
+def test_every_host_is_asked_how_it_is_and_one_that_does_not_say_is_an_answer(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async def test() -> None:
+        world = World()
+        monkeypatch.setattr("time.time", lambda: world.now_s)  # of the loop that jumps
+        world.host("a", ahead_s=2.5)
+        world.host("b")
+        world.host("c", stderr="Connection refused", exit_code=255)
+        world.host("d", version="0.9")
+        world.host("e", refuses="cannot ask 'patrol@7.e': its supervisor does not answer")
+        world.host("f", is_cut=True, heals_s=None)
+        world.hosts["a"].supervisor = Supervisor(world.hosts["a"])
+        parts = [Part(name=f"patrol@7.{e}", machine=e, manifest="", files=()) for e in "abcdef"]
+        found = await statuses(parts, world.hosts, version=VERSION)
+        assert [each.host for each in found] == [*"abcdef"]
+        assert found[0].status == {"phase": "active"}
+        assert found[0].clock is not None
+        assert found[0].clock.offset_s == pytest.approx(2.5, abs=0.01)
+        assert [each.is_absent for each in found] == [False, True, False, False, False, False]
+        assert [each.message for each in found[1:]] == [
+            "no supervisor runs there",
+            "Connection refused",
+            f"its lifecycle is version 0.9, and here it is {VERSION}",
+            "cannot ask 'patrol@7.e': its supervisor does not answer",
+            "no answer in time",
+        ]
+        assert all(each.status is None for each in found[1:])
+        channels = [each.channel for each in world.hosts.values()]
+        assert all(each is not None and each.is_closed for each in channels)
+
+    run(test())

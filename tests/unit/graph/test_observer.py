@@ -394,7 +394,7 @@ def test_what_diagnostics_say_of_a_node_is_its_worst_entry_until_that_is_stale()
     assert readings.reports() == {"/arm": stalled}
     now_s[0] = 6.0
     clients.diagnose([("arm: motor", 0, "fine")])
-    stale = HealthReport(ok=None, message="'gripper' is stale for 5 s")
+    stale = HealthReport(ok=None, message="'gripper' was not published for 5 s")
     assert readings.reports() == {"/arm": stale}
     now_s[0] = 8.0
     clients.diagnose([("gripper", 3, "no data")])
@@ -409,3 +409,18 @@ def test_what_diagnostics_say_of_a_node_is_its_worst_entry_until_that_is_stale()
     now_s[0] = 12.0
     clients.diagnose([])  # as each second
     assert len(woken) == asleep + 1
+
+
+def test_what_diagnostics_call_an_entry_is_taken_by_the_letter() -> None:
+    clients = FakeClients()
+    readings = DiagnosticReadings(clients, lambda: None, lambda: 0.0)
+    readings.listen({"/lidar": ("lidar [front]: *",)})
+    clients.diagnose([("lidar f: status", 2, "of another"), ("lidar [front]: rpm", 2, "")])
+    bad = HealthReport(ok=False, message="'lidar [front]: rpm' has level ERROR")
+    assert readings.reports() == {"/lidar": bad}
+    clients.diagnose([("lidar [front]: rpm", 7, "odd")])
+    odd = "'lidar [front]: rpm' has level 7, which has no meaning: odd"
+    assert readings.reports() == {"/lidar": HealthReport(ok=None, message=odd)}
+    # Another process comes in its place: what was said of the last one is not said of it.
+    readings.forget("/lidar")
+    assert readings.reports() == {}

@@ -281,6 +281,22 @@ def test_inside_a_process_nothing_can_be_chosen():
     )
 
 
+def test_a_connection_has_by_what_those_on_their_own_participant_discover_it():
+    """Beside another transport, Fast DDS announces nothing by shared memory."""
+    parties = [party("p", pub()), party("near", sub()), party("far", sub())]
+    graph = negotiate(parties, {("/t", "p", "far"): Wish.TCPV4}, Terms())
+    assert {key: medium for key, (medium, _) in media(graph).items()} == {
+        "near": "shm",
+        "far": "tcpv4",
+    }
+    assert list(urls(graph)) == ["far tcpv4", "p shm_udpv4_tcpv4"]
+
+
+def test_shared_memory_alone_is_joined_by_shared_memory_alone():
+    parties = [party("p", pub(by=("shm",), fixed=True)), party("s", sub())]
+    assert urls(negotiate(parties, {}, Terms())) == {"s shm": ("shm://",)}
+
+
 def test_shared_memory_wins_against_what_one_link_asks_for():
     graph = negotiate(
         [party("p", pub()), party("q", pub()), party("s", sub(fixed=True)), party("r", sub())],
@@ -289,8 +305,8 @@ def test_shared_memory_wins_against_what_one_link_asks_for():
     )
     assert problem(graph) == (
         "cannot carry '/t' from 'p' to 's' by tcpv4, as a link says so: the publisher's "
-        "participant has shm, tcpv4, the subscription's shm, udpv4, so it would go by shm; ask for "
-        "one transport for all that these two endpoints talk to"
+        "participant has shm, tcpv4, udpv4, the subscription's shm, udpv4, so it would go by shm; "
+        "ask for one transport for all that these two endpoints talk to"
     )
 
 

@@ -18,6 +18,7 @@ from lifecycle.plan import (
     differences,
     notice_of,
     plan_checksum,
+    shown,
     without_secrets,
 )
 
@@ -239,3 +240,28 @@ def test_secrets_of_the_environment_are_in_nothing_that_is_shown_written_or_anno
     shown = capsys.readouterr().out
     assert "CAMERA_TOKEN" in shown
     assert "hunter" not in shown
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        *(
+            (each, "x", "(redacted)")
+            for each in (
+                *("API_TOKEN", "DB_PASSWORD", "PASSWD", "KEY_PASSPHRASE", "MQTT_PASS", "db_pwd"),
+                *("SIGNING_KEY", "apikey", "SESSION_COOKIE", "GH_AUTH", "SSH_KEYS", "PASS"),
+            )
+        ),
+        *(
+            (each, "x", "x")
+            for each in ("PWD", "OLDPWD", "AUTHOR", "KEYBOARD", "PASSES", "BYPASS", "KEYSTORE_DIR")
+        ),
+        ("BROKER", "mqtt://me:pa:ss@host:1883/x", "mqtt://me:(redacted)@host:1883/x"),
+        ("BROKER", "redis://:pass@host", "redis://:(redacted)@host"),
+        ("BROKER", "http://host:80/a@b", "http://host:80/a@b"),
+    ],
+)
+def test_a_secret_is_known_by_its_variable_or_its_place_in_a_url(
+    name: str, value: str, said: str
+) -> None:
+    assert shown(name, value) == said

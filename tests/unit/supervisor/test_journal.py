@@ -56,9 +56,14 @@ class Kept:
     def __init__(self, directory: Path) -> None:
         self.directory = directory
         self.said: list[str] = []
+        self.set_s = 0.0
         clock = Clock()
         self.journal = Journal(
-            "robot", "42", say=self.said.append, wall=lambda: NOON + clock.now, clock=clock
+            "robot",
+            "42",
+            say=self.said.append,
+            wall=lambda: NOON + clock.now + self.set_s,
+            clock=clock,
         )
         self.output: dict[str, int] = {}
 
@@ -219,12 +224,48 @@ def test_times_are_read_as_people_write_them(kept: Kept, monkeypatch: pytest.Mon
     monkeypatch.setenv("TZ", "UTC")
     kept.look("/camera")
     recorded = read_run(journal_files(kept.directory))
-    began = recorded.moments[0].line.at - recorded.moments[0].line.elapsed_s
-    assert moment_of("+2.5", recorded) == began + 2.5
-    assert moment_of("2023-11-14T22:13:30Z", recorded) == NOON + 10
+    assert moment_of("+2.5", recorded) == 2.5
+    assert moment_of("2023-11-14T22:13:30Z", recorded) == 10
+    assert moment_of("22:13:22", recorded) == pytest.approx(3, abs=1e-5)
+    assert moment_of("22:13:22", recorded, first=True) == 2
+    assert moment_of("22:14", recorded, first=True) == 40
     for word in ("soon", "25:00:00", "12", "+x"):
         with pytest.raises(UsageError, match="12:03:05"):
             moment_of(word, recorded)
+
+
+def test_times_are_those_that_the_clock_showed_also_where_it_was_set_meanwhile(
+    kept: Kept, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TZ", "UTC")
+    for set_s in (0.0, 3600.0, -5.0, -86_400.0):
+        kept.set_s = set_s
+        for word in ("begins", "lasts"):
+            kept.journal.on_event(Notice(message=f"{word} at {set_s:g}"))
+    lines = [
+        line.split("  ") for line in _verb(history.command, str(kept.directory))[1].splitlines()
+    ]
+    told = [line[-1] for line in lines]
+    assert [each for each in told if each.startswith("the clock")] == [
+        "the clock of this host was set forward by 3600.0 s",
+        "the clock of this host was set back by 3605.0 s",
+        "the clock of this host was set back by 86395.0 s",
+    ]
+    assert told.index("the clock of this host was set forward by 3600.0 s") + 1 == told.index(
+        "begins at 3600"
+    )
+
+    def shown(*options: str) -> list[str]:
+        text = _verb(history.command, str(kept.directory), *options)[1]
+        return [line.split("  ")[-1] for line in text.splitlines() if " at " in line]
+
+    every = shown()
+    assert every == [each for each in told if " at " in each]
+    assert shown("--since", "23:00:00") == every[2:]
+    assert shown("--until", "22:30") == every[:2]
+    assert shown("--until", "22:13") == every  # it was that late three times
+    assert shown("--until", "2023-11-14T23:13:59Z") == every
+    assert shown("--since", "+4.5", "--until", "+6") == every[3:5]
 
 
 def _verb(command: object, *words: str) -> tuple[int, str]:

@@ -365,7 +365,7 @@ def test_a_node_waits_until_another_is_healthy_and_one_that_no_longer_is_has_a_c
             )
 
         async def change() -> None:
-            # What it does not say is taken on trust, but nobody activates by it.
+            # What it does not say in 5 s is taken on trust, but nobody activates by it.
             await world.story.until("/camera activate")
             await asyncio.sleep(3.0)
             assert "/viewer activate" not in world.story
@@ -375,7 +375,7 @@ def test_a_node_waits_until_another_is_healthy_and_one_that_no_longer_is_has_a_c
             report(HealthReport(ok=False, message="too hot"))
 
         await world.run(change())
-        at = world.outline.index("[system] active at 3.0 s")
+        at = world.outline.index("[system] active at 8.0 s")
         assert world.outline[at + 1 : at + 4] == [
             "[verdict] active violated node.unhealthy /camera",
             "[consequence] deactivate /camera for node.unhealthy",

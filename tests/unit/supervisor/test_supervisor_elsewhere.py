@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import dataclasses
+import socket
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from lifecycle.graph import set_within
-from lifecycle.manifest.model import Condition
+from lifecycle.manifest.model import Condition, Machine
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.nodes.system import InterfaceOnDemand, RemoteNode, RemoteNodes, System
 from lifecycle.supervisor.run.failure import ended
+from lifecycle.supervisor.run.options import address_that_is_down
 from lifecycle.verify.observation import Observation, ObservedNode
-from tests.builders import configuration, plan_of, planned_node
+from tests.builders import HERE, configuration, plan_of, planned_node
 from tests.unit.supervisor.fakes import World, run
 
 STARTED, CONFIGURED, CONNECTED, ACTIVE, HEALTHY = Condition
@@ -193,3 +197,32 @@ class _NoServices:
 
     def service_names(self) -> frozenset[str]:
         return frozenset()
+
+
+@pytest.mark.parametrize(
+    ("machine", "is_up", "expected"),
+    [
+        ("left", False, "192.0.2.1"),
+        ("", False, "192.0.2.1"),  # that host's own by its address
+        ("left", True, ""),
+        ("right", False, ""),  # it has no such address: behind a NAT, in a container
+    ],
+)
+def test_a_machine_waits_for_the_interface_with_its_address_where_others_are_to_find_it(
+    machine: str, is_up: bool, expected: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    address = SimpleNamespace(address="192.0.2.1", family=socket.AF_INET)
+    monkeypatch.setattr("psutil.net_if_addrs", lambda: {"e0": [address]})
+    monkeypatch.setattr("psutil.net_if_stats", lambda: {"e0": SimpleNamespace(isup=is_up)})
+    nodes = [
+        dataclasses.replace(planned_node(key), machine=of)
+        for key, of in (("camera", "left"), ("viewer", "right"))
+    ]
+    machines = tuple(
+        Machine(name=each, address=f"192.0.2.{number}", at=HERE)
+        for number, each in enumerate(("left", "right"), 1)
+    )
+    plan = dataclasses.replace(plan_of(*nodes), machines=machines)
+    assert address_that_is_down(plan, machine) == expected
+    alone = dataclasses.replace(plan, nodes=plan.nodes[:1])
+    assert address_that_is_down(alone, "left") == ""

@@ -16,6 +16,7 @@ from lifecycle.plan.model import Plan
 from lifecycle.supervisor.control.protocol import ProcessState, Reach
 from lifecycle.supervisor.gate.hold import Watch
 from lifecycle.supervisor.gate.verification_loop import (
+    HEALTH_S,
     PASSING_S,
     ChangeCounter,
     VerificationLoop,
@@ -180,6 +181,24 @@ def test_what_only_a_report_could_prove_is_waited_for_a_moment_and_not_for_all_t
         assert bench.now == pytest.approx(3.5, abs=0.1)
 
     _run(tmp_path, test, UNPROVEN)
+
+
+def test_a_node_that_must_be_healthy_is_given_time_to_say_how_it_is_once(tmp_path: Path) -> None:
+    unsaid = verdict_of(Outcome.UNVERIFIABLE, "node.unhealthy")
+
+    async def says(bench: _Bench) -> None:
+        asyncio.get_running_loop().call_later(1.0, bench.grow)
+        assert await bench.judge.until_clear(Stage.CONNECTED, 20.0) is OK
+        assert bench.now == pytest.approx(1.0, abs=0.1)
+
+    async def says_nothing(bench: _Bench) -> None:
+        assert await bench.judge.until_clear(Stage.CONNECTED, 20.0) is unsaid
+        assert bench.now == pytest.approx(HEALTH_S)
+        assert await bench.judge.until_clear(Stage.CONNECTED, 20.0) is unsaid
+        assert bench.now == pytest.approx(HEALTH_S)
+
+    _run(tmp_path, says, unsaid, OK)
+    _run(tmp_path, says_nothing, unsaid)
 
 
 def test_what_was_never_measured_is_not_waited_for(tmp_path: Path) -> None:

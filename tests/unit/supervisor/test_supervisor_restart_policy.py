@@ -488,6 +488,28 @@ def test_orders_in_backoff_are_carried_out_at_once(tmp_path: Path) -> None:
     run(main())
 
 
+def test_who_is_restarted_by_hand_in_its_backoff_takes_its_dependents_with_it(
+    tmp_path: Path,
+) -> None:
+    """They wait for nothing else; its own gate would stay closed until their delay is over."""
+
+    async def main() -> None:
+        how = dataclasses.replace(ON_FAILURE, on_failure=OnFailure.DEPENDENTS)
+        world = SessionWorld(_chain(how, Supervision()), tmp_path, stop_after_s=5.0)
+
+        async def order() -> None:
+            await world.story.until("[system] active")
+            world.kill("camera")
+            await world.story.until("[backoff] camera")
+            assert await world.order(ControlRequest.RESTART, "camera") == "0"
+            assert world.story[-1] == "[system] active at 0.0 s"
+
+        await world.run(order())
+        assert world.story.count("viewer start") == 2
+
+    run(main())
+
+
 def test_an_order_during_a_restart_waits_for_its_step_and_not_for_its_gate(tmp_path: Path) -> None:
     async def main() -> None:
         world = SessionWorld(_chain(), tmp_path, stop_after_s=10.0)

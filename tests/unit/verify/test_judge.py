@@ -11,7 +11,7 @@ from lifecycle.manifest.model import (
     Policy,
     RosInterfaceAccess,
 )
-from lifecycle.manifest.qos import Durability, QosProfile
+from lifecycle.manifest.qos import Durability, Liveliness, QosProfile
 from lifecycle.network import UniqueRequirement
 from lifecycle.plan import Plan
 from lifecycle.verify import Outcome, Stage, Verdict, verify
@@ -97,6 +97,7 @@ def test_observers_are_listed_only_where_they_do_more_than_observe() -> None:
 
 
 ARRAY, TRIGGER = "diagnostic_msgs/msg/DiagnosticArray", "std_srvs/srv/Trigger"
+SYSTEM_DEFAULT = Liveliness.SYSTEM_DEFAULT
 ONE_PARTICIPANT = "10000000000000000000000a"
 
 
@@ -167,6 +168,7 @@ def test_who_reads_diagnostics_has_those_of_supervisors_and_of_nobody_else() -> 
     ("end", "publishes"),
     [
         (subscription("/diagnostics", ARRAY), True),
+        (subscription("/diagnostics", ARRAY, qos=QosProfile(liveliness=SYSTEM_DEFAULT)), True),
         (publisher("/diagnostics", ARRAY), True),
         (subscription("/diagnostics", "my_msgs/msg/Diagnostics"), False),
         (

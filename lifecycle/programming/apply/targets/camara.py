@@ -80,6 +80,8 @@ class CamaraService:
     def __init__(self, settings: CamaraTargetSettings, api: Api) -> None:
         self._settings = settings
         self._api = api
+        self._expires: dict[str, tuple[float, float]] = {}
+        """By key, when a session expires: since the epoch, and on the clock that goes forward."""
 
     @property
     def scope(self) -> str:
@@ -172,14 +174,20 @@ class CamaraService:
             return None
         least, most = _MARGIN_S
         margin_s = min(max(_MARGIN * self._settings.duration_s, least), most)
-        return entry.expires_s - margin_s - self._api.clock.now_s()
+        clock = self._api.clock
+        left_s, now_s = entry.expires_s - clock.now_s(), clock.steady_s()
+        # A clock that is set back meanwhile makes no session last longer.
+        known = self._expires.get(entry.key)
+        if known is None or known[0] != entry.expires_s:
+            known = self._expires[entry.key] = entry.expires_s, now_s + left_s
+        return min(left_s, known[1] - now_s) - margin_s
 
     def _settled(self, id_: str, session: Fields) -> Fields:
         """Ask until the session is more than requested, for `wait_s`."""
         wait_s = _POLL_S
-        deadline_s = self._api.clock.now_s() + self._settings.wait_s
+        deadline_s = self._api.clock.steady_s() + self._settings.wait_s
         while _status(session) == "REQUESTED":
-            left_s = deadline_s - self._api.clock.now_s()
+            left_s = deadline_s - self._api.clock.steady_s()
             if left_s <= 0:
                 break
             self._api.pause(min(wait_s, left_s))

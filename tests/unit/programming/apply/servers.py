@@ -55,9 +55,13 @@ class Clock:
 
     def __init__(self) -> None:
         self.now = 1_700_000_000.0
+        self.is_set_s = 0.0
         self.slept: list[float] = []
 
     def now_s(self) -> float:
+        return self.now + self.is_set_s
+
+    def steady_s(self) -> float:
         return self.now
 
     def sleep(self, seconds: float, woken: threading.Event) -> None:

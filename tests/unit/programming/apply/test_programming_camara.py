@@ -148,6 +148,17 @@ def test_a_session_is_extended_before_it_expires_and_not_sooner(bench: Bench) ->
     assert bench.session["duration"] == 2000
 
 
+def test_a_clock_that_is_set_back_makes_no_session_last_longer(bench: Bench) -> None:
+    target = bench.make(duration_s=1000)
+    target.apply([rule()])
+    assert target.renew() == 800.0
+    bench.clock.is_set_s = -3600.0
+    assert target.renew() == 800.0
+    bench.clock.now += 801
+    target.renew()
+    assert bench.server.asked[-1].path.endswith("/extend")
+
+
 def test_a_session_at_its_longest_is_replaced_instead_of_left_to_expire(bench: Bench) -> None:
     bench.server.longest_s = 1000
     target = bench.make(duration_s=1000)
