@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import functools
 import threading
 from collections.abc import Awaitable, Callable
 from typing import Any
@@ -215,7 +214,8 @@ class _Spinner:
         self._stopped = False
         self._thread = threading.Thread(target=self._spin, name=thread, daemon=True)
         self._thread.start()
-        self._clock = ClockWatch(functools.partial(republish_names, (node,)))
+        self._node = node
+        self._clock = ClockWatch(self._clock_set)
 
     def stop(self) -> None:
         """End the thread; again is harmless."""
@@ -223,6 +223,11 @@ class _Spinner:
         self._clock.close()
         self._executor.shutdown()
         self._thread.join()
+
+    def _clock_set(self) -> None:
+        """Have the executor look anew how long to wait, and the participant send what is due."""
+        with contextlib.suppress(RuntimeError):  # its context may be over
+            republish_names((self._node,))
 
     def _spin(self) -> None:
         with contextlib.suppress(ExternalShutdownException, ShutdownException):
