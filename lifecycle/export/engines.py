@@ -347,6 +347,8 @@ def _pod(deployment: Deployment, machine: str) -> dict[str, object]:
             "failureThreshold": failures,
         }
 
+    # podman 4 shares a volume among all pods that call it the same.
+    volume = deployment.name(machine)
     container: dict[str, object] = {
         "name": "supervisor",
         "image": deployment.image,
@@ -366,7 +368,7 @@ def _pod(deployment: Deployment, machine: str) -> dict[str, object]:
             "capabilities": {"drop": ["ALL"]},
             "seccompProfile": {"type": "RuntimeDefault"},
         },
-        "volumeMounts": [{"name": "tmp", "mountPath": "/tmp"}],  # noqa: S108
+        "volumeMounts": [{"name": volume, "mountPath": "/tmp"}],  # noqa: S108
     }
     spec: dict[str, object] = {
         "hostNetwork": True,
@@ -374,7 +376,7 @@ def _pod(deployment: Deployment, machine: str) -> dict[str, object]:
         "dnsPolicy": "ClusterFirstWithHostNet",
         "terminationGracePeriodSeconds": deployment.stop_s,
         "containers": [container],
-        "volumes": [{"name": "tmp", "emptyDir": {}}],
+        "volumes": [{"name": volume, "emptyDir": {}}],
     }
     if machine and machine != THIS_HOST:
         # A node's name is a DNS name: capitals and `_` cannot be in it.

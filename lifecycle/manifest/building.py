@@ -96,11 +96,11 @@ def build_on_violation(cursor: Cursor) -> OnViolation:
 
 
 def _consequences(cursor: Cursor) -> Iterator[tuple[str, Cursor]]:
-    """Yield the entries of `on_violation`; a single word is for every rule."""
+    """Yield the entries of `on_violation`; a single value is for every rule."""
     written = cursor.get("on_violation")
     if written is None:
         return
-    if isinstance(written.value.data, Mapping):
+    if isinstance(written.value.data, Mapping) and [*written.value.data] != ["mode"]:
         yield from written.entries()
     else:
         yield BY_DEFAULT, written

@@ -106,7 +106,8 @@ def _meant(choice: Violation) -> tuple[Violation, ...] | None:
         branch
         for branch in choice.branches
         if not any(
-            each.keyword in {"type", "required"} and each.place == choice.place for each in branch
+            each.keyword in {"type", "required", "not"} and each.place == choice.place
+            for each in branch
         )
     ]
     return fitting[0] if len(fitting) == 1 else None
@@ -427,10 +428,11 @@ def _holds(schema: Any, value: Any, definitions: Mapping[str, Any]) -> bool:
             fits = any(_is_type(value, each) for each in _listed(operand))
         elif keyword == "$ref":
             fits = _holds(definitions[operand.removeprefix("#/$defs/")], value, definitions)
-        elif keyword == "anyOf":
-            fits = any(_holds(each, value, definitions) for each in operand)
-        elif keyword == "oneOf":
-            fits = sum(_holds(each, value, definitions) for each in operand) == 1
+        elif keyword in {"anyOf", "oneOf"}:
+            holding = (_holds(each, value, definitions) for each in operand)
+            fits = any(holding) if keyword == "anyOf" else sum(holding) == 1
+        elif keyword == "not":
+            fits = not _holds(operand, value, definitions)
         elif keyword in {"enum", "const"}:
             fits = _is_one_of(value, operand if keyword == "enum" else [operand])
         elif isinstance(value, dict):

@@ -815,5 +815,8 @@ def test_a_publisher_serves_one_by_tcp_and_another_by_shared_memory(
     with up(manifest, "--until", "verified", runtime=tmp_path) as run:
         assert run.finish() == ExitCode.OK
         (*_, last) = run.of_kind("verdict")
-        assert {each["transport"] for each in last["verdict"]["flows"]} == {"tcpv4", "shm"}
+        assert {each["effective_transport"] for each in last["verdict"]["flows"]} == {
+            "tcpv4",
+            "shm",
+        }
         run.assert_nothing_left()
