@@ -127,10 +127,12 @@ class _Done:
     Attributes:
         touched: keys of the nodes that were taken down, or are new.
         given: by key, parameters that a running node has taken.
+        asked: likewise that it was asked to take; who did not answer may have taken them.
     """
 
-    touched: set[str]
-    given: dict[str, GivenParameters]
+    touched: set[str] = dataclasses.field(default_factory=set)
+    given: dict[str, GivenParameters] = dataclasses.field(default_factory=dict)
+    asked: dict[str, GivenParameters] = dataclasses.field(default_factory=dict)
 
 
 class Applying:
@@ -206,7 +208,7 @@ class Applying:
             phase=self._sequence.phase,
             active=active,
         )
-        done = _Done(touched=set(), given={})
+        done = _Done()
         timeout_s = order.timeout_s or self._timeout_s
         self._gate.close()
         self._sequence.phase = _APPLYING
@@ -325,10 +327,10 @@ class Applying:
         deadline = asyncio.get_running_loop().time() + self._timeout_s
         given = {
             key: dataclasses.replace(each, before=each.now, now=each.before)
-            for key, each in done.given.items()
+            for key, each in done.asked.items()
             if key not in done.touched and not system.nodes[key].is_gone
         }
-        back = _Done(touched=set(), given={})
+        back = _Done()
         try:
             await self._give(given, back)
         except StepFailedError as failure:
@@ -382,6 +384,7 @@ class Applying:
 
         async def give(key: str, values: GivenParameters) -> None:
             node = self._system.nodes[key]
+            done.asked[key] = values
             try:
                 await self._sets(node.name, values.now, values.types)
             except MiddlewareError as error:

@@ -269,6 +269,25 @@ def test_parameters_that_were_set_are_set_back(tmp_path: Path) -> None:
     assert "/viewer deactivate" not in _since_begun(world)
 
 
+def test_parameters_that_a_death_kept_us_from_hearing_of_are_set_back_too(tmp_path: Path) -> None:
+    camera = dataclasses.replace(CAMERA, supervision=AGAIN)
+    plans = [plan_of(camera, _rate(VIEWER, rate)) for rate in (1.0, 2.0)]
+
+    async def acts(world: SessionWorld) -> None:
+        world.hosts.takes_s["/viewer set"] = 1.0  # it takes them at once, and answers late
+        applying = asyncio.ensure_future(world.apply(plans[1]))
+        await world.story.until("/viewer set {'rate': 2.0}")
+        world.kill("camera")
+        assert "cannot keep '/camera' running" in (await applying).error
+        await world.story.until("[restarted] camera (1)")
+
+    world = _session(tmp_path, plans[0], acts)
+    assert [line for line in world.story if " set " in line] == [
+        "/viewer set {'rate': 2.0}",
+        "/viewer set {'rate': 1.0}",
+    ]
+
+
 def test_one_that_takes_too_long_is_rolled_back(tmp_path: Path) -> None:
     async def acts(world: SessionWorld) -> None:
         world.hosts.takes_s["/arm configure"] = 4.0
