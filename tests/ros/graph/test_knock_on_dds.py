@@ -34,7 +34,7 @@ os._exit(0)
 """
 """Ends when told to, whatever rclpy's own handling of signals makes of it in its first moment."""
 
-NOTHING = SimpleNamespace(nodes=())
+NOTHING = SimpleNamespace(nodes=(), system="nothing", modes=())
 TIMES = 6
 
 
