@@ -71,6 +71,7 @@ class ServiceCalls:
         self._observer = observer
         self._clients: dict[tuple[str, type[Any]], Client] = {}
         self.group = ReentrantCallbackGroup()
+        self._destroyed = False
         self._spinner: _Spinner | None = None
         if observer.owns_node:
             self._spinner = _Spinner(observer.node, thread="service-calls")
@@ -96,13 +97,14 @@ class ServiceCalls:
             before: awaited when the first request is about to leave; what it raises keeps it back.
 
         Raises:
-            ServiceUnansweredError: at the deadline, or as soon as the service is forgotten.
+            ServiceUnansweredError: at the deadline, or as soon as the service is forgotten once the
+                request was sent.
         """
         try:
             loop = asyncio.get_running_loop()
             deadline = loop.time() + timeout_s
-            client = self._client(service, type_)
-            if not await self._found(client, service, deadline):
+            client = await self._usable(service, type_, deadline)
+            if client is None:
                 raise ServiceUnansweredError(service, found=False, timeout_s=timeout_s)
             if before is not None:
                 await before()
@@ -145,6 +147,7 @@ class ServiceCalls:
 
     def destroy(self) -> None:
         """Stop the thread and drop the clients; again is harmless."""
+        self._destroyed = True
         if self._spinner is not None:
             self._spinner.stop()
         self.forget("")
@@ -155,6 +158,20 @@ class ServiceCalls:
             client = self._observer.node.create_client(type_, service, callback_group=self.group)
             self._clients[service, type_] = client
         return client
+
+    async def _usable(self, service: str, type_: type[Any], deadline: float) -> Client | None:
+        """Wait until a service is there; None at the deadline.
+
+        Its client may be dropped meanwhile, with a node of that name that the graph shows to have
+        left only now: its successor is waited for by another one.
+        """
+        while True:
+            client = self._client(service, type_)
+            try:
+                return client if await self._found(client, service, deadline) else None
+            except InvalidHandle:
+                if self._destroyed:
+                    raise
 
     async def _found(self, client: Client, service: str, deadline: float) -> bool:
         """Wait until `client` may be used: matched with every server, or long enough with some.

@@ -304,10 +304,37 @@ def test_a_question_to_a_node_that_is_forgotten_meanwhile_is_unanswered(
     clients: NodeClients,
 ) -> None:
     async def ask() -> None:
-        asking = asyncio.ensure_future(clients.get_state("/absent", timeout_s=5.0))
+        asking = asyncio.ensure_future(clients.get_state("/absent", timeout_s=0.2))
         await asyncio.sleep(0)
         clients.forget("/absent")
         await asking
+
+    with pytest.raises(ServiceUnansweredError):
+        asyncio.run(ask())
+
+
+def test_a_question_to_a_node_that_comes_outlives_one_of_its_name_that_is_seen_to_leave(
+    clients: NodeClients, context: rclpy.Context, serve: Serve
+) -> None:
+    """The graph shows that a process ended after its successor was asked: seen of a container."""
+
+    async def ask() -> str:
+        asking = asyncio.ensure_future(clients.get_state("/served", timeout_s=BOUND_S))
+        await asyncio.sleep(0)
+        clients.forget("/served")
+        await asyncio.sleep(0)
+        serve(ManagedNode("served", context=context))
+        return await asking
+
+    assert run(ask()) == "unconfigured"
+
+
+def test_a_question_that_waits_ends_with_the_clients(clients: NodeClients) -> None:
+    async def ask() -> None:
+        asking = asyncio.ensure_future(clients.get_state("/absent", timeout_s=BOUND_S))
+        await asyncio.sleep(0)
+        clients.destroy()
+        await asyncio.wait_for(asking, 1.0)
 
     with pytest.raises(ServiceUnansweredError):
         asyncio.run(ask())
