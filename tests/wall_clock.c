@@ -32,6 +32,7 @@ static int (*semaphore_of)(sem_t *, clockid_t, const struct timespec *);
 static int (*mutex_of)(pthread_mutex_t *, clockid_t, const struct timespec *);
 static int (*timer_of)(int, int, const struct itimerspec *, struct itimerspec *);
 static ssize_t (*read_of)(int, void *, size_t);
+static int (*poll_of)(struct pollfd *, nfds_t, int);
 static int (*sleep_of)(clockid_t, int, const struct timespec *, struct timespec *);
 
 /* x86_64 has an older one, too, for other conditions. */
@@ -55,6 +56,7 @@ __attribute__((constructor)) static void begin(void) {
   mutex_of = dlsym(RTLD_NEXT, "pthread_mutex_clocklock");
   timer_of = dlsym(RTLD_NEXT, "timerfd_settime");
   read_of = dlsym(RTLD_NEXT, "read");
+  poll_of = dlsym(RTLD_NEXT, "poll");
   sleep_of = dlsym(RTLD_NEXT, "clock_nanosleep");
   clock_of = dlsym(RTLD_NEXT, "clock_gettime");
 }
@@ -198,10 +200,38 @@ int timerfd_settime(int timer, int flags, const struct itimerspec *when, struct 
   return timer_of(timer, flags, when, old);
 }
 
+/* Note of FILES which are timers that were cancelled; return how many poll(2) did not count. */
+static int cancelled(struct pollfd *files, nfds_t count) {
+  int more = 0;
+  for (nfds_t each = 0; each < count; each++) {
+    int found = files[each].fd < 0 ? -1 : watch_of(files[each].fd);
+    if (found < 0 || watches[found].expects == *ahead) continue;
+    more += !files[each].revents;
+    files[each].revents |= POLLIN;
+  }
+  return more;
+}
+
+int poll(struct pollfd *files, nfds_t count, int wait_ms) {
+  int64_t end = now_of(CLOCK_MONOTONIC) + wait_ms * (SECOND / 1000), left;
+  int slice = SLICE / 1000000, watched = 0, result;
+  if (!poll_of) poll_of = dlsym(RTLD_NEXT, "poll");
+  for (nfds_t each = 0; each < count; each++)
+    watched += files[each].fd >= 0 && watch_of(files[each].fd) >= 0;
+  if (!watched) return poll_of(files, count, wait_ms);
+  do {
+    left = wait_ms < 0 ? slice : (end - now_of(CLOCK_MONOTONIC)) / 1000000;
+    result = poll_of(files, count, left < 0 ? 0 : left < slice ? (int)left : slice);
+    if (result >= 0) result += cancelled(files, count);
+  } while (!result && left > 0);
+  return result;
+}
+
 ssize_t read(int file, void *data, size_t length) {
   int found = watch_of(file);
   struct pollfd readable = {.fd = file, .events = POLLIN};
-  while (found >= 0 && watches[found].timer == file + 1 && poll(&readable, 1, SLICE / 1000000) == 0)
+  while (found >= 0 && watches[found].timer == file + 1 &&
+         poll_of(&readable, 1, SLICE / 1000000) == 0)
     if (watches[found].expects != *ahead) {
       watches[found].expects = *ahead;
       errno = ECANCELED;

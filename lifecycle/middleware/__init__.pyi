@@ -28,7 +28,7 @@ from .fastdds.settings import stop_listening as stop_listening
 from .fastdds.settings import unknown_versions as unknown_versions
 from .process.busy_timer import BusySign as BusySign
 from .process.busy_timer import Overdue as Overdue
-from .process.clock import ClockWatch as ClockWatch
+from .process.clock import ClockTimer as ClockTimer
 from .process.control import adopt_orphans as adopt_orphans
 from .process.control import check_threads as check_threads
 from .process.control import drop_network_administration as drop_network_administration

@@ -257,7 +257,7 @@ class Host:
         """Construct, say ready, obey; never returns."""
         # Both before any constructor of the user's: whatever it does, the process can be ended.
         self._obey()
-        beside = (self._channel.fileno(), self._receive)
+        beside = {self._channel.fileno(): self._receive, **self._loop.beside}
         with on_signal(lambda number: self._end(number.name), beside=beside):
             follow_nodes(self._adoption)
             for index, planned in enumerate(self._spec.nodes):

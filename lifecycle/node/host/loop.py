@@ -22,7 +22,7 @@ import socket
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Callable, Coroutine, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, Protocol
 
 from rclpy.context import Context
@@ -37,7 +37,7 @@ from rclpy.node import Node
 from lifecycle.manifest import Executor
 from lifecycle.middleware import (
     BusySign,
-    ClockWatch,
+    ClockTimer,
     NodeExecutor,
     Watching,
     hidden_nodes,
@@ -244,7 +244,8 @@ class NodeLoop:
         >>> loop = NodeLoop(context)
         >>> camera = Camera()
         >>> loop.add(camera, camera.lifecycle)
-        >>> with on_signal(lambda number: loop.stop(f"signal {number}", code=0)):
+        >>> ending = lambda number: loop.stop(f"signal {number}", code=0)
+        >>> with on_signal(ending, beside=loop.beside):
         ...     loop.spin_and_exit()
     """
 
@@ -272,6 +273,12 @@ class NodeLoop:
         self._left = False
         self._leaving = threading.Lock()
         self._code = 0
+        self._clock = ClockTimer()
+
+    @property
+    def beside(self) -> dict[int, Callable[[], bool]]:
+        """What is to be read beside signals, see `on_signal`."""
+        return {self._clock.fileno(): self._clock_set} if self._clock.works else {}
 
     @property
     def nodes(self) -> tuple[Node, ...]:
@@ -364,7 +371,6 @@ class NodeLoop:
             threading.Thread(target=self._spin_own, name="executor", daemon=True).start()
         if self._prober is not None:
             self._prober.start()
-        ClockWatch(self._clock_set)
         while not self._done:
             try:
                 self._turn()
@@ -378,11 +384,14 @@ class NodeLoop:
         contexts = dict.fromkeys([self._context, *(node.context for node in self._nodes)])
         leave_and_exit(self._code, nodes=self._nodes, contexts=contexts)
 
-    def _clock_set(self) -> None:
+    def _clock_set(self) -> bool:
         """Have executors look anew how long to wait, and participants send what is due."""
+        if not self._clock.is_set():
+            return False
         self.call_beside(self.republish_names)
         if self._own is not self._executor:
             self._own.wake()
+        return True
 
     def _turn(self) -> None:
         """Run the next callback under the watchdog."""
@@ -466,14 +475,14 @@ def _executor(kind: Executor, threads: int, context: Context) -> Any:
 def on_signal(
     handler: Callable[[signal.Signals], None],
     *,
-    beside: tuple[int, Callable[[], bool]] | None = None,
+    beside: Mapping[int, Callable[[], bool]],
 ) -> Iterator[None]:
     """Call `handler` in a thread of its own for each SIGINT and SIGTERM.
 
     Args:
         handler: takes the signal.
-        beside: a descriptor that this thread reads, too: the function is called whenever it is
-            readable, until it returns False.
+        beside: descriptors that this thread reads, too: the function of each is called whenever it
+            is readable, until it returns False.
 
     A Python signal handler runs only when the main thread runs Python, and the main thread sits
     in rcl's wait. The wake-up descriptor is written by the C handler, so a thread can read it.
@@ -487,12 +496,12 @@ def on_signal(
     def read() -> None:
         poll = select.poll()
         poll.register(receiver, select.POLLIN)
-        if beside is not None:
-            poll.register(beside[0], select.POLLIN)
+        for each in beside:
+            poll.register(each, select.POLLIN)
         while True:
             for descriptor, _ in poll.poll():
-                if beside is not None and descriptor == beside[0]:
-                    if not beside[1]():
+                if descriptor in beside:
+                    if not beside[descriptor]():
                         poll.unregister(descriptor)
                     continue
                 data = receiver.recv(16)

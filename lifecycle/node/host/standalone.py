@@ -159,7 +159,9 @@ def run(
     loop = NodeLoop(
         context, liveliness.watchdog, executor=planned.executor, threads=planned.threads
     )
-    with on_signal(lambda number: _on_signal(number, loop, report, interrupted)):
+    with on_signal(
+        lambda number: _on_signal(number, loop, report, interrupted), beside=loop.beside
+    ):
         if spec is not None and not _is_ours(node_class):
             _adopt(node_class, spec, loop, context=context, report=report, mode=mode)
             loop.spin_and_exit()
