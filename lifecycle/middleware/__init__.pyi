@@ -12,6 +12,7 @@ from .discovery.rediscovery import call_out as call_out
 from .discovery.rediscovery import introduce as introduce
 from .discovery.rediscovery import republish_names as republish_names
 from .discovery.rediscovery import send_again_soon as send_again_soon
+from .discovery.rediscovery import wake_participants as wake_participants
 from .fastdds.dscp import widen_discovery_buffers as widen_discovery_buffers
 from .fastdds.nfe import SHARED_MEMORY as SHARED_MEMORY
 from .fastdds.nfe import UniqueFlowNotFeasible as UniqueFlowNotFeasible
