@@ -7,7 +7,8 @@ Two participants that lost each other for longer than their lease (20 s) drop on
 each announces itself once in 3 s. `call_out` makes both sides announce themselves at once: a
 participant that receives the announcement of one that does not exist answers to where it seems to
 be (see probe.py). rmw_dds_common keeps the name of a node that was dropped out of the graph until
-its participant publishes its entities anew, which `republish_names` makes it do.
+its participant publishes its entities anew, which `republish_names` makes it do, and no endpoint
+may end for it.
 
 The kernel doubles the time between TCP retransmissions each time, up to 120 s, so that after an
 outage nothing passes for about as long again (RFC 6298 §5.5).
@@ -172,12 +173,12 @@ def introduce(
 def republish_names(nodes: Iterable[Node]) -> None:
     """Make the participants of `nodes` publish anew which nodes and endpoints they have.
 
-    rmw_fastrtps does so whenever a node or an endpoint is made or destroyed. It is a hidden node
-    without endpoints, for a moment: a discovery server of Fast DDS 2.14 that is told of the end of
-    one endpoint drops all that it has still to tell of its participant, to hosts that are cut off
-    for good (PDPServer::process_disposals, remove_related_alive_from_history_nts; measured: made
-    while a link was cut, 8 of 16 publishers were never seen by the other host). Take one node of
-    each participant.
+    rmw_fastrtps does so whenever a node or an endpoint is made or destroyed. Here it is a hidden
+    node without endpoints, for a moment: when an endpoint ends, a discovery server of Fast DDS 2.14
+    drops whatever it has not told others yet of that participant's other endpoints, and never tells
+    it again (remove_related_alive_from_history_nts in PDPServer::process_disposals). What was made
+    while a link was cut arrives there together with what is said once it is back (measured: of 16
+    publishers 8 were never seen by the other host). Take one node of each participant.
     """
     for node in nodes:
         with node.context.handle:
