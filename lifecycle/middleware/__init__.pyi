@@ -4,7 +4,6 @@ from .discovery.discovery_server import discovery_server_listens as discovery_se
 from .discovery.liveliness import AlivePublisher as AlivePublisher
 from .discovery.liveliness import AliveSubscription as AliveSubscription
 from .discovery.liveliness import PlanNotices as PlanNotices
-from .discovery.liveliness import machine_topic as machine_topic
 from .discovery.liveliness import node_topic as node_topic
 from .discovery.probe import discovery_peers as discovery_peers
 from .discovery.probe import peers_environment as peers_environment
