@@ -72,7 +72,7 @@ def test_each_supervisor_says_how_its_own_nodes_are_to_a_node_of_either(
         "run": {"python": "tests.ros.supervisor.systems:Monitor"},
         "interface": {"subscriptions": [reads]},
     }
-    edit = {**UNIQUE, "nodes/monitor": monitor, "policy/ros_interface": "read_only"}
+    edit = {**UNIQUE, "nodes/monitor": monitor}
     manifest = article(tmp_path, pair[0].ipv4, pair[1].ipv4, edit=edit)
     with up_on_both(*pair, manifest, runtime=tmp_path) as ups:
         begun = []
