@@ -207,6 +207,11 @@ class ObserverParticipant:
 
         disown_ports()
 
+    @property
+    def prefix(self) -> str:
+        """GUID prefix of our participant, 24 hex digits; empty where that is not known."""
+        return self._graph.discovery.prefix
+
     def announce_machine(self, system: str, machine: str) -> AlivePublisher:
         """Announce ourselves as the supervisor of a machine, by DDS liveliness."""
         from lifecycle.middleware import AlivePublisher
