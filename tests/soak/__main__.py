@@ -34,7 +34,7 @@ _SET_UP = (
 
 
 EXCUSED = 5
-"""Rounds that are done once more because Fast DDS locked itself up; it did once in 55 rounds."""
+"""Rounds that are done once more because Fast DDS deadlocked; it did once in 55 rounds."""
 
 
 def main() -> int:
@@ -120,7 +120,7 @@ def _soak(options: argparse.Namespace, rounds: list, *, private: bool) -> int:
                 print(f"  as expected, {time.monotonic() - started_s:.1f} s", flush=True)
         print(soaking.measured())
         if excused:
-            print(f"done once more, because Fast DDS had locked itself up: {excused}")
+            print(f"done once more, because Fast DDS was deadlocked: {excused}")
         if options.keep:
             kept = Path(tempfile.mkdtemp(prefix=f"soak-kept-{options.seed}-")) / "kept"
             shutil.copytree(directory, kept, ignore=_sockets)

@@ -65,7 +65,7 @@ DOWN_S = 25.0
 FLOWS_S = 5.0
 """From a system that is as it was to data that flow to every node; on two busy cores."""
 LOOKS_S = STUCK_S + 2.0
-"""So long it takes to find out that our own participant is deaf."""
+"""So long it takes to find out that our own participant is deadlocked."""
 APPLY_S = 15.0
 """`lifecycle apply --timeout`."""
 
@@ -201,20 +201,20 @@ class Soaking:
             run.close()
 
     def locked_up(self) -> str:
-        """Say whose participant hears nothing any more, if that is why a round failed.
+        """Say whose participant receives nothing any more, if that is why a round failed.
 
         Fast DDS 2.14 does that now and then in whoever uses it (docs/liveliness.md). The supervisor
         reports it of its nodes and of itself; our own participant is replaced.
         """
         events = () if self._watched is None else tuple(self._watched.events)
         for event in events:
-            if event.get("event") == "silent" and event["cause"] == "deaf":
+            if event.get("event") == "silent" and event["cause"] == "deadlocked":
                 return str(event["message"])
             if event.get("event") == "notice" and "participant has left unread" in event["message"]:
                 return str(event["message"])
         deadline = time.monotonic() + LOOKS_S
         while time.monotonic() < deadline:
-            if how := self._reception.deaf([os.getpid()]).get(os.getpid()):
+            if how := self._reception.deadlocked([os.getpid()]).get(os.getpid()):
                 self.transitions.abandon()
                 self._abandoned.append(self.transitions)  # what destroys it would wait for ever
                 self.transitions = _transitions(self.domain_id)

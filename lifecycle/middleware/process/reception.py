@@ -1,6 +1,6 @@
-"""Participants that hear nothing any more: threads that leave unread what waits at their sockets.
+"""Participants that receive nothing any more: threads that leave unread what arrives.
 
-Owns: `Reception`. Fast DDS 2.14 locks itself up for good when a writer leaves to which it is just
+Owns: `Reception`. Fast DDS 2.14 deadlocks for good when a writer leaves to which it is just
 answering, and a lease is looked at next: the thread that receives waits for the thread of timers to
 be done (ResourceEvent::unregister_timer), and that one for a lock of the former
 (PDP::check_remote_participant_liveliness; eProsima/Fast-DDS, issue 6502). The process runs on, its
@@ -38,12 +38,12 @@ class Reception:
         self._unread: frozenset[int] = frozenset()
         self._asleep: dict[tuple[int, int], _Asleep] = {}
 
-    def deaf(self, pids: Iterable[int]) -> dict[int, str]:
-        """Return who hears nothing any more, and how that shows, as half a sentence.
+    def deadlocked(self, pids: Iterable[int]) -> dict[int, str]:
+        """Return who receives nothing any more, and how that shows, as half a sentence.
 
         One look tells nothing: ask each second or two. A process that was stopped, or whose threads
-        wait for a processor, is not deaf. Known are threads of Fast DDS that receive over UDP;
-        over TCP and shared memory nobody is found to be deaf.
+        wait for a processor, is not deadlocked. Threads of Fast DDS that receive over UDP are
+        known; over TCP and shared memory alone nobody is found to be deadlocked.
 
         Args:
             pids: of processes of this host, in our network namespace.
@@ -67,7 +67,7 @@ class Reception:
                     for_s = now_s - known.since_s
                     found[pid] = (
                         f"has left unread for {for_s:.0f} s what arrives at UDP port "
-                        f"{ports[inode]}: Fast DDS has locked itself up in it"
+                        f"{ports[inode]}: Fast DDS is deadlocked in it"
                     )
         self._asleep = asleep
         return found

@@ -3,8 +3,8 @@
 Owns: `SilenceMonitor`, which turns what is noticed of processes and machines into events, findings
 and the status of nodes. Nothing here waits or asks: the kernel says that a process was stopped or
 that an executor hangs (middleware/process/busy_timer.py), DDS that a machine is lost; reception.py
-looks who hears nothing. A process that ended is not silent but dead, see process_monitor.py. Must
-not import rclpy.
+looks who receives nothing. A process that ended is not silent but dead, see process_monitor.py.
+Must not import rclpy.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from lifecycle.supervisor.run.events import (
     Notice,
 )
 from lifecycle.verify import (
-    DEAF_OBSERVER,
+    DEADLOCKED_OBSERVER,
     SILENT_NODE,
     Finding,
     Observation,
@@ -47,7 +47,7 @@ class Cause(enum.Enum):
     STOPPED = "stopped"
     HUNG = "hung"
     UNSERVED = "unserved"
-    DEAF = "deaf"
+    DEADLOCKED = "deadlocked"
     LOST = "lost"
     REPORTED = "told"
 
@@ -77,7 +77,7 @@ class SilenceMonitor:
         self._is_there = is_there
         self._listeners = [changed]
         self._silent: dict[str, _Silence] = {}
-        self._observer_is_deaf = ""
+        self._observer_is_deadlocked = ""
 
     @property
     def silent(self) -> Mapping[str, str]:
@@ -128,12 +128,12 @@ class SilenceMonitor:
         if news:
             self._tell()
 
-    def observer_is_deaf(self, how: str) -> None:
-        """Note how it shows that our own participant hears nothing any more; empty if it hears."""
-        if how and not self._observer_is_deaf:
+    def observer_is_deadlocked(self, how: str) -> None:
+        """Note how it shows that our own participant receives nothing; empty while it does."""
+        if how and not self._observer_is_deadlocked:
             self._emit(Notice(message=f"{_OBSERVER} {how}; {_OBSERVER_FIX}"))
-        news = bool(how) is not bool(self._observer_is_deaf)
-        self._observer_is_deaf = how
+        news = bool(how) is not bool(self._observer_is_deadlocked)
+        self._observer_is_deadlocked = how
         if news:
             self._tell()
 
@@ -187,18 +187,8 @@ class SilenceMonitor:
             listener()
 
     def findings(self) -> tuple[Finding, ...]:
-        """Return one finding for each silent node, and one if we hear nothing ourselves."""
-        deaf = self._observer_is_deaf
-        observer = (
-            DEAF_OBSERVER.finding(
-                Outcome.VIOLATED,
-                subject="supervisor",
-                expected="a graph that is observed",
-                observed="nothing new",
-                message=f"{_OBSERVER} {deaf}: what it sees of the graph does not change any more",
-            ),
-        )
-        return (observer if deaf else ()) + tuple(
+        """Return one finding for each silent node, and one if we receive nothing ourselves."""
+        return self._of_the_observer() + tuple(
             SILENT_NODE.finding(
                 Outcome.VIOLATED,
                 subject=name,
@@ -208,6 +198,20 @@ class SilenceMonitor:
                 node=name,
             )
             for name, silence in sorted(self._silent.items())
+        )
+
+    def _of_the_observer(self) -> tuple[Finding, ...]:
+        if not self._observer_is_deadlocked:
+            return ()
+        message = f"{_OBSERVER} {self._observer_is_deadlocked}: it sees no change of the graph"
+        return (
+            DEADLOCKED_OBSERVER.finding(
+                Outcome.VIOLATED,
+                subject="supervisor",
+                expected="a graph that is observed",
+                observed="nothing new",
+                message=message,
+            ),
         )
 
 

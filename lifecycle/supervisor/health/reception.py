@@ -1,4 +1,4 @@
-"""Which participants of this host hear nothing any more, the supervisor's own included.
+"""Which participants of this host receive nothing any more, the supervisor's own included.
 
 Owns: `watch_reception`, which turns what the kernel says of unread sockets
 (middleware/process/reception.py) into silent nodes. No event tells of it, so it looks each
@@ -16,32 +16,32 @@ from lifecycle.supervisor.health.liveliness import Cause
 from lifecycle.supervisor.nodes.system import System
 
 EACH_S = 2.0
-"""Two looks and what `Reception` waits make a deaf participant known after 4 to 9 s, once something
-has come that it does not read; participants announce themselves each 3 s."""
+"""With two looks and what `Reception` waits, a deadlocked participant is known 4 to 9 s after
+something came that it does not read; participants announce themselves each 3 s."""
 
 
 async def watch_reception(
-    system: System, deaf: Callable[[Iterable[int]], dict[int, str]] | None = None
+    system: System, deadlocked: Callable[[Iterable[int]], dict[int, str]] | None = None
 ) -> None:
     """Follow who leaves unread what it receives, until cancelled.
 
     Args:
         system: whose nodes fall silent and come back.
-        deaf: see `Reception.deaf`; by default that of a new one.
+        deadlocked: see `Reception.deadlocked`; by default that of a new one.
     """
-    deaf = Reception().deaf if deaf is None else deaf
+    deadlocked = Reception().deadlocked if deadlocked is None else deadlocked
     monitor = system.liveliness
     silent: dict[int, tuple[str, ...]] = {}
     while True:
         await asyncio.sleep(EACH_S)
         names = _names(system)
-        found = deaf([os.getpid(), *names])
-        monitor.observer_is_deaf(found.pop(os.getpid(), ""))
+        found = deadlocked([os.getpid(), *names])
+        monitor.observer_is_deadlocked(found.pop(os.getpid(), ""))
         for pid in silent.keys() - found.keys():
-            monitor.came_back(silent.pop(pid), Cause.DEAF)
+            monitor.came_back(silent.pop(pid), Cause.DEADLOCKED)
         for pid, how in found.items():
             silent[pid] = names[pid]
-            monitor.fell_silent(names[pid], Cause.DEAF, f"its participant (pid {pid}) {how}")
+            monitor.fell_silent(names[pid], Cause.DEADLOCKED, f"its participant (pid {pid}) {how}")
 
 
 def _names(system: System) -> dict[int, tuple[str, ...]]:

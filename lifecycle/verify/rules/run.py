@@ -67,8 +67,8 @@ SILENT_NODE = Rule(
     heals=Heals.WITH_TIME,
     about=About.PRESENCE,
 )
-DEAF_OBSERVER = Rule(
-    id="run.deaf-observer",
+DEADLOCKED_OBSERVER = Rule(
+    id="run.deadlocked-observer",
     meaning="the supervisor receives nothing from the graph any more",
     outcomes=(Outcome.VIOLATED,),
     fix="end the system and start it again: Fast DDS does not get over it",
@@ -95,7 +95,7 @@ RULES = (
     NOT_PROGRAMMED,
     NOT_WIRED,
     SILENT_NODE,
-    DEAF_OBSERVER,
+    DEADLOCKED_OBSERVER,
     PLANS_DIFFER,
     PLAN_UNKNOWN,
 )

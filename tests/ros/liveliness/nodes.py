@@ -38,14 +38,14 @@ class Working(LifecycleNode):
             pass
 
 
-class Deaf(LifecycleNode):
+class Deadlocked(LifecycleNode):
     """Once it is active for the first time, a thread like those of Fast DDS reads nothing more.
 
-    When Fast DDS locks itself up cannot be chosen; what the kernel then says of it can be played.
+    When Fast DDS deadlocks cannot be chosen; what the kernel then says of it can be played.
     """
 
     def on_activate(self, state):
-        mark = Path("deaf")
+        mark = Path("deadlocked")
         if not mark.exists():
             mark.touch()
             self._receiver = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)

@@ -62,11 +62,11 @@ def _send(port: int) -> None:
         sender.sendto(b"hello", ("127.0.0.1", port))
 
 
-def _deaf(reception: Reception, pid: int, within_s: float = 8.0) -> str:
-    """Look again and again until a process is deaf; empty if it never is."""
+def _deadlocked(reception: Reception, pid: int, within_s: float = 8.0) -> str:
+    """Look again and again until a process is deadlocked; empty if it never is."""
     deadline = time.monotonic() + within_s
     while time.monotonic() < deadline:
-        if found := reception.deaf([pid]).get(pid, ""):
+        if found := reception.deadlocked([pid]).get(pid, ""):
             return found
         time.sleep(0.2)
     return ""
@@ -76,18 +76,18 @@ def test_who_does_not_read_is_deaf_until_it_does(play: Play) -> None:
     player, port = play("late")
     _send(port)
     reception = Reception()
-    assert f"UDP port {port}" in _deaf(reception, player.pid)
+    assert f"UDP port {port}" in _deadlocked(reception, player.pid)
     assert player.stdin is not None
     player.stdin.write("\n")
     player.stdin.flush()
     deadline = time.monotonic() + 8.0
-    while reception.deaf([player.pid]):
+    while reception.deadlocked([player.pid]):
         assert time.monotonic() < deadline
         time.sleep(0.05)
 
 
 @pytest.mark.parametrize("how", [("reads",), ("locked", "reads"), ()])
-def test_who_reads_or_is_no_thread_of_fast_dds_is_not_deaf(
+def test_who_reads_or_is_no_thread_of_fast_dds_is_not_deadlocked(
     play: Play, how: tuple[str, ...]
 ) -> None:
     """Two threads may have one name: of a group's socket, and of an address."""
@@ -96,23 +96,23 @@ def test_who_reads_or_is_no_thread_of_fast_dds_is_not_deaf(
     deadline = time.monotonic() + 4.5
     while time.monotonic() < deadline:
         _send(port)
-        assert reception.deaf([player.pid]) == {}
+        assert reception.deadlocked([player.pid]) == {}
         time.sleep(0.05)
 
 
-def test_who_was_stopped_is_not_deaf(play: Play) -> None:
+def test_who_was_stopped_is_not_deadlocked(play: Play) -> None:
     player, port = play("locked")
     _send(port)
     player.send_signal(signal.SIGSTOP)
-    assert _deaf(Reception(), player.pid, within_s=4.5) == ""
+    assert _deadlocked(Reception(), player.pid, within_s=4.5) == ""
 
 
 def test_who_is_not_asked_for_or_gone_is_not_found(play: Play) -> None:
     player, port = play("locked")
     _send(port)
     reception = Reception()
-    assert _deaf(reception, player.pid)
-    assert reception.deaf([]) == {}
+    assert _deadlocked(reception, player.pid)
+    assert reception.deadlocked([]) == {}
     player.kill()
     player.wait()
-    assert reception.deaf([player.pid]) == {}
+    assert reception.deadlocked([player.pid]) == {}

@@ -597,7 +597,7 @@ def test_a_fork_server_tells_that_a_process_was_stopped_and_continues(tmp_path: 
     asyncio.run(test())
 
 
-def test_who_hears_nothing_any_more_is_silent_and_so_said_of_the_supervisor_itself(
+def test_who_receives_nothing_any_more_is_silent_and_so_said_of_the_supervisor_itself(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(reception, "EACH_S", 0.0)
@@ -609,7 +609,7 @@ def test_who_hears_nothing_any_more_is_silent_and_so_said_of_the_supervisor_itse
         looks = iter([{}, {4711: "has left unread"}, {os.getpid(): "has left unread"}, {}])
         done = asyncio.Event()
 
-        def deaf(pids: Iterable[int]) -> dict[int, str]:
+        def deadlocked(pids: Iterable[int]) -> dict[int, str]:
             asked.append(set(pids))
             found = next(looks, None)
             if found is None:
@@ -618,13 +618,13 @@ def test_who_hears_nothing_any_more_is_silent_and_so_said_of_the_supervisor_itse
             return found or {}
 
         rules: list[list[str]] = []
-        watching = asyncio.ensure_future(reception.watch_reception(desk.system, deaf))
+        watching = asyncio.ensure_future(reception.watch_reception(desk.system, deadlocked))
         await asyncio.wait_for(done.wait(), 5.0)
         watching.cancel()
         assert asked[0] == {os.getpid(), 4711}
-        assert rules[:5] == [[], [], ["run.silent-node"], ["run.deaf-observer"], []]
+        assert rules[:5] == [[], [], ["run.silent-node"], ["run.deadlocked-observer"], []]
         assert [(each.kind, getattr(each, "cause", "")) for each in desk.events] == [
-            ("silent", "deaf"),
+            ("silent", "deadlocked"),
             ("notice", ""),
             ("alive", ""),
         ]
