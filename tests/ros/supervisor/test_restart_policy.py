@@ -70,9 +70,7 @@ def test_a_killed_node_of_three_is_active_and_verified_again_and_the_others_go_o
 def test_a_node_that_is_killed_as_soon_as_it_is_active_is_not_waited_for_longer_than_later(
     tmp_path: Path, fresh_domain: int, victim: str
 ) -> None:
-    with up(
-        pair(tmp_path, fresh_domain, edit={"restart": "on-failure"}), runtime=tmp_path
-    ) as run:
+    with up(pair(tmp_path, fresh_domain, edit={"restart": "on-failure"}), runtime=tmp_path) as run:
         run.until("system", reached="active")
         os.kill(run.pid_of(victim), signal.SIGKILL)
         done = run.until("restarted", process=victim)
