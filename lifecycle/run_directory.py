@@ -80,6 +80,7 @@ class RunRecord:
         began_s: seconds since the epoch.
         segments: names of the shared memory files that the processes were seen to use.
         domain_id: where the system is; None if it was not written down.
+        participant: GUID prefix of the supervisor's own, 24 hex digits; empty before there is one.
     """
 
     run_id: str
@@ -89,6 +90,7 @@ class RunRecord:
     children: tuple[ChildRecord, ...] = ()
     segments: tuple[str, ...] = ()
     domain_id: int | None = None
+    participant: str = ""
 
 
 def new_run_id() -> str:
@@ -181,12 +183,14 @@ class RunDirectory:
     Attributes:
         run_id: see RUN_VARIABLE.
         previous: what the supervisor before us wrote, if it did not leave in order.
+        participant: GUID prefix of our supervisor's own, for the record; empty before there is one.
     """
 
     def __init__(self, path: Path, run_id: str, domain_id: int | None = None) -> None:
         self.path = path
         self.run_id = run_id
         self.domain_id = domain_id
+        self.participant = ""
         self.began_s = time.time()
         self.previous: RunRecord | None = None
         self._lock: int | None = None
@@ -294,6 +298,7 @@ class RunDirectory:
             children=children,
             segments=tuple(sorted(segments)),
             domain_id=self.domain_id,
+            participant=self.participant,
         )
         part = self.path / _PART_NAME
         part.unlink(missing_ok=True)

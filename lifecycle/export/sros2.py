@@ -18,7 +18,13 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping
 
 from lifecycle import dataclasses
-from lifecycle.manifest import DIAGNOSTICS_TOPIC, EndpointKind, RunKind
+from lifecycle.manifest import (
+    ALIVE_PULSE,
+    DIAGNOSTICS_TOPIC,
+    EndpointKind,
+    RunKind,
+    supervisor_alive_topic,
+)
 from lifecycle.plan import Plan, PlannedNode, PlannedProcess
 from lifecycle.verify import (
     GRAPH_TOPIC,
@@ -251,8 +257,8 @@ def _supervisor_profile(plan: Plan, machine: str) -> Profile:
             allowed |= {(EndpointKind.SUBSCRIPTION, each) for each in _node_topics(node)}
     for other in plan.machines:
         kind = EndpointKind.PUBLISHER if other.name == machine else EndpointKind.SUBSCRIPTION
-        topic = f"/_lifecycle/{plan.system.replace('-', '_')}/{other.name}/alive"
-        allowed |= {(kind, topic), (kind, f"{topic}_pulse")}
+        topic = supervisor_alive_topic(plan.system, other.name)
+        allowed |= {(kind, topic), (kind, f"{topic}{ALIVE_PULSE}")}
     if any(node.health is not None and node.health.diagnostics for node in plan.nodes):
         allowed.add((EndpointKind.SUBSCRIPTION, DIAGNOSTICS_TOPIC))
     several = len({each.machine for each in plan.nodes}) > 1

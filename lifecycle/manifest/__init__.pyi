@@ -70,6 +70,7 @@ from .model import SystemDeclaration as SystemDeclaration
 from .model import TargetState as TargetState
 from .model import Timeouts as Timeouts
 from .model import UniqueHow as UniqueHow
+from .names import ALIVE_PULSE as ALIVE_PULSE
 from .names import DIAGNOSTICS_TOPIC as DIAGNOSTICS_TOPIC
 from .names import MODE_SERVICE as MODE_SERVICE
 from .names import SUPERVISOR_STATUS as SUPERVISOR_STATUS
@@ -82,6 +83,7 @@ from .names import name_problem as name_problem
 from .names import namespace_problem as namespace_problem
 from .names import node_name_problem as node_name_problem
 from .names import resolve as resolve
+from .names import supervisor_alive_topic as supervisor_alive_topic
 from .names import supervisor_prefix as supervisor_prefix
 from .names import supervisor_services as supervisor_services
 from .names import supervisor_status_topic as supervisor_status_topic

@@ -38,7 +38,6 @@ from lifecycle.manifest.model import (
     Network,
     Node,
     Policy,
-    RosInterfaceAccess,
 )
 from lifecycle.manifest.schema import MANIFEST, nearest, read_schema, validate
 from lifecycle.manifest.shared import Shared, settle
@@ -272,26 +271,10 @@ def load(
         part = partial(manifest, wrong, lost=loading.lost, machines=loading.machines)
         found += check_sound(part, environment=variables)
         raise ManifestError(every())
-    manifest = _offering_by_default(manifest)
     found += check(manifest, environment=variables)
     if any(each.severity is Severity.ERROR for each in found):
         raise ManifestError(every())
     return Loaded(manifest=manifest, warnings=every())
-
-
-def _offering_by_default(manifest: Manifest) -> Manifest:
-    """Return a manifest whose supervisors, if there are several, offer in ROS what is asked for.
-
-    After an outage of a link Fast DDS may show services of a supervisor without the topic by which
-    it is known to be one: for a system of one supervisor nobody is to see that.
-    """
-    policy = manifest.policy
-    alone = len({each.machine for each in manifest.nodes}) <= 1
-    if alone or policy.ros_interface_required:
-        return manifest
-    return dataclasses.replace(
-        manifest, policy=dataclasses.replace(policy, ros_interface=RosInterfaceAccess.OFF)
-    )
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

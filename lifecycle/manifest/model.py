@@ -746,8 +746,7 @@ class Policy:
         unverifiable_blocks: an unverifiable finding closes the gate.
         unpublished: severity of a subscription without publisher; None ignores it.
         unheard: severity of a publisher without subscription; None ignores it.
-        ros_interface: what the supervisor publishes, and may be asked, in ROS. Nothing where nodes
-            run on several machines and the manifest does not ask for it.
+        ros_interface: what the supervisor publishes, and may be asked, in ROS.
         ros_interface_required: the manifest asks for it; else the system runs without it where
             the packages that it takes are not installed.
     """

@@ -4,7 +4,6 @@ from .discovery.discovery_server import discovery_server_listens as discovery_se
 from .discovery.liveliness import AlivePublisher as AlivePublisher
 from .discovery.liveliness import AliveSubscription as AliveSubscription
 from .discovery.liveliness import PlanNotices as PlanNotices
-from .discovery.liveliness import machine_topic as machine_topic
 from .discovery.liveliness import node_topic as node_topic
 from .discovery.probe import discovery_peers as discovery_peers
 from .discovery.probe import peers_environment as peers_environment
@@ -12,6 +11,7 @@ from .discovery.rediscovery import call_out as call_out
 from .discovery.rediscovery import introduce as introduce
 from .discovery.rediscovery import republish_names as republish_names
 from .discovery.rediscovery import send_again_soon as send_again_soon
+from .discovery.rediscovery import wake_participants as wake_participants
 from .fastdds.dscp import widen_discovery_buffers as widen_discovery_buffers
 from .fastdds.nfe import SHARED_MEMORY as SHARED_MEMORY
 from .fastdds.nfe import UniqueFlowNotFeasible as UniqueFlowNotFeasible

@@ -17,6 +17,7 @@ from collections.abc import Collection, Iterable, Mapping
 
 from lifecycle import dataclasses
 from lifecycle.manifest import (
+    ALIVE_PULSE,
     DIAGNOSTICS_TOPIC,
     MODE_SERVICE,
     SUPERVISOR_STATUS,
@@ -32,6 +33,7 @@ from lifecycle.manifest import (
     RosInterfaceAccess,
     incompatibilities,
     join,
+    supervisor_alive_topic,
     supervisor_prefix,
     supervisor_services,
     supervisor_status_topic,
@@ -57,6 +59,8 @@ _DIAGNOSTICS_QOS = QosProfile(
 )
 """What a supervisor's publisher offers."""
 _SUPERVISOR_TOPIC = SUPERVISOR_STATUS, "std_msgs/msg/String"
+_ALIVE_TYPES = {"": "std_msgs/msg/String", ALIVE_PULSE: "std_msgs/msg/Empty"}
+"""Of the topics on which a supervisor asserts its liveliness, by the ends of their names."""
 _SUPERVISOR_SERVICE_TYPE = "std_srvs/srv/Trigger"
 
 PLACEHOLDER_NAMES = frozenset({"_NODE_NAME_UNKNOWN_", "_CREATED_BY_BARE_DDS_APP_"})
@@ -208,6 +212,7 @@ class DeclaredNames:
             parameter services, `~/transition_event` and the like.
         of_supervisors: likewise, those that only supervisors of the plan may have, whatever
             `policy.ros_interface` says.
+        alive: names of the topics by which its supervisors assert their liveliness to each other.
         diagnosed: the plan declares who reads /diagnostics, so that it must be known who are
             supervisors, those of other systems too.
     """
@@ -215,6 +220,7 @@ class DeclaredNames:
     names: frozenset[tuple[EndpointKind, str]] = frozenset()
     own: frozenset[tuple[EndpointKind, str]] = frozenset()
     of_supervisors: frozenset[tuple[EndpointKind, str]] = frozenset()
+    alive: frozenset[str] = frozenset()
     diagnosed: bool = False
 
     @classmethod
@@ -254,6 +260,7 @@ class DeclaredNames:
             own=own,
             # A manifest may declare a node of its own that has them.
             of_supervisors=of_supervisors - names,
+            alive=frozenset(topic for topic, _ in _alive(plan)),
             diagnosed=(EndpointKind.PUBLISHER, DIAGNOSTICS_TOPIC) in names,
         )
 
@@ -280,6 +287,8 @@ class DeclaredNames:
 
     def looks_for(self, kind: EndpointKind, name: str) -> bool:
         """Return whether an undeclared node's endpoint is looked at, whatever it looks like."""
+        if kind is EndpointKind.PUBLISHER and name in self.alive:
+            return True
         return self.fed_by(kind, name) or (self.diagnosed and _is_status(kind, name))
 
 
@@ -387,46 +396,81 @@ def of_supervisors(
 ) -> frozenset[ObservedEndpoint]:
     """Return those endpoints that supervisors offer as policies allow, of this or another system.
 
-    A name proves nothing: who publishes a status topic is that supervisor, if nobody else does; its
-    services are of the same node, and what it publishes on /diagnostics is of the same participant.
+    A name proves nothing: the participant that publishes a status topic, or asserts the liveliness
+    of a machine's supervisor, is that supervisor, if no other does; its services are of the same
+    node, and what it publishes on /diagnostics is of the same participant. Either may be seen late:
+    after an outage of a link they arrive one after the other.
 
     Args:
         plan: of the system that is judged.
         endpoints: of tools.
     """
-    found = [
-        each
-        for each in endpoints
-        if is_supervisor_endpoint(each.kind, each.node, each.name, each.type)
-    ]
-    claims: dict[str, list[ObservedEndpoint]] = {}
-    for each in found:
-        if _is_status(each.kind, each.name):
-            claims.setdefault(each.name, []).append(each)
-    ours = {supervisor_status_topic(each): each for each in supervisor_prefixes(plan)}
+    ours = supervisor_prefixes(plan)
+    alive = _alive(plan)
+    found: list[ObservedEndpoint] = []
+    asserting: list[ObservedEndpoint] = []
+    claims: dict[str, set[_Claim]] = {}
+    for each in endpoints:
+        if is_supervisor_endpoint(each.kind, each.node, each.name, each.type):
+            found.append(each)
+            if _is_status(each.kind, each.name):
+                claims.setdefault(each.name.rpartition("/")[0], set()).add(_claim(each))
+        elif _is_alive(each) and (prefix := alive.get((each.name, each.type))) is not None:
+            asserting.append(each)
+            claims.setdefault(prefix, set()).add(_claim(each))
     access = plan.policy.ros_interface
-    allowed: set[ObservedEndpoint] = set()
+    known: dict[str, _Claim] = {}
     services: set[tuple[str, EndpointKind, str]] = set()
-    participants: set[tuple[str, str]] = set()
-    for topic, (claim, *others) in claims.items():
-        if others or (topic in ours and access is RosInterfaceAccess.OFF):
+    for prefix, (claim, *others) in claims.items():
+        if others or (prefix in ours and access is RosInterfaceAccess.OFF):
             continue
-        allowed.add(claim)
-        participants.add((claim.node, claim.gid[:_PREFIX_DIGITS]))
-        if topic in ours:
-            services |= {(claim.node, *each) for each in _below(ours[topic], plan, access)}
+        known[prefix] = claim
+        if prefix in ours:
+            services |= {(claim[0], *each) for each in _below(prefix, plan, access)}
+    participants = set(known.values())
     diagnoses = takes_diagnostics(plan)
-    return frozenset(
+    allowed = [
         each
         for each in found
-        if each in allowed
-        or (not each.kind.is_topic and (each.node, each.kind, each.name) in services)
-        or (
-            each.name == DIAGNOSTICS_TOPIC
-            and diagnoses
-            and (each.node, each.gid[:_PREFIX_DIGITS]) in participants
+        if (
+            _is_status(each.kind, each.name)
+            and known.get(each.name.rpartition("/")[0]) == _claim(each)
         )
-    )
+        or (not each.kind.is_topic and (each.node, each.kind, each.name) in services)
+        or (each.name == DIAGNOSTICS_TOPIC and diagnoses and _claim(each) in participants)
+    ]
+    return frozenset((*allowed, *asserting))
+
+
+_Claim = tuple[str, str]
+"""A node's name and the GUID prefix of its participant."""
+
+
+def _claim(endpoint: ObservedEndpoint) -> _Claim:
+    return endpoint.node, endpoint.gid[:_PREFIX_DIGITS]
+
+
+def _alive(plan: Plan) -> dict[tuple[str, str], str]:
+    """Return the topics by which supervisors of a plan assert their liveliness, each with its type.
+
+    Returns:
+        The prefix of the supervisor, see `supervisor_prefix`, by name and type.
+    """
+    machines = {each.machine for each in plan.nodes}
+    return {
+        (supervisor_alive_topic(plan.system, machine) + end, type_): supervisor_prefix(
+            plan.system, machine
+        )
+        for machine in (machines if len(machines) > 1 else ())
+        if machine
+        for end, type_ in _ALIVE_TYPES.items()
+    }
+
+
+def _is_alive(endpoint: ObservedEndpoint) -> bool:
+    """Return whether an endpoint may be one by which a supervisor asserts its liveliness."""
+    name = endpoint.node.rpartition("/")[2]
+    return endpoint.kind is EndpointKind.PUBLISHER and matches(name, OUR_NODES)
 
 
 def is_supervisor_endpoint(kind: EndpointKind, node: str, name: str, type_: str) -> bool:

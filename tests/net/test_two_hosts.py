@@ -63,16 +63,19 @@ def test_both_supervisors_activate_their_own_on_the_same_verified_flows(
     assert {each["effective_transport"] for each in flows} == {"udpv4"}
 
 
+_MONITOR = {
+    "machine": "a",
+    "run": {"python": "tests.ros.supervisor.systems:Monitor"},
+    "interface": {
+        "subscriptions": [{"name": "/diagnostics", "type": "diagnostic_msgs/msg/DiagnosticArray"}]
+    },
+}
+
+
 def test_each_supervisor_says_how_its_own_nodes_are_to_a_node_of_either(
     pair: tuple[Host, Host], tmp_path: Path
 ) -> None:
-    reads = {"name": "/diagnostics", "type": "diagnostic_msgs/msg/DiagnosticArray"}
-    monitor = {
-        "machine": "a",
-        "run": {"python": "tests.ros.supervisor.systems:Monitor"},
-        "interface": {"subscriptions": [reads]},
-    }
-    edit = {**UNIQUE, "nodes/monitor": monitor, "policy/ros_interface": "read_only"}
+    edit = {**UNIQUE, "nodes/monitor": _MONITOR}
     manifest = article(tmp_path, pair[0].ipv4, pair[1].ipv4, edit=edit)
     with up_on_both(*pair, manifest, runtime=tmp_path) as ups:
         begun = []
@@ -173,6 +176,31 @@ def test_a_host_that_is_held_reports_when_the_other_one_leaves(
         assert up_b.of_kind("stopping") == []
         up_b.signal(signal.SIGTERM)
         assert up_b.finish() == ExitCode.OK
+
+
+def test_a_supervisor_that_was_killed_and_the_next_one_are_not_taken_for_two(
+    pair: tuple[Host, Host], tmp_path: Path
+) -> None:
+    manifest = article(tmp_path, pair[0].ipv4, pair[1].ipv4, edit={"nodes/monitor": _MONITOR})
+    diagnosed = {"line": "diagnosed article/b: /n2 as active"}
+    with up_on_both(*pair, manifest, "--keep-going", runtime=tmp_path) as (up_a, up_b):
+        for up in (up_a, up_b):
+            up.until("system", reached="active")
+        up_a.met("log", **diagnosed)
+        since = up_a.catch_up()
+        up_b.signal(signal.SIGKILL)
+        up_b.process.wait(BOUND_S)
+        with up_on(pair[1], manifest, "--machine", "b", runtime=tmp_path / "b") as again:
+            again.until("system", reached="active")
+            up_a.catch_up()
+            up_a.until("log", **diagnosed)
+            up_a.until_verdict(lambda verdict: verdict["verdict"] == "ok", since=since)
+        verdicts = [
+            each["verdict"] for each in up_a.events[since:] if each.get("event") == "verdict"
+        ]
+        found = {each["rule"] for verdict in verdicts for each in verdict["findings"]}
+        assert "graph.missing-node" in found
+        assert not {each for each in found if each.startswith("graph.undeclared")}
 
 
 def test_without_a_machine_named_a_host_runs_those_that_have_its_address(

@@ -43,6 +43,7 @@ from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, Reliabilit
 from std_msgs.msg import Empty, String
 
 from lifecycle.codec import from_json
+from lifecycle.manifest import ALIVE_PULSE
 from lifecycle.middleware.rcl import abi
 
 LEASE_S = 0.85
@@ -57,13 +58,6 @@ _LONGEST_NOTICE = 1 << 16
 """Characters of a notice; a line for each silent node."""
 
 _logger = logging.getLogger(__name__)
-_PULSE = "_pulse"
-"""Ends the name of the topic that is asserted; the other one carries messages."""
-
-
-def machine_topic(system: str, machine: str) -> str:
-    """Return the hidden topic on which the supervisor of a machine asserts its liveliness."""
-    return f"/_lifecycle/{system.replace('-', '_')}/{machine}/alive"
 
 
 def node_topic(full_name: str) -> str:
@@ -106,7 +100,7 @@ class AlivePublisher:
         self._node = node
         self._topic = topic
         self._on_listener = on_listener
-        self._pulse = _Pulse(node, topic + _PULSE)
+        self._pulse = _Pulse(node, topic + ALIVE_PULSE)
         # rclpy's own methods: a managed node's would gate them.
         self._publisher = Node.create_publisher(
             node,
@@ -252,7 +246,7 @@ class AliveSubscription:
         self._subscriptions = (
             node.create_subscription(
                 Empty,
-                topic + _PULSE,
+                topic + ALIVE_PULSE,
                 _ignore,
                 _ASSERTED,
                 event_callbacks=_no_subscription_events(liveliness=changed),

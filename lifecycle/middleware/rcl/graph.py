@@ -346,6 +346,12 @@ class GraphObserver:
                 probe.ask_again(to_count=False)
         return max(0.0, PATIENCE_S - age_s)
 
+    @property
+    def prefix(self) -> str:
+        """GUID prefix of its own participant, 24 hex digits; empty where that is not known."""
+        homes = self._stale_node_filter.homes()
+        return next(iter(homes.get(self.node.get_fully_qualified_name(), ())), "")
+
     def announce_ourselves(self) -> None:
         """Have our participant announce itself to all others of this host, as far as that goes."""
         everybody = answered_at(self.domain_id, self.urls, os.environ)
@@ -409,8 +415,7 @@ class GraphObserver:
         """
         if self._destroyed:
             return frozenset()
-        homes = self._stale_node_filter.homes()
-        own = next(iter(homes.get(self.node.get_fully_qualified_name(), ())), "")
+        homes, own = self._stale_node_filter.homes(), self.prefix
         claimed = {*reported, *(prefix for name in nodes for prefix in homes.get(name, ()))}
         if not claimed and is_alone(pid):
             named = {prefix for name, home in homes.items() if name for prefix in home}

@@ -22,7 +22,7 @@ from rclpy.node import Node
 from rclpy.task import Future
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.discovery.rediscovery import republish_names
+from lifecycle.middleware.discovery.rediscovery import wake_participants
 from lifecycle.middleware.process.clock import ClockWatch
 from lifecycle.middleware.rcl.graph import GraphObserver
 
@@ -244,7 +244,7 @@ class _Spinner:
     def _clock_set(self) -> None:
         """Have the executor look anew how long to wait, and the participant send what is due."""
         with contextlib.suppress(RuntimeError):  # its context may be over
-            republish_names((self._node,))
+            wake_participants((self._node,))
 
     def _spin(self) -> None:
         with contextlib.suppress(ExternalShutdownException, ShutdownException):

@@ -43,6 +43,7 @@ from lifecycle.middleware import (
     hidden_nodes,
     leave_and_exit,
     republish_names,
+    wake_participants,
 )
 from lifecycle.node.author.node import LifecycleNode
 from lifecycle.node.lifecycle.execution import hint
@@ -319,8 +320,11 @@ class NodeLoop:
 
     def republish_names(self) -> None:
         """Make every participant of this process publish anew which nodes and endpoints it has."""
+        republish_names(self._of_each_participant())
+
+    def _of_each_participant(self) -> tuple[Node, ...]:
         by_context = {id(node.context): node for node in self._nodes}
-        republish_names((*by_context.values(), *hidden_nodes()))
+        return (*by_context.values(), *hidden_nodes())
 
     def call_soon(self, task: Callable[..., Coroutine[Any, Any, None]], *arguments: object) -> None:
         """Run an `async def` where callbacks of nodes run; from any thread. It must not raise.
@@ -388,7 +392,7 @@ class NodeLoop:
         """Have executors look anew how long to wait, and participants send what is due."""
         if not self._clock.is_set():
             return False
-        self.call_beside(self.republish_names)
+        self.call_beside(lambda: wake_participants(self._of_each_participant()))
         if self._own is not self._executor:
             self._own.wake()
         return True

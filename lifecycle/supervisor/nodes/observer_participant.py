@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.graph import set_within
-from lifecycle.manifest import EndpointKind
+from lifecycle.manifest import EndpointKind, supervisor_alive_topic
 from lifecycle.plan import ParticipantConnections, Plan, PlannedNode
 from lifecycle.supervisor.control.ros_interface import Answer, Offer
 from lifecycle.supervisor.health.peer_supervisors import Listener
@@ -207,17 +207,20 @@ class ObserverParticipant:
 
         disown_ports()
 
+    @property
+    def prefix(self) -> str:
+        """GUID prefix of our participant, 24 hex digits; empty where that is not known."""
+        return self._graph.discovery.prefix
+
     def announce_machine(self, system: str, machine: str) -> AlivePublisher:
         """Announce ourselves as the supervisor of a machine, by DDS liveliness."""
-        from lifecycle.middleware import AlivePublisher, machine_topic
+        from lifecycle.middleware import AlivePublisher
 
-        return AlivePublisher(self._node, machine_topic(system, machine))
+        return AlivePublisher(self._node, supervisor_alive_topic(system, machine))
 
     def watch_machine(self, system: str, machine: str, to: Listener) -> AliveSubscription:
         """Watch the liveliness of the supervisor of a machine."""
-        from lifecycle.middleware import machine_topic
-
-        return self._watch(machine_topic(system, machine), to)
+        return self._watch(supervisor_alive_topic(system, machine), to)
 
     def watch_node(self, node: str, to: Listener) -> AliveSubscription:
         """Watch the liveliness of a node that is attached."""

@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import gc
 import os
+import re
 import time
 import traceback
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
@@ -33,6 +34,7 @@ from lifecycle.plan import Plan, PlannedProcess, moved_observer, reached_hosts
 from lifecycle.run_directory import (
     RunDirectory,
     RunRecord,
+    boot_id,
     run_name,
     runtime_root,
 )
@@ -205,7 +207,7 @@ def _up(
                 with ending.raised():
                     await discovery_server.begin(system, fork_server, ours=_serves(plan, options))
                 observer_participant = await _observer_participant(plan, options, emit, ending)
-                leaving.callback(observer_participant.destroy)
+                leaving.callback(_succeed(directory, observer_participant).destroy)
                 await records.note_segments()
                 emit(_started(system, observer_participant, str(logs)))
                 session = Session(
@@ -437,6 +439,24 @@ def _enter_graph(plan: Plan, options: UpOptions, directory: RunDirectory) -> Non
 def _graph_variables(environment: Mapping[str, str]) -> tuple[tuple[str, str], ...]:
     """What a fork server that was started before `_enter_graph` has to pass on."""
     return tuple((name, environment[name]) for name in _GRAPH_VARIABLES if name in environment)
+
+
+_PREFIX = re.compile(r"[0-9a-f]{24}")
+
+
+def _succeed(
+    directory: RunDirectory, observer_participant: ObserverParticipant
+) -> ObserverParticipant:
+    """Have all others forget the participant of a supervisor that was killed; note and return ours.
+
+    They would take the two for supervisors that both say they are the same, until its lease is
+    over.
+    """
+    directory.participant = observer_participant.prefix
+    killed = directory.previous
+    if killed is not None and killed.boot_id == boot_id() and _PREFIX.fullmatch(killed.participant):
+        observer_participant.remove_participants([killed.participant], ())
+    return observer_participant
 
 
 def _clean_up_after(record: RunRecord, emit: Emitter) -> None:

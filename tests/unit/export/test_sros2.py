@@ -14,9 +14,9 @@ from click.testing import CliRunner
 from lifecycle.cli import cli
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.export.sros2 import OVERRIDE, PLANS_TOPIC, Enclave, documents, enclaves_of
-from lifecycle.manifest import load
+from lifecycle.manifest import load, supervisor_alive_topic
 from lifecycle.middleware.discovery import liveliness
-from lifecycle.middleware.discovery.liveliness import machine_topic, node_topic
+from lifecycle.middleware.discovery.liveliness import node_topic
 from lifecycle.plan import Plan, build_plan
 
 ROOT = Path(__file__).parents[3]
@@ -248,7 +248,7 @@ def test_names_of_topics_are_those_that_the_middleware_uses(tmp_path: Path) -> N
     text = machines + NODES.replace("run: ", "machine: here\n    run: ")
     _, files = made(plan_of(Path(), tmp_path, text))
     here = files["enclaves/my_robot/supervisor_here/permissions.xml"]
-    mine, others = (f"rt{machine_topic('my-robot', each)}" for each in ("here", "there"))
+    mine, others = (f"rt{supervisor_alive_topic('my-robot', each)}" for each in ("here", "there"))
 
     assert PLANS_TOPIC == liveliness.PLANS_TOPIC
     assert mine in dds(here, "publish")

@@ -8,6 +8,7 @@ from lifecycle.manifest.model import (
     Endpoint,
     EndpointKind,
     EndpointPolicy,
+    Machine,
     Policy,
     RosInterfaceAccess,
 )
@@ -17,7 +18,7 @@ from lifecycle.plan import Plan
 from lifecycle.verify import Outcome, Stage, Verdict, verify
 from lifecycle.verify.tool_filter import takes_diagnostics
 from lifecycle.verify.verdict import OpenEndpoint, ToleratedNode
-from tests.builders import need, node, planned, publisher, subscription
+from tests.builders import at, need, node, planned, publisher, subscription
 from tests.unit.verify.edits import Edit, add_endpoint, add_node, both, change_report
 from tests.unit.verify.perfect import perfect
 
@@ -138,6 +139,84 @@ def test_what_a_supervisor_offers_in_ros_is_its_own_and_no_one_elses() -> None:
         "/lifecycle/robot/status",
         "/lifecycle/robot/get_status",
     }
+
+
+def of_two_machines(**policy: object) -> Plan:
+    return planned(
+        node("one", publisher("a"), machine="near"),
+        node("two", subscription("a"), machine="far"),
+        machines=tuple(Machine(name=each, address="", at=at(2)) for each in ("near", "far")),
+        policy=Policy(**policy),
+    )
+
+
+def asserts(number: int, end: str = "", type: str = STRING, name: str = "", gid: str = "") -> Edit:  # noqa: A002
+    """The liveliness of the supervisor of machine `far`, of the participant of `supervisor`."""
+    name = name or f"/_lifecycle_observer_{number}"
+    gid = gid or f"{ONE_PARTICIPANT[:-1]}{number}7"
+    topic = f"/_lifecycle/robot/far/alive{end}"
+    return add_endpoint(PUB, name, topic, gid=gid, type=type, qos=QosProfile())
+
+
+def serves(number: int, service: str = "get_status", machine: str = "far") -> Edit:
+    name = f"/_lifecycle_observer_{number}"
+    return add_endpoint(SERVER, name, f"/lifecycle/robot/{machine}/{service}", type=TRIGGER)
+
+
+@pytest.mark.parametrize(("end", "type_"), [("", STRING), ("_pulse", "std_msgs/msg/Empty")])
+def test_a_supervisor_of_another_machine_is_known_by_its_liveliness_before_its_status_is_seen(
+    end: str, type_: str
+) -> None:
+    """After an outage its services may be seen before its status topic, or the other way round."""
+    plan, observer = of_two_machines(), add_node("/_lifecycle_observer_1")
+    alive = asserts(1, end, type_)
+    server = "graph.undeclared-service-server", "/_lifecycle_observer_1"
+    assert rules(plan, observer, serves(1)) == [(*server, "/lifecycle/robot/far/get_status")]
+    assert rules(plan, observer, serves(1), alive) == []
+    # It is that of its machine, and may do what the policy allows.
+    near = serves(1, machine="near")
+    assert rules(plan, observer, near, alive) == [(*server, "/lifecycle/robot/near/get_status")]
+    pauses = serves(1, "pause")
+    assert rules(plan, observer, pauses, alive) == [(*server, "/lifecycle/robot/far/pause")]
+    full = of_two_machines(ros_interface=RosInterfaceAccess.FULL)
+    assert rules(full, observer, pauses, alive) == []
+    off = of_two_machines(ros_interface=RosInterfaceAccess.OFF)
+    assert rules(off, observer, serves(1), alive) == [(*server, "/lifecycle/robot/far/get_status")]
+    assert judged(plan, observer, serves(1), alive).tolerated == ()
+
+
+def test_who_only_is_called_as_the_supervisor_of_a_machine_is_not_taken_for_it() -> None:
+    plan = of_two_machines()
+    both_are = both(add_node("/_lifecycle_observer_1"), add_node("/_lifecycle_observer_2"))
+    # Two participants assert to be it: of one node's name, or of two.
+    for other in (asserts(2), asserts(2, name="/_lifecycle_observer_1"), asserts(1, gid="7" * 25)):
+        found = rules(plan, both_are, serves(1), asserts(1), other)
+        assert found == [
+            (
+                "graph.undeclared-service-server",
+                "/_lifecycle_observer_1",
+                "/lifecycle/robot/far/get_status",
+            )
+        ]
+    # One asserts it and another has its status: neither is believed.
+    both_say = rules(
+        plan, supervisor(1, "robot/far"), add_node("/_lifecycle_observer_2"), asserts(2)
+    )
+    assert {each[2] for each in both_say} == {
+        "/lifecycle/robot/far/status",
+        "/lifecycle/robot/far/get_status",
+    }
+    # Its own status and its own liveliness agree, and so do two status topics of one participant.
+    again = add_endpoint(
+        *(PUB, "/_lifecycle_observer_1", "/lifecycle/robot/far/status"),
+        gid=f"{ONE_PARTICIPANT[:-1]}19",
+        qos=QosProfile(),
+    )
+    assert rules(plan, supervisor(1, "robot/far"), asserts(1), again) == []
+    # No liveliness of another type or of a tool's counts.
+    for other in (asserts(1, type=TRIGGER), asserts(1, name="/rqt_1")):
+        tools = both(both_are, add_node("/rqt_1"))
+        assert rules(plan, tools, serves(1), other)[0][2] == "/lifecycle/robot/far/get_status"
 
 
 def test_who_reads_diagnostics_has_those_of_supervisors_and_of_nobody_else() -> None:
