@@ -42,6 +42,7 @@ RULE = "program.missing"
 UNHANDLED = "program.handler"
 UNDECLARED = "program.endpoint"
 IMMOVABLE = "program.connection"
+NO_HEALTH = "program.health"
 
 _WORDS = {
     EndpointKind.SUBSCRIPTION: ("subscription", "@on_message"),
@@ -161,6 +162,7 @@ class _Looking:
             self.found += _called(node, found, at)
             if found.is_managed is not None and not found.is_ours and found.is_node:
                 self.found += _immovable(node, found, at, self._authority)
+            self.found += _without_health(node, found)
             self._interface(node, found, subject)
 
     def _class(self, node: Node) -> NodeClass | NotThereError | UnknownError:
@@ -297,6 +299,29 @@ def _immovable(
                     "topics can be placed",
                     "derive it from lifecycle.LifecycleNode, or leave it out of 'map'",
                 )
+
+
+def _without_health(node: Node, found: NodeClass) -> Iterator[Diagnostic]:
+    """Yield that a node is to be asked for its health whose class has nothing to ask."""
+    if node.health is None or not node.health.check or not node.managed or not found.is_node:
+        return
+    what = f"{found.name} ({found.file or 'rclpy'})"
+    if not found.is_ours and found.is_managed is not None:
+        yield error(
+            NO_HEALTH,
+            node.where("health"),
+            f"cannot ask {node.key!r} whether it is healthy: {what} is not a "
+            "lifecycle.LifecycleNode",
+            "derive it from lifecycle.LifecycleNode, or write 'health: {diagnostics: NAME}'",
+        )
+    elif found.is_ours and not found.has_health and not found.unknown:
+        yield error(
+            NO_HEALTH,
+            node.where("health"),
+            f"cannot ask {node.key!r} whether it is healthy: {what} has no method 'health'",
+            "give it 'def health(self)', which returns None if all is well and else what is "
+            "wrong, or write 'health: {diagnostics: NAME}'",
+        )
 
 
 def _find_program(word: str, folder: Path, variables: Mapping[str, str]) -> None:

@@ -105,6 +105,7 @@ class NodeClass:
         spins: where a function calls what its host has done or does, `rclpy.spin (nodes.py:7)`.
         unknown: why more may belong to it than is known; empty if nothing does.
         declares: its code declares endpoints itself.
+        has_health: it, or a base of it, has a `health` method of its own.
     """
 
     name: str
@@ -119,6 +120,7 @@ class NodeClass:
     accesses: tuple[Access, ...] = ()
     unknown: str = ""
     declares: bool = False
+    has_health: bool = False
 
 
 @dataclasses.dataclass(slots=True)
@@ -232,8 +234,9 @@ class Sources:
             takes, needs = _arguments(constructors[0], of_method=True)
         found: dict[str, list[Handler]] = {}
         accesses: list[Access] = []
-        declares = False
+        declares = has_health = False
         for each in line:
+            has_health = has_health or _binds_in_body(each.node, "health")
             for name, function in _methods(each.node):
                 marks, why = self._marks(each, function)
                 unknown = unknown or why
@@ -259,6 +262,7 @@ class Sources:
             accesses=tuple(accesses),
             unknown=unknown,
             declares=declares,
+            has_health=has_health,
         )
 
     def _line(self, classes: list[_Class], depth: int) -> tuple[list[_Class], set[str], str]:
@@ -593,6 +597,26 @@ def _methods(node: ast.ClassDef) -> Iterator[tuple[str, ast.AST]]:
     for each in node.body:
         if isinstance(each, _Function):
             yield each.name, each
+
+
+def _binds_in_body(node: ast.ClassDef, name: str) -> bool:
+    """Return whether anything in a class body gives a name, also under a condition."""
+    return any(
+        (isinstance(each, (*_Function, ast.ClassDef)) and each.name == name)
+        or (isinstance(each, ast.Name) and each.id == name and isinstance(each.ctx, ast.Store))
+        or (isinstance(each, ast.alias) and (each.asname or each.name) == name)
+        for each in _of_scope(node)
+    )
+
+
+def _of_scope(node: ast.ClassDef) -> Iterator[ast.AST]:
+    """Yield what belongs to a class body, and not to the functions and classes in it."""
+    left: list[ast.AST] = list(node.body)
+    while left:
+        each = left.pop()
+        yield each
+        if not isinstance(each, (*_Function, ast.ClassDef, ast.Lambda)):
+            left += ast.iter_child_nodes(each)
 
 
 def _arguments(

@@ -215,4 +215,7 @@ def _change(change: ChangedNodes) -> list[str]:
         "given parameters": change.parameters,
     }
     done = [f"{word}: {', '.join(names)}" for word, names in what.items() if names]
-    return [*change.differences, *(done or ["no node is touched: rules are judged by again"])]
+    return [
+        *change.differences,
+        *(done or ["no node is touched: what runs is judged by the new rules"]),
+    ]

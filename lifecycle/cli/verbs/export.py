@@ -151,6 +151,8 @@ def _engine_command(engine: str) -> click.Command:
         for name, text in ENGINES[engine](deployment).items():
             _write(output / name, text)
             click.echo(str(output / name))
+        for word in (*assignments, *words):
+            _say_secret(word, engine)
         return ExitCode.OK
 
     if engine in _CONTAINERS:
@@ -173,6 +175,36 @@ def _engine_command(engine: str) -> click.Command:
 
 for _engine in _WRITTEN_FOR:
     command.add_command(_engine_command(_engine))
+
+
+_VARIABLES = {
+    "systemd": "EnvironmentFile= or LoadCredential=",
+    "quadlet": "Secret=…,type=env",
+    "compose": "env_file: or secrets:",
+    "kubernetes": "a Secret, by valueFrom: secretKeyRef",
+}
+"""By what each engine gives a process variables that are in none of the files written here."""
+
+
+def _say_secret(word: str, engine: str) -> None:
+    """Say that a word of the command line seems to be secret, and is written as it is."""
+    from lifecycle.plan import shown
+
+    name, is_argument, value = word.partition(":=")
+    if not is_argument:
+        name, _, value = word.lstrip("-").partition("=")
+    if not value or shown(name, value) == value:
+        return
+    variable = name.upper().replace("-", "_")
+    click.echo(
+        lines(
+            f"warning: the value of {name!r} is in what was written as it was given, and will be "
+            "in a command line, which every user of the machine can read; have the manifest take "
+            f"it from the environment, 'default: $(env {variable} \"\")', leave it out here, and "
+            f"give it by {_VARIABLES[engine]}"
+        ),
+        err=True,
+    )
 
 
 def _up_options(more: str, *, container: bool) -> tuple[tuple[str, ...], float]:

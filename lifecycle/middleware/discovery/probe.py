@@ -160,7 +160,9 @@ class Probe:
         with contextlib.suppress(BlockingIOError):
             while self._socket is not None:
                 data, source = self._socket.recvfrom(65536, socket.MSG_DONTWAIT)
-                if data.startswith(b"RTPS") and len(data) > len(HEADER) + _PREFIX_BYTES:
+                # What calls all sockets of this process, `introduce` say, calls this one, too.
+                is_answer = data.startswith(b"RTPS") and _NOBODY not in data
+                if is_answer and len(data) > len(HEADER) + _PREFIX_BYTES:
                     self._answers[data[8 : 8 + _PREFIX_BYTES].hex()] = source[0]
         return dict(self._answers)
 
@@ -192,6 +194,19 @@ def _send_by(sender: socket.socket, interface: str) -> None:
     sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, chosen)
 
 
+def _parameters(parameters: Iterable[tuple[int, bytes]]) -> bytes:
+    return b"".join(struct.pack("<HH", pid, len(value)) + value for pid, value in parameters)
+
+
+_NOBODY = _parameters(
+    (
+        (0x0002, struct.pack("<iI", 0, int(_LEASE_S * 2**32))),  # PID_PARTICIPANT_LEASE_DURATION
+        (0x0058, struct.pack("<I", 0x3)),  # PID_BUILTIN_ENDPOINT_SET: announcer and detector only
+    )
+)
+"""By which announcements of participants that do not exist are known, also those of others."""
+
+
 def announcement(locators: Iterable[tuple[str, int]]) -> bytes:
     """Return a DATA(p) of a new, random participant that can be answered at `locators`.
 
@@ -203,17 +218,16 @@ def announcement(locators: Iterable[tuple[str, int]]) -> bytes:
         (0x0015, b"\x02\x03\x00\x00"),  # PID_PROTOCOL_VERSION
         (0x0016, b"\x01\x0f\x00\x00"),  # PID_VENDORID
         (0x0050, prefix + b"\x00\x00\x01\xc1"),  # PID_PARTICIPANT_GUID
-        (0x0002, struct.pack("<iI", 0, int(_LEASE_S * 2**32))),  # PID_PARTICIPANT_LEASE_DURATION
-        (0x0058, struct.pack("<I", 0x3)),  # PID_BUILTIN_ENDPOINT_SET: announcer and detector only
     ]
+    located = []
     for address, port in locators:
         packed = ipaddress.ip_address(address).packed
         kind = _UDPV6 if len(packed) == 16 else _UDPV4
         locator = struct.pack("<iI", kind, port) + packed.rjust(16, b"\0")
-        parameters.append((0x0032, locator))  # PID_METATRAFFIC_UNICAST_LOCATOR
-        parameters.append((0x0031, locator))  # PID_DEFAULT_UNICAST_LOCATOR
+        located.append((0x0032, locator))  # PID_METATRAFFIC_UNICAST_LOCATOR
+        located.append((0x0031, locator))  # PID_DEFAULT_UNICAST_LOCATOR
     payload = b"\x00\x03\x00\x00"  # PL_CDR_LE
-    payload += b"".join(struct.pack("<HH", pid, len(value)) + value for pid, value in parameters)
+    payload += _parameters(parameters) + _NOBODY + _parameters(located)
     payload += struct.pack("<HH", 0x0001, 0)  # PID_SENTINEL
     reader, writer = b"\x00\x01\x00\xc7", b"\x00\x01\x00\xc2"  # SPDP builtin endpoints
     body = struct.pack("<HH", 0, 16) + reader + writer + struct.pack("<iI", 0, 1) + payload

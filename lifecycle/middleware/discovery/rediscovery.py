@@ -145,7 +145,8 @@ def introduce(
     discovery server, nor over shared memory and TCP.
 
     Args:
-        newcomers: pids of the new processes of this host, whose participants listen by now.
+        newcomers: pids of the new processes of this host; nothing is sent before their participants
+            listen.
         domain_id: 0–232.
         urls: of this process's observer.
         environment: see `probe.probe_targets`.
@@ -156,6 +157,8 @@ def introduce(
     if not asked or (urls and not leaves_discovery_open(urls)):
         return
     new = frozenset(newcomers)
+    if not any(listening(new).values()):
+        return
     # The observer itself is no target of its own probes, and is to answer as well.
     for kind, found in listening((*new, *pids, os.getpid())).items():
         family = kind.socket_family

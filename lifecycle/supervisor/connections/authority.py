@@ -191,6 +191,7 @@ class ConnectionAuthority:
         self._wirings: dict[str, _Wiring] = {}
         self._others: dict[str, NodeConfiguration] = {}
         self._instructions: Mapping[str, Instructions] = {}
+        self._making = 0
         self._wake = asyncio.Event()
         self._following: asyncio.Task[None] | None = None
         layer = system.plan.data_layer
@@ -307,9 +308,15 @@ class ConnectionAuthority:
         return tuple(found)
 
     def is_at_work(self) -> bool:
-        """Whether a running node lacks something that is still to be made."""
+        """Whether a running node lacks something that is still to be made, or is being made.
+
+        A node reports a mapping as soon as it has begun; the endpoint before it is there until its
+        peers have found the new one, for seconds.
+        """
         if not (self._dynamic or self._repairs):
             return False
+        if self._making:
+            return True
         for name, _, _, configuration in self._wirable():
             wiring = self._wirings.get(name) or _Wiring()
             given_up = wiring.rounds >= TRIES and configuration.checksum == wiring.given_up
@@ -432,12 +439,14 @@ class ConnectionAuthority:
             )
             if node is not None:
                 node.doing = f"is told to {step}"
+            self._making += 1
             try:
                 configuration = await interface.wire(step)
             except BringUpError as error:
                 self._emit(dataclasses.replace(event, error=error.message))
                 raise
             finally:
+                self._making -= 1
                 if node is not None:
                     node.doing = ""
             wiring.actual = wiring.actual.after(step)

@@ -136,13 +136,29 @@ _HINTS = {
 }
 
 
-def check_order(order: Order, system: System, phase: str) -> None:
-    """Make sure that an order can be carried out now.
+def check_order(order: Order, system: System, phase: str, *, waits: Order | None = None) -> None:
+    """Make sure that an order can be carried out now, or after another.
+
+    Args:
+        order: to be carried out.
+        system: whose.
+        phase: of it.
+        waits: the order that is carried out now, and after which this one's turn comes; None if
+            none is. Who knows what the system will be then cannot be asked: the phase counts at
+            the turn. While another manifest is applied only `down` is taken: what an order means
+            may change by it.
 
     Raises:
         UsageError: it does not fit the phase, or names a node that cannot be restarted.
     """
-    if phase not in _PHASES[order.kind]:
+    applies = waits is not None and waits.kind is OrderKind.APPLY
+    if applies and phase not in _PHASES[order.kind]:
+        raise UsageError(
+            f"cannot {order.kind.said} {system.plan.system!r}: it is {phase}, another manifest is "
+            "being applied to it",
+            hint="ask again once 'lifecycle apply' has ended; 'lifecycle down' is taken at once",
+        )
+    if waits is None and phase not in _PHASES[order.kind]:
         raise UsageError(
             f"cannot {order.kind.said} {system.plan.system!r}: it is {phase}",
             hint=_HINTS[order.kind],

@@ -166,6 +166,7 @@ class Holding:
         self._mailbox = Mailbox()
         self._violated = ""
         self._before = ""  # phase of a system that is being restarted by policy
+        self._under_way: Order | None = None  # given by a person
 
     async def hold(self, stage: Stage, hold_s: float | None) -> str:
         """Keep the system as it is, or as it is ordered; return what was violated, else nothing.
@@ -215,9 +216,12 @@ class Holding:
             stage = self._gate_sequence.stage
 
     async def ordered(self, order: Order) -> Done:
-        """Take an order from outside, if it fits what the system is doing; return its outcome."""
+        """Take an order from outside, if it fits what the system is doing; return its outcome.
+
+        One that comes while another is carried out waits for that one's end, and fits then or not.
+        """
         try:
-            self._check(order)
+            self._check(order, waits=self._under_way)
         except UsageError as error:
             return Done(exit_code=error.exit_code, error=str(error))
         if order.dry_run and order.plan is not None:
@@ -294,9 +298,10 @@ class Holding:
         """Let through its gate what waits there."""
         await self._gate_sequence.let_through()
 
-    def _check(self, order: Order) -> None:
+    def _check(self, order: Order, *, waits: Order | None = None) -> None:
         # A restart by policy is nobody's order: what comes meanwhile is carried out after it.
-        check_order(order, self._system, self._before or self._gate_sequence.phase)
+        phase = self._before or self._gate_sequence.phase
+        check_order(order, self._system, phase, waits=waits)
         self._revisions.check(order)
 
     def close(self, reason: str) -> None:
@@ -309,6 +314,7 @@ class Holding:
         try:
             # Another order may have come first.
             self._check(pending.order)
+            self._under_way = pending.order
             if pending.order.kind is OrderKind.APPLY:
                 change = await self._apply(pending.order)
             else:
@@ -332,6 +338,8 @@ class Holding:
             self._emit(Notice(message=str(error)))
         else:
             pending.finish(Done(change=change))
+        finally:
+            self._under_way = None
 
     def _taking(self, order: Order) -> Order:
         """Return an order without a plan that is the one that runs; say what is taken otherwise."""

@@ -123,6 +123,10 @@ datagram may be lost. After the first two only while discovery still shows a par
 INTRODUCED_AGAIN_S = (0.1, 0.1, 0.1, 0.2, 0.4, 0.8)
 """Seconds between repetitions: a datagram may be lost, and be answered before it is listened."""
 
+STARTING_S = 0.2
+"""Seconds between looks whether a command that is started again has a participant yet: nothing says
+when it has, and until it and we know each other its node is not known to have started."""
+
 _ALWAYS = 3
 """Times that it is sent in any case: at once and after the first two pauses."""
 
@@ -176,6 +180,8 @@ class StaleNodes:
         """Take an event of the system; of interest are ends of processes, and restarted ones."""
         if isinstance(event, NodeChanged) and event.reach in (Reach.STARTED, Reach.CONNECTED):
             self._came_again(event.node, event.reach)
+        if isinstance(event, ProcessChanged) and event.state is ProcessState.STARTING:
+            self._starts(self._system.processes.get(event.process))
         if isinstance(event, ProcessChanged) and event.state is ProcessState.EXITED:
             process = self._system.processes.get(event.process)
             if process is not None and process.pid == event.pid:
@@ -208,6 +214,32 @@ class StaleNodes:
 
         loop = asyncio.get_running_loop()
         handle = loop.call_later(INTRODUCED_AGAIN_S[repetition], again)
+        self._later.add(handle)
+
+    def _starts(self, process: ManagedProcess | None) -> None:
+        """Introduce a command that was started again, or added, until its node has started.
+
+        One that we host says itself that it is there; a command is there once discovery shows it.
+        """
+        if process is None or not (process.is_restarted or process.joins):
+            return
+        nodes = [self._system.nodes.get(key) for key in process.planned.nodes]
+        if self._closed or process.is_gone or process.channel is not None:
+            return
+        if not any(
+            node is not None and node.process is process and node.reach is Reach.WAITING
+            for node in nodes
+        ):
+            return
+        if process.pid:
+            pids = [each.pid for each in self._system.living if each is not process]
+            self._graph.introduce([process.pid], pids)
+
+        def again() -> None:
+            self._later.discard(handle)
+            self._starts(process)
+
+        handle = asyncio.get_running_loop().call_later(STARTING_S, again)
         self._later.add(handle)
 
     def close(self) -> None:

@@ -366,8 +366,9 @@ class RestartSchedule:
         history = record.history[-how.start_limit_burst :]
         lines = "".join(f"\n  at {each.elapsed_s:.1f} s: {each.message}" for each in history)
         last = record.history[-1]
+        burst = how.start_limit_burst
         message = (
-            f"cannot keep {name!r} running: it was started {how.start_limit_burst} times within "
+            f"cannot keep {name!r} running: it was started {burst} time{'s' * (burst != 1)} within "
             f"{how.start_limit_interval_sec:g} s (start_limit_burst, start_limit_interval_sec) and "
             f"failed again:{lines}"
         )

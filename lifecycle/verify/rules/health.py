@@ -1,4 +1,4 @@
-"""Rule about the health of nodes: what their `health` method and /diagnostics say. Pure."""
+"""Rules about the health of nodes: what their `health` method and /diagnostics say. Pure."""
 
 from __future__ import annotations
 
@@ -20,7 +20,13 @@ UNHEALTHY = Rule(
     about=About.PROGRESS,
     heals=Heals.WITH_TIME,
 )
-RULES = (UNHEALTHY,)
+NOT_ASKED = Rule(
+    id="node.without-health",
+    meaning="a node is to be asked whether it is healthy, and its class has no `health` method",
+    outcomes=(Outcome.VIOLATED,),
+    fix="give its class a method 'health', or write 'health: {diagnostics: NAME}'",
+)
+RULES = (UNHEALTHY, NOT_ASKED)
 
 _HEALTHY = "healthy"
 _NO_METHOD = HealthReport(
@@ -61,13 +67,24 @@ def _judge(facts: NodeFacts) -> Iterator[Finding]:
     node, frame, report = facts.node, facts.frame, facts.configuration
     if node.health is None or facts.absent:
         return
+    # One that has the method reports what it returned, or that it has not returned, at once.
+    lacks = report is not None and report.connected and report.health is None
+    if node.health.check and lacks:
+        yield NOT_ASKED.on_node(
+            Outcome.VIOLATED,
+            node,
+            expected="a method 'health'",
+            observed="none",
+            message=f"cannot ask node {node.full_name} whether it is healthy: "
+            "its class has no method 'health'",
+        )
     # A method is asked from when its node is connected, and a held node publishes nothing before it
     # is active; until then its state, or the lack of a report, says enough.
     asks = not frame.ours(node) or (report is not None and report.connected)
     works = not node.holds or frame.stage is Stage.ACTIVE or facts.name in frame.ahead
     asked = dataclasses.replace(
         node.health,
-        check=node.health.check and asks,
+        check=node.health.check and asks and not lacks,
         diagnostics=node.health.diagnostics if works else (),
     )
     health = health_of(

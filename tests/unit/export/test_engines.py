@@ -387,3 +387,31 @@ def test_places_that_an_engine_would_not_find_are_refused(tmp_path: Path) -> Non
         exported(tmp_path, "systemd", TELEOP, "--program", "./lifecycle")
     with pytest.raises(UsageError, match="cannot use image 'a b'"):
         exported(tmp_path, "compose", TELEOP, "--image", "a b")
+
+
+_ARGUED = """manifest_version: 1
+system: argued
+arguments:
+  api_token: {default: $(env API_TOKEN "")}
+  broker: {default: none}
+nodes:
+  camera: {run: {command: [camera]}, managed: false}
+"""
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_secret_that_is_given_as_an_argument_is_said_to_be_written(
+    tmp_path: Path, engine: str
+) -> None:
+    manifest = tmp_path / "argued.lifecycle.yaml"
+    manifest.write_text(_ARGUED)
+    option = [] if engine == "systemd" else ["--image", "robot:1"]
+
+    def said(*words: str) -> str:
+        command = ["export", engine, str(manifest), *words, "-o", str(tmp_path / "out"), *option]
+        result = CliRunner().invoke(cli, command, standalone_mode=False, catch_exceptions=False)
+        return result.output
+
+    assert "warning" not in said("broker:=mqtt://robot@broker")
+    assert "the value of 'api_token' is in what was written as it was given" in said("api_token:=x")
+    assert "'default: $(env BROKER \"\")'" in said("broker:=mqtt://robot:x@broker")

@@ -11,6 +11,7 @@ import pytest
 
 from lifecycle.middleware.discovery.probe import (
     Probe,
+    announcement,
     answered_at,
     chosen_otherwise,
     probes_for,
@@ -62,6 +63,20 @@ def test_a_listed_peer_is_asked_to_answer_the_observer_and_is_counted(peer: sock
         assert locators(message, address) == {7910, asked_from}
         assert probe.answered() == frozenset()
         peer.sendto(_ANSWER, (address, asked_from))
+        assert probe.answered() == {_PREFIX.hex()}
+    finally:
+        probe.close()
+
+
+def test_what_introduces_others_to_each_other_is_no_participant_that_answers(
+    peer: socket.socket,
+) -> None:
+    url, address = url_for(peer)
+    (probe,) = probes_for(25, (parse(url),), {})
+    try:
+        called, (_, asked_from, *_) = peer.recvfrom(65536)
+        for message in (called, announcement([(address, 7910)]), announcement(()), _ANSWER):
+            peer.sendto(message, (address, asked_from))
         assert probe.answered() == {_PREFIX.hex()}
     finally:
         probe.close()

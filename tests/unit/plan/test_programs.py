@@ -15,6 +15,7 @@ from lifecycle.manifest.model import (
     ConnectionDeclaration,
     DataLayer,
     EndpointKind,
+    Health,
     Position,
     Run,
     RunKind,
@@ -388,3 +389,57 @@ def test_modules_are_found_beside_the_manifest_and_on_pythonpath(folder: Path) -
     at = Position(file=str(folder / "src" / "them.lifecycle.yaml"), line=1, column=1)
     beside = dataclasses.replace(node("talker", run=run), at=at)
     assert said(resolve_programs(manifest(beside), environment={})) == []
+
+
+_CLASSES = """
+from lifecycle import LifecycleNode
+from rclpy.lifecycle import LifecycleNode as Theirs
+from elsewhere import Mixin
+class Deaf(LifecycleNode): pass
+class Method(LifecycleNode):
+    async def health(self): ...
+class Inherits(Method): pass
+class Assigned(LifecycleNode):
+    health = Method.health
+class Conditional(LifecycleNode):
+    if True:
+        def health(self): ...
+class Inner(LifecycleNode):
+    def on_configure(self, state):
+        def health(): ...
+class Unknown(Mixin, LifecycleNode): pass
+class Rclpy(Theirs):
+    def health(self): ...
+def made(): return []
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("Deaf", "Deaf (health.py) has no method 'health'"),
+        ("Inner", "Inner (health.py) has no method 'health'"),
+        ("Rclpy", "Rclpy (health.py) is not a lifecycle.LifecycleNode"),
+        ("Theirs", "Theirs (rclpy) is not a lifecycle.LifecycleNode"),
+        *((each, "") for each in ("Method", "Inherits", "Assigned", "Conditional", "Unknown")),
+        ("made", ""),  # which nodes a function returns only running it shows
+    ],
+)
+def test_a_class_that_cannot_say_how_it_is_is_not_to_be_asked(
+    folder: Path, name: str, why: str
+) -> None:
+    write(folder, health=_CLASSES)
+    run = Run(kind=RunKind.PYTHON, python=f"health:{name}")
+    for health in (None, Health(diagnostics=("lidar",))):
+        asked = manifest(node("lidar", run=run, health=health))
+        assert not any(
+            each.rule == "program.health"
+            for each in resolve_programs(asked, environment={}).diagnostics
+        )
+    asked = manifest(node("lidar", run=run, health=Health(check=True)))
+    found = [
+        each.message
+        for each in resolve_programs(asked, environment={}).diagnostics
+        if each.rule == "program.health"
+    ]
+    assert found == ([f"cannot ask 'lidar' whether it is healthy: {why}"] if why else [])

@@ -350,9 +350,11 @@ def test_a_node_waits_until_another_is_healthy_and_one_that_no_longer_is_has_a_c
         plan = plan_of(camera, viewer)
         plan = dataclasses.replace(plan, on_violation=_said((("node", DEACTIVATE),)))
         world = SessionWorld(plan, tmp_path, stop_after_s=10.0)
+        interfaces = world.hosts.interfaces
+        unsaid = HealthReport(ok=None, message="it has not answered")
+        interfaces["/camera"] = dataclasses.replace(interfaces["/camera"], health=unsaid)
 
         def report(health: HealthReport) -> None:
-            interfaces = world.hosts.interfaces
             interfaces["/camera"] = dataclasses.replace(interfaces["/camera"], health=health)
             world.system.on_host_event(
                 HostEvent(

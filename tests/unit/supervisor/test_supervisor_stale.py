@@ -8,8 +8,8 @@ from collections.abc import Iterable
 from types import SimpleNamespace
 from typing import Any, cast
 
-from lifecycle.supervisor.control.protocol import ProcessState
-from lifecycle.supervisor.health.process_monitor import StaleNodes
+from lifecycle.supervisor.control.protocol import ProcessState, Reach
+from lifecycle.supervisor.health.process_monitor import STARTING_S, StaleNodes
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.run.events import ProcessChanged
 
@@ -23,6 +23,7 @@ class Graph:
     def __init__(self, removals: int) -> None:
         self.asked: list[tuple[int, frozenset[str]]] = []
         self.removed: list[tuple[frozenset[str], tuple[int, ...]]] = []
+        self.introduced: list[tuple[tuple[int, ...], tuple[int, ...]]] = []
         self._removals = removals
 
     def participants_of(
@@ -33,6 +34,9 @@ class Graph:
 
     def remove_participants(self, prefixes: Iterable[str], pids: Iterable[int]) -> None:
         self.removed.append((frozenset(prefixes), tuple(pids)))
+
+    def introduce(self, newcomers: Iterable[int], pids: Iterable[int]) -> None:
+        self.introduced.append((tuple(newcomers), tuple(pids)))
 
     def disown_ports(self) -> None:
         """There is no shared memory."""
@@ -98,3 +102,25 @@ def test_what_a_process_made_just_before_its_end_is_removed_once_it_is_discovere
     graph = Late(removals=2)
     after(graph, ENDED, seconds=0.3)
     assert graph.removed[0] == (frozenset((PREFIX,)), (8,))
+
+
+def test_a_command_that_is_started_again_is_introduced_until_its_node_has_started() -> None:
+    async def run() -> None:
+        graph = Graph(removals=0)
+        of = system()
+        node, process = cast("Any", of.nodes["camera"]), cast("Any", of.processes["camera"])
+        node.process, node.reach = process, Reach.WAITING
+        process.__dict__.update(is_restarted=True, joins=False, is_gone=False, channel=None, pid=0)
+        stale = StaleNodes(of, graph)
+        stale.on_event(dataclasses.replace(ENDED, state=ProcessState.STARTING, pid=0))
+        await asyncio.sleep(0)
+        assert graph.introduced == []
+        process.pid = 7
+        await asyncio.sleep(2.5 * STARTING_S)
+        assert graph.introduced == [((7,), (8,))] * 2
+        node.reach = Reach.STARTED
+        await asyncio.sleep(1.5 * STARTING_S)
+        assert len(graph.introduced) == 2
+        stale.close()
+
+    asyncio.run(run())

@@ -386,6 +386,36 @@ def test_only_the_difference_is_wired_when_the_negotiation_changes(tmp_path: Pat
     run(main())
 
 
+def test_it_is_at_work_until_what_a_node_reports_already_is_done(tmp_path: Path) -> None:
+    async def main() -> None:
+        plan = wired_plan(wired_node("a"), source=DataLayerSource.DYNAMIC)
+        wiring = Wiring(plan, tmp_path)
+        await wiring.world.bring_up.connect(LIMIT_S)
+        wiring.report("/a")
+        wiring.look()
+        await settle()
+        assert not wiring.authority.is_at_work()
+        wiring.source.now["/a"] = dataclasses.replace(
+            wiring.source.now["/a"], mappings=(("publishers/out", ""), ("subscriptions/in", ""))
+        )
+        wiring.world.spawner.takes_s["/a map_to publishers/out"] = 2.0
+        wiring.look()
+        await settle(1.0)
+        # As a node does whose old endpoint stays until its peers have found the new one.
+        interfaces = wiring.world.spawner.interfaces
+        interfaces["/a"] = rewired(interfaces["/a"], MAP, endpoint="publishers/out", connection="")
+        wiring.report("/a")
+        wiring.look()
+        assert wiring.authority.is_at_work()
+        await settle(2.0)
+        wiring.look()
+        await settle()
+        assert not wiring.authority.is_at_work()
+        await wiring.down()
+
+    run(main())
+
+
 def test_a_negotiation_that_fails_while_running_is_a_finding_until_it_succeeds(
     tmp_path: Path,
 ) -> None:

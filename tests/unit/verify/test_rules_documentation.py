@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -67,3 +68,11 @@ def test_nobody_reads_from_the_id_of_a_rule_what_the_rule_says(room: str):
     assert files
     parsed = re.compile(r"\.(rule|subject)\.(startswith|partition|rpartition|split)\(")
     assert [each.name for each in files if parsed.search(each.read_text("utf-8"))] == []
+
+
+def test_a_manifest_may_name_every_rule_and_every_family_in_on_violation() -> None:
+    schema = json.loads((PAGE.parents[1] / "schemas" / "manifest.v1.schema.json").read_text())
+    names = schema["$defs"]["on_violation"]["anyOf"][1]["propertyNames"]["enum"]
+    assert sorted(names) == sorted(
+        {"default", *(each.family for each in RULES), *(each.id for each in RULES)}
+    )

@@ -542,16 +542,13 @@ def test_every_rule_has_a_case_in_which_it_fires():
     remote_nodes |= {each.id for each in RULES if each.id.startswith(("connection.", "param."))}
     remote_nodes |= {each.id for each in RULES if each.id.startswith("run.")}
     remote_nodes.add("graph.ended-node")  # in a test of its own: nothing of a graph says it
-    remote_nodes.add("node.unhealthy")  # likewise: no node of this plan is asked
+    remote_nodes |= {"node.unhealthy", "node.without-health"}  # no node of this plan is asked
     remote_nodes.add("state.activated-at-closed-gate")  # tests/unit/supervisor, it is the guard's
     fired = {rule for _, expected in FIRES.values() for rule, _, _ in expected}
     assert fired | remote_nodes == {rule.id for rule in RULES}
 
 
-_NO_HEALTH = (
-    "cannot verify that node /viewer is healthy: it reports no health; its class needs a method "
-    "'health'"
-)
+_NO_HEALTH = "cannot ask node /viewer whether it is healthy: its class has no method 'health'"
 
 
 @pytest.mark.parametrize(
@@ -568,7 +565,7 @@ _NO_HEALTH = (
         ),
         (
             None,
-            f"unverifiable {_NO_HEALTH}",
+            f"violated {_NO_HEALTH}",
         ),
     ],
 )
@@ -592,19 +589,21 @@ def test_the_health_that_a_node_reports_is_judged_where_the_manifest_asks_it(
     )
     both_ways = dataclasses.replace(PLAN, nodes=nodes)
     said = HealthReport(ok=False, message="'viewer: lens': dirty")
-    (worse,) = verify(
+    *_, worse = verify(
         both_ways,
         both(edit, change_node("/viewer", health=said))(perfect(both_ways, Stage.ACTIVE)),
         stage=Stage.ACTIVE,
     ).findings
+    assert worse.rule == "node.unhealthy"
     assert worse.outcome is Outcome.VIOLATED
     assert worse.message.endswith("'viewer: lens': dirty")
     early = findings_after(edit, plan=both_ways, stage=Stage.CONNECTED)
-    assert early == [("node.unhealthy", found.partition(" ")[0], "/viewer")] * bool(found)
+    rule = "node.unhealthy" if health else "node.without-health"
+    assert early == [(rule, found.partition(" ")[0], "/viewer")] * bool(found)
     # It is asked from when it is connected.
     early = both(edit, change_configuration("/viewer", connected=False))
     rules = {rule for rule, _, _ in findings_after(early, plan=plan)}
-    assert "node.unhealthy" not in rules
+    assert rules.isdisjoint({"node.unhealthy", "node.without-health"})
 
 
 def test_a_node_that_has_ended_as_it_may_is_unverifiable_and_not_missing():
