@@ -42,6 +42,7 @@ from .process.control import no_room_for_threads as no_room_for_threads
 from .process.control import refuse_new_privileges as refuse_new_privileges
 from .process.control import rename_process as rename_process
 from .process.process_table import note_ended as note_ended
+from .process.reception import Reception as Reception
 from .process.shared_memory import Creations as Creations
 from .process.shared_memory import check_room as check_room
 from .process.shared_memory import disown_ports as disown_ports

@@ -39,6 +39,7 @@ from .rules.nodes import DUPLICATE_NODE as DUPLICATE_NODE
 from .rules.nodes import MISSING_NODE as MISSING_NODE
 from .rules.nodes import UNATTRIBUTED_ENDPOINT as UNATTRIBUTED_ENDPOINT
 from .rules.run import DEADLINE as DEADLINE
+from .rules.run import DEADLOCKED_OBSERVER as DEADLOCKED_OBSERVER
 from .rules.run import GAVE_UP as GAVE_UP
 from .rules.run import NOT_PROGRAMMED as NOT_PROGRAMMED
 from .rules.run import NOT_WIRED as NOT_WIRED

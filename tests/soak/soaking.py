@@ -23,7 +23,8 @@ from pathlib import Path
 
 import psutil
 
-from lifecycle.middleware import leftovers, segments_of
+from lifecycle.middleware import Reception, leftovers, segments_of
+from lifecycle.middleware.process.reception import STUCK_S
 from tests.ros.supervisor.running import ROOT, command, environment, left_of
 from tests.soak.model import (
     DIES,
@@ -63,6 +64,8 @@ UP_S = 60.0
 DOWN_S = 25.0
 FLOWS_S = 5.0
 """From a system that is as it was to data that flow to every node; on two busy cores."""
+LOOKS_S = STUCK_S + 2.0
+"""So long it takes to find out that our own participant is deadlocked."""
 APPLY_S = 15.0
 """`lifecycle apply --timeout`."""
 
@@ -95,7 +98,10 @@ class Soaking:
         self.clock = None if LACKS else WallClock(directory)
         self.manifest = manifest(directory, domain_id, self.mark, Manifest())
         self.in_force = self.manifest
-        self.transitions = Transitions(domain_id, (f"/{each}" for each in REPORTING))
+        self.transitions = _transitions(domain_id)
+        self._abandoned: list[Transitions] = []
+        self._reception = Reception()
+        self._watched: Watched | None = None
         self.domain_id = domain_id
         self.stalls = Stalls()
         self.state = State()
@@ -123,6 +129,7 @@ class Soaking:
                 shutil.rmtree(each)
             variables = {} if self.clock is None else self.clock.variables
             self.run = Watched(self.manifest, runtime=self.runtime, variables=variables)
+            self._watched = self.run
             self._until_as_it_was(self.run, UP_S)
             # What is compared with the requests must not be empty because nothing is received.
             deadline = time.monotonic() + DOWN_S
@@ -192,6 +199,28 @@ class Soaking:
         self.state = State()
         if run is not None:
             run.close()
+
+    def locked_up(self) -> str:
+        """Say whose participant receives nothing any more, if that is why a round failed.
+
+        Fast DDS 2.14 does that now and then in whoever uses it (docs/liveliness.md). The supervisor
+        reports it of its nodes and of itself; our own participant is replaced.
+        """
+        events = () if self._watched is None else tuple(self._watched.events)
+        for event in events:
+            if event.get("event") == "silent" and event["cause"] == "deadlocked":
+                return str(event["message"])
+            if event.get("event") == "notice" and "participant has left unread" in event["message"]:
+                return str(event["message"])
+        deadline = time.monotonic() + LOOKS_S
+        while time.monotonic() < deadline:
+            if how := self._reception.deadlocked([os.getpid()]).get(os.getpid()):
+                self.transitions.abandon()
+                self._abandoned.append(self.transitions)  # what destroys it would wait for ever
+                self.transitions = _transitions(self.domain_id)
+                return f"the participant that follows transition events {how}"
+            time.sleep(0.5)
+        return ""
 
     def measured(self) -> str:
         """Say how fast faults were reported, and how soon the system was as it was."""
@@ -668,6 +697,10 @@ class Soaking:
                 continue
             if who.strip("/") not in names:
                 raise NotAsPromisedError(f"nothing was done to {who}: {event}")
+
+
+def _transitions(domain_id: int) -> Transitions:
+    return Transitions(domain_id, (f"/{each}" for each in REPORTING))
 
 
 def _finding(rule: str, subjects: set[str]) -> Callable[[dict], bool]:

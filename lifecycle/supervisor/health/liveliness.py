@@ -2,8 +2,9 @@
 
 Owns: `SilenceMonitor`, which turns what is noticed of processes and machines into events, findings
 and the status of nodes. Nothing here waits or asks: the kernel says that a process was stopped or
-that an executor hangs (middleware/process/busy_timer.py), DDS that a machine is lost. A process
-that ended is not silent but dead, see process_monitor.py. Must not import rclpy.
+that an executor hangs (middleware/process/busy_timer.py), DDS that a machine is lost; reception.py
+looks who receives nothing. A process that ended is not silent but dead, see process_monitor.py.
+Must not import rclpy.
 """
 
 from __future__ import annotations
@@ -20,8 +21,10 @@ from lifecycle.supervisor.run.events import (
     NodeJoined,
     NodeLeft,
     NodeSilent,
+    Notice,
 )
 from lifecycle.verify import (
+    DEADLOCKED_OBSERVER,
     SILENT_NODE,
     Finding,
     Observation,
@@ -34,12 +37,17 @@ if TYPE_CHECKING:
     from lifecycle.supervisor.processes.process import ManagedProcess
 
 
+_OBSERVER = "the supervisor's participant"
+_OBSERVER_FIX = "nothing is verified any more; end the system and start it again"
+
+
 class Cause(enum.Enum):
     """Why nothing can be expected of a node; a node may have several at once."""
 
     STOPPED = "stopped"
     HUNG = "hung"
     UNSERVED = "unserved"
+    DEADLOCKED = "deadlocked"
     LOST = "lost"
     REPORTED = "told"
 
@@ -69,6 +77,7 @@ class SilenceMonitor:
         self._is_there = is_there
         self._listeners = [changed]
         self._silent: dict[str, _Silence] = {}
+        self._observer_is_deadlocked = ""
 
     @property
     def silent(self) -> Mapping[str, str]:
@@ -116,6 +125,15 @@ class SilenceMonitor:
                 silent_s = self._emit.elapsed_s - silence.since_s
                 there = self._is_there(name)
                 self._emit(NodeAlive(node=name, silent_s=silent_s, there=there))
+        if news:
+            self._tell()
+
+    def observer_is_deadlocked(self, how: str) -> None:
+        """Note how it shows that our own participant receives nothing; empty while it does."""
+        if how and not self._observer_is_deadlocked:
+            self._emit(Notice(message=f"{_OBSERVER} {how}; {_OBSERVER_FIX}"))
+        news = bool(how) is not bool(self._observer_is_deadlocked)
+        self._observer_is_deadlocked = how
         if news:
             self._tell()
 
@@ -169,8 +187,8 @@ class SilenceMonitor:
             listener()
 
     def findings(self) -> tuple[Finding, ...]:
-        """Return one finding for each silent node."""
-        return tuple(
+        """Return one finding for each silent node, and one if we receive nothing ourselves."""
+        return self._of_the_observer() + tuple(
             SILENT_NODE.finding(
                 Outcome.VIOLATED,
                 subject=name,
@@ -180,6 +198,20 @@ class SilenceMonitor:
                 node=name,
             )
             for name, silence in sorted(self._silent.items())
+        )
+
+    def _of_the_observer(self) -> tuple[Finding, ...]:
+        if not self._observer_is_deadlocked:
+            return ()
+        message = f"{_OBSERVER} {self._observer_is_deadlocked}: it sees no change of the graph"
+        return (
+            DEADLOCKED_OBSERVER.finding(
+                Outcome.VIOLATED,
+                subject="supervisor",
+                expected="a graph that is observed",
+                observed="nothing new",
+                message=message,
+            ),
         )
 
 

@@ -395,8 +395,8 @@ class RestartSchedule:
     # Watchdog
 
     def _look_at_silent(self) -> None:
-        """Have processes ended that are stopped or hang for too long."""
-        causes = (Cause.HUNG, Cause.STOPPED)
+        """Have processes ended that are stopped, hang or receive nothing for too long."""
+        causes = (Cause.HUNG, Cause.STOPPED, Cause.DEADLOCKED)
         silent = {
             name: why
             for cause in causes

@@ -122,7 +122,8 @@ class NodeSilent:
 
     Attributes:
         cause: "stopped" by a signal, "hung" in a callback, "unserved" by an overloaded machine,
-            "lost" from the network, or "told" by its own supervisor.
+            "deadlocked" in Fast DDS so that it receives nothing, "lost" from the network, or "told"
+            by its own supervisor.
     """
 
     kind: ClassVar[str] = "silent"

@@ -47,6 +47,7 @@ from lifecycle.supervisor.health.process_monitor import (
     Sightings,
     StaleNodes,
 )
+from lifecycle.supervisor.health.reception import watch_reception
 from lifecycle.supervisor.nodes.adoption import SETTLE_S, Adoption, Census, ran_before
 from lifecycle.supervisor.nodes.bring_up import BringUp
 from lifecycle.supervisor.nodes.driver import NodeDriver
@@ -362,7 +363,10 @@ class Session:
         self._ros_interface.begin()
         self._emit.listen(self._keep)
         result = UpResult(exit_code=ExitCode.INTERNAL, verdict=NOT_JUDGED)
-        offering = asyncio.ensure_future(self._interfaces.follow())
+        beside = (
+            asyncio.ensure_future(self._interfaces.follow()),
+            asyncio.ensure_future(watch_reception(self._system)),
+        )
         try:
             with self._signals():
                 try:
@@ -372,7 +376,7 @@ class Session:
                 if self._hurry.is_set() and result.exit_code == ExitCode.OK:
                     result = _hurried(result)
         finally:
-            await ended(offering)
+            await ended(*beside)
             for each in self._system.adopted:
                 each.close()
             self._stale.close()
