@@ -735,7 +735,8 @@ class System:
     def on_host_event(self, event: HostEvent) -> None:
         """Take a host's event about one of its nodes, in the order in which it comes.
 
-        Of a reply this is the configuration; the rest is for who asked.
+        Of a reply this is the configuration, if any, which may have changed; the rest is for who
+        asked.
         """
         node = self._by_name.get(event.node)
         if node is None:
@@ -743,10 +744,13 @@ class System:
         if event.configuration is not None:
             before = node.configuration
             node.configuration = event.configuration
-            node.reports_changes = node.reports_changes or event.kind == "configuration"
+            reports = event.kind == "configuration" or event.reports
+            node.reports_changes = node.reports_changes or reports
             if before is not None and before.health != event.configuration.health:
                 node.wake()
         if event.kind == "reply":
+            if event.reports:
+                self.touched.set()
             return
         if event.state:
             node.report(event.state, connected=event.connected)
