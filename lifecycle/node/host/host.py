@@ -124,6 +124,8 @@ def _rehearse() -> None:
     import hashlib
 
     from lifecycle.middleware import ParticipantSettings
+    from lifecycle.node.author.handlers import note_unmarked
+    from lifecycle.node.author.node import LifecycleNode
     from lifecycle.node.author.spec import default_name, plan_without_manifest
     from lifecycle.node.lifecycle.machine import (
         CallbackOutcome,
@@ -133,6 +135,7 @@ def _rehearse() -> None:
 
     codecs.lookup("ascii")  # in which the machine's id is read
     hashlib.sha256()
+    note_unmarked(LifecycleNode)
     node = plan_without_manifest(HostSpec, name=default_name(HostSpec), namespace="/")
     spec = HostSpec(
         system="",
