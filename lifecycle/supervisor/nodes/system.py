@@ -176,7 +176,9 @@ class InterfaceOnDemand:
             await self._changes.beyond(count, None)
             end_s = loop.time() + _BURST_S
             while (left_s := end_s - loop.time()) > 0:
-                if not await self._changes.beyond(self._changes.count, min(_QUIET_S, left_s)):
+                count = self._changes.count
+                await asyncio.sleep(min(_QUIET_S, left_s))
+                if self._changes.count == count:
                     break
 
     async def _look(self) -> None:
@@ -255,7 +257,7 @@ _CONDITIONS = {
 }
 
 _QUIET_S = 0.05
-"""Without a change for so long a burst is over: a client's endpoints come together."""
+"""So often is looked whether a burst is over: a client's endpoints come together."""
 
 _BURST_S = 0.5
 """While a system comes up the graph changes all the time: then it is looked at so often."""
